@@ -1,0 +1,46 @@
+# `make` lists what there is. Every target makes its own environment first, in .venv.
+
+PYTHON ?= python3
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+
+BIN := .venv/bin
+READY := .venv/.ready
+
+.PHONY: help demo test bench lint format clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z.]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@echo "  PYTHON=python3.12 and the like choose the interpreter of a new .venv"
+
+.venv: $(READY) ## make or refresh the environment
+
+# The stamp is younger than the files it was made from, so a changed dependency refreshes the environment.
+$(READY): pyproject.toml constraints.txt
+	@echo "Installing hyrfpack and its tools into .venv (a minute or two when new) ..."
+	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	@$(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt -e ".[dev]" \
+		| { grep --line-buffered -oE '^(Collecting|Building|Installing|Successfully installed) ?[^ ]*' || true; }
+	@touch $@
+
+demo: $(READY) ## train, compress and render a small made-up scene; results in demo/
+	$(BIN)/hyrfpack demo -o demo
+
+test: lint ## check style, then run all tests
+	$(BIN)/python -m pytest
+
+bench: $(READY) ## time the hot operations against their references
+	$(BIN)/python tools/bench.py
+
+lint: $(READY) ## check style only
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: $(READY) ## rewrite the code in the house style
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean: ## remove what was made here, but for .venv and runs/
+	rm -rf build dist demo *.egg-info .pytest_cache .ruff_cache .hypothesis
+	find hyrfpack tests tools -name __pycache__ -type d -prune -exec rm -rf {} +

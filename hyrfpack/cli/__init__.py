@@ -1,0 +1,51 @@
+"""The command line: parses, calls the library, prints. No numerics.
+
+Exit codes: 0 done, 1 a bug of ours or interrupted, 2 something the user can mend (one sentence on standard error).
+Nothing here imports torch or numpy before a command needs it, so that `hyrfpack info` answers at once.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+import hyrfpack
+from hyrfpack.cli.demo import demo
+from hyrfpack.cli.files import compress, decompress, info
+from hyrfpack.cli.train import train
+from hyrfpack.cli.views import evaluate, render
+from hyrfpack.errors import HyrfError
+
+
+class _Commands(click.Group):
+    """A group of commands that turns errors of the user's into one sentence and exit code 2."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except HyrfError as error:
+            failure = click.ClickException(str(error))
+            failure.exit_code = 2
+            raise failure from error
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self.commands)  # in the order of use, not of the alphabet
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(hyrfpack.__version__, prog_name="hyrfpack")
+def main() -> None:
+    """Train hybrid radiance fields from posed photos, pack them into small .hyrf files, render and measure them.
+
+    \b
+    A first round:
+      hyrfpack demo -o demo
+      hyrfpack train photos/bonsai -o runs/bonsai
+      hyrfpack compress runs/bonsai/model.hyrf -o bonsai.hyrf
+      hyrfpack evaluate bonsai.hyrf --data photos/bonsai
+    """
+
+
+for _command in (train, compress, decompress, render, evaluate, info, demo):
+    main.add_command(_command)

@@ -1,0 +1,100 @@
+"""What several commands share: options of data sets, and how results are printed."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import click
+
+from hyrfpack.errors import HyrfError
+
+if TYPE_CHECKING:
+    from hyrfpack.scene import Scene, View
+
+Command = TypeVar("Command", bound=Callable)
+
+PATH = click.Path(path_type=Path)
+LAYOUTS = ("colmap", "blender", "nerfstudio")
+
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
+
+
+def scene_options(command: Command) -> Command:
+    """Options that say how a data folder is read: --test-every, --images, --layout."""
+    for option in (
+        click.option("--layout", type=click.Choice(LAYOUTS), help="How the folder is laid out.  [default: detected]"),
+        click.option("--images", metavar="NAME", help="Folder of pictures to use, such as images_4."),
+        click.option(
+            "--test-every",
+            type=click.IntRange(min=0),
+            default=8,
+            show_default=True,
+            metavar="N",
+            help="Hold out every Nth photo by name for testing; 0 holds out none. Sets with a split of their own "
+            "keep it.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+def read_scene(path: Path, test_every: int, images: str | None, layout: str | None) -> Scene:
+    """Read a data folder and tell what the reader has to say about it."""
+    from hyrfpack.data import load_scene
+
+    scene = load_scene(path, test_every=test_every, images=images, layout=layout)
+    for sentence in scene.notes:
+        note(sentence)
+    return scene
+
+
+def split_views(scene: Scene, split: str) -> list[View]:
+    """The views of a split.
+
+    Raises:
+        HyrfError: it has none.
+    """
+    views = {"test": scene.test, "train": scene.train, "all": scene.views}[split]
+    if not views:
+        raise HyrfError(f"{scene.path}: no photo is in the split '{split}'; name another --split or --test-every")
+    return views
+
+
+def refuse_same_file(source: Path, target: Path) -> None:
+    """Raise HyrfError when writing `target` would overwrite `source`."""
+    if os.path.realpath(source) == os.path.realpath(target):
+        raise HyrfError(f"{target}: the output is the input itself; name another file with -o")
+
+
+def note(sentence: str) -> None:
+    """Tell the person something on standard error."""
+    click.echo(sentence, err=True)
+
+
+def print_json(values: dict) -> None:
+    """Print one JSON object, the only thing a command puts on standard output under --json."""
+    click.echo(json.dumps(values, indent=1, allow_nan=False))
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Rows of words and numbers as aligned text: the first column to the left, the others to the right."""
+    lines = [list(header), *map(list, rows)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(header))]
+
+    def align(line: Sequence[str]) -> str:
+        cells = [
+            line[0].ljust(widths[0]),
+            *(cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True)),
+        ]
+        return "  ".join(cells).rstrip()
+
+    return "\n".join(
+        [
+            "  ".join(["-" * width for width in widths]) if line is None else align(line)
+            for line in (lines[0], None, *lines[1:])
+        ]
+    )

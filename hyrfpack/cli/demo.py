@@ -1,0 +1,30 @@
+"""`hyrfpack demo`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from hyrfpack.cli.common import PATH, json_option, note, print_json
+
+
+@click.command(short_help="See all of it on a scene made on the spot.")
+@click.option("-o", "--output", type=PATH, default=Path("demo"), show_default=True, metavar="DIR", help="Folder.")
+@click.option("--steps", type=click.IntRange(min=1), default=2000, show_default=True, help="Optimiser steps.")
+@json_option
+def demo(output: Path, steps: int, as_json: bool) -> None:
+    """Make a scene, train on it, compress, decompress, render and measure, and draw one picture of it all.
+
+    \b
+    Example:
+      hyrfpack demo -o demo
+    """
+    from hyrfpack.demo import run_demo
+
+    result = run_demo(output, steps=steps, report=note)
+    if as_json:
+        print_json(result.to_dict())
+        return
+    click.echo("\n".join(result.table()))
+    click.echo(f"{result.picture}: photos, renders and errors of held-out views")

@@ -1,0 +1,88 @@
+"""`hyrfpack train`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from hyrfpack.cli.common import PATH, json_option, note, print_json, read_scene, scene_options
+from hyrfpack.errors import HyrfError
+
+PRESETS = ("auto", "synthetic", "standard", "large", "street")  # hyrfpack.train.PRESETS, without loading torch
+BACKGROUND_COLORS = ("black", "white", "random")
+
+
+@click.command(short_help="Train a model from posed photos.")
+@click.argument("data", type=PATH)
+@click.option("-o", "--output", "out", type=PATH, required=True, metavar="RUN", help="Folder of the run.")
+@click.option("--steps", type=click.IntRange(min=1), default=3000, show_default=True, help="Optimiser steps.")
+@click.option("--max-gaussians", type=click.IntRange(min=1), metavar="N", help="Budget.  [default: from the photos]")
+@click.option("--preset", type=click.Choice(PRESETS), default="auto", show_default=True, help="The kind of scene.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same bytes.")
+@scene_options
+@click.option("--background/--no-background", default=None, help="Train a background sphere.  [default: preset]")
+@click.option(
+    "--background-color",
+    type=click.Choice(BACKGROUND_COLORS),
+    default="black",
+    show_default=True,
+    help="What transparent photos are laid over.",
+)
+@click.option("--antialiased", is_flag=True, help="Compensate small Gaussians for the pixel filter.")
+@click.option("--log2-table-size", type=click.IntRange(4, 24), metavar="B", help="Hash rows a level, as 2^B.")
+@click.option(
+    "--cache-mb", type=click.IntRange(min=1), metavar="MB", help="Decoded photos to keep.  [default: RAM / 4]"
+)
+@click.option("--resume", is_flag=True, help="Go on from the run's checkpoint.")
+@click.option("--overwrite", is_flag=True, help="Replace what an earlier run left in the folder.")
+@json_option
+def train(
+    data: Path,
+    out: Path,
+    test_every: int,
+    images: str | None,
+    layout: str | None,
+    cache_mb: int | None,
+    resume: bool,
+    overwrite: bool,
+    as_json: bool,
+    **settings: Any,
+) -> None:
+    """Train a model on DATA, a folder of photos and poses (COLMAP, NeRF-synthetic, instant-ngp or nerfstudio).
+
+    RUN gets model.hyrf, metrics.json, the training curve and pictures of held-out views. Ctrl-C saves a checkpoint;
+    --resume goes on with it and ends with the same model as an uninterrupted run.
+
+    \b
+    Examples:
+      hyrfpack train photos/bonsai -o runs/bonsai
+      hyrfpack train photos/garden -o runs/garden --images images_4 --steps 30000
+      hyrfpack train lego -o runs/lego --background-color white --max-gaussians 50000
+      hyrfpack train photos/garden -o runs/garden --images images_4 --steps 30000 --resume
+    """
+    if resume and overwrite:
+        raise click.UsageError("--resume goes on with a run and --overwrite replaces it; give one of them")
+    if resume and not (out / "checkpoint.pt").is_file():
+        raise HyrfError(f"{out}: there is no checkpoint to resume; leave out --resume to start a run")
+    from hyrfpack.data import PictureCache
+    from hyrfpack.train import TrainConfig
+    from hyrfpack.train import train as run
+
+    scene = read_scene(data, test_every, images, layout)
+    note(f"{scene.layout} scene: {len(scene.train)} photos to train on, {len(scene.test)} held out")
+    cache = None if cache_mb is None else PictureCache(cache_mb * 2**20)
+    result = run(scene, out, TrainConfig(**settings), resume=resume, overwrite=overwrite, cache=cache)
+    if not result.complete:
+        note(f"stopped after step {result.step:,}; the same command with --resume goes on from there")
+    if as_json:
+        print_json({"complete": result.complete, "step": result.step, **result.metrics})
+    elif result.complete:
+        metrics = result.metrics
+        click.echo(
+            f"{result.model}: {metrics['gaussians']:,} Gaussians, {metrics['bytes']:,} bytes, "
+            f"{metrics['seconds']:.0f} s of training"
+        )
+        if scores := metrics.get("evaluation"):
+            click.echo(f"held-out views: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}")

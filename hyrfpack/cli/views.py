@@ -1,0 +1,141 @@
+"""`hyrfpack render` and `evaluate`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import click
+
+from hyrfpack.cli.common import PATH, json_option, note, print_json, read_scene, scene_options, split_views, table
+
+SPLITS = ("test", "train", "all")
+DEFAULT_ORBIT = 60  # frames
+
+
+@click.command(short_help="Render views to pictures.")
+@click.argument("model", type=PATH)
+@click.option("-o", "--output", type=PATH, required=True, metavar="OUT", help="Folder for the pictures.")
+@click.option("--data", type=PATH, help="Render the views of this data folder, named as its photos.")
+@click.option("--split", type=click.Choice(SPLITS), default="test", show_default=True, help="Which views of --data.")
+@scene_options
+@click.option("--cameras", type=PATH, metavar="JSON", help="Render the cameras of this file.")
+@click.option("--orbit", type=click.IntRange(1, 100_000), metavar="N", help="Render N frames around the scene.")
+@click.option("--depth", is_flag=True, help="Also write depth in world units (float32 TIFF).")
+@click.option("--video", is_flag=True, help="Also put the frames together as OUT/video.mp4 (needs ffmpeg).")
+@json_option
+def render(
+    model: Path,
+    output: Path,
+    data: Path | None,
+    split: str,
+    test_every: int,
+    images: str | None,
+    layout: str | None,
+    cameras: Path | None,
+    orbit: int | None,
+    depth: bool,
+    video: bool,
+    as_json: bool,
+) -> None:
+    """Render MODEL, a .hyrf file, to PNG pictures: the views of photos, cameras of a file, or an orbit of 60 frames.
+
+    A cameras file is a list of {"name", "width", "height", "fx", "fy", "cx", "cy", "camera_from_world": 4 x 4}
+    with OpenCV axes, or a transforms.json as nerfstudio writes it.
+
+    \b
+    Examples:
+      hyrfpack render bonsai.hyrf -o orbit --video
+      hyrfpack render bonsai.hyrf -o out --data photos/bonsai --split test
+      hyrfpack render bonsai.hyrf -o out --cameras path.json --depth
+    """
+    if sum(source is not None for source in (data, cameras, orbit)) > 1:
+        raise click.UsageError("--data, --cameras and --orbit each say what to render; give one of them")
+    from hyrfpack.format import describe, load
+    from hyrfpack.render.camera_files import cameras_from_json
+    from hyrfpack.render.files import render_files
+    from hyrfpack.render.paths import orbit as orbit_around
+    from hyrfpack.render.paths import stored_viewpoint
+    from hyrfpack.render.video import has_ffmpeg, write_video
+
+    if data is not None:
+        views = split_views(read_scene(data, test_every, images, layout), split)
+        named = [(view.name, view.camera) for view in views]
+    elif cameras is not None:
+        named = cameras_from_json(cameras)
+    else:
+        path = orbit_around(stored_viewpoint(describe(model)), orbit or DEFAULT_ORBIT)
+        named = [(f"{number:04d}", camera) for number, camera in enumerate(path)]
+
+    written = []
+    with click.progressbar(
+        render_files(load(model), named, output, depth=depth),
+        len(named),
+        "rendering",
+        file=sys.stderr,
+    ) as frames:
+        for path in frames:
+            written.append(path)
+    film = output / "video.mp4" if video and has_ffmpeg() else None
+    if film:
+        write_video(written, film)
+    elif video:
+        note("there is no ffmpeg program, so no video was made; the pictures are in place")
+    if as_json:
+        print_json({"pictures": [str(path) for path in written], "video": str(film) if film else None})
+    else:
+        click.echo(f"{output}: {len(written)} pictures{' and video.mp4' if film else ''}")
+
+
+@click.command(short_help="Score a model against photos.")
+@click.argument("model", type=PATH)
+@click.option("--data", type=PATH, required=True, help="The folder of photos and poses.")
+@click.option("--split", type=click.Choice(SPLITS), default="test", show_default=True, help="Which of its photos.")
+@scene_options
+@click.option("--lpips-weights", type=PATH, metavar="FILE", help="Weights of the lpips package, to score LPIPS too.")
+@click.option("--pictures", type=PATH, metavar="DIR", help="Write photo | render | error pictures here.")
+@json_option
+def evaluate(
+    model: Path,
+    data: Path,
+    split: str,
+    test_every: int,
+    images: str | None,
+    layout: str | None,
+    lpips_weights: Path | None,
+    pictures: Path | None,
+    as_json: bool,
+) -> None:
+    """Score MODEL, a .hyrf file, against photos it has not seen: PSNR, SSIM, LPIPS, bytes on disk, seconds a frame.
+
+    Renders are rounded to 8 bits before they are scored. LPIPS needs the trained weights of the lpips package:
+    torch.save(lpips.LPIPS(net="alex").state_dict(), FILE)
+
+    \b
+    Examples:
+      hyrfpack evaluate bonsai.hyrf --data photos/bonsai
+      hyrfpack evaluate bonsai.hyrf --data photos/bonsai --pictures compare --json
+    """
+    from hyrfpack.evaluate import evaluate as score
+    from hyrfpack.format import load
+
+    loaded = load(model)
+    views = split_views(read_scene(data, test_every, images, layout), split)
+    scores = score(loaded, views, lpips_weights=lpips_weights, pictures=pictures)
+    size = os.path.getsize(model)
+    if scores.skipped:
+        note(f"{len(scores.skipped)} photos were not scored because their masks leave no pixel")
+    if as_json:
+        print_json({"bytes": size, **scores.to_dict()})
+        return
+    rows = [[view.name, f"{view.psnr:.2f}", f"{view.ssim:.4f}", _optional(view.lpips)] for view in scores.views]
+    rows.append(["mean", f"{scores.psnr:.2f}", f"{scores.ssim:.4f}", _optional(scores.lpips)])
+    click.echo(table(["view", "PSNR (dB)", "SSIM", "LPIPS"], rows))
+    click.echo(f"{model}: {size:,} bytes, {scores.gaussians:,} Gaussians, {scores.seconds_per_frame:.4f} s a frame")
+    if scores.lpips is None:
+        click.echo(f"LPIPS: {scores.lpips_reason}")
+
+
+def _optional(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4f}"

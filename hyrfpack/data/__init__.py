@@ -1,0 +1,73 @@
+"""Readers: a folder of posed photos -> Scene, one file a format."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from hyrfpack.data.cache import PictureCache
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.scene import Scene
+
+__all__ = ["PictureCache", "load_scene"]
+
+
+def load_scene(
+    path: str | os.PathLike[str], *, test_every: int = 8, images: str | None = None, layout: str | None = None
+) -> Scene:
+    """Read a folder of posed photos; pictures are decoded later, one by one, by `View.load`.
+
+    Args:
+        path: the folder. Known layouts: COLMAP (`sparse/0`, `sparse`, or `colmap/sparse/0`, binary or text, beside
+            `images/`), Blender (`transforms_train.json`), nerfstudio and instant-ngp (`transforms.json`).
+            Masks in `masks/` beside the photos are honoured (0 = ignored pixel).
+        test_every: hold out every n-th of the sorted names, beginning with the first; 0 holds out none.
+            A split of the set's own counts instead.
+        images: take the photos from this folder ("images_2"); intrinsics follow the size of its files.
+        layout: "colmap", "blender" or "nerfstudio"; None takes the first of these that is there and says so in
+            `Scene.notes` when there was a choice.
+
+    Returns:
+        The scene in the frame and units of its files.
+
+    Raises:
+        HyrfDataError: the folder cannot be used; one sentence says what, where, and what to do.
+        ValueError: an unknown `layout` or a negative `test_every`.
+    """
+    if test_every < 0:
+        raise ValueError(f"test_every must be 0 or more, not {test_every}")
+    if layout not in (None, "colmap", "blender", "nerfstudio"):
+        raise ValueError(f"no layout '{layout}'; there are colmap, blender, nerfstudio")
+    folder = Path(path)
+    if not folder.exists():
+        raise HyrfDataError(f"{folder}: no such folder; check the path")
+    if not folder.is_dir():
+        raise HyrfDataError(f"{folder}: a file, not a folder; give the folder that holds photos and poses")
+
+    from hyrfpack.data.blender import read_blender
+    from hyrfpack.data.colmap import find_model, read_colmap
+    from hyrfpack.data.nerfstudio import read_nerfstudio
+
+    there = {
+        "colmap": find_model(folder) is not None,
+        "blender": (folder / "transforms_train.json").is_file(),
+        "nerfstudio": (folder / "transforms.json").is_file(),
+    }
+    found = [name for name, present in there.items() if present]
+    if not found or (layout is not None and not there[layout]):
+        raise HyrfDataError(
+            f"{folder}: no {layout + ' ' if layout else ''}poses found (looked for a COLMAP model in sparse/0, "
+            "transforms_train.json and transforms.json); give the folder that holds them"
+        )
+    chosen = layout or found[0]
+    if chosen == "blender" and images is not None:
+        raise HyrfDataError(f"{folder}: a Blender-style set names its own pictures; leave out the folder '{images}'")
+    if chosen == "colmap":
+        scene = read_colmap(folder, test_every=test_every, images=images)
+    elif chosen == "blender":
+        scene = read_blender(folder, test_every=test_every)
+    else:
+        scene = read_nerfstudio(folder, test_every=test_every, images=images)
+    if len(found) > 1:
+        scene.notes.insert(0, f"poses are there as {' and '.join(found)}; {chosen} was taken")
+    return scene

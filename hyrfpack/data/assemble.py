@@ -1,0 +1,168 @@
+"""From what a format says about each photo to a checked Scene: sizes, poses, the split. Shared by all readers."""
+
+from __future__ import annotations
+
+from collections.abc import Set
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from hyrfpack.data.pictures import Header, PhotoFile, read_header, same_aspect
+from hyrfpack.data.undistort import Lens
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.scene import Camera, Scene, View
+
+_RIGID_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One photo as a format describes it; `path` exists.
+
+    Attributes:
+        name: its path below the picture folder.
+        path: the file.
+        header: what the file says.
+        lens: as calibrated; its size may differ from the file's by a uniform scale.
+        camera_from_world: (4, 4) OpenCV pose, not yet checked.
+        mask: the file of its mask, if any.
+    """
+
+    name: str
+    path: Path
+    header: Header
+    lens: Lens
+    camera_from_world: np.ndarray
+    mask: Path | None = None
+
+
+def make_scene(
+    path: Path,
+    layout: str,
+    photos: list[Photo],
+    *,
+    test_every: int,
+    test_names: Set[str] | None = None,
+    points: np.ndarray | None = None,
+    point_colors: np.ndarray | None = None,
+    notes: list[str],
+) -> Scene:
+    """Check every photo and split them.
+
+    Args:
+        path: the scene folder.
+        layout: the format's name.
+        photos: found on disk, in any order.
+        test_every: every n-th of the sorted names, from the first on, is held out; 0 holds out none.
+        test_names: the set's own split, which then counts instead of `test_every`.
+        points: (P, 3) world positions, none when None.
+        point_colors: (P, 3) RGB in [0, 1].
+        notes: sentences for the user; more are added.
+
+    Raises:
+        HyrfDataError: no photo, a name twice, a bad pose, intrinsics or size, or nothing left to train on.
+    """
+    if not photos:
+        raise HyrfDataError(f"{path}: none of the posed photos is on disk; put them where the poses name them")
+    photos = sorted(photos, key=lambda photo: photo.name)
+    for first, second in zip(photos, photos[1:], strict=False):
+        if first.name == second.name:
+            raise HyrfDataError(f"{path}: photo {first.name} is listed twice; remove one of the entries")
+    if test_names is None:
+        test_names = {photo.name for photo in photos[::test_every]} if test_every else set()
+    views = [_make_view(photo) for photo in photos]
+    train = [view for view in views if view.name not in test_names]
+    test = [view for view in views if view.name in test_names]
+    if not train:
+        raise HyrfDataError(
+            f"{path}: all {len(test)} photos are held out for testing and none is left to train on; "
+            "add photos or hold out fewer (0 holds out none)"
+        )
+    masked = sum(photo.mask is not None for photo in photos)
+    if masked:
+        notes.append(f"{masked} of {len(photos)} photos have a mask")
+    bent = sum(photo.lens.distorted for photo in photos)
+    if bent:
+        notes.append(f"{bent} of {len(photos)} photos are undistorted as they are loaded")
+    points, point_colors = _finite_points(points, point_colors, notes)
+    has_alpha = any(photo.header.has_alpha for photo in photos)
+    return Scene(str(path), layout, train, test, points, point_colors, has_alpha, notes)
+
+
+def safe_name(text: str) -> str:
+    """A photo's name as a relative path that stays below the folder it is joined to."""
+    parts = [part for part in PurePosixPath(text.replace("\\", "/")).parts if part not in ("..", "/")]
+    return "/".join(parts)
+
+
+def skipped_note(missing: int, listed: int, where: str) -> list[str]:
+    """The note about listed photos that are not on disk; no note when none is missing."""
+    return [f"{missing} of {listed} photos listed in {where} are not on disk and were skipped"] if missing else []
+
+
+def _make_view(photo: Photo) -> View:
+    lens, header = photo.lens, photo.header
+    if not _is_sane(lens):
+        raise HyrfDataError(
+            f"{photo.path}: the camera of this photo has unusable intrinsics (size {lens.width} x {lens.height}, "
+            f"focal lengths {lens.fx:g} and {lens.fy:g}, centre {lens.cx:g}, {lens.cy:g}); calibrate it again"
+        )
+    if not same_aspect(header.width, header.height, lens.width, lens.height):
+        raise HyrfDataError(
+            f"{photo.path}: the picture is {header.width} x {header.height} but its camera says {lens.width} x "
+            f"{lens.height}, which is no uniform rescaling; use the pictures that were calibrated (unrotated)"
+        )
+    if (header.width, header.height) != (lens.width, lens.height):
+        lens = lens.scaled(header.width, header.height)
+    if photo.mask is not None:
+        mask = read_header(photo.mask)
+        if not same_aspect(mask.width, mask.height, header.width, header.height):
+            raise HyrfDataError(
+                f"{photo.mask}: the mask is {mask.width} x {mask.height} but its photo {header.width} x "
+                f"{header.height}; make it the photo's size"
+            )
+    pose = _rigid(photo.camera_from_world, photo.path)
+    camera = Camera(header.width, header.height, lens.fx, lens.fy, lens.cx, lens.cy, pose)
+    return View(photo.name, camera, PhotoFile(photo.path, lens, photo.mask))
+
+
+def _is_sane(lens: Lens) -> bool:
+    """Finite numbers and a field of view that a lens can have: far wider bounds than any real one needs."""
+    size = max(lens.width, lens.height)
+    return (
+        bool(np.isfinite((lens.fx, lens.fy, lens.cx, lens.cy, *lens.coefficients)).all())
+        and min(lens.width, lens.height) >= 1
+        and all(1e-3 * size <= focal <= 1e5 * size for focal in (lens.fx, lens.fy))
+        and max(abs(lens.cx), abs(lens.cy)) <= 1e3 * size
+    )
+
+
+def _rigid(pose: np.ndarray, path: Path) -> np.ndarray:
+    """The pose with its rotation made exactly orthonormal (text files round it)."""
+    with np.errstate(over="ignore"):
+        finite = np.isfinite(pose.astype(np.float32)).all()
+    if not finite:
+        raise HyrfDataError(f"{path}: the pose of this photo is not finite (NaN or Inf); remove or re-register it")
+    rotation = pose[:3, :3]
+    if np.abs(rotation).max() > 2 or np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID_TOLERANCE:
+        raise HyrfDataError(f"{path}: the pose of this photo is not rigid (its axes are scaled or skewed); mend it")
+    if np.linalg.det(rotation) < 0:
+        raise HyrfDataError(f"{path}: the pose of this photo mirrors the world; mend its rotation")
+    u, _, vt = np.linalg.svd(rotation)
+    rigid = np.eye(4)
+    rigid[:3, :3] = u @ vt
+    rigid[:3, 3] = pose[:3, 3]
+    return rigid
+
+
+def _finite_points(
+    points: np.ndarray | None, colors: np.ndarray | None, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    if points is None or colors is None:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.float32)
+    with np.errstate(over="ignore"):  # float32 is what they are used in
+        finite = np.isfinite(points.astype(np.float32)).all(axis=1)
+    if not finite.all():
+        notes.append(f"{(~finite).sum()} of {len(points)} points are not finite and were dropped")
+    return points[finite].astype(np.float64), colors[finite].astype(np.float32)

@@ -1,0 +1,60 @@
+"""NeRF-synthetic sets: transforms_{train,val,test}.json beside folders of RGBA renders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hyrfpack.data.assemble import Photo, make_scene, safe_name, skipped_note
+from hyrfpack.data.pictures import find_picture, read_header
+from hyrfpack.data.transforms import focal_from_angle, number, pose_from_opengl, read_json
+from hyrfpack.data.undistort import Lens
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.scene import Scene
+
+
+def read_blender(path: Path, *, test_every: int) -> Scene:
+    """Read a Blender-style set; the world is the file's (z up), pictures keep straight alpha.
+
+    The set's own split counts: train, and test (val where there is no test). `test_every` is for sets with neither.
+
+    Raises:
+        HyrfDataError: a file is missing or cannot be used.
+    """
+    notes: list[str] = []
+    photos = _read_split(path, "train", notes)
+    held_out = next((split for split in ("test", "val") if (path / f"transforms_{split}.json").is_file()), None)
+    test_names = None
+    if held_out is None:
+        notes.append("the set has no split of its own")
+    else:
+        test = _read_split(path, held_out, notes)
+        test_names = {photo.name for photo in test}
+        photos += test
+        if held_out == "val":
+            notes.append("the set has no test split; val is used")
+    return make_scene(path, "blender", photos, test_every=test_every, test_names=test_names, notes=notes)
+
+
+def _read_split(path: Path, split: str, notes: list[str]) -> list[Photo]:
+    file = path / f"transforms_{split}.json"
+    content = read_json(file)
+    angle = number(content, "camera_angle_x", file)
+    if angle is None:
+        raise HyrfDataError(f"{file}: has no 'camera_angle_x', so the focal length is unknown; add it")
+    photos, missing = [], 0
+    for frame in content["frames"]:
+        picture = find_picture(path / frame["file_path"])
+        if picture is None:
+            missing += 1
+            continue
+        header = read_header(picture)
+        focal = focal_from_angle(angle, header.width, file)
+        lens = Lens(header.width, header.height, focal, focal, header.width / 2, header.height / 2)
+        name = safe_name(frame["file_path"])
+        if not name.endswith(picture.suffix):
+            name += picture.suffix
+        photos.append(Photo(name, picture, header, lens, pose_from_opengl(frame, file)))
+    if not photos:
+        raise HyrfDataError(f"{file}: none of its {missing} pictures is on disk; put them where 'file_path' says")
+    notes += skipped_note(missing, len(content["frames"]), file.name)
+    return photos

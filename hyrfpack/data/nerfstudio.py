@@ -1,0 +1,173 @@
+"""nerfstudio and instant-ngp sets: one transforms.json, intrinsics for all or for each frame."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from hyrfpack.data.assemble import Photo, make_scene, safe_name, skipped_note
+from hyrfpack.data.pictures import Header, find_mask, find_picture, read_header
+from hyrfpack.data.transforms import focal_from_angle, number, pose_from_opengl, read_json
+from hyrfpack.data.undistort import Lens, brown
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.scene import Scene
+
+_PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+_DENOMINATOR = ("k4", "k5", "k6")
+
+
+def read_nerfstudio(path: Path, *, test_every: int, images: str | None) -> Scene:
+    """Read a folder with a transforms.json.
+
+    The world is that of the file's matrices. `applied_transform` says how it was turned from the reconstruction's
+    frame; poses and the points of `ply_file_path` are both already turned, so nothing is left to do.
+
+    Args:
+        path: the scene folder.
+        test_every: see `load_scene`; `train_filenames`, `val_filenames`, `test_filenames` come first.
+        images: a folder to take the photos from instead of the one the frames name.
+
+    Raises:
+        HyrfDataError: a file is missing or cannot be used.
+    """
+    file = path / "transforms.json"
+    content = read_json(file)
+    frames = content["frames"]
+    if images is not None and not (path / images).is_dir():
+        raise HyrfDataError(f"{path}: no photo folder '{images}'; name one that is there")
+    keep, test_names = _own_split(content, file)
+    strip = _common_folder([frame["file_path"] for frame in frames])
+    photos, missing, test = [], 0, set()
+    for frame in frames:
+        listed = PurePosixPath(frame["file_path"])
+        if keep is not None and listed not in keep:
+            continue
+        name = safe_name(str(listed.relative_to(strip)))
+        picture = find_picture(path / listed if images is None else path / images / name)
+        if picture is None:
+            missing += 1
+            continue
+        header = read_header(picture)
+        if not PurePosixPath(name).suffix:
+            name += picture.suffix
+        if listed in test_names:
+            test.add(name)
+        lens = _lens(content, frame, header, file)
+        mask = _mask(path, images or strip.name, frame, name, file)
+        photos.append(Photo(name, picture, header, lens, pose_from_opengl(frame, file), mask))
+    notes = skipped_note(missing, len(frames), file.name)
+    points, colors = _read_ply(path, content, file)
+    return make_scene(
+        path,
+        "nerfstudio",
+        photos,
+        test_every=test_every,
+        test_names=None if keep is None else test,
+        points=points,
+        point_colors=colors,
+        notes=notes,
+    )
+
+
+def _own_split(content: dict[str, Any], file: Path) -> tuple[set | None, set]:
+    """Listed paths to keep (None: all) and, among them, those held out."""
+    lists = {}
+    for key in ("train_filenames", "val_filenames", "test_filenames"):
+        names = content.get(key) or []
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise HyrfDataError(f"{file}: '{key}' is no list of file names; mend or remove it")
+        lists[key] = {PurePosixPath(name) for name in names}
+    train, val, test = lists.values()
+    held_out = test or val
+    if not train or not held_out:
+        return None, set()
+    return train | held_out, held_out
+
+
+def _common_folder(listed: list[str]) -> PurePosixPath:
+    """The first folder of all frames ("images"), which is no part of a photo's name."""
+    firsts = {PurePosixPath(name).parts[:1] for name in listed if len(PurePosixPath(name).parts) > 1}
+    alone = any(len(PurePosixPath(name).parts) < 2 for name in listed)
+    return PurePosixPath(*next(iter(firsts))) if len(firsts) == 1 and not alone else PurePosixPath()
+
+
+def _lens(content: dict[str, Any], frame: dict[str, Any], header: Header, file: Path) -> Lens:
+    """The frame's intrinsics where it has its own, the file's otherwise."""
+
+    def value(key: str) -> float | None:
+        own = number(frame, key, file)
+        return own if own is not None else number(content, key, file)
+
+    where = f"{file}: frame {frame['file_path'][:80]}"
+    width, height = int(value("w") or header.width), int(value("h") or header.height)
+    fx, fy = value("fl_x"), value("fl_y")
+    angle_x, angle_y = value("camera_angle_x"), value("camera_angle_y")
+    if fx is None and angle_x is not None:
+        fx = focal_from_angle(angle_x, width, file)
+    if fy is None:
+        fy = focal_from_angle(angle_y, height, file) if angle_y is not None and value("fl_x") is None else fx
+    if fx is None:
+        fx = fy
+    if fx is None or fy is None:
+        raise HyrfDataError(f"{where} has neither 'fl_x' nor 'camera_angle_x'; add its focal length")
+    cx, cy = value("cx"), value("cy")
+    pinhole = (width, height, fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
+
+    model = frame.get("camera_model", content.get("camera_model", "OPENCV"))
+    if frame.get("is_fisheye", content.get("is_fisheye", False)):
+        model = "OPENCV_FISHEYE"
+    k1, k2, k3, k4, k5, k6, p1, p2 = (value(key) or 0.0 for key in ("k1", "k2", "k3", *_DENOMINATOR, "p1", "p2"))
+    if model == "OPENCV_FISHEYE":
+        return Lens(*pinhole, "fisheye", (k1, k2, k3, k4))
+    if model not in _PERSPECTIVE:
+        raise HyrfDataError(f"{where} has camera model {str(model)[:40]!r}, which is not supported; undistort it first")
+    if model in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return Lens(*pinhole)
+    if model != "FULL_OPENCV" and (k4 or k5 or k6):
+        raise HyrfDataError(
+            f"{where} has 'k4' or more, which camera model {model} does not define; "
+            "say FULL_OPENCV (rational) or OPENCV_FISHEYE, or set it to 0"
+        )
+    return Lens(*pinhole, "brown", brown(k1, k2, p1, p2, k3, k4, k5, k6))
+
+
+def _mask(path: Path, picture_folder: str, frame: dict[str, Any], name: str, file: Path) -> Path | None:
+    listed = frame.get("mask_path")
+    if listed is None:
+        return find_mask(path, picture_folder, name)
+    mask = find_picture(path / listed) if isinstance(listed, str) else None
+    if mask is None:
+        raise HyrfDataError(f"{file}: mask {str(listed)[:80]} of {name} is not on disk; restore it or drop 'mask_path'")
+    return mask
+
+
+def _read_ply(path: Path, content: dict[str, Any], file: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
+    listed = content.get("ply_file_path")
+    if listed is None:
+        return None, None
+    ply = path / str(listed)
+    if not isinstance(listed, str) or not ply.is_file():
+        raise HyrfDataError(f"{file}: points {str(listed)[:80]} are not on disk; restore them or drop 'ply_file_path'")
+    try:
+        import trimesh
+    except ModuleNotFoundError as error:
+        raise HyrfDataError(f"{ply}: reading points needs trimesh; run 'pip install trimesh'") from error
+    try:
+        with ply.open("rb") as stream:
+            stated = re.search(rb"element vertex (\d{1,18})\s", stream.read(4096))
+        cloud = trimesh.load(str(ply), file_type="ply", process=False)
+        points = np.asarray(getattr(cloud, "vertices", np.zeros((0, 3))), dtype=np.float64)
+        mesh = isinstance(cloud, trimesh.Trimesh)
+        rgba = np.asarray(cloud.visual.vertex_colors if mesh else getattr(cloud, "colors", ()))
+        colors = rgba[:, :3] / 255 if rgba.shape == (len(points), 4) else np.full_like(points, 0.5)
+    except Exception as error:  # trimesh raises whatever its parsing meets.
+        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+        raise HyrfDataError(f"{ply}: the points cannot be read ({reason}); export them again") from error
+    if points.ndim != 2 or points.shape[1:] != (3,) or colors.shape != points.shape:
+        raise HyrfDataError(f"{ply}: the points have no usable positions and colours; export them again")
+    if stated and int(stated[1]) != len(points):
+        raise HyrfDataError(f"{ply}: says {int(stated[1])} points but holds {len(points)}; export them again")
+    return points, colors

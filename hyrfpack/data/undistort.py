@@ -1,0 +1,170 @@
+"""Lenses: what a calibrated camera does to a ray, and how to undo it in a photo.
+
+The forward distortion is all that is needed: each pixel of the undistorted picture looks up where its ray fell
+in the photo. The undistorted camera keeps the photo's size, focal lengths and principal point, so nothing is
+rescaled; its pixels whose rays fell outside the photo are masked out instead of being cropped or painted black.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+
+from hyrfpack.scene import Picture
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics of a photo as it was taken.
+
+    Attributes:
+        width, height: picture size in pixels.
+        fx, fy, cx, cy: pinhole part, in pixels (pixel centres at .5).
+        model: "pinhole" (no coefficients), "brown" (k1 k2 p1 p2 k3 k4 k5 k6, COLMAP's FULL_OPENCV), or
+            "fisheye" (k1 k2 k3 k4 of the equidistant OPENCV_FISHEYE).
+        coefficients: as many as the model has, dimensionless.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    model: Literal["pinhole", "brown", "fisheye"] = "pinhole"
+    coefficients: tuple[float, ...] = ()
+
+    @property
+    def distorted(self) -> bool:
+        """Whether straight lines in the world are bent in the photo."""
+        return self.model == "fisheye" or any(self.coefficients)
+
+    def scaled(self, width: int, height: int) -> Lens:
+        """The same lens for a copy of the photo resized to (width, height); coefficients have no unit and stay."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )
+
+
+def brown(k1: float = 0, k2: float = 0, p1: float = 0, p2: float = 0, *higher: float) -> tuple[float, ...]:
+    """Pad Brown coefficients in COLMAP's order (k1 k2 p1 p2 k3 k4 k5 k6) to all eight."""
+    return (k1, k2, p1, p2, *higher, *(0.0,) * (4 - len(higher)))
+
+
+def distort(lens: Lens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bend rays as the lens does.
+
+    With r^2 = x^2 + y^2, brown is the OpenCV rational model
+
+        d = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
+        x' = x d + 2 p1 x y + p2 (r^2 + 2 x^2),   y' = y d + 2 p2 x y + p1 (r^2 + 2 y^2)
+
+    and fisheye, with theta = atan r, is (x', y') = (x, y) theta (1 + k1 theta^2 + ... + k4 theta^8) / r.
+
+    Args:
+        lens: the lens.
+        x, y: ray direction at depth 1, X/Z and Y/Z, any common shape.
+
+    Returns:
+        (x', y') of the same shape; the photo's pixel is (fx x' + cx, fy y' + cy).
+    """
+    if lens.model == "pinhole":
+        return x, y
+    r2 = x * x + y * y
+    if lens.model == "fisheye":
+        r = np.sqrt(r2)
+        scale = np.divide(_fisheye_angle(lens, np.arctan(r)), r, out=np.ones_like(r), where=r > 1e-9)
+        return x * scale, y * scale
+    p1, p2 = lens.coefficients[2:4]
+    d = _brown_factor(lens, r2)
+    return x * d + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * d + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+
+
+def _brown_factor(lens: Lens, r2: np.ndarray) -> np.ndarray:
+    k1, k2, _, _, k3, k4, k5, k6 = lens.coefficients
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+
+
+def _fisheye_angle(lens: Lens, theta: np.ndarray) -> np.ndarray:
+    k1, k2, k3, k4 = lens.coefficients
+    t2 = theta * theta
+    return theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+
+
+def fold_radius(lens: Lens, largest: float) -> float:
+    """The radius |(x, y)| up to which the lens maps rays one to one, `largest` if that is all of them.
+
+    Past it the polynomial bends back and would show the photo's content a second time.
+    """
+    radii = np.linspace(0, largest, 4096)
+    with np.errstate(over="ignore", invalid="ignore"):
+        if lens.model == "fisheye":
+            bent = _fisheye_angle(lens, np.arctan(radii))
+        else:
+            bent = radii * _brown_factor(lens, radii * radii)
+        folded = np.flatnonzero(~(np.diff(bent) > 0))
+    return float(radii[folded[0]]) if folded.size else largest
+
+
+@lru_cache(maxsize=4)  # One camera for all photos is the common case; a map costs 9 bytes a pixel.
+def _source_map(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Where each undistorted pixel finds its colour: (H, W) float32 column and row (pixel centres at integers,
+    inside the photo), and (H, W) bool of the pixels that have one, None for all."""
+    x = ((np.arange(lens.width) + 0.5 - lens.cx) / lens.fx)[None, :]
+    y = ((np.arange(lens.height) + 0.5 - lens.cy) / lens.fy)[:, None]
+    x, y = np.broadcast_arrays(x, y)
+    radius = np.hypot(x, y)
+    largest = float(radius.max())
+    with np.errstate(over="ignore", invalid="ignore"):
+        bent_x, bent_y = distort(lens, x, y)
+        u, v = lens.fx * bent_x + lens.cx, lens.fy * bent_y + lens.cy
+        seen = (u >= 0) & (u <= lens.width) & (v >= 0) & (v <= lens.height)  # NaN compares false
+    seen &= radius <= fold_radius(lens, largest)
+    column = np.where(seen, np.clip(u - 0.5, 0, lens.width - 1), 0).astype(np.float32)
+    row = np.where(seen, np.clip(v - 0.5, 0, lens.height - 1), 0).astype(np.float32)
+    return column, row, None if seen.all() else seen
+
+
+def undistort(picture: Picture, lens: Lens) -> Picture:
+    """Resample a photo to the pinhole camera of the same size, focal lengths and principal point (bilinear).
+
+    Args:
+        picture: the photo, (lens.height, lens.width).
+        lens: the lens it was taken with.
+
+    Returns:
+        The undistorted picture. Its mask is False where the photo shows nothing or a masked pixel contributes.
+    """
+    column, row, seen = _source_map(lens)
+    left, top = column.astype(np.int32), row.astype(np.int32)
+    right, bottom = np.minimum(left + 1, lens.width - 1), np.minimum(top + 1, lens.height - 1)
+    a, b = (column - left)[..., None], (row - top)[..., None]
+
+    def sample(values: np.ndarray) -> np.ndarray:
+        upper = values[top, left] * (1 - a) + values[top, right] * a
+        lower = values[bottom, left] * (1 - a) + values[bottom, right] * a
+        return upper * (1 - b) + lower * b
+
+    alpha = mask = None
+    if picture.alpha is None:
+        rgb = sample(picture.rgb)
+    else:
+        # Straight colours under zero coverage mean nothing: weigh by coverage, then take the weight out again.
+        coverage = picture.alpha[..., None].astype(np.float32)
+        blended = sample(coverage)
+        rgb = sample(picture.rgb * coverage) / np.maximum(blended, 1e-6)
+        alpha = _to_bytes(blended[..., 0])
+    if picture.mask is not None:
+        mask = sample(picture.mask[..., None])[..., 0] > 0.999
+    if seen is not None:
+        mask = seen if mask is None else mask & seen
+    return Picture(_to_bytes(rgb), alpha, mask)
+
+
+def _to_bytes(values: np.ndarray) -> np.ndarray:
+    return (np.clip(values, 0, 255) + 0.5).astype(np.uint8)

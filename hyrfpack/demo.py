@@ -1,0 +1,167 @@
+"""Everything once, on a scene made on the spot: photos, training, compression, decompression, rendering, scores."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from hyrfpack.data import load_scene
+from hyrfpack.data.demo_scene import write_demo_scene
+from hyrfpack.evaluate import Evaluation, evaluate
+from hyrfpack.evaluate.figures import comparison, contact_sheet
+from hyrfpack.evaluate.metrics import psnr, to_8bit
+from hyrfpack.format import compress, load
+from hyrfpack.model import HybridModel
+from hyrfpack.render import render
+from hyrfpack.render.files import make_folder, render_files, save_picture
+from hyrfpack.scene import Scene
+from hyrfpack.train import TrainConfig, train
+
+DRAWN_VIEWS = 4
+
+
+@dataclass(frozen=True)
+class ProfileResult:
+    """One profile of the demo's model, measured on the decoded file.
+
+    Attributes:
+        profile: "raw" or "paper".
+        psnr, ssim: means over the held-out views.
+        bytes: on disk.
+        compress_seconds: reading the trained file and writing this one; None for the file that training wrote.
+        decompress_seconds: reading this file and writing it as raw.
+        frames_per_second: one over the median time of a frame.
+    """
+
+    profile: str
+    psnr: float
+    ssim: float
+    bytes: int
+    compress_seconds: float | None
+    decompress_seconds: float
+    frames_per_second: float
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What a demo came to.
+
+    Attributes:
+        steps, gaussians: of the training.
+        train_seconds: its time, kernels compiled on the way included.
+        profiles: raw, then paper.
+        picture: path of the picture that shows it.
+    """
+
+    steps: int
+    gaussians: int
+    train_seconds: float
+    profiles: list[ProfileResult]
+    picture: Path
+
+    def table(self) -> list[str]:
+        """The profiles as lines of aligned text."""
+        lines = ["profile  PSNR (dB)    SSIM       bytes  compress (s)  decompress (s)  frames/s"]
+        for p in self.profiles:
+            packing = "-" if p.compress_seconds is None else f"{p.compress_seconds:.2f}"
+            lines.append(
+                f"{p.profile:<7}  {p.psnr:9.2f}  {p.ssim:.4f}  {p.bytes:10,}  {packing:>12}  "
+                f"{p.decompress_seconds:14.2f}  {p.frames_per_second:8.1f}"
+            )
+        return lines
+
+    def to_dict(self) -> dict:
+        """Plain numbers, strings, lists and dictionaries, ready for JSON."""
+        return {**asdict(self), "picture": str(self.picture)}
+
+
+def run_demo(
+    folder: str | os.PathLike[str],
+    *,
+    steps: int = 2000,
+    views: int = 60,
+    size: int = 200,
+    report: Callable[[str], None] = lambda sentence: None,
+) -> DemoResult:
+    """Make a scene, train on it, compress, decompress, render, score, and draw one picture of it.
+
+    Leaves in `folder`: `scene/` (photos and poses), `run/` (the training), `paper.hyrf`, `back.hyrf` (paper.hyrf
+    decompressed), `renders/` (held-out views from paper.hyrf) and `demo.png`. Earlier results are replaced.
+
+    Args:
+        folder: made if missing.
+        steps: of the training.
+        views, size: how many photos, and their width and height in pixels.
+        report: called with a sentence before each part.
+
+    Raises:
+        HyrfError: something cannot be written.
+    """
+    folder = Path(folder)
+    make_folder(folder)
+    report(f"making a scene of {views} photos")
+    write_demo_scene(folder / "scene", views=views, size=size)
+    scene = load_scene(folder / "scene")
+    report(f"training {steps:,} steps on {len(scene.train)} photos, {len(scene.test)} held out")
+    trained = train(scene, folder / "run", TrainConfig(steps=steps), overwrite=True)
+    if trained.model is None:
+        raise KeyboardInterrupt
+
+    report("compressing, decompressing and scoring")
+    packed, back = folder / "paper.hyrf", folder / "back.hyrf"
+    compress_seconds = _seconds(lambda: compress(trained.model, packed, "paper"))
+    profiles = []
+    for profile, path, seconds in (("raw", trained.model, None), ("paper", packed, compress_seconds)):
+        decompress_seconds = _seconds(lambda path=path: compress(path, back, "raw"))
+        scores = evaluate(load(back), scene.test)
+        profiles.append(_profile_result(profile, path, scores, seconds, decompress_seconds))
+
+    report("rendering held-out views")
+    model = load(packed)
+    for _ in render_files(model, [(view.name, view.camera) for view in scene.test], folder / "renders"):
+        pass
+    result = DemoResult(steps, len(model), trained.metrics["seconds"], profiles, folder / "demo.png")
+    save_picture(result.picture, _draw(model, scene, result))
+    return result
+
+
+def _profile_result(
+    profile: str, path: Path, scores: Evaluation, compress_seconds: float | None, decompress_seconds: float
+) -> ProfileResult:
+    return ProfileResult(
+        profile=profile,
+        psnr=scores.psnr,
+        ssim=scores.ssim,
+        bytes=path.stat().st_size,
+        compress_seconds=compress_seconds,
+        decompress_seconds=decompress_seconds,
+        frames_per_second=1 / scores.seconds_per_frame,
+    )
+
+
+@torch.no_grad()
+def _draw(model: HybridModel, scene: Scene, result: DemoResult) -> Image.Image:
+    """The demo's picture: held-out views of the paper file under the table."""
+    geometry = model.decode_geometry()
+    solid = np.array(model.config.solid, np.float32)
+    rows = []
+    for number in np.linspace(0, len(scene.test) - 1, min(DRAWN_VIEWS, len(scene.test))).round().astype(int):
+        view = scene.test[number]
+        photo = torch.from_numpy(view.load().composite(solid))
+        image = to_8bit(render(model, view.camera, geometry=geometry).rgb)
+        rows.append(comparison(photo, image, caption=f"{view.name}   {psnr(image, photo):.2f} dB"))
+    title = f"hyrfpack demo: {result.gaussians:,} Gaussians, {result.steps:,} steps in {result.train_seconds:.0f} s"
+    return contact_sheet(rows, title, result.table())
+
+
+def _seconds(action: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    action()
+    return time.perf_counter() - start

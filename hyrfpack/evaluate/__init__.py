@@ -1,0 +1,154 @@
+"""Scores of a model against photos it has not seen."""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from hyrfpack.errors import HyrfError
+from hyrfpack.evaluate.figures import comparison
+from hyrfpack.evaluate.lpips import LPIPS
+from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
+from hyrfpack.model import HybridModel
+from hyrfpack.render import RenderSettings, render
+from hyrfpack.render.files import file_names, save_picture
+from hyrfpack.scene import View
+
+NO_LPIPS = (
+    "no weights: LPIPS needs the trained network of the lpips package; "
+    'pass a file made by torch.save(lpips.LPIPS(net="alex").state_dict(), FILE)'
+)
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """One held-out view; lpips is None without weights."""
+
+    name: str
+    psnr: float
+    ssim: float
+    lpips: float | None
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores on held-out views; the first three are means over `views`.
+
+    Attributes:
+        psnr: dB, pooled over each picture's pixels and channels, then averaged over views.
+        ssim: 11x11 Gaussian window, sigma 1.5.
+        lpips: perceptual distance, or None.
+        lpips_reason: why lpips is None, or which network made it.
+        gaussians: how many the model has.
+        seconds_per_frame: median time to render a view, everything warm and the geometry decoded beforehand.
+        views: scores of each view.
+        skipped: names of views whose mask leaves no pixel to score.
+    """
+
+    psnr: float
+    ssim: float
+    lpips: float | None
+    lpips_reason: str
+    gaussians: int
+    seconds_per_frame: float
+    views: list[ViewScore] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+
+    def to_dict(self) -> dict:
+        """Plain numbers, strings, lists and dictionaries, ready for JSON."""
+        return asdict(self)
+
+
+@torch.no_grad()
+def evaluate(
+    model: HybridModel,
+    views: Sequence[View],
+    *,
+    lpips_weights: str | os.PathLike[str] | None = None,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    pictures: str | os.PathLike[str] | None = None,
+    picture_count: int = 6,
+) -> Evaluation:
+    """Render held-out views and score them against their photos.
+
+    Renders are clamped and rounded to 8 bits first, as they would be saved. Photos with transparency are laid over
+    the model's solid colour. Masked pixels do not count.
+
+    Args:
+        model: what to score.
+        views: photos to compare with, not used in training.
+        lpips_weights: see `hyrfpack.evaluate.lpips`; without it lpips is None.
+        settings: how to render.
+        pictures: folder for photo | render | error pictures of `picture_count` views spread over `views`.
+
+    Raises:
+        HyrfError: there is no view to score, or a file cannot be read or written.
+    """
+    if not views:
+        raise HyrfError("there is no view to score; name a split that has photos or a smaller --test-every")
+    perceptual = None if lpips_weights is None else LPIPS.load(lpips_weights)
+    geometry = model.decode_geometry()
+    solid = np.array(model.config.solid, dtype=np.float32)
+    device = model.gaussians.positions.device
+    names = file_names([view.name for view in views])
+    drawn = _spread(len(views), picture_count) if pictures is not None else set()
+
+    render(model, views[0].camera, settings, geometry=geometry)  # compiles kernels and fills caches
+    scores: list[ViewScore] = []
+    skipped: list[str] = []
+    seconds: list[float] = []
+    for number, view in enumerate(views):
+        photo = view.load()
+        reference = torch.from_numpy(photo.composite(solid)).to(device)
+        mask = None if photo.mask is None else torch.from_numpy(photo.mask).to(device)
+        if mask is not None and not mask.any():
+            skipped.append(view.name)
+            continue
+        started = _now(device)
+        rendering = render(model, view.camera, settings, geometry=geometry)
+        seconds.append(_now(device) - started)
+        image = to_8bit(rendering.rgb)
+        distance = None
+        if perceptual is not None:
+            seen = image if mask is None else torch.where(mask[..., None], image, reference)
+            distance = perceptual(seen, reference)
+        score = ViewScore(view.name, psnr(image, reference, mask), ssim(image, reference, mask), distance)
+        scores.append(score)
+        if number in drawn:
+            sheet = comparison(reference, image, mask, _caption(score))
+            save_picture(Path(pictures) / f"{names[number]}.png", sheet)
+    if not scores:
+        raise HyrfError("the masks of all views leave no pixel to score; check that white means 'use this pixel'")
+    return Evaluation(
+        psnr=statistics.fmean(score.psnr for score in scores),
+        ssim=statistics.fmean(score.ssim for score in scores),
+        lpips=None if perceptual is None else statistics.fmean(score.lpips for score in scores),
+        lpips_reason=NO_LPIPS if perceptual is None else f"network {perceptual.name}",
+        gaussians=len(model),
+        seconds_per_frame=statistics.median(seconds),
+        views=scores,
+        skipped=skipped,
+    )
+
+
+def _spread(count: int, wanted: int) -> set[int]:
+    """`wanted` whole numbers below `count`, evenly spaced, the first and the last among them."""
+    return set(np.linspace(0, count - 1, min(wanted, count)).round().astype(int).tolist())
+
+
+def _caption(score: ViewScore) -> str:
+    perceptual = "" if score.lpips is None else f"   LPIPS {score.lpips:.3f}"
+    return f"{score.name}   {score.psnr:.2f} dB   SSIM {score.ssim:.3f}{perceptual}"
+
+
+def _now(device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()

@@ -1,0 +1,162 @@
+"""Pictures for people: photo beside render beside error map, and the curve of a training."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+from collections.abc import Sequence
+from itertools import accumulate
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from hyrfpack.format.atomic import write_atomic
+from hyrfpack.render.files import make_folder
+
+ERROR_LIMIT = 0.2  # mean absolute difference over channels that gets the brightest colour
+PANEL_WIDTH = 640  # pixels; larger pictures are shrunk to it
+SMALL_PANEL = 400  # pixels; smaller pictures are enlarged a whole number of times, up to this width
+SMOOTHING = 0.1  # weight of the newest point in the drawn mean of a curve
+INK, PAPER, FAINT = (32, 33, 36), (255, 255, 255), (128, 130, 134)
+GAP = 8
+
+
+def comparison(photo: Tensor, render: Tensor, mask: Tensor | None = None, caption: str = "") -> Image.Image:
+    """Photo | render | error map in a row, with a caption above and the error's colour bar below.
+
+    Args:
+        photo, render: (H, W, 3) in [0, 1].
+        mask: (H, W) bool; pixels that do not count are dimmed in the photo and show no error.
+        caption: one line.
+    """
+    seen = photo.cpu().numpy()
+    error = (render - photo).abs().mean(dim=-1).cpu().numpy()
+    if mask is not None:
+        counted = mask.cpu().numpy()
+        seen = np.where(counted[..., None], seen, 0.3 * seen)
+        error = np.where(counted, error, 0)
+    height, width = error.shape
+    size = _panel_size(width, height)
+    panels = [_panel(pixels, size) for pixels in (seen, render.cpu().numpy(), _error_colors(error))]
+
+    text = _font(size[0])
+    line = round(1.6 * text.size)
+    sheet = Image.new("RGB", (3 * size[0] + 2 * GAP, size[1] + 2 * line + GAP), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    draw.text((GAP, line / 2), caption, INK, text, anchor="lm")
+    for column, (panel, label) in enumerate(zip(panels, ("photo", "render", ""), strict=True)):
+        left = column * (size[0] + GAP)
+        sheet.paste(panel, (left, line))
+        draw.text((left + size[0] / 2, line + size[1] + line / 2), label, FAINT, text, anchor="mm")
+    _color_bar(sheet, draw, text, (2 * (size[0] + GAP), line + size[1], size[0], line))
+    return sheet
+
+
+def contact_sheet(rows: Sequence[Image.Image], title: str, lines: Sequence[str]) -> Image.Image:
+    """Comparisons below each other, under a title and a few lines of text in fixed-width type."""
+    width = max(row.width for row in rows)
+    large, text = _font(width, 0.022), _font(width, 0.0145, fixed=True)
+    margin, line = 2 * GAP, round(1.5 * text.size)
+    top = margin + round(1.8 * large.size)
+    header = top + line * len(lines) + margin
+    width = max(width, *(math.ceil(text.getlength(words)) for words in lines))
+    height = header + sum(row.height + GAP for row in rows) + margin
+    sheet = Image.new("RGB", (width + 2 * margin, height), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    draw.text((margin, margin), title, INK, large)
+    for number, words in enumerate(lines):
+        draw.text((margin, top + number * line), words, INK, text)
+    for row in rows:
+        sheet.paste(row, (margin, header))
+        header += row.height + GAP
+    return sheet
+
+
+def training_curve(records: Sequence[dict], path: str | os.PathLike[str]) -> None:
+    """Draw how a training went: PSNR and loss of the views trained on, faint with their mean, and the Gaussians.
+
+    Args:
+        records: each with "step", "psnr" (dB), "loss" and "gaussians".
+        path: the PNG to write.
+
+    Raises:
+        HyrfError: the file cannot be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(3, 1, sharex=True)
+    steps = [record["step"] for record in records]
+    for axis, key, label, color in zip(
+        axes,
+        ("psnr", "loss", "gaussians"),
+        ("training PSNR (dB)", "loss", "Gaussians"),
+        ("#1a73e8", "#d93025", "#188038"),
+        strict=True,
+    ):
+        values = [record[key] for record in records]
+        if key != "gaussians":
+            axis.plot(steps, values, color=color, linewidth=0.8, alpha=0.35)
+            values = _running_mean(values)
+        axis.plot(steps, values, color=color, linewidth=1.5)
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[1].set_yscale("log")
+    axes[2].set_ylim(bottom=0)
+    axes[2].set_xlabel("step")
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=120, metadata={"Software": None})
+    make_folder(Path(path).parent)
+    write_atomic(path, data.getbuffer())
+
+
+def _panel_size(width: int, height: int) -> tuple[int, int]:
+    if width > PANEL_WIDTH:
+        return PANEL_WIDTH, max(1, round(height * PANEL_WIDTH / width))
+    times = max(1, SMALL_PANEL // width)
+    return times * width, times * height
+
+
+def _panel(pixels: np.ndarray, size: tuple[int, int]) -> Image.Image:
+    image = Image.fromarray((np.clip(pixels, 0, 1) * 255).round().astype(np.uint8))
+    return image if image.size == size else image.resize(size, Image.Resampling.BOX)
+
+
+def _running_mean(values: Sequence[float]) -> list[float]:
+    return list(accumulate(values, lambda mean, value: mean + SMOOTHING * (value - mean)))
+
+
+def _error_colors(error: np.ndarray) -> np.ndarray:
+    """(H, W) errors to (H, W, 3) colours, black at 0 and bright from ERROR_LIMIT on."""
+    from matplotlib import colormaps
+
+    return colormaps["inferno"](np.clip(error / ERROR_LIMIT, 0, 1))[..., :3]
+
+
+def _color_bar(
+    sheet: Image.Image, draw: ImageDraw.ImageDraw, text: ImageFont.FreeTypeFont, box: tuple[int, int, int, int]
+) -> None:
+    """The scale of the error map, centred in `box` (left, top, width, height)."""
+    left, top, width, height = box
+    length, thickness = width // 3, max(4, text.size // 2)
+    middle = top + height // 2
+    start = left + (width - length) // 2
+    ramp = np.broadcast_to(np.linspace(0, ERROR_LIMIT, length), (thickness, length))
+    sheet.paste(_panel(_error_colors(ramp), (length, thickness)), (start, middle - thickness // 2))
+    draw.text((start - GAP, middle), "error 0", FAINT, text, anchor="rm")
+    draw.text((start + length + GAP, middle), f"{ERROR_LIMIT:g}+", FAINT, text, anchor="lm")
+
+
+def _font(width: int, fraction: float = 0.036, fixed: bool = False) -> ImageFont.FreeTypeFont:
+    """Type that fits a picture of that width; matplotlib brings the files on every system."""
+    from matplotlib import get_data_path
+
+    name = "DejaVuSansMono.ttf" if fixed else "DejaVuSans.ttf"
+    size = min(20, max(9, round(width * fraction)))
+    return ImageFont.truetype(str(Path(get_data_path()) / "fonts" / "ttf" / name), size)

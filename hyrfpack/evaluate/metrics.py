@@ -1,0 +1,49 @@
+"""How near a rendered picture is to a photo: PSNR and SSIM, on 8-bit values, with masks."""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor
+
+from hyrfpack.ops.ssim import photometric_loss
+
+IDENTICAL_PSNR = 100.0  # dB, what two pictures without any difference score (the formula says infinity)
+
+
+def to_8bit(image: Tensor) -> Tensor:
+    """Clamp to [0, 1] and round to the 256 levels of a saved picture, still float32 in [0, 1].
+
+    Renders are scored after this, so that a score is what anyone measures on the PNG files.
+    """
+    return (image.detach().float().clamp(0, 1) * 255).round() / 255
+
+
+def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB, the squared error pooled over all counted pixels and channels.
+
+        PSNR = -10 log10(mean((image - reference)^2))
+
+    Args:
+        image, reference: (H, W, 3) in [0, 1].
+        mask: (H, W) bool, True where a pixel counts; all when None. At least one must.
+
+    Returns:
+        dB; `IDENTICAL_PSNR` at most.
+    """
+    squares = (image.double() - reference.double()) ** 2
+    mean = float(squares.mean() if mask is None else squares[mask].mean())
+    return min(-10 * math.log10(mean), IDENTICAL_PSNR) if mean > 0 else IDENTICAL_PSNR
+
+
+def ssim(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
+    """Structural similarity: Gaussian window 11x11 with sigma 1.5, zeros around the picture, mean over channels.
+
+    Pixels that do not count are set to the photo's on both sides, so that nothing rendered there leaks into the
+    windows of their neighbours, and are left out of the mean.
+
+    Args:
+        image, reference: (H, W, 3) in [0, 1].
+        mask: (H, W) bool, True where a pixel counts; all when None. At least one must.
+    """
+    return 1 - float(photometric_loss(image, reference, mask, ssim_weight=1.0))

@@ -1,0 +1,21 @@
+"""The `.hyrf` file: the container (bytes, sections, checks) and the codec that maps a HybridModel to its sections.
+
+`describe` needs no torch; the names that do are loaded at their first use.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from hyrfpack.format.info import SectionSize, describe
+
+_LAZY = ("CompressionReport", "compress", "decode_model", "encode_model", "load", "save")
+
+__all__ = ["SectionSize", "describe", *_LAZY]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    return getattr(import_module("hyrfpack.format.codec"), name)

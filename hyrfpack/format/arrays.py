@@ -1,0 +1,106 @@
+"""A HybridModel as a handful of matrices, and back."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import torch
+
+from hyrfpack.errors import HyrfError, HyrfFormatError
+from hyrfpack.format.info import SECTIONS
+from hyrfpack.model.background import RADIUS
+from hyrfpack.model.config import ModelConfig
+from hyrfpack.model.field import DIRECTION_FEATURES
+from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.model.hash_grid import FEATURES
+from hyrfpack.model.hybrid import HybridModel
+
+# What every model of this version computes and no setting of it says; `docs/format.md` has the equations.
+RULES = {
+    "activations": "sigmoid",
+    "background_radius": RADIUS,
+    "contraction": "l2",
+    "decoders": "relu",
+    "hash": "instant-ngp",
+    "rotation": "identity-offset",
+}
+
+
+def _decoder(field: str) -> tuple[str, ...]:
+    return tuple(f"{field}.{kind}.{layer}" for layer in range(3) for kind in ("weights", "biases"))
+
+
+# The parameters in each group, laid one after another, each row by row.
+GROUPS = {
+    "POSI": ("gaussians.positions",),
+    "COLO": ("gaussians.color_logits",),
+    "SCAL": ("gaussians.scale_logits",),
+    "OPAC": ("gaussians.opacity_logits",),
+    "GTAB": ("geometry.grid.table",),
+    "GMLP": _decoder("geometry"),
+    "RTAB": ("radiance.grid.table",),
+    "RMLP": _decoder("radiance"),
+}
+
+
+def to_arrays(model: HybridModel) -> dict[str, np.ndarray]:
+    """The model's parameters by group, as float32 matrices; a decoder's are one column, layer after layer.
+
+    Raises:
+        HyrfError: a parameter is NaN or infinite.
+    """
+    state = model.state_dict()
+    matrices = {}
+    for group, names in GROUPS.items():
+        parts = [state[name].cpu().numpy().astype(np.float32) for name in names]
+        values = parts[0] if len(parts) == 1 else np.concatenate([part.ravel() for part in parts])[:, None]
+        if wrong := int(np.count_nonzero(~np.isfinite(values))):
+            raise HyrfError(
+                f"{wrong} of {values.size} numbers in the model's {SECTIONS[group]} are NaN or infinite; train it "
+                "again from an earlier checkpoint"
+            )
+        matrices[group] = values
+    return matrices
+
+
+def group_shapes(config: ModelConfig, gaussians: int) -> dict[str, tuple[int, int]]:
+    """(rows, columns) of each matrix of a model. Allocates nothing: what a file claims can be checked first."""
+    shapes = {group: (gaussians, width) for group, width in zip(GROUPS, Gaussians.WIDTHS, strict=False)}
+    directions = DIRECTION_FEATURES[config.direction_encoding]
+    for field, grid, extra, outputs in (("G", config.geometry, 0, 8), ("R", config.radiance, directions, 3)):
+        widths = (grid.levels * FEATURES + extra, config.hidden, config.hidden, outputs)
+        shapes[field + "TAB"] = (grid.rows, FEATURES)
+        shapes[field + "MLP"] = (sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(widths)), 1)
+    return shapes
+
+
+def to_model(config: ModelConfig, arrays: dict[str, np.ndarray]) -> HybridModel:
+    """The inverse of `to_arrays`; shapes must be those of `group_shapes`."""
+    gaussians = Gaussians(*(torch.from_numpy(arrays[group]) for group in list(GROUPS)[: len(Gaussians.WIDTHS)]))
+    model = HybridModel(config, gaussians, torch.Generator())  # its own generator: the global one stays untouched
+    shapes = {name: value.shape for name, value in model.state_dict().items()}
+    state = {}
+    for group, names in GROUPS.items():
+        parts = torch.from_numpy(arrays[group]).flatten().split([shapes[name].numel() for name in names])
+        state.update((name, part.reshape(shapes[name]).clone()) for name, part in zip(names, parts, strict=True))
+    model.load_state_dict(state, assign=True)
+    return model
+
+
+def check_rules(rules: dict) -> None:
+    """Raise HyrfFormatError unless this version computes by exactly these rules."""
+    for name in sorted({*rules, *RULES}):
+        if rules.get(name) != RULES.get(name):
+            raise HyrfFormatError(
+                f"rule '{name}' is {rules.get(name)!r:.40} and this hyrfpack knows only {RULES.get(name)!r}; update "
+                "hyrfpack"
+            )
+
+
+def parse_config(values: dict) -> ModelConfig:
+    """The ModelConfig of checked metadata. Raises HyrfFormatError when a field is unknown or out of range."""
+    try:
+        return ModelConfig.from_dict(values)
+    except (TypeError, ValueError, KeyError) as error:
+        raise HyrfFormatError(f"the model's configuration is not valid ({error}); write the file again") from error

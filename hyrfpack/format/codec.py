@@ -1,0 +1,142 @@
+"""HybridModel <-> `.hyrf` bytes. What each byte means is in `docs/format.md`."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from hyrfpack.errors import HyrfError, HyrfFormatError
+from hyrfpack.format import paper, raw
+from hyrfpack.format.arrays import RULES, check_rules, group_shapes, parse_config, to_model
+from hyrfpack.format.atomic import write_atomic
+from hyrfpack.format.container import Container, read_container, write_container
+from hyrfpack.format.info import SECTIONS, SectionSize, section_sizes
+from hyrfpack.format.metadata import Metadata, read_metadata
+from hyrfpack.model.hybrid import HybridModel
+
+PROFILES = {"raw": raw.encode, "paper": paper.encode}
+DECODERS = {**raw.DECODERS, **paper.DECODERS}
+
+
+@dataclass(frozen=True)
+class CompressionReport:
+    """What a file takes.
+
+    Attributes:
+        profile: "raw" or "paper".
+        gaussians: how many.
+        bytes_before: of all parameters as float32.
+        bytes_after: of the file.
+        sections: bytes of each section before and after; header, table of contents and padding are the rest.
+    """
+
+    profile: str
+    gaussians: int
+    bytes_before: int
+    bytes_after: int
+    sections: list[SectionSize]
+
+
+def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | None = None, **settings: object) -> bytes:
+    """Write a model as the bytes of a `.hyrf` file: same model, same settings, same bytes.
+
+    Args:
+        model: on any device.
+        profile: "raw" (float32, exact) or "paper" (see `hyrfpack.format.paper`).
+        provenance: where the model comes from, any JSON object; kept for people.
+        settings: of the profile, the fields of `paper.PaperSettings`; "raw" has none.
+
+    Raises:
+        HyrfError: there is no such profile, or a parameter is NaN, infinite or too large for the profile.
+    """
+    if profile not in PROFILES:
+        raise HyrfError(f"there is no profile '{profile}'; use one of: {', '.join(PROFILES)}")
+    sections, used = PROFILES[profile](model, **settings)
+    metadata = Metadata(profile, len(model), model.config.to_dict(), RULES, used, provenance or {})
+    return write_container([metadata.to_section(), *sections])
+
+
+def decode_model(data: bytes | memoryview, device: str | torch.device = "cpu", name: str = "the data") -> HybridModel:
+    """Read a model from the bytes of a `.hyrf` file. Safe on any input.
+
+    Args:
+        device: where the parameters shall live.
+        name: what error messages call the file.
+
+    Raises:
+        HyrfFormatError: the bytes are damaged, contradict themselves, or come from a newer version.
+    """
+    return _decode(read_container(data, SECTIONS, name), name).to(device)
+
+
+def save(
+    model: HybridModel,
+    path: str | os.PathLike[str],
+    profile: str = "raw",
+    provenance: dict | None = None,
+    **settings: object,
+) -> CompressionReport:
+    """Write a model to a `.hyrf` file, whole or not at all. Arguments and errors as `encode_model`.
+
+    Raises:
+        HyrfError: also when the file cannot be written.
+    """
+    data = encode_model(model, profile, provenance, **settings)
+    write_atomic(path, data)
+    sizes = section_sizes(read_container(data))
+    before = sum(size.before for size in sizes if size.type != "META")
+    return CompressionReport(profile, len(model), before, len(data), sizes)
+
+
+def load(path: str | os.PathLike[str], device: str | torch.device = "cpu") -> HybridModel:
+    """Read a model from a `.hyrf` file. Arguments and errors as `decode_model`, and where no file can be read."""
+    with Container.open(path, SECTIONS) as container:
+        return _decode(container, os.fspath(path)).to(device)
+
+
+def compress(
+    source: str | os.PathLike[str], target: str | os.PathLike[str], profile: str = "paper", **settings: object
+) -> CompressionReport:
+    """Rewrite a `.hyrf` file with another profile; its provenance goes along. "raw" decompresses.
+
+    Arguments and errors as `encode_model`, `load` and `save`.
+    """
+    with Container.open(source, SECTIONS) as container:
+        model = _decode(container, os.fspath(source))
+        provenance = read_metadata(container, os.fspath(source)).provenance
+    return save(model, target, profile, provenance, **settings)
+
+
+def _decode(container: Container, name: str) -> HybridModel:
+    metadata = read_metadata(container, name)
+    try:
+        check_rules(metadata.rules)
+        config = parse_config(metadata.config)
+    except HyrfFormatError as error:
+        raise HyrfFormatError(f"{name}: {error}") from error
+    shapes = group_shapes(config, metadata.gaussians)
+    # Every size is checked before the first section is decoded.
+    for group, (rows, columns) in shapes.items():
+        if group not in container:
+            raise HyrfFormatError(f"{name}: there is no section '{group}'; the file is incomplete, write it again")
+        entry = container.entries[group]
+        if entry.codec not in DECODERS:
+            raise HyrfFormatError(f"{name}: section '{group}' has the unknown codec {entry.codec}; update hyrfpack")
+        if entry.raw_length != 4 * rows * columns:
+            raise HyrfFormatError(
+                f"{name}: section '{group}' says it decodes to {entry.raw_length} bytes and the metadata asks for "
+                f"{4 * rows * columns}; the file is damaged, write it again"
+            )
+    arrays = {}
+    for group, shape in shapes.items():
+        section = container[group]
+        try:
+            arrays[group] = DECODERS[section.codec](section.data, shape)
+        except HyrfFormatError as error:
+            raise HyrfFormatError(f"{name}: section '{group}': {error}") from error
+        if not np.isfinite(arrays[group]).all():
+            raise HyrfFormatError(f"{name}: section '{group}' holds numbers that are not finite; write the file again")
+    return to_model(config, arrays)

@@ -1,0 +1,77 @@
+"""What a `.hyrf` file holds, told from its first kilobytes. Imports neither torch nor numpy."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, dataclass
+
+from hyrfpack.format.container import Container
+from hyrfpack.format.metadata import read_metadata
+
+# Section types and what they hold, in file order; every one is required.
+SECTIONS = {
+    "META": "metadata",
+    "POSI": "positions",
+    "COLO": "colour logits",
+    "SCAL": "scale logits",
+    "OPAC": "opacity logits",
+    "GTAB": "geometry hash table",
+    "GMLP": "geometry decoder",
+    "RTAB": "radiance hash table",
+    "RMLP": "radiance decoder",
+}
+
+
+@dataclass(frozen=True)
+class SectionSize:
+    """Bytes of one section.
+
+    Attributes:
+        type, holds: its four letters, and what they stand for.
+        before: bytes of its content as float32 (of the metadata: as it is).
+        after: bytes stored.
+    """
+
+    type: str
+    holds: str
+    before: int
+    after: int
+
+
+def section_sizes(container: Container) -> list[SectionSize]:
+    """Sizes of all sections in file order, unknown optional ones included."""
+    return [
+        SectionSize(type, SECTIONS.get(type, "unknown"), entry.raw_length, entry.length)
+        for type, entry in container.entries.items()
+    ]
+
+
+def describe(path: str | os.PathLike[str]) -> dict:
+    """Say what a `.hyrf` file holds without decoding it: header, table of contents and metadata are read, no more.
+
+    Returns:
+        A dictionary ready for JSON: `bytes` (of the file), `version` ("1.0"), and the metadata's `writer`, `profile`,
+        `gaussians`, `config` (frame, grids, background, rules of the model), `rules`, `settings`, `provenance`;
+        `bits_per_gaussian` of the whole file (null without Gaussians), and `sections`: for each `type`, `holds`,
+        `before` (bytes as float32), `after` (bytes stored) and `bits_per_gaussian`.
+
+    Raises:
+        HyrfFormatError: there is no such file, or its header, table of contents or metadata is damaged.
+    """
+    with Container.open(path, SECTIONS) as container:
+        metadata = read_metadata(container, os.fspath(path))
+        sizes = section_sizes(container)
+        version = ".".join(map(str, container.version))
+    count = metadata.gaussians
+
+    def bits(length: int) -> float | None:
+        return 8 * length / count if count else None
+
+    length = os.path.getsize(path)
+    return {
+        "bytes": length,
+        "version": version,
+        **asdict(metadata),
+        "bits_per_gaussian": bits(length),
+        "sections": [{**asdict(size), "bits_per_gaussian": bits(size.after)} for size in sizes],
+    }

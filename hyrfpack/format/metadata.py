@@ -1,0 +1,133 @@
+"""The META section: one JSON object that says what the other sections hold. Plain Python: `describe` needs it fast."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import dataclass, field, fields
+
+import hyrfpack
+from hyrfpack.errors import HyrfFormatError
+from hyrfpack.format.container import Container, Section
+
+TYPE = "META"
+CODEC_JSON = 0
+MAX_BYTES = 1 << 20
+
+# Types of the configuration's values, as JSON has them; a tuple is a list of that length. `ModelConfig` checks ranges.
+_GRID = {"log2_table_size": int, "levels": int, "base": int, "finest": int}
+_CONFIG = {
+    "frame": {"center": (float,) * 3, "scale": float, "half_extent": (float,) * 3},
+    "geometry": _GRID,
+    "radiance": _GRID,
+    "hidden": int,
+    "background": bool,
+    "solid": (float,) * 3,
+    "scale_rule": str,
+    "scale_grows": bool,
+    "direction_encoding": str,
+    "position_gradients": bool,
+    "antialiased": bool,
+}
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What a reader must know before it decodes a section, and what a person may want to know.
+
+    Attributes:
+        profile: "raw" or "paper"; for people, each section names its own codec.
+        gaussians: how many there are.
+        config: `ModelConfig.to_dict()`.
+        rules: names of the equations that are not settings of a model; a reader refuses names it does not know.
+        settings: what the profile was asked for, for people.
+        provenance: where the model comes from, for people: preset, steps, why the sizes were chosen.
+        writer: program and version that wrote the file.
+    """
+
+    profile: str
+    gaussians: int
+    config: dict
+    rules: dict
+    settings: dict = field(default_factory=dict)
+    provenance: dict = field(default_factory=dict)
+    writer: str = field(default_factory=lambda: writer())
+
+    def to_section(self) -> Section:
+        """The section, same values, same bytes: keys sorted, no spaces, ASCII.
+
+        Raises:
+            ValueError: a value is not JSON (NaN and infinity are not), or all are more than MAX_BYTES.
+        """
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        try:
+            text = json.dumps(values, sort_keys=True, separators=(",", ":"), allow_nan=False)
+        except TypeError as error:
+            raise ValueError(f"the metadata is not JSON: {error}") from error
+        if len(text) > MAX_BYTES:
+            raise ValueError(f"the metadata takes {len(text)} bytes and may take {MAX_BYTES}; shorten the provenance")
+        return Section(TYPE, CODEC_JSON, text.encode("ascii"), len(text))
+
+
+def writer() -> str:
+    """The program and its version, as files name it."""
+    return f"hyrfpack {hyrfpack.__version__}"
+
+
+def read_metadata(container: Container, name: str) -> Metadata:
+    """Read and check the metadata: `config` has the right types; the other objects may hold anything.
+
+    Raises:
+        HyrfFormatError: the section is absent, too long, not JSON, or a field is missing or of the wrong type.
+    """
+    entry = container.entries.get(TYPE)
+    if entry is not None and (entry.length > MAX_BYTES or entry.codec != CODEC_JSON):
+        raise HyrfFormatError(
+            f"{name}: the metadata has {entry.length} bytes in codec {entry.codec}, and {MAX_BYTES} bytes at most in "
+            f"codec {CODEC_JSON} can be read; the file is damaged or newer than this hyrfpack"
+        )
+    data = bytes(container[TYPE].data)
+    try:
+        values = json.loads(data.decode("utf-8"), parse_constant=_finite, parse_float=_finite)
+    # Nesting without end overflows the parser's stack, and a number of 5,000 digits is a ValueError.
+    except (ValueError, RecursionError) as error:
+        raise HyrfFormatError(f"{name}: the metadata is not valid JSON ({error}); write the file again") from error
+    if not isinstance(values, dict):
+        raise HyrfFormatError(f"{name}: the metadata is not a JSON object; write the file again")
+    values = {item.name: values.get(item.name) for item in fields(Metadata)}
+    try:
+        for key, kind in (("gaussians", int), ("rules", dict), ("settings", dict), ("provenance", dict)):
+            _check(values[key], kind, key)
+        _check(values["config"], _CONFIG, "config")
+        _check([values["profile"], values["writer"]], (str, str), "profile or writer")
+        if not 0 <= values["gaussians"] < 1 << 40:
+            raise ValueError(f"there cannot be {values['gaussians']} Gaussians")
+    except ValueError as error:
+        raise HyrfFormatError(f"{name}: the metadata is not valid: {error}; write the file again") from error
+    return Metadata(**values)
+
+
+def _check(value: object, kind: type | tuple | dict, path: str) -> None:
+    """Raise ValueError unless a JSON value has the types of `kind`. Keys that `kind` lacks may have any."""
+    if isinstance(kind, dict):
+        _check(value, dict, path)
+        for key, inner in kind.items():
+            _check(value.get(key), inner, f"{path}.{key}")
+    elif isinstance(kind, tuple):
+        if type(value) is not list or len(value) != len(kind):
+            raise ValueError(f"'{path}' must be a list of {len(kind)}")
+        for item, inner in zip(value, kind, strict=True):
+            _check(item, inner, path)
+    elif kind is float:
+        if type(value) not in (int, float) or abs(value) > sys.float_info.max:
+            raise ValueError(f"'{path}' must be a finite number")
+    elif type(value) is not kind:
+        raise ValueError(f"'{path}' must be of type {kind.__name__}")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"the number {text[:20]} is not finite")
+    return value

@@ -1,0 +1,44 @@
+"""Profile `raw`: every number as float32, exact. Section codec 1."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hyrfpack.errors import HyrfFormatError
+from hyrfpack.format.arrays import to_arrays
+from hyrfpack.format.container import Section
+from hyrfpack.model.hybrid import HybridModel
+
+CODEC_FLOAT32 = 1
+
+
+def encode(model: HybridModel) -> tuple[list[Section], dict]:
+    """Sections for a model, one a group, and the settings used (none).
+
+    Raises:
+        HyrfError: a parameter is NaN or infinite.
+    """
+    sections = [
+        Section(group, CODEC_FLOAT32, values.astype("<f4").tobytes(), 4 * values.size)
+        for group, values in to_arrays(model).items()
+    ]
+    return sections, {}
+
+
+def decode_plain(data: memoryview, shape: tuple[int, int], dtype: str) -> np.ndarray:
+    """Numbers stored row by row as `dtype` -> (rows, columns) float32.
+
+    Raises:
+        HyrfFormatError: there are more or fewer bytes than that.
+    """
+    expected = shape[0] * shape[1] * np.dtype(dtype).itemsize
+    if len(data) != expected:
+        raise HyrfFormatError(f"it has {len(data)} bytes and the metadata asks for {expected}; the file is damaged")
+    return np.frombuffer(data, dtype).astype(np.float32).reshape(shape)
+
+
+def _decode_float32(data: memoryview, shape: tuple[int, int]) -> np.ndarray:
+    return decode_plain(data, shape, "<f4")
+
+
+DECODERS = {CODEC_FLOAT32: _decode_float32}

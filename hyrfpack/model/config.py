@@ -1,0 +1,70 @@
+"""What shape a model has: everything that is chosen before the first step and stored in the file."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+from hyrfpack.model.frame import Frame
+from hyrfpack.model.hash_grid import HashGridConfig
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The shape of a HybridModel.
+
+    Attributes:
+        frame: the scene's box.
+        geometry, radiance: the two hash grids.
+        hidden: width of the decoders' two hidden layers.
+        background: whether a background sphere lies behind the Gaussians (coloured by the radiance field).
+        solid: RGB in [0, 1] behind everything when there is no background sphere.
+        scale_rule: "sum" S * sigmoid(s_n + s_e), or "product" S * sigmoid(s_n) * sigmoid(s_e).
+        scale_grows: whether the largest scale S(p) grows with max(1, |u|) outside the box.
+        direction_encoding: "sh" (real spherical harmonics, bands 0 to 2) or "frequency" (NeRF, 4 octaves).
+        position_gradients: whether the fields pass gradients on to positions (training only).
+        antialiased: opacity is compensated for the rasteriser's low-pass filter.
+    """
+
+    frame: Frame
+    geometry: HashGridConfig
+    radiance: HashGridConfig
+    hidden: int = 64
+    background: bool = True
+    solid: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    scale_rule: str = "sum"
+    scale_grows: bool = True
+    direction_encoding: str = "sh"
+    position_gradients: bool = False
+    antialiased: bool = False
+
+    def to_dict(self) -> dict:
+        """Plain numbers, strings, lists and dictionaries, ready for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict) -> ModelConfig:
+        """The inverse of `to_dict`. Raises KeyError, TypeError or ValueError when a field is missing, unknown or wrong."""
+        parts = dict(values)
+        frame = parts.pop("frame")
+        parts["frame"] = Frame(
+            center=_triple(frame["center"]), scale=float(frame["scale"]), half_extent=_triple(frame["half_extent"])
+        )
+        for name in ("geometry", "radiance"):
+            parts[name] = HashGridConfig(**parts[name])
+        parts["solid"] = _triple(parts["solid"])
+        return cls(**parts)
+
+    def __post_init__(self) -> None:
+        if self.scale_rule not in ("sum", "product"):
+            raise ValueError(f"scale_rule is '{self.scale_rule}'; it must be 'sum' or 'product'")
+        if self.direction_encoding not in ("sh", "frequency"):
+            raise ValueError(f"direction_encoding is '{self.direction_encoding}'; it must be 'sh' or 'frequency'")
+        if not 1 <= self.hidden <= 1024:
+            raise ValueError(f"hidden is {self.hidden}; it must lie in [1, 1024]")
+        if not (self.frame.scale > 0 and all(h > 0 for h in self.frame.half_extent)):
+            raise ValueError("the frame's scale and half extents must be positive")
+
+
+def _triple(values: list[float]) -> tuple[float, float, float]:
+    x, y, z = map(float, values)
+    return x, y, z

@@ -1,0 +1,100 @@
+"""World <-> frame <-> contracted cube.
+
+Three systems of coordinates, one after the other:
+
+- **world**: the input's own axes, origin and unit (float64);
+- **local**: `local = (world - center) / scale`, axes kept; the box that matters is about [-1, 1]^3. All learnt
+  numbers live here, so nothing depends on the unit or the origin of a reconstruction, and float32 is enough;
+- **cube**: `contract(local / half_extent)` in (0, 1)^3, where the hash grids live.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.scene import Camera
+
+# No axis of the box is thinner than this fraction of the longest: a row of cameras still sees a volume.
+THINNEST_AXIS = 0.25
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The box B0 of a scene.
+
+    Attributes:
+        center: (x, y, z) of the box in world units.
+        scale: world units per local unit: the longest half-axis of the box. Positive.
+        half_extent: half-axes of the box in local units, each in [THINNEST_AXIS, 1].
+    """
+
+    center: tuple[float, float, float]
+    scale: float
+    half_extent: tuple[float, float, float]
+
+    @classmethod
+    def from_box(cls, low: np.ndarray, high: np.ndarray) -> Frame:
+        """The frame of the box between two corners (3,) in world units; flat axes are widened.
+
+        Raises:
+            HyrfDataError: a corner is not finite, or the box has no size at all.
+        """
+        low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+        half = (high - low) / 2
+        scale = float(half.max())
+        if not (np.isfinite(low).all() and np.isfinite(high).all()):
+            raise HyrfDataError("the scene's box is not finite; check the poses and points for NaN or infinity")
+        if not scale > 0:
+            raise HyrfDataError(
+                "cameras and points all lie at one place, so the scene has no size; give views from different places"
+            )
+        half = np.maximum(half / scale, THINNEST_AXIS)
+        center = (low + high) / 2
+        return cls(tuple(map(float, center)), scale, tuple(map(float, half)))
+
+    def to_local(self, points: np.ndarray) -> np.ndarray:
+        """World positions (N, 3) to local ones, float64."""
+        return (np.asarray(points, np.float64) - np.array(self.center)) / self.scale
+
+    def to_world(self, points: np.ndarray) -> np.ndarray:
+        """Local positions (N, 3) to world ones, float64."""
+        return np.asarray(points, np.float64) * self.scale + np.array(self.center)
+
+    def local_pose(self, camera: Camera) -> np.ndarray:
+        """camera_from_local (4, 4) float64: the camera's pose with depths in local units.
+
+        Worked out in float64, so that a scene a million units from the origin loses nothing.
+        """
+        pose = camera.camera_from_world.copy()
+        pose[:3, 3] = (pose[:3, :3] @ np.array(self.center) + pose[:3, 3]) / self.scale
+        return pose
+
+    def normalize(self, local: Tensor) -> Tensor:
+        """Local positions (..., 3) to u = local / half_extent, where the box is [-1, 1]^3."""
+        return local / local.new_tensor(self.half_extent)
+
+
+def contract(u: Tensor) -> Tensor:
+    """Map normalised coordinates into the open unit cube.
+
+    The ball |u| <= 1 fills the inner half; everything outside is squeezed into the shell around it
+    (mip-NeRF 360 contraction, shifted and scaled to (0, 1) as HyRF eq. 3 intends):
+
+        c(u) = 0.25 u + 0.5                          |u| <= 1
+        c(u) = 0.25 (2 - 1/|u|) u/|u| + 0.5          otherwise
+
+    Args:
+        u: (..., 3) normalised coordinates, any finite value.
+
+    Returns:
+        (..., 3) in [0, 1]. Differentiable everywhere, also at |u| = 1 (C1).
+    """
+    # Divided by the largest component first: the square of 1e30 would overflow float32.
+    largest = u.abs().amax(-1, keepdim=True).clamp_min(1)
+    radius = torch.linalg.vector_norm(u / largest, dim=-1, keepdim=True).clamp_min(1 / largest) * largest
+    return 0.25 * (2 - 1 / radius) * (u / radius) + 0.5

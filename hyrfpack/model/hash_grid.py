@@ -1,0 +1,70 @@
+"""Multiresolution hash grids (Mueller et al. 2022): shape and storage; the lookup itself is ops.hash_encode."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor, nn
+
+from hyrfpack.ops.hash_encode import hash_encode, level_offsets, level_resolutions
+
+FEATURES = 2
+
+
+@dataclass(frozen=True)
+class HashGridConfig:
+    """The shape of one hash grid.
+
+    Attributes:
+        log2_table_size: rows of a level are min(resolution^3, 2^log2_table_size).
+        levels: number of levels, resolutions in geometric progression.
+        base, finest: vertices per axis of the first and the last level.
+    """
+
+    log2_table_size: int
+    levels: int = 16
+    base: int = 64
+    finest: int = 1024
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.levels <= 32:
+            raise ValueError(f"levels is {self.levels}; it must lie in [1, 32]")
+        if not 4 <= self.log2_table_size <= 24:
+            raise ValueError(f"log2_table_size is {self.log2_table_size}; it must lie in [4, 24]")
+        if not 2 <= self.base <= self.finest <= 65536:
+            raise ValueError(f"resolutions {self.base} to {self.finest} must rise within [2, 65536]")
+
+    @cached_property
+    def resolutions(self) -> tuple[int, ...]:
+        """Vertices per axis of each level."""
+        return level_resolutions(self.levels, self.base, self.finest)
+
+    @cached_property
+    def offsets(self) -> tuple[int, ...]:
+        """(levels + 1,) first row of each level in the table, and the number of rows."""
+        return level_offsets(self.resolutions, self.log2_table_size)
+
+    @property
+    def rows(self) -> int:
+        """Rows of the whole table."""
+        return self.offsets[-1]
+
+
+class HashGrid(nn.Module):
+    """A trainable table (rows, 2), all levels one after another."""
+
+    def __init__(self, config: HashGridConfig, generator: torch.Generator | None = None) -> None:
+        super().__init__()
+        self.config = config
+        self.table = nn.Parameter((torch.rand(config.rows, FEATURES, generator=generator) * 2 - 1) * 1e-4)
+
+    @property
+    def features(self) -> int:
+        """Numbers per point that `forward` returns."""
+        return self.config.levels * FEATURES
+
+    def forward(self, coords: Tensor) -> Tensor:
+        """Features (N, levels * 2) of points (N, 3) in the unit cube."""
+        return hash_encode(coords, self.table, self.config.resolutions, self.config.log2_table_size)

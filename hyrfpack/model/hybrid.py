@@ -1,0 +1,114 @@
+"""HybridModel: explicit Gaussians, a geometry field, a radiance field and the background, put together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from hyrfpack.model.background import pixel_directions, sphere_points
+from hyrfpack.model.config import ModelConfig
+from hyrfpack.model.field import DIRECTION_FEATURES, Field, encode_directions
+from hyrfpack.model.frame import contract
+from hyrfpack.model.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """The view-independent part of decoded Gaussians, activated.
+
+    Attributes:
+        scales: (N, 3) standard deviations in local units.
+        quats: (N, 4) wxyz, not normalised (the rasteriser normalises).
+        opacities: (N,) in (0, 1).
+    """
+
+    scales: Tensor
+    quats: Tensor
+    opacities: Tensor
+
+    def __getitem__(self, index: Tensor) -> Geometry:
+        return Geometry(self.scales[index], self.quats[index], self.opacities[index])
+
+
+class HybridModel(nn.Module):
+    """A hybrid radiance field (HyRF, NeurIPS 2025).
+
+    Each Gaussian's properties are the sum of what it stores (e) and what the fields say at its place (n):
+
+        opacity = sigmoid(a_n + a_e)      colour = sigmoid(c_n(direction) + c_e)
+        scale = S(p) sigmoid(s_n + s_e)   rotation = normalize(r_n + (1, 0, 0, 0))
+
+    with S(p) = max(1, |u|) local units. All positions are local to `config.frame`.
+    """
+
+    def __init__(self, config: ModelConfig, gaussians: Gaussians, generator: torch.Generator | None = None) -> None:
+        super().__init__()
+        self.config = config
+        self.gaussians = gaussians
+        self.geometry = Field(config.geometry, outputs=8, hidden=config.hidden, generator=generator)
+        self.radiance = Field(
+            config.radiance,
+            outputs=3,
+            hidden=config.hidden,
+            extra_inputs=DIRECTION_FEATURES[config.direction_encoding],
+            generator=generator,
+        )
+
+    def cube_coords(self, positions: Tensor) -> Tensor:
+        """Local positions (N, 3) to the hash grids' unit cube."""
+        return contract(self.config.frame.normalize(positions))
+
+    def scale_bounds(self, positions: Tensor) -> Tensor:
+        """S(p), (N, 1): the largest scale a Gaussian may have at these local positions (N, 3)."""
+        if not self.config.scale_grows:
+            return positions.new_ones(len(positions), 1)
+        return torch.linalg.vector_norm(self.config.frame.normalize(positions), dim=-1, keepdim=True).clamp_min(1)
+
+    def _field_positions(self, positions: Tensor) -> Tensor:
+        return positions if self.config.position_gradients else positions.detach()
+
+    def decode_geometry(self, index: Tensor | None = None) -> Geometry:
+        """Scales, rotations and opacities of the Gaussians at `index` (n,) int64, or of all."""
+        explicit = self.gaussians
+        pick = (lambda values: values) if index is None else (lambda values: values[index])
+        positions = self._field_positions(pick(explicit.positions))
+        raw = self.geometry(self.cube_coords(positions))
+        opacities = torch.sigmoid(raw[:, 0] + pick(explicit.opacity_logits)[:, 0])
+        scales = self.activate_scales(raw[:, 1:4], pick(explicit.scale_logits)) * self.scale_bounds(positions)
+        return Geometry(scales, raw[:, 4:] + raw.new_tensor((1, 0, 0, 0)), opacities)
+
+    def activate_scales(self, neural: Tensor, explicit: Tensor) -> Tensor:
+        """Scales (N, 3) as a fraction of S(p), from neural (N, 3) and explicit (N, 1) logits."""
+        if self.config.scale_rule == "sum":
+            return torch.sigmoid(neural + explicit)
+        return torch.sigmoid(neural) * torch.sigmoid(explicit)
+
+    def decode_colors(self, viewpoint: Tensor, index: Tensor | None = None) -> Tensor:
+        """Colours (n, 3) in (0, 1) of the Gaussians at `index`, seen from `viewpoint` (3,) local units."""
+        explicit = self.gaussians
+        positions, logits = explicit.positions, explicit.color_logits
+        if index is not None:
+            positions, logits = positions[index], logits[index]
+        positions = self._field_positions(positions)
+        directions = torch.nn.functional.normalize(positions - viewpoint, dim=-1, eps=1e-12)
+        return torch.sigmoid(self._radiance(positions, directions) + logits)
+
+    def decode_background(
+        self, pixels: Tensor, width: int, intrinsics: tuple[float, float, float, float], pose: Tensor
+    ) -> Tensor:
+        """Background colours (n, 3) in (0, 1) of pixels (n,), flat indices into a picture of that width.
+
+        Args:
+            pose: (4, 4) camera_from_local, float32.
+        """
+        directions = pixel_directions(pixels, width, intrinsics, pose)
+        origin = -(pose[:3, :3].T @ pose[:3, 3])
+        return torch.sigmoid(self._radiance(sphere_points(origin, directions), directions))
+
+    def _radiance(self, positions: Tensor, directions: Tensor) -> Tensor:
+        return self.radiance(self.cube_coords(positions), encode_directions(directions, self.config.direction_encoding))
+
+    def __len__(self) -> int:
+        return len(self.gaussians)

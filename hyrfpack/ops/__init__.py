@@ -1,0 +1,1 @@
+"""The few hot numeric operations: each one function with a reference and faster implementations behind it."""

@@ -1,0 +1,76 @@
+"""Multiresolution hash encoding (instant-ngp): a point of the unit cube -> features from the tables of all levels."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.hash_encode import reference
+from hyrfpack.ops.hash_encode.reference import cells, corner_rows, level_offsets, level_resolutions
+
+__all__ = ["cells", "corner_rows", "hash_encode", "level_offsets", "level_resolutions"]
+
+
+def hash_encode(
+    coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int, *, implementation: str = "auto"
+) -> Tensor:
+    """Look a point up in every level's table, trilinearly between the 8 vertices around it.
+
+    A level with r vertices per axis puts the point at x = coords * (r - 1), in the cell floor(x) clamped to
+    [0, r - 2]. A vertex has its own row where all r^3 fit the level's table, and otherwise shares the row that
+    instant-ngp's spatial hash gives it (see `corner_rows`).
+
+    Args:
+        coords: (N, 3) points in [0, 1]; outside, the nearest cell is extrapolated. Finite.
+        table: (rows, F) features of all levels, one after the other as `level_offsets` says.
+        resolutions: (L,) vertices per axis, each at least 2; see `level_resolutions`.
+        log2_table_size: most rows of a level, as a power of two; 1 to 28.
+        implementation: "auto", "reference" or "cpu" (float32, two features a level).
+
+    Returns:
+        (N, L * F) features, level after level. The "cpu" implementation stores them feature by feature, as the
+        transpose of a contiguous (L * F, N); what keeps that layout (`mlp` does) spares the backward pass a copy.
+        Differentiable once in `table` and in `coords` (there by the cell the point is in).
+
+    Raises:
+        ValueError: shapes, sizes, types or devices do not fit together.
+    """
+    if coords.ndim != 2 or coords.shape[1] != 3 or table.ndim != 2:
+        raise ValueError(f"coords {tuple(coords.shape)} must be (N, 3) and table {tuple(table.shape)} (rows, F)")
+    if not resolutions or min(resolutions) < 2 or not 1 <= log2_table_size <= 28:
+        raise ValueError(
+            f"resolutions {resolutions} need 2 vertices or more, log2_table_size {log2_table_size} 1 to 28"
+        )
+    rows = level_offsets(resolutions, log2_table_size)[-1]
+    if table.shape[0] != rows:
+        raise ValueError(f"table has {table.shape[0]} rows; these levels need {rows}")
+    available = ("reference", "cpu") if table.shape[1] == 2 else ("reference",)
+    if choose(implementation, available, coords, table) == "reference":
+        return reference.hash_encode(coords, table, resolutions, log2_table_size)
+    return _HashEncode.apply(coords, table, tuple(resolutions), log2_table_size)
+
+
+class _HashEncode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int) -> Tensor:
+        from hyrfpack.ops.hash_encode import cpu
+
+        ctx.save_for_backward(coords, table)
+        ctx.settings = resolutions, log2_table_size
+        return cpu.encode(coords, table, resolutions, log2_table_size)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
+        from hyrfpack.ops.hash_encode import cpu
+
+        arguments = (*ctx.saved_tensors, *ctx.settings, grad)
+        needs_coords, needs_table = ctx.needs_input_grad[:2]
+        return (
+            cpu.grad_coords(*arguments) if needs_coords else None,
+            cpu.grad_table(*arguments) if needs_table else None,
+            None,
+            None,
+        )

@@ -1,0 +1,61 @@
+"""One small pool of threads for every compiled CPU kernel.
+
+Kernels release the GIL, so plain Python threads run them on all cores. One pool for all of them (and not OpenMP
+inside each) keeps a second threading runtime from fighting torch's over the same cores.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import torch
+
+
+def thread_count() -> int:
+    """Threads to use: HYRFPACK_THREADS, else the cores this process may run on."""
+    asked = os.environ.get("HYRFPACK_THREADS", "")
+    if asked.isdigit() and int(asked) > 0:
+        return int(asked)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@cache
+def _executor() -> ThreadPoolExecutor:
+    # Each worker is one core's worth of work: a torch call inside it must not fan out again.
+    return ThreadPoolExecutor(
+        thread_count(), thread_name_prefix="hyrfpack", initializer=torch.set_num_threads, initargs=(1,)
+    )
+
+
+def run_tasks(task: Callable[[int], None], count: int) -> None:
+    """Call task(0) ... task(count - 1) on the pool's threads and wait for all; the first error is raised here.
+
+    Tasks are pulled one by one, so uneven ones balance. Results must not depend on which thread ran what: each
+    task writes to its own place.
+    """
+    if count == 1 or thread_count() == 1:
+        for index in range(count):
+            task(index)
+        return
+    pending = iter(range(count))
+
+    def worker() -> None:
+        # next() on a range iterator is atomic under the GIL.
+        for index in pending:
+            task(index)
+
+    futures = [_executor().submit(worker) for _ in range(min(thread_count(), count))]
+    for future in futures:
+        future.result()
+
+
+def run_ranges(task: Callable[[int, int], None], length: int, minimum: int = 2048) -> None:
+    """Split [0, length) into contiguous ranges, a few for each thread, and call task(start, stop) on each."""
+    if length == 0:
+        return
+    ranges = max(1, min(4 * thread_count(), length // minimum))
+    edges = [length * i // ranges for i in range(ranges + 1)]
+    run_tasks(lambda i: task(edges[i], edges[i + 1]), ranges)

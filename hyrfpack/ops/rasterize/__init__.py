@@ -1,0 +1,119 @@
+"""Rasterising: 3D Gaussians and a camera to a picture, differentiably."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from hyrfpack.ops.dispatch import choose
+
+__all__ = ["Rasterization", "rasterize"]
+
+
+@dataclass(frozen=True)
+class Rasterization:
+    """A picture of the Gaussians alone, with no background.
+
+    Attributes:
+        rgb: (H, W, 3) sum over Gaussians of T alpha color.
+        transmittance: (H, W) the share of light that passes all Gaussians; differentiable like rgb.
+        depth: (H, W) mean camera z weighted by T alpha, in world units, 0 where nothing is hit; not differentiable.
+            None unless asked for.
+        visible: (N,) bool, in front of the near plane and reaching alpha >= 1/255 in at least one tile.
+        pairs: number of (Gaussian, tile) pairs blended.
+        seconds: wall time of the stages project, sort, bin and blend.
+    """
+
+    rgb: Tensor
+    transmittance: Tensor
+    depth: Tensor | None
+    visible: Tensor
+    pairs: int
+    seconds: dict[str, float]
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    camera_from_world: Tensor,
+    intrinsics: tuple[float, float, float, float],
+    width: int,
+    height: int,
+    *,
+    near: float = 0.01,
+    antialiased: bool = False,
+    depth: bool = False,
+    absgrad: Tensor | None = None,
+    implementation: str = "auto",
+) -> Rasterization:
+    """Draw 3D Gaussians as a camera sees them (3D Gaussian Splatting, Kerbl et al. 2023).
+
+    Each Gaussian is projected to a 2D Gaussian (EWA, with 0.3 px^2 of low-pass) and blended front to back, by camera
+    z and then by index:
+
+        alpha = min(0.99, opacity exp(-1/2 d^T Sigma^-1 d)),  skipped below 1/255
+        rgb = sum_i T_i alpha_i color_i,   T_i = product over j < i of (1 - alpha_j)
+
+    and a pixel is finished before the Gaussian that would take T below 1e-4. Gradients reach means, quats, scales,
+    opacities and colors, not the camera; none passes through an alpha that is cut at 0.99 (as autograd has it; the
+    3DGS kernels let it through). Results do not depend on the number of threads.
+
+    Args:
+        means: (N, 3) centres in world units.
+        quats: (N, 4) wxyz of any length; normalised here. Zero counts as no rotation.
+        scales: (N, 3) standard deviations along the rotated axes, in world units, > 0.
+        opacities: (N,) in [0, 1].
+        colors: (N, 3) RGB.
+        camera_from_world: (4, 4) rigid transform, best in float64; OpenCV axes.
+        intrinsics: (fx, fy, cx, cy) in pixels; the first pixel's centre is (0.5, 0.5).
+        width, height: picture size in pixels.
+        near: Gaussians with camera z <= near, in world units and >= 0, are left out.
+        antialiased: scale opacities by sqrt(det(Sigma) / det(Sigma + 0.3 I)), so that the low-pass adds no light.
+        depth: also return depth.
+        absgrad: (N, 2) buffer to which backward adds the sums over pixels of |dL/d mean2d| (x, y) in 1/px,
+            the signal of abs-gradient densification.
+        implementation: "auto", "reference" or "cpu".
+
+    Raises:
+        ValueError: shapes, dtypes or devices that do not fit, or a picture without pixels.
+    """
+    count = len(means)
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "colors": (3,)}
+    inputs = (means, quats, scales, opacities, colors)
+    for (name, shape), tensor in zip(shapes.items(), inputs, strict=True):
+        if tensor.shape != (count, *shape):
+            raise ValueError(f"{name} is {tuple(tensor.shape)}, expected {(count, *shape)}")
+    if camera_from_world.shape != (4, 4):
+        raise ValueError(f"camera_from_world is {tuple(camera_from_world.shape)}, expected (4, 4)")
+    if absgrad is not None and (absgrad.shape != (count, 2) or absgrad.dtype != means.dtype):
+        raise ValueError(f"absgrad is {absgrad.dtype} {tuple(absgrad.shape)}, expected {means.dtype} {(count, 2)}")
+    if not near >= 0:
+        raise ValueError(f"near is {near}, expected a distance in front of the camera")
+    if width < 1 or height < 1:
+        raise ValueError(f"a picture of {width} x {height} has no pixels")
+
+    chosen = choose(implementation, ("reference", "cpu"), *inputs)
+    if chosen == "cpu":
+        if means.device.type != "cpu" or means.dtype != torch.float32:
+            raise ValueError(f"the cpu kernels take float32 on the CPU, not {means.dtype} on {means.device}")
+        from hyrfpack.ops.rasterize.cpu import rasterize as run
+    else:
+        from hyrfpack.ops.rasterize.reference import rasterize as run
+    return Rasterization(
+        *run(
+            *inputs,
+            camera_from_world,
+            intrinsics,
+            width,
+            height,
+            near=near,
+            antialiased=antialiased,
+            depth=depth,
+            absgrad=absgrad,
+        )
+    )

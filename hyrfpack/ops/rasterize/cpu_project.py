@@ -1,0 +1,262 @@
+"""Compiled projection: 3D Gaussians to the records that binning and blending read, and the way back for gradients.
+
+Everything is in float64, which costs little here and keeps far-away scenes, needles and huge Gaussians exact; the
+records are float32. A Gaussian whose numbers overflow is left out like one behind the camera.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from hyrfpack.ops.rasterize.reference import ALPHA_MIN, COMPENSATION_MIN, LOW_PASS, QUAT_NORM_MIN, TILE
+
+# One record of a projected Gaussian: 16 float32, one cache line. With Sigma = its 2D covariance,
+#     u = U_X dx + U_Y dy,  v = V_Y dy,  u^2 + v^2 = 1/16 d^T Sigma^-1 d   (so the exponent is -8 (u^2 + v^2)).
+# Squares of a triangular form lose nothing to cancellation on long needles, and are never negative.
+MEAN_X, MEAN_Y, U_X, U_Y, V_Y, CUT, OPACITY, RED, GREEN, BLUE, DEPTH, COV_XX, COV_YY, REACH = range(14)
+RECORD = 16
+# CUT: the largest u^2 + v^2 with alpha >= 1/255.  REACH: the largest d^T Sigma^-1 d to bin, slightly more.
+
+# One gradient row of a (Gaussian, tile) pair: sums over pixels of p = dL/d(exponent) times u, v, uu, uv, vv and 1;
+# dL/d(color); sums of |p u| and |p (U_Y u + V_Y v)|. Padded to a cache line.
+SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_P, SUM_RED, SUM_GREEN, SUM_BLUE, SUM_ABS_U, SUM_ABS_V = range(11)
+ROW = 16
+
+HIDDEN = np.uint32(0xFFFFFFFF)  # the sort key of a Gaussian that is not drawn
+_OVERFLOW = 1e30
+_kernel = njit(nogil=True, cache=True, fastmath={"contract", "nsz"}, error_model="numpy")
+
+
+@_kernel
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@_kernel
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@_kernel
+def _combine(s, a, t, b):
+    """s a + t b."""
+    return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
+
+
+@_kernel
+def _times(a, b):
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
+
+
+@_kernel
+def _clamp(value, low, high):
+    return min(max(value, low), high)
+
+
+@_kernel
+def _double(x, y, z):
+    return np.float64(x), np.float64(y), np.float64(z)
+
+
+@_kernel
+def _columns(q0, q1, q2, q3):
+    """The rotation matrix of a unit quaternion wxyz, column by column."""
+    return (
+        (1 - 2 * (q2 * q2 + q3 * q3), 2 * (q1 * q2 + q0 * q3), 2 * (q1 * q3 - q0 * q2)),
+        (2 * (q1 * q2 - q0 * q3), 1 - 2 * (q1 * q1 + q3 * q3), 2 * (q2 * q3 + q0 * q1)),
+        (2 * (q1 * q3 + q0 * q2), 2 * (q2 * q3 - q0 * q1), 1 - 2 * (q1 * q1 + q2 * q2)),
+    )
+
+
+@_kernel
+def _locate(mean, axes, shift):
+    """x / z, y / z and z of a mean in the camera with rotation rows `axes`."""
+    z = _dot(axes[2], mean) + shift[2]
+    inv_z = 1 / z
+    return (_dot(axes[0], mean) + shift[0]) * inv_z, (_dot(axes[1], mean) + shift[1]) * inv_z, z
+
+
+@_kernel
+def _spread(x_z, y_z, z, quat, axes, lens):
+    """The factors of the covariance.
+
+    Returns:
+        a, b: the rows of J R; e, f: the rows of J R Q; q: the unit quaternion; norm: its length before.
+    """
+    q0, q1, q2, q3 = quat
+    norm = math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+    scale = 1 / max(norm, QUAT_NORM_MIN)
+    q0, q1, q2, q3 = q0 * scale, q1 * scale, q2 * scale, q3 * scale
+    axis_0, axis_1, axis_2 = _columns(q0, q1, q2, q3)
+    inv_z = 1 / z
+    j_x, j_y = lens[0] * inv_z, lens[1] * inv_z
+    a = _combine(j_x, axes[0], -j_x * _clamp(x_z, lens[4], lens[5]), axes[2])
+    b = _combine(j_y, axes[1], -j_y * _clamp(y_z, lens[6], lens[7]), axes[2])
+    e = _dot(a, axis_0), _dot(a, axis_1), _dot(a, axis_2)
+    f = _dot(b, axis_0), _dot(b, axis_1), _dot(b, axis_2)
+    return a, b, e, f, (q0, q1, q2, q3), norm
+
+
+@_kernel
+def _covariance(g, h):
+    """xx, xy, yy of the filtered covariance whose root has rows g and h; determinants before and after the filter."""
+    xx, xy, yy = _dot(g, g), _dot(g, h), _dot(h, h)
+    # |g x h|^2 = xx yy - xy^2 without the cancellation that needles suffer from.
+    normal = _cross(g, h)
+    raw = _dot(normal, normal)
+    det = raw + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS
+    return xx + LOW_PASS, xy, yy + LOW_PASS, raw, det
+
+
+@_kernel
+def _triangle(xx, xy, yy, det):
+    """U_X, U_Y and V_Y of a record."""
+    inv_yy = 1 / yy
+    u_x = 0.25 * math.sqrt(yy / det)
+    return u_x, -u_x * xy * inv_yy, 0.25 * math.sqrt(inv_yy)
+
+
+@_kernel
+def project(
+    start, stop, means, quats, scales, opacities, colors, axes, shift, lens, width, height, near, antialiased,
+    records, keys, boxes,
+):  # fmt: skip
+    """Fill records (N, 16), keys (N,) uint32 that sort by depth, boxes (N,) how many tiles the bounding box meets.
+
+    axes: the rows of the camera's rotation; shift: its translation; lens: fx, fy, cx, cy, then the limits of x/z (low,
+    high) and of y/z in the Jacobian. All tuples of float64, for loads from arrays would stay in the loop.
+    Only Gaussians start to stop are handled. A record is written only for what is drawn.
+    """
+    for i in range(np.uint64(start), np.uint64(stop)):
+        keys[i] = HIDDEN
+        boxes[i] = 0
+        x_z, y_z, z = _locate(_double(means[i, 0], means[i, 1], means[i, 2]), axes, shift)
+        opacity = np.float64(opacities[i])
+        # Written so that NaN fails every test and is not drawn.
+        if not (z > near and z < _OVERFLOW and opacity >= ALPHA_MIN and opacity < _OVERFLOW):
+            continue
+        quat = np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+        _, _, e, f, _, _ = _spread(x_z, y_z, z, quat, axes, lens)
+        scale = _double(scales[i, 0], scales[i, 1], scales[i, 2])
+        xx, xy, yy, raw, det = _covariance(_times(e, scale), _times(f, scale))
+        if antialiased:
+            opacity *= math.sqrt(max(raw / det, COMPENSATION_MIN))
+        mean_x, mean_y = lens[0] * x_z + lens[2], lens[1] * y_z + lens[3]
+        if not (opacity >= ALPHA_MIN and xx < _OVERFLOW and yy < _OVERFLOW):
+            continue
+        if not (abs(mean_x) < _OVERFLOW and abs(mean_y) < _OVERFLOW):
+            continue
+
+        cut = 2 * math.log(255 * opacity)
+        reach = cut + 1e-3
+        extent_x, extent_y = math.sqrt(reach * xx) + 0.01, math.sqrt(reach * yy) + 0.01
+        left, right = max(mean_x - extent_x - 0.5, 0.0), min(mean_x + extent_x - 0.5, width - 1.0)
+        top, bottom = max(mean_y - extent_y - 0.5, 0.0), min(mean_y + extent_y - 0.5, height - 1.0)
+        if not (math.ceil(left) <= math.floor(right) and math.ceil(top) <= math.floor(bottom)):
+            continue
+        columns = np.int64(right) // TILE - np.int64(math.ceil(left)) // TILE + 1
+        rows = np.int64(bottom) // TILE - np.int64(math.ceil(top)) // TILE + 1
+
+        keys[i] = np.float32(z).view(np.uint32)
+        boxes[i] = columns * rows
+        records[i, MEAN_X], records[i, MEAN_Y] = mean_x, mean_y
+        records[i, U_X], records[i, U_Y], records[i, V_Y] = _triangle(xx, xy, yy, det)
+        records[i, CUT], records[i, REACH] = cut / 16, reach
+        records[i, OPACITY], records[i, DEPTH] = opacity, z
+        records[i, RED], records[i, GREEN], records[i, BLUE] = colors[i, 0], colors[i, 1], colors[i, 2]
+        records[i, COV_XX], records[i, COV_YY] = xx, yy
+
+
+@_kernel
+def project_backward(
+    start, stop, first, rows, means, quats, scales, opacities, axes, shift, lens, antialiased,
+    grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, absgrad,
+):  # fmt: skip
+    """Sum the gradient rows of each Gaussian and pull them back through the projection.
+
+    first: (N + 1,) where each one's rows (P, 16) begin. The gradients are written, absgrad ((N, 2) or None) is added
+    to. Only Gaussians start to stop are handled.
+    """
+    sums = np.empty(ROW, np.float32)
+    for i in range(np.uint64(start), np.uint64(stop)):
+        begin, end = np.uint64(first[i]), np.uint64(first[i + np.uint64(1)])
+        if begin == end:
+            grad_means[i] = 0
+            grad_quats[i] = 0
+            grad_scales[i] = 0
+            grad_opacities[i] = 0
+            grad_colors[i] = 0
+            continue
+        sums[:] = 0
+        for row in range(begin, end):
+            for k in range(np.uint64(ROW)):
+                sums[k] += rows[row, k]
+        grad_colors[i, 0], grad_colors[i, 1], grad_colors[i, 2] = sums[SUM_RED], sums[SUM_GREEN], sums[SUM_BLUE]
+        sum_p = np.float64(sums[SUM_P])
+        grad_opacities[i] = sum_p / opacities[i]
+
+        x_z, y_z, z = _locate(_double(means[i, 0], means[i, 1], means[i, 2]), axes, shift)
+        inv_z = 1 / z
+        quat = np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+        a, b, e, f, q, norm = _spread(x_z, y_z, z, quat, axes, lens)
+        scale = _double(scales[i, 0], scales[i, 1], scales[i, 2])
+        g, h = _times(e, scale), _times(f, scale)
+        xx, xy, yy, raw, det = _covariance(g, h)
+        u_x, u_y, v_y = _triangle(xx, xy, yy, det)
+
+        # Sigma^-1 d = 16 (U_X u, U_Y u + V_Y v), and dL/dSigma = 1/2 sum p (Sigma^-1 d)(Sigma^-1 d)^T.
+        su, sv = np.float64(sums[SUM_U]), np.float64(sums[SUM_V])
+        suu, suv, svv = np.float64(sums[SUM_UU]), np.float64(sums[SUM_UV]), np.float64(sums[SUM_VV])
+        grad_x, grad_y = -16 * u_x * su, -16 * (u_y * su + v_y * sv)
+        grad_xx = 128 * u_x * u_x * suu
+        grad_xy = 256 * u_x * (u_y * suu + v_y * suv)
+        grad_yy = 128 * (u_y * u_y * suu + 2 * u_y * v_y * suv + v_y * v_y * svv)
+        if absgrad is not None:
+            absgrad[i, 0] += np.float32(16 * u_x * sums[SUM_ABS_U])
+            absgrad[i, 1] += np.float32(16 * sums[SUM_ABS_V])
+        if antialiased and raw / det >= COMPENSATION_MIN:
+            # The exponent gains 1/2 log(raw / det).
+            grad_xx += 0.5 * sum_p * ((yy - LOW_PASS) / raw - yy / det)
+            grad_yy += 0.5 * sum_p * ((xx - LOW_PASS) / raw - xx / det)
+            grad_xy -= sum_p * xy * (1 / raw - 1 / det)
+
+        grad_g, grad_h = _combine(2 * grad_xx, g, grad_xy, h), _combine(2 * grad_yy, h, grad_xy, g)
+        by_e, by_f = _times(grad_g, e), _times(grad_h, f)
+        for k in range(3):
+            grad_scales[i, k] = by_e[k] + by_f[k]
+        grad_e, grad_f = _times(grad_g, scale), _times(grad_h, scale)
+
+        # Through e = a Q and f = b Q: the rotation's matrix, then its unit quaternion, then the length.
+        d0 = _combine(a[0], grad_e, b[0], grad_f)
+        d1 = _combine(a[1], grad_e, b[1], grad_f)
+        d2 = _combine(a[2], grad_e, b[2], grad_f)
+        q0, q1, q2, q3 = q
+        w0 = 2 * (q1 * (d2[1] - d1[2]) + q2 * (d0[2] - d2[0]) + q3 * (d1[0] - d0[1]))
+        w1 = 2 * (q0 * (d2[1] - d1[2]) + q2 * (d0[1] + d1[0]) + q3 * (d0[2] + d2[0]) - 2 * q1 * (d1[1] + d2[2]))
+        w2 = 2 * (q0 * (d0[2] - d2[0]) + q1 * (d0[1] + d1[0]) + q3 * (d1[2] + d2[1]) - 2 * q2 * (d0[0] + d2[2]))
+        w3 = 2 * (q0 * (d1[0] - d0[1]) + q1 * (d0[2] + d2[0]) + q2 * (d1[2] + d2[1]) - 2 * q3 * (d0[0] + d1[1]))
+        along = q0 * w0 + q1 * w1 + q2 * w2 + q3 * w3 if norm > QUAT_NORM_MIN else 0.0
+        inv_norm = 1 / max(norm, QUAT_NORM_MIN)
+        grad_quats[i, 0], grad_quats[i, 1] = (w0 - along * q0) * inv_norm, (w1 - along * q1) * inv_norm
+        grad_quats[i, 2], grad_quats[i, 3] = (w2 - along * q2) * inv_norm, (w3 - along * q3) * inv_norm
+
+        # Through a = j_x R_x - j_x clamp(x/z) R_z and likewise b: the Jacobian, then the mean.
+        axis_0, axis_1, axis_2 = _columns(q0, q1, q2, q3)
+        grad_a = _combine(1.0, _combine(grad_e[0], axis_0, grad_e[1], axis_1), grad_e[2], axis_2)
+        grad_b = _combine(1.0, _combine(grad_f[0], axis_0, grad_f[1], axis_1), grad_f[2], axis_2)
+        right, down, forward = axes
+        j_x, j_y = lens[0] * inv_z, lens[1] * inv_z
+        towards_x, towards_y = _dot(grad_a, forward), _dot(grad_b, forward)
+        grad_x_z, grad_y_z = lens[0] * grad_x, lens[1] * grad_y
+        if lens[4] <= x_z <= lens[5]:
+            grad_x_z -= j_x * towards_x
+        if lens[6] <= y_z <= lens[7]:
+            grad_y_z -= j_y * towards_y
+        by_j_x = _dot(grad_a, right) - _clamp(x_z, lens[4], lens[5]) * towards_x
+        by_j_y = _dot(grad_b, down) - _clamp(y_z, lens[6], lens[7]) * towards_y
+        grad_z = -(by_j_x * j_x + by_j_y * j_y + grad_x_z * x_z + grad_y_z * y_z) * inv_z
+        for k in range(3):
+            grad_means[i, k] = (grad_x_z * right[k] + grad_y_z * down[k]) * inv_z + grad_z * forward[k]

@@ -1,0 +1,102 @@
+"""Structural similarity of two pictures, and the photometric loss built on it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.ssim import reference as _reference
+
+__all__ = ["photometric_loss", "ssim"]
+
+_AVAILABLE = ("reference", "cpu")
+
+
+def ssim(image: Tensor, reference: Tensor, *, implementation: str = "auto") -> Tensor:
+    """Mean structural similarity (Wang et al. 2004) of two pictures, over all pixels and channels.
+
+        SSIM = (2 m_x m_y + C1) (2 s_xy + C2) / ((m_x^2 + m_y^2 + C1) (s_x^2 + s_y^2 + C2))
+
+    Local means m and (co)variances s are weighted by an 11x11 Gaussian window with sigma 1.5; C1 = 0.01^2,
+    C2 = 0.03^2. Outside the picture is black, as in 3D Gaussian splatting, so pictures of any size do.
+
+    Args:
+        image, reference: (H, W, 3) in [0, 1], at least one pixel.
+        implementation: "auto", "reference" or "cpu" (float32).
+
+    Returns:
+        Scalar in [-1, 1]; 1 for equal pictures. Differentiable once, in `image` only.
+
+    Raises:
+        ValueError: shapes, types or devices do not fit together.
+    """
+    _check(image, reference, None)
+    if choose(implementation, _AVAILABLE, image, reference) == "reference":
+        return _reference.ssim(image, reference.detach())
+    return 1 - _Loss.apply(image, reference, None, 0.0, 1.0)
+
+
+def photometric_loss(
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    *,
+    ssim_weight: float = 0.2,
+    implementation: str = "auto",
+) -> Tensor:
+    """How far a rendered picture is from a photo: (1 - w) mean |image - target| + w (1 - mean SSIM).
+
+    Where the mask is False, `image` is first replaced by `target`, and both means leave these pixels out: neither a
+    value nor a gradient comes from them, nor from what either picture holds there in `image`.
+
+    Args:
+        image, target: (H, W, 3) in [0, 1], at least one pixel.
+        mask: (H, W) bool, True where the photo counts; None counts all of it.
+        ssim_weight: w, in [0, 1].
+        implementation: "auto", "reference" or "cpu" (float32).
+
+    Returns:
+        Scalar, 0 for equal pictures and where nothing counts. Differentiable once, in `image` only.
+
+    Raises:
+        ValueError: shapes, types or devices do not fit together.
+    """
+    _check(image, target, mask)
+    if choose(implementation, _AVAILABLE, image, target) == "reference":
+        return _reference.photometric_loss(image, target.detach(), mask, ssim_weight)
+    return _Loss.apply(image, target, mask, 1 - ssim_weight, ssim_weight)
+
+
+def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
+    if image.ndim != 3 or image.shape[2] != 3 or image.numel() == 0 or image.shape != target.shape:
+        raise ValueError(f"pictures must be two equal (H, W, 3), not {tuple(image.shape)} and {tuple(target.shape)}")
+    if mask is not None and (mask.shape != image.shape[:2] or mask.dtype != torch.bool):
+        raise ValueError(f"mask must be bool {tuple(image.shape[:2])}, not {mask.dtype} {tuple(mask.shape)}")
+
+
+class _Loss(torch.autograd.Function):
+    """l1_weight * mean |image - target| + ssim_weight * (1 - mean SSIM); the gradient is made in the same pass."""
+
+    @staticmethod
+    def forward(
+        ctx, image: Tensor, target: Tensor, mask: Tensor | None, l1_weight: float, ssim_weight: float
+    ) -> Tensor:
+        from hyrfpack.ops.ssim import cpu
+
+        shape, count, weights = image.shape, image.numel(), None
+        if mask is not None:
+            count = max(1, 3 * int(mask.sum()))
+            image = torch.where(mask[..., None], image, target)
+            weights = mask[..., None].expand(shape).float().reshape(shape[0], -1).numpy()
+        pixels, wanted = (picture.detach().reshape(shape[0], -1).contiguous().numpy() for picture in (image, target))
+        loss, gradient = cpu.loss_and_gradient(pixels, wanted, weights, l1_weight / count, ssim_weight / count)
+        ctx.save_for_backward(torch.from_numpy(gradient).view(shape))
+        return image.new_tensor(loss)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,) = ctx.saved_tensors
+        return grad * gradient, None, None, None, None

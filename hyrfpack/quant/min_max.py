@@ -1,0 +1,120 @@
+"""Uniform quantisation between the smallest and the largest value."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrfpack.errors import HyrfError, HyrfFormatError
+
+_PARAMS = struct.Struct("<ffB")
+
+
+@dataclass(frozen=True)
+class MinMaxParams:
+    """What `MinMaxQuantizer.decode` needs besides the codes.
+
+    Attributes:
+        minimum, maximum: the range, each exactly a float32.
+        bits: bits of a code, 1 to 16.
+    """
+
+    minimum: float
+    maximum: float
+    bits: int
+
+    def to_bytes(self) -> bytes:
+        """Nine bytes, little-endian: minimum float32, maximum float32, bits u8."""
+        return _PARAMS.pack(self.minimum, self.maximum, self.bits)
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> MinMaxParams:
+        """Read what `to_bytes` wrote.
+
+        Raises:
+            HyrfFormatError: not nine bytes, a range that is not finite or not ordered, or bits not in 1 to 16.
+        """
+        if len(data) != _PARAMS.size:
+            raise HyrfFormatError(
+                f"min-max parameters: {len(data)} bytes instead of {_PARAMS.size}; the data is damaged"
+            )
+        params = cls(*_PARAMS.unpack(data))
+        if not (-math.inf < params.minimum <= params.maximum < math.inf and 1 <= params.bits <= 16):
+            raise HyrfFormatError(f"min-max parameters: {params} is no range; the data is damaged")
+        return params
+
+
+@dataclass(frozen=True)
+class MinMaxQuantizer:
+    """Quantises an array to evenly spaced levels between its minimum and maximum, both of them levels.
+
+        L = 2^b - 1        q = round(L (v - min) / (max - min))        decoded: ((L - q) min + q max) / L
+
+    The arithmetic is float64, one correctly rounded operation at a time in the order written, halves rounded to the
+    even code, and decoded levels are rounded to float32 once: every platform gives the same codes and values.
+
+    Error of a decoded value: at most (max - min) / (2 L), half a step, plus rounding, at most
+    2^-23 max(|min|, |max|). Arrays with min = max, and the minimum and the maximum of a float32 array, are exact.
+
+    Attributes:
+        bits: b, bits of a code, 1 to 16.
+    """
+
+    bits: int = 8
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.bits <= 16:
+            raise ValueError(f"bits must be in 1 to 16, got {self.bits}")
+
+    def encode(self, values: np.ndarray) -> tuple[np.ndarray, MinMaxParams]:
+        """Quantise.
+
+        Args:
+            values: floats of any shape, finite and within the range of float32; may be empty.
+
+        Returns:
+            Codes 0 to 2^b - 1 of the same shape, uint8 up to 8 bits, else uint16; and the parameters.
+
+        Raises:
+            HyrfError: a value is not finite as float32.
+        """
+        work = np.array(values, np.float64)  # a copy, worked on in place
+        with np.errstate(over="ignore"):
+            minimum, maximum = (float(np.float32(f(work))) if work.size else 0.0 for f in (np.min, np.max))
+        if not (math.isfinite(minimum) and math.isfinite(maximum)):
+            raise HyrfError("min-max quantisation: a value is NaN or beyond float32; only finite values can be coded")
+        last = 2**self.bits - 1
+        if maximum > minimum:
+            work -= minimum
+            work *= last
+            work /= maximum - minimum
+            np.rint(work, out=work)
+            # float64 values may lie a little outside a range rounded to float32.
+            np.clip(work, 0, last, out=work)
+        else:
+            work[...] = 0
+        return work.astype(np.uint8 if self.bits <= 8 else np.uint16), MinMaxParams(minimum, maximum, self.bits)
+
+    @staticmethod
+    def decode(codes: np.ndarray, params: MinMaxParams) -> np.ndarray:
+        """Values for codes.
+
+        Args:
+            codes: unsigned integers of any shape.
+            params: as `encode` returned them; they alone say how many bits a code has.
+
+        Returns:
+            float32 of the same shape.
+
+        Raises:
+            HyrfFormatError: a code is 2^b or more.
+        """
+        last = 2**params.bits - 1
+        if codes.max(initial=0) > last:
+            raise HyrfFormatError(f"min-max codes: {codes.max()} is more than {params.bits} bits; the data is damaged")
+        levels = np.arange(last + 1)
+        # Both products are exact in float64, so the ends of the range are, however far apart.
+        return (((last - levels) * params.minimum + levels * params.maximum) / last).astype(np.float32)[codes]

@@ -1,0 +1,5 @@
+"""Model + camera -> picture."""
+
+from hyrfpack.render.renderer import RenderSettings, Rendering, render
+
+__all__ = ["RenderSettings", "Rendering", "render"]

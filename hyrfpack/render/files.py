@@ -1,0 +1,102 @@
+"""Rendered views as picture files."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path, PurePosixPath
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from hyrfpack.errors import HyrfError
+from hyrfpack.format.atomic import write_atomic
+from hyrfpack.model import HybridModel
+from hyrfpack.render.renderer import RenderSettings, render
+from hyrfpack.scene import Camera
+
+PICTURE_SUFFIXES = {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
+
+
+def render_files(
+    model: HybridModel,
+    cameras: Sequence[tuple[str, Camera]],
+    folder: str | os.PathLike[str],
+    *,
+    depth: bool = False,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+) -> Iterator[Path]:
+    """Render named cameras to `folder/<name>.png`, sub-folders kept; yields each path once it is written.
+
+    Args:
+        model: what to render.
+        cameras: names (of photos, or any) and cameras.
+        folder: made if missing.
+        depth: also write `<name>.depth.tiff`: one float32 channel, depth along the view axis in world units, 0 where
+            no Gaussian is hit.
+        settings: how to render.
+
+    Raises:
+        HyrfError: a picture cannot be written.
+    """
+    with torch.no_grad():
+        geometry = model.decode_geometry()
+    for name, (_, camera) in zip(file_names([name for name, _ in cameras]), cameras, strict=True):
+        with torch.no_grad():
+            rendering = render(model, camera, settings, geometry=geometry, depth=depth)
+        path = Path(folder) / f"{name}.png"
+        save_picture(path, to_image(rendering.rgb))
+        if depth:
+            save_picture(path.with_suffix(".depth.tiff"), Image.fromarray(rendering.depth.float().cpu().numpy()))
+        yield path
+
+
+def to_image(rgb: Tensor) -> Image.Image:
+    """(H, W, 3) colours, clamped to [0, 1] and rounded to 8 bits."""
+    return Image.fromarray((rgb.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
+
+
+def file_names(names: Sequence[str]) -> list[str]:
+    """Names of photos to paths for renders, without an extension: relative, inside the folder, no two alike.
+
+    "left/0001.JPG" becomes "left/0001"; where two photos differ in their extension only, all keep it.
+    """
+    full = [_safe(name) for name in names]
+    bare = [
+        str(PurePosixPath(name).with_suffix("")) if PurePosixPath(name).suffix.lower() in PICTURE_SUFFIXES else name
+        for name in full
+    ]
+    chosen = bare if len(set(bare)) == len(bare) else full
+    if len(set(chosen)) < len(chosen):
+        chosen = [f"{number:04d}_{name}" for number, name in enumerate(chosen)]
+    return chosen
+
+
+def _safe(name: str) -> str:
+    parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in {"/", ".", ".."}]
+    kept = "/".join(parts)
+    return "".join(c if c.isprintable() and c not in ':*?"<>|' else "_" for c in kept) or "view"
+
+
+def save_picture(path: str | os.PathLike[str], image: Image.Image) -> None:
+    """Write a picture in one step, in the format of its extension, making its folder.
+
+    Raises:
+        HyrfError: the folder or the file cannot be written.
+    """
+    data = io.BytesIO()
+    image.save(data, format=Image.registered_extensions()[Path(path).suffix.lower()])
+    make_folder(Path(path).parent)
+    write_atomic(path, data.getbuffer())
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it. Raises HyrfError when that cannot be done."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise HyrfError(
+            f"{path}: the folder cannot be made ({error.strerror or error}); choose another place"
+        ) from error

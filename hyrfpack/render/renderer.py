@@ -1,0 +1,143 @@
+"""The renderer: cull -> decode the visible -> project, bin, blend -> background."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from hyrfpack.model import Geometry, HybridModel
+from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.render.cull import frustum_cull
+from hyrfpack.scene import Camera
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """How exactly to render; every default is far below what an 8-bit picture shows.
+
+    Attributes:
+        near: Gaussians nearer than this are dropped, local units (the frame's longest half-axis is 1).
+        cull_tolerance: how far outside the picture a centre may project, as a fraction of half its size.
+        background_threshold: pixels with no more transmittance than this get no background (the paper's tau).
+    """
+
+    near: float = 0.01
+    cull_tolerance: float = 0.3
+    background_threshold: float = 1 / 512
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """A rendered view.
+
+    Attributes:
+        rgb: (H, W, 3) display-referred colour, background included; within [0, 1] up to rounding.
+        alpha: (H, W) coverage by Gaussians, 1 - transmittance.
+        depth: (H, W) expected depth along the view axis in world units, 0 where nothing is hit; None unless asked.
+        decoded: (n,) indices of the Gaussians that were decoded.
+        visible: (n,) bool, which of these touched the picture.
+        absgrad: (n, 2) sums over pixels of |dL/d mean2d| in pixels; zero until backward has run; None unless asked.
+        pairs: Gaussian-tile pairs blended.
+        seconds: wall time per stage.
+    """
+
+    rgb: Tensor
+    alpha: Tensor
+    depth: Tensor | None
+    decoded: Tensor
+    visible: Tensor
+    absgrad: Tensor | None
+    pairs: int
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def render(
+    model: HybridModel,
+    camera: Camera,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    *,
+    geometry: Geometry | None = None,
+    depth: bool = False,
+    absgrad: bool = False,
+    solid: Tensor | None = None,
+    background: bool = True,
+) -> Rendering:
+    """Render one view; differentiable in the model's parameters.
+
+    Args:
+        model: what to render.
+        camera: from where, in world units.
+        settings: accuracy against speed.
+        geometry: `model.decode_geometry()` of all Gaussians, when the caller keeps it between views (it does not
+            depend on the view, so inference decodes it once).
+        depth: also return depth.
+        absgrad: also collect absolute gradients of the projected centres during backward.
+        solid: (3,) colour behind everything instead of the model's own; for models without a background sphere.
+        background: False leaves the background sphere out.
+    """
+    seconds: dict[str, float] = {}
+    positions = model.gaussians.positions
+    pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=positions.dtype, device=positions.device)
+    with _timed(seconds, "cull"), torch.no_grad():
+        index = frustum_cull(
+            positions, pose, camera.intrinsics, camera.width, camera.height, settings.near, settings.cull_tolerance
+        )
+    with _timed(seconds, "decode"):
+        geometry = model.decode_geometry(index) if geometry is None else geometry[index]
+        colors = model.decode_colors(-(pose[:3, :3].T @ pose[:3, 3]), index)
+    gradients = positions.new_zeros(len(index), 2) if absgrad else None
+    raster = rasterize(
+        positions[index],
+        geometry.quats,
+        geometry.scales,
+        geometry.opacities,
+        colors,
+        pose,
+        camera.intrinsics,
+        camera.width,
+        camera.height,
+        near=settings.near,
+        antialiased=model.config.antialiased,
+        depth=depth,
+        absgrad=gradients,
+    )
+    seconds.update(raster.seconds)
+    with _timed(seconds, "background"):
+        if model.config.background and background:
+            behind = _background(model, camera, pose, raster.transmittance, settings.background_threshold)
+        else:
+            behind = positions.new_tensor(model.config.solid) if solid is None else solid
+        rgb = raster.rgb + raster.transmittance[..., None] * behind
+    return Rendering(
+        rgb=rgb,
+        alpha=1 - raster.transmittance,
+        depth=None if raster.depth is None else raster.depth * model.config.frame.scale,
+        decoded=index,
+        visible=raster.visible,
+        absgrad=gradients,
+        pairs=raster.pairs,
+        seconds=seconds,
+    )
+
+
+def _background(model: HybridModel, camera: Camera, pose: Tensor, transmittance: Tensor, threshold: float) -> Tensor:
+    """(H, W, 3) colours of the sphere where it shines through, 0 elsewhere."""
+    flat = transmittance.detach().reshape(-1)
+    pixels = torch.nonzero(flat > threshold).squeeze(-1)
+    behind = flat.new_zeros(len(flat), 3)
+    if len(pixels):
+        colors = model.decode_background(pixels, camera.width, camera.intrinsics, pose)
+        behind = behind.index_put((pixels,), colors)
+    return behind.reshape(*transmittance.shape, 3)
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    seconds[stage] = time.perf_counter() - start

@@ -1,0 +1,135 @@
+"""What was photographed: cameras, pictures and points. Plain numpy, no torch.
+
+Cameras follow OpenCV: x right, y down, z forward, pixel centres at .5, poses are rigid `camera_from_world`.
+Readers in `hyrfpack.data` bring every input to this form; nothing after them knows about file layouts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Camera:
+    """An undistorted pinhole camera.
+
+    Attributes:
+        width, height: picture size in pixels.
+        fx, fy: focal lengths in pixels.
+        cx, cy: principal point in pixels; the top-left corner of the picture is (0, 0), the centre of its first
+            pixel (0.5, 0.5).
+        camera_from_world: (4, 4) float64 rigid transform, row-major, last row (0, 0, 0, 1).
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    camera_from_world: np.ndarray
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """(3, 3) world axes seen from the camera."""
+        return self.camera_from_world[:3, :3]
+
+    @property
+    def position(self) -> np.ndarray:
+        """(3,) centre of projection in world units: -R^T t."""
+        return -self.rotation.T @ self.camera_from_world[:3, 3]
+
+    @property
+    def forward(self) -> np.ndarray:
+        """(3,) unit viewing direction in the world."""
+        return self.rotation[2]
+
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """(fx, fy, cx, cy) in pixels."""
+        return self.fx, self.fy, self.cx, self.cy
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A decoded photo, straight (not premultiplied) as it was stored.
+
+    Attributes:
+        rgb: (H, W, 3) uint8, display-referred sRGB.
+        alpha: (H, W) uint8 coverage, or None when the photo is opaque.
+        mask: (H, W) bool, True where a pixel may be used for training and scoring, or None for all.
+    """
+
+    rgb: np.ndarray
+    alpha: np.ndarray | None = None
+    mask: np.ndarray | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes this picture holds in memory."""
+        return sum(part.nbytes for part in (self.rgb, self.alpha, self.mask) if part is not None)
+
+    def composite(self, background: np.ndarray | None = None) -> np.ndarray:
+        """Lay the picture over a solid colour.
+
+        Args:
+            background: (3,) RGB in [0, 1]; black when None. Ignored by opaque pictures.
+
+        Returns:
+            (H, W, 3) float32 in [0, 1]: alpha * rgb + (1 - alpha) * background.
+        """
+        rgb = self.rgb.astype(np.float32) * np.float32(1 / 255)
+        if self.alpha is None:
+            return rgb
+        alpha = self.alpha.astype(np.float32)[..., None] * np.float32(1 / 255)
+        rgb *= alpha
+        if background is not None:
+            rgb += (1 - alpha) * np.asarray(background, dtype=np.float32)
+        return rgb
+
+
+@dataclass(frozen=True)
+class View:
+    """One photo with its camera. `load` decodes the photo; nothing is read before it is called.
+
+    Attributes:
+        name: the photo's path below the picture folder, with its extension ("DSCF5565.jpg", "left/0001.png").
+        camera: the camera after undistortion; its size is the size of the loaded picture.
+        load: returns the Picture, size checked against the camera.
+    """
+
+    name: str
+    camera: Camera
+    load: Callable[[], Picture]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Posed photos and what is known of the geometry.
+
+    Attributes:
+        path: the folder it was read from.
+        layout: "colmap", "blender" or "nerfstudio".
+        train, test: views, sorted by name; disjoint.
+        points: (P, 3) float64 world positions; P may be 0.
+        point_colors: (P, 3) float32 RGB in [0, 1].
+        has_alpha: photos carry coverage (object-centred captures without a background).
+        notes: sentences for the user about what the reader skipped or assumed.
+    """
+
+    path: str
+    layout: str
+    train: list[View]
+    test: list[View]
+    points: np.ndarray
+    point_colors: np.ndarray
+    has_alpha: bool = False
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def views(self) -> list[View]:
+        """All views, sorted by name."""
+        return sorted(self.train + self.test, key=lambda view: view.name)

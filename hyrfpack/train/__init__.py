@@ -1,0 +1,7 @@
+"""Posed photos -> a trained HybridModel in a run folder."""
+
+from hyrfpack.train.config import PRESETS, DensityConfig, LearningRates, TrainConfig
+from hyrfpack.train.run import TrainResult, train
+from hyrfpack.train.trainer import Trainer
+
+__all__ = ["PRESETS", "DensityConfig", "LearningRates", "TrainConfig", "TrainResult", "Trainer", "train"]

@@ -1,0 +1,65 @@
+"""Checkpoints: everything a run needs to go on as if it had never stopped.
+
+Order of views, colours and densification draw from generators seeded by (seed, step), so no generator state is kept.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+from pathlib import Path
+
+import torch
+
+from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.format.atomic import write_atomic
+
+VERSION = 1
+
+
+def save_checkpoint(path: Path, *, settings: dict, tensors: dict[str, torch.Tensor], progress: dict) -> None:
+    """Write a checkpoint in one step.
+
+    Args:
+        settings: plain values that must be the same on resuming.
+        tensors: by name.
+        progress: plain values (step, records).
+    """
+    buffer = io.BytesIO()
+    texts = {"version": VERSION, "settings": json.dumps(settings, sort_keys=True), "progress": json.dumps(progress)}
+    torch.save({**texts, "tensors": tensors}, buffer)
+    write_atomic(path, buffer.getvalue())
+
+
+def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor], dict]:
+    """Read a checkpoint; nothing in the file is executed.
+
+    Returns:
+        Tensors by name, and progress.
+
+    Raises:
+        HyrfTrainingError: it is missing, damaged, or of a run with other settings (which are named).
+    """
+    if not path.is_file():
+        raise HyrfTrainingError(f"{path}: there is no checkpoint to resume from; train without --resume")
+    try:
+        content = torch.load(path, weights_only=True, map_location="cpu")
+        saved, progress = json.loads(content["settings"]), json.loads(content["progress"])
+        tensors = content["tensors"]
+        version = content["version"]
+    except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError, OSError) as error:
+        raise HyrfTrainingError(f"{path}: the checkpoint is damaged; delete it and train anew") from error
+    if version != VERSION:
+        raise HyrfTrainingError(f"{path}: the checkpoint is of another version of hyrfpack; train anew")
+    different = sorted(key for key in saved.keys() | settings.keys() if saved.get(key) != _plain(settings.get(key)))
+    if different:
+        raise HyrfTrainingError(
+            f"{path}: the run was started with other settings ({', '.join(different)}); "
+            "resume with the same ones or train anew with --overwrite"
+        )
+    return tensors, progress
+
+
+def _plain(value: object) -> object:
+    return json.loads(json.dumps(value))

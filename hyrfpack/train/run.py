@@ -1,0 +1,174 @@
+"""A whole training run in a folder: train, save, score on held-out views, report."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from hyrfpack import format as hyrf_format
+from hyrfpack.data import PictureCache
+from hyrfpack.errors import HyrfError
+from hyrfpack.evaluate import Evaluation, evaluate
+from hyrfpack.evaluate.figures import training_curve
+from hyrfpack.format.atomic import write_atomic
+from hyrfpack.model import HybridModel
+from hyrfpack.render import render
+from hyrfpack.render.paths import viewpoint_hint
+from hyrfpack.scene import Scene
+from hyrfpack.train.config import TrainConfig
+from hyrfpack.train.progress import ProgressLine
+from hyrfpack.train.trainer import Trainer
+
+MODEL, CHECKPOINT, METRICS = "model.hyrf", "checkpoint.pt", "metrics.json"
+BACKGROUND_SEEN = 1e-3  # a background that gets less than this share of the light is not there
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """What a run came to.
+
+    Attributes:
+        complete: False when it was interrupted; the checkpoint is in the folder.
+        step: optimiser steps taken.
+        model: path of the `.hyrf` file, None when interrupted.
+        metrics: what `metrics.json` holds, empty when interrupted.
+    """
+
+    complete: bool
+    step: int
+    model: Path | None
+    metrics: dict
+
+
+def train(
+    scene: Scene,
+    out: Path | str,
+    config: TrainConfig | None = None,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    cache: PictureCache | None = None,
+    quiet: bool = False,
+) -> TrainResult:
+    """Train a model on a scene and leave everything about the run in a folder.
+
+    The folder gets `model.hyrf` (profile raw), `metrics.json`, `curve.png`, `views/` (held-out photos beside their
+    renders and error maps) and, while running, `checkpoint.pt`. The first Ctrl-C (or SIGTERM) saves the checkpoint
+    and returns.
+
+    Args:
+        scene: from `hyrfpack.load_scene`.
+        out: the run's folder, made if missing.
+        config: settings, all defaults measured.
+        resume: go on from the folder's checkpoint; the result is the one an uninterrupted run gives.
+        overwrite: replace what an earlier run left in the folder.
+        cache: holds decoded photos; by default a quarter of the memory.
+        quiet: print nothing.
+
+    Raises:
+        HyrfError: the folder holds another run, or training cannot start or go on.
+    """
+    out = Path(out)
+    config = config or TrainConfig()
+    checkpoint = out / CHECKPOINT
+    _prepare(out, resume, overwrite)
+    trainer = Trainer(scene, config, cache)
+    if resume:
+        trainer.load(checkpoint)
+    start = time.monotonic()
+    first = trainer.step
+    with ProgressLine(config.steps, first, quiet) as line, _stop_requests() as stop:
+        complete = trainer.run(
+            checkpoint=checkpoint,
+            report=lambda t, loss, mse: line.update(t.step, loss, mse, len(t.model)),
+            stop=stop,
+        )
+    if not complete:
+        return TrainResult(False, trainer.step, None, {})
+    seconds = time.monotonic() - start
+
+    model = _drop_unseen_background(trainer)
+    path = out / MODEL
+    provenance = {
+        "steps": config.steps,
+        "seed": config.seed,
+        "choices": trainer.choices,
+        "viewpoint": viewpoint_hint([view.camera for view in scene.train]),
+    }
+    hyrf_format.save(model, path, profile="raw", provenance=provenance)
+    metrics = {
+        "settings": config.to_dict(),
+        "scene": {"path": scene.path, "layout": scene.layout, "train": len(scene.train), "test": len(scene.test)},
+        "choices": trainer.choices,
+        "notes": scene.notes,
+        "gaussians": len(model),
+        "bytes": path.stat().st_size,
+        "seconds": seconds,
+        "steps_per_second": (config.steps - first) / max(seconds, 1e-9),
+        "stage_seconds": {name: round(value, 3) for name, value in sorted(trainer.seconds.items())},
+        "curve": trainer.records,
+    }
+    if scene.test:
+        # Scored on the file as it was written, not on what is in memory.
+        scores: Evaluation = evaluate(hyrf_format.load(path), scene.test, pictures=out / "views")
+        metrics["evaluation"] = scores.to_dict()
+    training_curve(trainer.records, out / "curve.png")
+    write_atomic(out / METRICS, json.dumps(metrics, indent=1).encode())
+    checkpoint.unlink(missing_ok=True)
+    return TrainResult(True, trainer.step, path, metrics)
+
+
+def _prepare(out: Path, resume: bool, overwrite: bool) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise HyrfError(f"{out}: the folder cannot be made ({error.strerror}); name another with -o") from error
+    left = [name for name in (MODEL, CHECKPOINT) if (out / name).exists()]
+    if left and not (resume or overwrite):
+        hint = "--resume goes on with it, " if CHECKPOINT in left else ""
+        raise HyrfError(f"{out}: the folder holds an earlier run ({left[-1]}); {hint}--overwrite replaces it")
+
+
+@torch.no_grad()
+def _drop_unseen_background(trainer: Trainer) -> HybridModel:
+    """The model without its background sphere if hardly any light reaches the training cameras from there."""
+    model = trainer.model
+    if not model.config.background:
+        return model
+    views = trainer.scene.train[:: max(1, len(trainer.scene.train) // 16)]
+    seen = max(float((1 - render(model, view.camera, background=False).alpha).mean()) for view in views)
+    if seen >= BACKGROUND_SEEN:
+        trainer.choices["background"] += f"; up to {seen:.1%} of a view's light comes from it"
+        return model
+    trainer.choices["background"] = f"none: no training view gets more than {BACKGROUND_SEEN:.1%} of its light from it"
+    model.config = dataclasses.replace(model.config, background=False)
+    return model
+
+
+@contextmanager
+def _stop_requests() -> Iterator:
+    """Turns the first Ctrl-C or SIGTERM into a request to stop; a second one interrupts at once."""
+    requested = threading.Event()
+    if threading.current_thread() is not threading.main_thread():  # signals belong to the main thread
+        yield requested.is_set
+        return
+
+    def handle(number: int, _frame: object) -> None:
+        requested.set()
+        signal.signal(number, previous[number])
+
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield requested.is_set
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

@@ -1,0 +1,192 @@
+"""From a scene to an untrained model: regime, frame, sizes and the first Gaussians.
+
+"Model only what a scene needs": every size here follows from the photos and the length of the run, and each choice
+is recorded with its reason, for `hyrfpack info`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
+from hyrfpack.model.gaussians import Gaussians, logit
+from hyrfpack.scene import Scene
+from hyrfpack.train.config import FULL_STEPS, TrainConfig
+from hyrfpack.train.silhouette import inside_silhouettes
+
+SYNTHETIC_HALF_BOX = 1.3  # NeRF-synthetic objects lie in [-1.3, 1.3]^3
+PIXELS_PER_GAUSSIAN = 80  # training pixels for each Gaussian of a full-length run (Mip-NeRF 360: 200M to 2.5M)
+GAUSSIANS_PER_ROW = 12  # and for each row of the radiance table; the paper's models have 8 to 20
+INITIAL_OPACITY = 0.1
+INITIAL_SIZE = (1e-5, 0.5)  # local units over S(p)
+ONE_PLACE = 1e-3  # cameras spread by less than this share of their distance to the points see it all from one place
+BACKGROUND_RGB = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": (0.0, 0.0, 0.0)}
+
+
+def detect_preset(scene: Scene) -> tuple[str, str]:
+    """The paper's regime that fits a scene, and the reason in words.
+
+    - "synthetic": photos with coverage (an object without a background);
+    - "large": the cameras look the same way and fly across it (aerial surveys);
+    - "street": the cameras look the same way and move along it;
+    - "standard": everything else.
+    """
+    if scene.has_alpha or scene.layout == "blender":
+        return "synthetic", "the photos have transparency" if scene.has_alpha else "the layout is NeRF-synthetic's"
+    cameras = [view.camera for view in scene.train]
+    mean_forward = np.mean([camera.forward for camera in cameras], axis=0)
+    agreement = float(np.linalg.norm(mean_forward))
+    if agreement < 0.8 or len(scene.points) == 0:
+        return "standard", "the cameras look in different directions" if agreement < 0.8 else "the scene has no points"
+    axis = mean_forward / agreement
+    positions = np.array([camera.position for camera in cameras])
+    offsets = positions - positions.mean(0)
+    along = float(np.ptp(offsets @ axis))
+    across = float(np.linalg.norm(np.ptp(offsets - np.outer(offsets @ axis, axis), axis=0)))
+    depth = float(np.median((scene.points - positions.mean(0)) @ axis))
+    if along > 2 * across and along > depth:
+        return "street", "the cameras move along the direction they look in"
+    if across > 0.5 * abs(depth):
+        return "large", "the cameras look the same way and fly across it"
+    return "standard", "the cameras look the same way from nearly one place"
+
+
+def scene_frame(scene: Scene, preset: str) -> Frame:
+    """The box B0 of a scene under a regime, in the scene's own axes.
+
+    "synthetic" +-1.3 around the origin; "large" the 1st to 99th percentile of the points; otherwise the box of the
+    cameras, or of the points where the cameras share one place.
+    """
+    if preset == "synthetic":
+        return Frame((0.0, 0.0, 0.0), SYNTHETIC_HALF_BOX, (1.0, 1.0, 1.0))
+    positions = np.array([view.camera.position for view in scene.train])
+    low, high = positions.min(0), positions.max(0)
+    if len(scene.points):
+        reach = float(np.median(np.linalg.norm(scene.points - positions.mean(0), axis=1)))
+        if preset == "large" or (high - low).max() <= ONE_PLACE * reach:
+            low, high = np.percentile(scene.points, [1, 99], axis=0)
+    # No points, or all coincident, and one place (up to rounding): a box of unit size in front of the first camera.
+    if (high - low).max() <= 1e-9 * np.abs(positions).max():
+        forward = scene.train[0].camera.forward
+        low, high = positions[0] + forward - 1, positions[0] + forward + 1
+    return Frame.from_box(low, high)
+
+
+def budget_for(scene: Scene, config: TrainConfig) -> tuple[int, str]:
+    """The most Gaussians a run may have, and why.
+
+    Published models have about one Gaussian for every 80 training pixels after 30,000 steps; a shorter run can fit
+    fewer, in proportion to the square root of its length.
+    """
+    if config.max_gaussians is not None:
+        return config.max_gaussians, "asked for"
+    pixels = sum(view.camera.width * view.camera.height for view in scene.train)
+    share = math.sqrt(min(1.0, config.steps / FULL_STEPS))
+    budget = max(1000, round(pixels / PIXELS_PER_GAUSSIAN * share))
+    return budget, f"{pixels:,} training pixels, {config.steps:,} steps"
+
+
+def table_size_for(budget: int, config: TrainConfig) -> tuple[int, str]:
+    """log2 of the radiance table's rows per level for that many Gaussians, and why."""
+    if config.log2_table_size is not None:
+        return config.log2_table_size, "asked for"
+    log2 = round(math.log2(max(1, budget / GAUSSIANS_PER_ROW)))
+    return min(21, max(8, log2)), f"{GAUSSIANS_PER_ROW} Gaussians for each row and level"
+
+
+def build_model(scene: Scene, config: TrainConfig) -> tuple[HybridModel, int, dict[str, str]]:
+    """An untrained model for a scene.
+
+    Returns:
+        The model, its budget of Gaussians, and the choices made, each with its reason.
+
+    Raises:
+        HyrfTrainingError: the scene has no training views.
+    """
+    if not scene.train:
+        raise HyrfTrainingError(
+            f"{scene.path}: no views are left for training; use fewer test views (--test-every 0 trains on all)"
+        )
+    preset, why_preset = (config.preset, "asked for") if config.preset != "auto" else detect_preset(scene)
+    frame = scene_frame(scene, preset)
+    budget, why_budget = budget_for(scene, config)
+    log2, why_log2 = table_size_for(budget, config)
+    if config.background is not None:
+        background, why_background = config.background, "asked for"
+    else:
+        background, why_background = preset in ("standard", "street"), f"preset {preset}"
+
+    model_config = ModelConfig(
+        frame=frame,
+        geometry=HashGridConfig(max(4, log2 - 1)),
+        radiance=HashGridConfig(log2),
+        background=background,
+        solid=BACKGROUND_RGB[config.background_color],
+        scale_rule=config.scale_rule,
+        scale_grows=config.scale_grows,
+        direction_encoding=config.direction_encoding,
+        position_gradients=config.position_gradients,
+        antialiased=config.antialiased,
+    )
+    points, colors = initial_points(scene, frame, budget, config.seed)
+    model = HybridModel(model_config, _gaussians(points, colors, model_config), _generator(config.seed))
+    choices = {
+        "preset": f"{preset}: {why_preset}",
+        "max_gaussians": f"{budget:,}: {why_budget}",
+        "log2_table_size": f"{log2}: {why_log2}",
+        "background": f"{'sphere' if background else 'none'}: {why_background}",
+        "initial_gaussians": f"{len(points):,}: {'points of the scene' if len(scene.points) else 'random'}",
+    }
+    return model, budget, choices
+
+
+def initial_points(scene: Scene, frame: Frame, budget: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Local positions (N, 3) float64 and colours (N, 3) in [0, 1] to start from, N at most the budget.
+
+    The scene's points (a random part of them if they are too many), or without points half a budget of random ones
+    in the box - for photos with coverage only where all silhouettes agree.
+    """
+    generator = np.random.default_rng(seed)
+    if len(scene.points):
+        points, colors = frame.to_local(scene.points), np.asarray(scene.point_colors, np.float64)
+        if len(points) > budget:
+            chosen = np.sort(generator.choice(len(points), budget, replace=False))
+            points, colors = points[chosen], colors[chosen]
+        return points, colors
+    count = max(1, budget // 2)
+    half = np.array(frame.half_extent)
+    if not scene.has_alpha:
+        return generator.uniform(-half, half, (count, 3)), np.full((count, 3), 0.5)
+    return inside_silhouettes(scene, frame, count, generator)
+
+
+def _gaussians(points: np.ndarray, colors: np.ndarray, config: ModelConfig) -> Gaussians:
+    """Gaussians at points, as large as the gaps between them: sigma is the rms distance to the 3 nearest."""
+    positions = torch.from_numpy(points).float()
+    if len(points) > 1:
+        distances, _ = cKDTree(points).query(points, k=min(4, len(points)))
+        sizes = np.sqrt((distances[:, 1:] ** 2).mean(1))
+    else:
+        sizes = np.full(len(points), 0.1)
+    # In units of S(p), which grows outside the box.
+    bounds = torch.ones(len(points), 1)
+    if config.scale_grows:
+        bounds = torch.linalg.vector_norm(config.frame.normalize(positions), dim=-1, keepdim=True).clamp_min(1)
+    fraction = (torch.from_numpy(sizes).float()[:, None] / bounds).clamp(*INITIAL_SIZE)
+    if config.scale_rule == "product":
+        fraction = (2 * fraction).clamp(max=0.999)  # the neural factor starts at a half
+    return Gaussians(
+        positions,
+        logit(torch.from_numpy(np.clip(colors, 0.02, 0.98))),
+        logit(fraction),
+        logit(torch.full((len(points), 1), INITIAL_OPACITY)),
+    )
+
+
+def _generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)

@@ -1,0 +1,56 @@
+"""Random points inside an object's visual hull."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hyrfpack.model import Frame
+from hyrfpack.scene import Scene
+
+VIEWS = 24  # silhouettes compared; more would hardly carve more
+AGREEMENT = 0.95  # share of the views that see a point which must see it covered
+
+
+def inside_silhouettes(
+    scene: Scene, frame: Frame, count: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw points in the frame's box that project onto covered pixels in (nearly) every view that sees them.
+
+    Returns:
+        Local positions (N, 3) and mean pixel colours (N, 3) in [0, 1]; N is `count`, or less when hardly any point
+        of the box lies inside the silhouettes (then points of the whole box fill up, in grey).
+    """
+    chosen = scene.train[:: max(1, len(scene.train) // VIEWS)]
+    pictures = [(view.camera, view.load()) for view in chosen]
+    half = np.array(frame.half_extent)
+    kept_points: list[np.ndarray] = []
+    kept_colors: list[np.ndarray] = []
+    found = 0
+    for _ in range(20):
+        points = generator.uniform(-half, half, (4 * count, 3))
+        world = frame.to_world(points)
+        seen = np.zeros(len(points))
+        covered = np.zeros(len(points))
+        colors = np.zeros((len(points), 3))
+        for camera, picture in pictures:
+            x, y, z = (world @ camera.rotation.T + camera.camera_from_world[:3, 3]).T
+            with np.errstate(divide="ignore", invalid="ignore"):
+                column, row = np.floor(camera.fx * x / z + camera.cx), np.floor(camera.fy * y / z + camera.cy)
+            inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+            column, row = column[inside].astype(np.int64), row[inside].astype(np.int64)
+            coverage = np.ones(len(column)) if picture.alpha is None else picture.alpha[row, column] / 255
+            seen[inside] += 1
+            covered[inside] += coverage > 0.5
+            colors[inside] += coverage[:, None] * (picture.rgb[row, column] / 255)
+        good = (seen > 0) & (covered >= AGREEMENT * seen)
+        kept_points.append(points[good])
+        kept_colors.append(colors[good] / covered[good, None].clip(1))
+        found += int(good.sum())
+        if found >= count:
+            break
+    points, colors = np.concatenate(kept_points)[:count], np.concatenate(kept_colors)[:count].clip(0, 1)
+    if len(points) < max(1, count // 10):
+        missing = count - len(points)
+        points = np.concatenate([points, generator.uniform(-half, half, (missing, 3))])
+        colors = np.concatenate([colors, np.full((missing, 3), 0.5)])
+    return points, colors

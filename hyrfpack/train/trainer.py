@@ -1,0 +1,191 @@
+"""The trainer: one view a step, until the run is done, interrupted or broken."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from hyrfpack.data import PictureCache
+from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.model import HybridModel
+from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.ops.ssim import photometric_loss
+from hyrfpack.render import render
+from hyrfpack.scene import Picture, Scene, View
+from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
+from hyrfpack.train.config import TrainConfig
+from hyrfpack.train.density import DensityControl
+from hyrfpack.train.optimizer import Optimizer
+from hyrfpack.train.setup import build_model
+
+RECORDS = 200  # points on the training curve
+
+
+class Trainer:
+    """Holds a run: model, optimiser, density control, and the step they are at.
+
+    Example:
+        >>> trainer = Trainer(scene, TrainConfig(steps=2000))
+        >>> trainer.run()
+        >>> trainer.model
+    """
+
+    def __init__(self, scene: Scene, config: TrainConfig, cache: PictureCache | None = None) -> None:
+        self.scene = scene
+        self.config = config
+        self.cache = cache or PictureCache()
+        self.model, self.budget, self.choices = build_model(scene, config)
+        self.optimizer = Optimizer(self.model, config.learning_rates)
+        self.density = DensityControl(config.density, config.steps, self.budget, len(self.model), config.seed)
+        self.step = 0
+        self.records: list[dict] = []
+        self.seconds: dict[str, float] = defaultdict(float)
+
+    # -- the loop ------------------------------------------------------------------------------------------------
+
+    def run(
+        self,
+        *,
+        checkpoint: Path | None = None,
+        report: Callable[[Trainer, float, float], None] = lambda trainer, loss, mse: None,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> bool:
+        """Train until the last step, or until `stop()` says so.
+
+        Args:
+            checkpoint: where to keep the run's state; written every `checkpoint_every` steps and when stopped early.
+            report: called after each step with the loss and the mean squared error of its view.
+            stop: asked after each step.
+
+        Returns:
+            Whether the run is complete.
+
+        Raises:
+            HyrfTrainingError: the loss or a gradient is not finite; the step, view and parameter group are named.
+        """
+        every = self.config.checkpoint_every or max(1, self.config.steps // 20)
+        views = self.cache.stream(self._order())
+        try:
+            while self.step < self.config.steps:
+                with self._timed("data"):
+                    view, picture = next(views)
+                loss, mse = self._train_step(view, picture)
+                report(self, loss, mse)
+                if checkpoint and self.step % every == 0 and self.step < self.config.steps:
+                    self.save(checkpoint)
+                if stop() and self.step < self.config.steps:
+                    if checkpoint:
+                        self.save(checkpoint)
+                    return False
+        finally:
+            views.close()
+        return True
+
+    def _order(self) -> Iterator[View]:
+        """Views in the order of the steps still to come: each epoch a permutation of its own."""
+        count = len(self.scene.train)
+        for step in range(self.step, self.config.steps):
+            epoch, place = divmod(step, count)
+            if place == 0 or step == self.step:
+                order = np.random.default_rng((self.config.seed, epoch)).permutation(count)
+            yield self.scene.train[order[place]]
+
+    def _train_step(self, view: View, picture: Picture) -> tuple[float, float]:
+        config = self.config
+        self.step += 1
+        with self._timed("data"):
+            solid = self._solid()
+            target = torch.from_numpy(picture.composite(solid))
+            mask = None if picture.mask is None else torch.from_numpy(picture.mask)
+        rendering = render(
+            self.model, view.camera, absgrad=True, solid=None if solid is None else torch.from_numpy(solid)
+        )
+        for stage, seconds in rendering.seconds.items():
+            self.seconds[stage] += seconds
+        with self._timed("loss"):
+            loss = photometric_loss(rendering.rgb, target, mask, ssim_weight=config.ssim_weight)
+            value = float(loss.detach())
+        if not np.isfinite(value):
+            self._refuse(view, "the loss is not finite", self._nonfinite_parameters())
+        with self._timed("backward"):
+            loss.backward()
+        with self._timed("density"):
+            self.density.observe(self.step, rendering, view.camera.width, view.camera.height)
+        with self._timed("optimizer"):
+            if broken := self.optimizer.nonfinite_groups():
+                self._refuse(view, "a gradient is not finite", broken)
+            self.optimizer.step((self.step - 1) / config.steps)
+        with self._timed("density"):
+            self.density.act(self.step, self.model, self.optimizer)
+        mse = float(torch.mean((rendering.rgb.detach() - target) ** 2))
+        if self.step % max(1, config.steps // RECORDS) == 0 or self.step == config.steps:
+            self.records.append({"step": self.step, "loss": value, "psnr": _psnr(mse), "gaussians": len(self.model)})
+        return value, mse
+
+    def _solid(self) -> np.ndarray | None:
+        """The colour behind this step's picture, None when the model has a background of its own."""
+        if self.model.config.background:
+            return None
+        if self.config.background_color == "random":
+            return np.random.default_rng((self.config.seed, 1, self.step)).random(3, dtype=np.float32)
+        return np.array(self.model.config.solid, np.float32)
+
+    def _nonfinite_parameters(self) -> list[str]:
+        return [name for name, p in self.model.named_parameters() if not torch.isfinite(p).all()]
+
+    def _refuse(self, view: View, what: str, groups: list[str]) -> None:
+        where = ", ".join(groups) if groups else "none; look at the photo itself"
+        raise HyrfTrainingError(
+            f"training stopped at step {self.step} on view '{view.name}': {what} (parameter groups: {where}); "
+            "lower the learning rates or remove the view"
+        )
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] += time.perf_counter() - start
+
+    # -- state ---------------------------------------------------------------------------------------------------
+
+    def _settings(self) -> dict:
+        views = [[view.name, view.camera.width, view.camera.height] for view in self.scene.train]
+        return {"config": self.config.to_dict(), "views": views, "model": self.model.config.to_dict()}
+
+    def save(self, path: Path) -> None:
+        """Write the run's state to `path`."""
+        tensors = {f"model.{name}": p.detach() for name, p in self.model.named_parameters()}
+        tensors |= {f"adam.{name}": value for name, value in self.optimizer.state_dict().items()}
+        tensors |= {"density.gradients": self.density.gradients, "density.views": self.density.views}
+        progress = {"step": self.step, "records": self.records, "seconds": dict(self.seconds)}
+        save_checkpoint(path, settings=self._settings(), tensors=tensors, progress=progress)
+
+    def load(self, path: Path) -> None:
+        """Go on from the state at `path`; the result is the one an uninterrupted run gives.
+
+        Raises:
+            HyrfTrainingError: as `load_checkpoint`.
+        """
+        tensors, progress = load_checkpoint(path, self._settings())
+        explicit = [tensors[f"model.gaussians.{name}"] for name in Gaussians.NAMES]
+        self.model = HybridModel(self.model.config, Gaussians(*explicit))
+        self.model.load_state_dict(
+            {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
+        )
+        self.optimizer = Optimizer(self.model, self.config.learning_rates)
+        self.optimizer.load_state_dict(
+            {name.removeprefix("adam."): value for name, value in tensors.items() if name.startswith("adam.")}
+        )
+        self.density.gradients, self.density.views = tensors["density.gradients"], tensors["density.views"]
+        self.step, self.records = progress["step"], progress["records"]
+        self.seconds = defaultdict(float, progress["seconds"])
+
+
+def _psnr(mse: float) -> float:
+    return float(-10 * np.log10(max(mse, 1e-10)))

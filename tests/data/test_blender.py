@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hyrfpack.data import load_scene
+from hyrfpack.errors import HyrfDataError
+
+ANGLE = 0.6911112070083618
+
+
+def write_blender(root: Path, opengl_frames, splits=("train", "val", "test")) -> dict[str, list[np.ndarray]]:
+    poses = {}
+    for split in splits:
+        names = [f"./{split}/r_{index}" for index in range(3)]
+        frames, poses[split] = opengl_frames(names)
+        (root / split).mkdir()
+        for index in range(3):
+            rgba = np.random.default_rng(index).integers(0, 256, (20, 30, 4), dtype=np.uint8)
+            Image.fromarray(rgba).save(root / split / f"r_{index}.png")
+        content = {"camera_angle_x": ANGLE, "frames": frames}
+        (root / f"transforms_{split}.json").write_text(json.dumps(content))
+    return poses
+
+
+def test_set_keeps_its_own_split_poses_and_straight_alpha(tmp_path, opengl_frames):
+    poses = write_blender(tmp_path, opengl_frames)
+
+    scene = load_scene(tmp_path)
+
+    assert scene.layout == "blender" and scene.has_alpha and len(scene.points) == 0
+    assert [view.name for view in scene.train] == ["train/r_0.png", "train/r_1.png", "train/r_2.png"]
+    assert [view.name for view in scene.test] == ["test/r_0.png", "test/r_1.png", "test/r_2.png"]
+    focal = 15 / np.tan(ANGLE / 2)
+    for view, pose in zip(scene.test, poses["test"], strict=True):
+        np.testing.assert_allclose(view.camera.camera_from_world, pose, atol=1e-12)
+        np.testing.assert_allclose(view.camera.intrinsics, (focal, focal, 15, 10))
+    stored = np.random.default_rng(1).integers(0, 256, (20, 30, 4), dtype=np.uint8)
+    np.testing.assert_array_equal(scene.train[1].load().rgb, stored[..., :3])
+    np.testing.assert_array_equal(scene.train[1].load().alpha, stored[..., 3])
+
+
+def test_val_stands_in_for_a_missing_test_split(tmp_path, opengl_frames):
+    write_blender(tmp_path, opengl_frames, splits=("train", "val"))
+
+    scene = load_scene(tmp_path)
+
+    assert [view.name for view in scene.test] == ["val/r_0.png", "val/r_1.png", "val/r_2.png"]
+    assert any("val is used" in note for note in scene.notes)
+
+
+def test_set_without_a_split_holds_out_every_nth(tmp_path, opengl_frames):
+    write_blender(tmp_path, opengl_frames, splits=("train",))
+
+    assert [view.name for view in load_scene(tmp_path, test_every=2).test] == ["train/r_0.png", "train/r_2.png"]
+
+
+def _edit(root: Path, **entries) -> None:
+    file = root / "transforms_train.json"
+    content = json.loads(file.read_text()) | entries
+    file.write_text(json.dumps({key: value for key, value in content.items() if value is not None}))
+
+
+def _frame(root: Path, **entries) -> None:
+    file = root / "transforms_train.json"
+    content = json.loads(file.read_text())
+    content["frames"][1] |= entries
+    file.write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (lambda root: _edit(root, camera_angle_x=None), "camera_angle_x"),
+        (lambda root: _edit(root, camera_angle_x=float("nan")), "camera_angle_x"),
+        (lambda root: _edit(root, camera_angle_x=4.0), "field of view"),
+        (lambda root: _edit(root, frames=[]), "frames"),
+        (lambda root: _frame(root, transform_matrix=[[float("nan")] * 4] * 4), "not finite"),
+        (lambda root: _frame(root, transform_matrix=(np.eye(4) * 3).tolist()), "not rigid"),
+        (lambda root: _frame(root, transform_matrix=np.diag([-1.0, 1, 1, 1]).tolist()), "mirrors"),
+        (lambda root: _frame(root, transform_matrix=[[1, 2], [3, 4]]), "transform_matrix"),
+        (lambda root: _frame(root, transform_matrix=None), "transform_matrix"),
+        (lambda root: _frame(root, file_path=7), "file_path"),
+        (lambda root: (root / "transforms_train.json").write_text('{"camera_angle_x": 0.7, "fra'), "JSON"),
+        (lambda root: (root / "train" / "r_1.png").write_bytes(b""), "r_1.png"),
+        (lambda root: [file.unlink() for file in (root / "train").iterdir()], "none of its 3 pictures"),
+        (lambda root: [file.unlink() for file in (root / "test").iterdir()], "none of its 3 pictures"),
+    ],
+)
+def test_broken_set_gives_one_sentence(tmp_path, opengl_frames, damage, says):
+    write_blender(tmp_path, opengl_frames)
+    damage(tmp_path)
+
+    with pytest.raises(HyrfDataError, match=says) as caught:
+        load_scene(tmp_path)
+
+    assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)

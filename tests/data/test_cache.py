@@ -1,0 +1,130 @@
+from __future__ import annotations
+
+import itertools
+import threading
+
+import numpy as np
+import pytest
+
+from hyrfpack.data import PictureCache
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.scene import Camera, Picture, View
+
+
+class Photo:
+    """A `load` that counts its calls."""
+
+    def __init__(self, value: int, size: int = 10, fails: bool = False):
+        self.value, self.size, self.fails, self.loads = value, size, fails, 0
+
+    def __call__(self) -> Picture:
+        self.loads += 1
+        if self.fails:
+            raise HyrfDataError("gone.png: the picture is missing; restore it")
+        return Picture(np.full((self.size, self.size, 3), self.value, np.uint8))
+
+
+def views_of(*photos: Photo) -> list[View]:
+    camera = Camera(10, 10, 1.0, 1.0, 5.0, 5.0, np.eye(4))
+    return [View(f"{index}.png", camera, photo) for index, photo in enumerate(photos)]
+
+
+def photo_threads() -> list[str]:
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("hyrfpack-photos")]
+
+
+def test_pictures_are_decoded_once():
+    views = views_of(Photo(1), Photo(2))
+    cache = PictureCache(10_000)
+
+    for view in views * 3:
+        assert cache.get(view).rgb[0, 0, 0] == view.load.value
+
+    assert [view.load.loads for view in views] == [1, 1]
+    assert cache.nbytes == 600
+
+
+def test_limit_is_kept_and_the_least_recently_used_goes_first():
+    a, b, c = views_of(Photo(1), Photo(2), Photo(3))
+    cache = PictureCache(700)
+
+    for view in (a, b, a, c, a):
+        cache.get(view)
+        assert cache.nbytes <= 700
+    cache.get(b)
+
+    assert [view.load.loads for view in (a, b, c)] == [1, 2, 1]
+
+
+def test_picture_above_the_limit_is_not_kept():
+    (view,) = views_of(Photo(1))
+    cache = PictureCache(100)
+
+    cache.get(view)
+    cache.get(view)
+
+    assert view.load.loads == 2 and cache.nbytes == 0
+
+
+def test_default_limit_is_part_of_the_memory():
+    assert 1 << 20 < PictureCache().limit_bytes < 1 << 50
+
+
+def test_stream_keeps_the_order():
+    views = views_of(*(Photo(index) for index in range(20)))
+
+    streamed = list(PictureCache(0).stream(views))
+
+    assert [view.name for view, _ in streamed] == [view.name for view in views]
+    assert all(picture.rgb[0, 0, 0] == view.load.value for view, picture in streamed)
+    assert not photo_threads()
+
+
+def test_stream_decodes_ahead_but_no_further_than_its_depth():
+    views = views_of(*(Photo(index) for index in range(20)))
+    stream = PictureCache(0).stream(views, depth=3)
+
+    next(stream)
+    stream.close()
+
+    assert 1 <= sum(view.load.loads for view in views) <= 4
+
+
+def test_stream_of_endless_views_ends_its_thread_when_closed():
+    stream = PictureCache(10_000).stream(itertools.cycle(views_of(Photo(1), Photo(2))))
+    for _ in range(50):
+        next(stream)
+    assert photo_threads()
+
+    stream.close()
+
+    assert not photo_threads()
+
+
+def test_stream_raises_a_decoding_error_in_its_turn():
+    views = views_of(Photo(1), Photo(2), Photo(3, fails=True), Photo(4))
+    seen = []
+
+    with pytest.raises(HyrfDataError, match=r"gone\.png"):
+        for view, _ in PictureCache(0).stream(views):
+            seen.append(view.name)
+
+    assert seen == ["0.png", "1.png"]
+    assert not photo_threads()
+
+
+def test_threads_sharing_a_cache_keep_its_books():
+    views = views_of(*(Photo(index) for index in range(30)))
+    cache = PictureCache(1500)
+
+    def read(seed: int) -> None:
+        for index in np.random.default_rng(seed).integers(0, 30, 300):
+            assert cache.get(views[index]).rgb[0, 0, 0] == index
+
+    threads = [threading.Thread(target=read, args=(seed,)) for seed in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+    assert cache.nbytes == sum(picture.nbytes for picture in cache._pictures.values()) <= 1500

@@ -1,0 +1,471 @@
+"""HybridModel <-> `.hyrf` bytes: exactness, error bounds, and what hostile files meet."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hyrfpack.errors import HyrfError, HyrfFormatError
+from hyrfpack.format import compress, decode_model, describe, encode_model, load, save
+from hyrfpack.format.container import Section, read_container, write_container
+from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
+from hyrfpack.model.gaussians import Gaussians
+
+PROFILES = ("raw", "paper")
+
+
+def make_model(count: int = 40, grid: HashGridConfig | None = None, **config) -> HybridModel:
+    """A small seeded model with numbers of every parameter drawn anew."""
+    generator = torch.Generator().manual_seed(count)
+    grid = grid or HashGridConfig(log2_table_size=6, levels=3, base=3, finest=9)
+    frame = Frame(center=(10.0, -2.5, 0.125), scale=3.5, half_extent=(1.0, 0.5, 0.25))
+    shape = ModelConfig(frame=frame, geometry=grid, radiance=grid, hidden=5, solid=(1.0, 0.5, 0.0), **config)
+    values = torch.randn(count, 8, generator=generator)
+    model = HybridModel(shape, Gaussians(values[:, :3], values[:, 3:6], values[:, 6:7], 3 * values[:, 7:]), generator)
+    with torch.no_grad():
+        for parameter in (*model.geometry.parameters(), *model.radiance.parameters()):
+            parameter.copy_(torch.randn(parameter.shape, generator=generator))
+    return model
+
+
+def bits(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().numpy().view(np.uint32)
+
+
+def rewrite(data: bytes, **changes: bytes | None) -> bytes:
+    """The file with payloads of sections replaced (None: dropped) and every checksum right."""
+    sections = [
+        replace(section, data=changes.get(section.type, section.data))
+        for section in read_container(data).sections
+        if changes.get(section.type, b"") is not None
+    ]
+    return write_container(sections)
+
+
+def metadata_of(data: bytes) -> dict:
+    return json.loads(bytes(read_container(data)["META"].data))
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 40])
+def test_raw_is_bit_exact(count):
+    model = make_model(count)
+    if count:
+        with torch.no_grad():
+            model.gaussians.positions[0] = torch.tensor([-0.0, 1e-45, -3.4e38])
+
+    decoded = decode_model(encode_model(model, "raw"))
+
+    for name, expected in model.state_dict().items():
+        assert np.array_equal(bits(decoded.state_dict()[name]), bits(expected)), name
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize(
+    "config",
+    [
+        {},
+        {"background": False, "antialiased": True, "scale_rule": "product", "scale_grows": False},
+        {"direction_encoding": "frequency", "position_gradients": True},
+    ],
+)
+def test_configuration_survives(profile, config):
+    model = make_model(**config)
+
+    decoded = decode_model(encode_model(model, profile))
+
+    assert decoded.config == model.config
+    assert all(parameter.requires_grad for parameter in decoded.parameters())
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 500])
+def test_paper_keeps_its_error_bounds(count):
+    model = make_model(count)
+    original = model.state_dict()
+
+    decoded = decode_model(encode_model(model, "paper", color=(4, 64), scale=(2, 64), opacity=(2, 64))).state_dict()
+
+    for name, expected in original.items():
+        expected, got = expected.double(), decoded[name].double()
+        assert got.shape == expected.shape
+        if "table" in name:
+            half_step = (expected.max() - expected.min()) / 510
+            assert (got - expected).abs().max() <= half_step * (1 + 1e-6)
+        elif "logits" not in name:
+            assert ((got - expected).abs() <= expected.abs() * 2**-11 + 2**-25).all()
+        elif count > 64:
+            # One stage of 64 codewords in 3 dimensions leaves a quarter of the deviation at most.
+            assert (got - expected).square().mean().sqrt() < 0.25 * expected.std()
+        elif count:
+            # Fewer rows than codewords: only the rounding of the codebooks is left.
+            assert (got - expected).abs().max() <= expected.abs().max() * 2**-10
+
+
+def test_paper_gets_better_and_bigger_with_stages():
+    model = make_model(2000)
+
+    def size_and_error(stages: int) -> tuple[int, float]:
+        data = encode_model(model, "paper", color=(stages, 64))
+        error = decode_model(data).gaussians.color_logits - model.gaussians.color_logits
+        return len(data), error.square().mean().item()
+
+    (small, coarse), (middle, fine), (large, finest) = map(size_and_error, (1, 2, 4))
+
+    assert small < middle < large
+    assert coarse > 2 * fine > 4 * finest
+
+
+def test_saturated_opacities_cost_no_accuracy_elsewhere():
+    model, with_tail = make_model(2000), make_model(2000)
+    with torch.no_grad():
+        with_tail.gaussians.opacity_logits[:200] = torch.linspace(40, 900, 200)[:, None]
+
+    def worst_opacity(model: HybridModel) -> float:
+        with torch.no_grad():
+            decoded = decode_model(encode_model(model, "paper")).decode_geometry().opacities
+            return (decoded - model.decode_geometry().opacities).abs().max().item()
+
+    assert worst_opacity(with_tail) < 1.5 * worst_opacity(model)
+
+
+def test_constant_channels_and_tables_are_exact():
+    model = make_model(30)
+    with torch.no_grad():
+        model.geometry.grid.table.fill_(0.1)
+        model.radiance.grid.table.zero_()
+        for logits in (model.gaussians.color_logits, model.gaussians.scale_logits, model.gaussians.opacity_logits):
+            logits.fill_(-1.5)
+
+    decoded = decode_model(encode_model(model, "paper")).state_dict()
+
+    for name, expected in model.state_dict().items():
+        if "logits" in name or "table" in name:
+            assert torch.equal(decoded[name], expected), name
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_same_model_gives_same_bytes(profile):
+    provenance = {"steps": 1000, "preset": "standard", "why": {"table": "8 Gaussians an entry"}}
+
+    first = encode_model(make_model(300), profile, provenance)
+    second = encode_model(make_model(300), profile, dict(reversed(provenance.items())))
+
+    assert first == second
+
+
+def test_encoding_leaves_model_and_random_state_alone():
+    model = make_model(300)
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    state = torch.get_rng_state()
+
+    decode_model(encode_model(model, "paper"))
+
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize(
+    ("parameter", "holds"),
+    [
+        ("gaussians.positions", "positions"),
+        ("gaussians.opacity_logits", "opacity logits"),
+        ("radiance.grid.table", "radiance hash table"),
+        ("geometry.biases.2", "geometry decoder"),
+    ],
+)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_save_refuses_numbers_that_are_not_finite_and_names_the_group(tmp_path, profile, parameter, holds, value):
+    model = make_model()
+    with torch.no_grad():
+        model.state_dict()[parameter].view(-1)[-1] = value
+
+    with pytest.raises(HyrfError, match=f"1 of [0-9]+ numbers in the model's {holds} "):
+        save(model, tmp_path / "model.hyrf", profile)
+
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("parameter", ["gaussians.positions", "gaussians.scale_logits", "radiance.weights.1"])
+def test_paper_refuses_what_overflows_half_precision(parameter):
+    model = make_model()
+    with torch.no_grad():
+        model.state_dict()[parameter].view(-1)[0] = -65505.0
+
+    with pytest.raises(HyrfError, match="half precision"):
+        encode_model(model, "paper")
+
+
+def test_paper_keeps_the_largest_half():
+    model = make_model()
+    with torch.no_grad():
+        model.gaussians.positions[0, 0] = 65504.0
+
+    assert decode_model(encode_model(model, "paper")).gaussians.positions[0, 0] == 65504.0
+
+
+def test_unknown_profile_and_settings_out_of_range_are_refused():
+    with pytest.raises(HyrfError, match="no profile 'best'.*raw, paper"):
+        encode_model(make_model(), "best")
+    with pytest.raises(HyrfError, match="0 stages"):
+        encode_model(make_model(), "paper", color=(0, 64))
+    with pytest.raises(HyrfError, match="257 codewords"):
+        encode_model(make_model(), "paper", opacity=(1, 257))
+
+
+def test_provenance_must_be_json():
+    with pytest.raises(ValueError, match="not JSON"):
+        encode_model(make_model(), provenance={"data": object()})
+    with pytest.raises(ValueError):
+        encode_model(make_model(), provenance={"loss": float("nan")})
+
+
+def test_report_adds_up_to_the_file(tmp_path):
+    path = tmp_path / "model.hyrf"
+    model = make_model(500)
+
+    report = save(model, path, "paper")
+
+    assert report.bytes_after == path.stat().st_size
+    assert report.bytes_before == 4 * sum(parameter.numel() for parameter in model.parameters())
+    stored = {size.type: size.after for size in report.sections}
+    assert stored["POSI"] == 500 * 6
+    # What is not in sections: a header of 48 bytes, 40 a section, and padding of less than 8 each.
+    overhead = report.bytes_after - sum(stored.values()) - 48 - 40 * len(stored)
+    assert 0 <= overhead < 8 * len(stored)
+
+
+def test_compress_keeps_configuration_and_provenance(tmp_path):
+    model = make_model(100)
+    save(model, tmp_path / "raw.hyrf", "raw", {"steps": 7})
+
+    report = compress(tmp_path / "raw.hyrf", tmp_path / "paper.hyrf", color=(3, 16))
+    compress(tmp_path / "paper.hyrf", tmp_path / "back.hyrf", "raw")
+
+    assert (tmp_path / "paper.hyrf").read_bytes() == encode_model(model, "paper", {"steps": 7}, color=(3, 16))
+    assert report.profile == "paper"
+    back, once = load(tmp_path / "back.hyrf"), load(tmp_path / "paper.hyrf")
+    assert all(torch.equal(a, b) for a, b in zip(back.parameters(), once.parameters(), strict=True))
+    assert describe(tmp_path / "back.hyrf")["provenance"] == {"steps": 7}
+
+
+def test_describe_tells_what_is_inside_without_torch_and_numpy(tmp_path):
+    path = tmp_path / "model.hyrf"
+    save(make_model(500), path, "paper", {"steps": 30})
+    program = (
+        "import sys, json; from hyrfpack.format import describe; info = describe(sys.argv[1]);"
+        "print(json.dumps([info, [name for name in ('torch', 'numpy', 'dahuffman') if name in sys.modules]]))"
+    )
+
+    output = subprocess.run([sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True)
+    info, imported = json.loads(output.stdout)
+
+    assert imported == []
+    assert info["gaussians"] == 500
+    assert info["profile"] == "paper"
+    assert info["version"] == "1.0"
+    assert info["provenance"] == {"steps": 30}
+    assert info["settings"] == {"color": [2, 64], "scale": [1, 32], "opacity": [1, 32], "seed": 0}
+    assert info["config"] == json.loads(json.dumps(make_model(500).config.to_dict()))
+    assert info["bytes"] == path.stat().st_size
+    assert info["bits_per_gaussian"] == 8 * path.stat().st_size / 500
+    (positions,) = (section for section in info["sections"] if section["type"] == "POSI")
+    assert positions["bits_per_gaussian"] == 48
+    assert positions["before"] == 6000
+
+
+def test_describe_of_no_gaussians_has_no_bits_per_gaussian(tmp_path):
+    save(make_model(0), tmp_path / "empty.hyrf")
+
+    assert describe(tmp_path / "empty.hyrf")["bits_per_gaussian"] is None
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_truncation_is_refused_everywhere(profile):
+    data = encode_model(make_model(), profile)
+    entries = read_container(data).entries.values()
+    edges = {
+        0,
+        1,
+        47,
+        48,
+        49,
+        *(entry.offset for entry in entries),
+        *(entry.offset + entry.length for entry in entries),
+    }
+    ends = {end for edge in edges for end in (edge - 1, edge, edge + 1) if 0 <= end < len(data)}
+
+    for end in ends:
+        with pytest.raises(HyrfFormatError):
+            decode_model(data[:end])
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_flipped_bit_is_found_everywhere(profile):
+    small_codebooks = {"color": (2, 8), "scale": (1, 4), "opacity": (1, 4)} if profile == "paper" else {}
+    data = bytearray(encode_model(make_model(5), profile, **small_codebooks))
+
+    for position in range(0, len(data), 3):
+        data[position] ^= 1 << position % 8
+        with pytest.raises(HyrfFormatError):
+            decode_model(data)
+        data[position] ^= 1 << position % 8
+
+
+def test_error_names_the_file_and_the_section(tmp_path):
+    path = tmp_path / "model.hyrf"
+    data = bytearray(encode_model(make_model()))
+    data[read_container(data).entries["GTAB"].offset] ^= 1
+    path.write_bytes(data)
+
+    with pytest.raises(HyrfFormatError, match="model.hyrf.*'GTAB'"):
+        load(path)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("count", [0, 39, 41, 2**39])
+def test_a_forged_count_is_refused(profile, count):
+    data = encode_model(make_model(40), profile)
+    forged = json.dumps(metadata_of(data) | {"gaussians": count}).encode()
+
+    with pytest.raises(HyrfFormatError):
+        decode_model(rewrite(data, META=forged))
+
+
+def test_a_forged_table_size_is_refused_before_anything_is_allocated():
+    data = encode_model(make_model())
+    metadata = metadata_of(data)
+    metadata["config"]["geometry"] = {"log2_table_size": 24, "levels": 32, "base": 1024, "finest": 65536}
+
+    with pytest.raises(HyrfFormatError, match="'GTAB' says it decodes to"):
+        decode_model(rewrite(data, META=json.dumps(metadata).encode()))
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("type", ["META", "POSI", "RTAB", "GMLP"])
+def test_a_missing_section_is_refused(profile, type):
+    with pytest.raises(HyrfFormatError):
+        decode_model(rewrite(encode_model(make_model(), profile), **{type: None}))
+
+
+def test_an_unknown_codec_is_refused():
+    sections = read_container(encode_model(make_model())).sections
+
+    with pytest.raises(HyrfFormatError, match="unknown codec 99; update"):
+        decode_model(write_container([replace(s, codec=99) if s.type == "RTAB" else s for s in sections]))
+
+
+def test_unknown_optional_section_is_skipped():
+    model = make_model()
+    sections = read_container(encode_model(model)).sections
+
+    decoded = decode_model(write_container([*sections, Section("NEW_", 7, b"later", 5, required=False)]))
+
+    assert torch.equal(decoded.gaussians.positions, model.gaussians.positions)
+
+
+def test_numbers_that_are_not_finite_are_refused_on_load():
+    data = encode_model(make_model())
+    positions = bytearray(read_container(data)["POSI"].data)
+    positions[:4] = np.float32(np.nan).tobytes()
+
+    with pytest.raises(HyrfFormatError, match="'POSI' holds numbers that are not finite"):
+        decode_model(rewrite(data, POSI=bytes(positions)))
+
+
+METADATA_FORGERIES = {
+    "not an object": lambda m: [m],
+    "no count": lambda m: {key: value for key, value in m.items() if key != "gaussians"},
+    "boolean count": lambda m: m | {"gaussians": True},
+    "fractional count": lambda m: m | {"gaussians": 40.0},
+    "negative count": lambda m: m | {"gaussians": -1},
+    "huge count": lambda m: m | {"gaussians": 10**30},
+    "config a list": lambda m: m | {"config": []},
+    "config empty": lambda m: m | {"config": {}},
+    "unknown field": lambda m: m | {"config": m["config"] | {"wavelets": True}},
+    "text for a number": lambda m: m | {"config": m["config"] | {"hidden": "5"}},
+    "text for a flag": lambda m: m | {"config": m["config"] | {"background": "no"}},
+    "fraction for a size": lambda m: m | {"config": m["config"] | {"hidden": 5.5}},
+    "unknown scale rule": lambda m: m | {"config": m["config"] | {"scale_rule": "max"}},
+    "two coordinates": lambda m: m | {"config": m["config"] | {"solid": [0, 0]}},
+    "null grid": lambda m: m | {"config": m["config"] | {"geometry": None}},
+    "fractional levels": lambda m: m | {"config": m["config"] | {"geometry": {"log2_table_size": 6, "levels": 2.5}}},
+    "negative levels": lambda m: m | {"config": m["config"] | {"geometry": {"log2_table_size": 6, "levels": -1}}},
+    "frame without scale": lambda m: m | {"config": m["config"] | {"frame": {"center": [0, 0, 0]}}},
+    "number past float64": lambda m: m | {"config": m["config"] | {"solid": [10**400, 0, 0]}},
+    "other rule": lambda m: m | {"rules": m["rules"] | {"contraction": "cube"}},
+    "new rule": lambda m: m | {"rules": m["rules"] | {"lighting": "sun"}},
+    "no rules": lambda m: m | {"rules": {}},
+}
+
+
+@pytest.mark.parametrize("forgery", METADATA_FORGERIES)
+def test_forged_metadata_is_refused(forgery):
+    data = encode_model(make_model())
+    forged = json.dumps(METADATA_FORGERIES[forgery](metadata_of(data))).encode()
+
+    with pytest.raises(HyrfFormatError):
+        decode_model(rewrite(data, META=forged))
+
+
+@pytest.mark.parametrize("key", ["frame", "geometry", "radiance", "hidden", "solid", "background"])
+def test_describe_refuses_a_configuration_of_wrong_types(tmp_path, key):
+    data = encode_model(make_model())
+    metadata = metadata_of(data)
+    metadata["config"][key] = {"center": 0}
+    (tmp_path / "model.hyrf").write_bytes(rewrite(data, META=json.dumps(metadata).encode()))
+
+    with pytest.raises(HyrfFormatError, match=f"model.hyrf.*config.{key}"):
+        describe(tmp_path / "model.hyrf")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b"{",
+        b"\xff\xfe",
+        b"[" * 200_000,
+        b'{"gaussians":NaN}',
+        b'{"gaussians":1e999}',
+        b'{"gaussians":' + b"9" * 5000 + b"}",
+        b" " * (2 << 20),
+    ],
+)
+def test_metadata_that_is_not_json_is_refused(tmp_path, text):
+    path = tmp_path / "model.hyrf"
+    path.write_bytes(rewrite(encode_model(make_model()), META=text))
+
+    with pytest.raises(HyrfFormatError, match="model.hyrf.*metadata"):
+        describe(path)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    profile=st.sampled_from(PROFILES),
+    type=st.sampled_from(["META", "POSI", "COLO", "OPAC", "GTAB", "RMLP"]),
+    edit=st.tuples(st.floats(0, 1), st.integers(0, 4), st.binary(max_size=8)),
+)
+def test_forged_payloads_with_right_checksums_never_escape_the_error_family(profile, type, edit):
+    data = FORGERY_TARGETS[profile]
+    container = read_container(data)
+    where, removed, inserted = edit
+    payload = bytes(container[type].data)
+    start = int(where * len(payload))
+    forged = rewrite(data, **{type: payload[:start] + inserted + payload[start + removed :]})
+
+    try:
+        model = decode_model(forged)
+    except HyrfFormatError:
+        return
+    assert all(torch.isfinite(parameter).all() for parameter in model.parameters())
+
+
+FORGERY_TARGETS = {profile: encode_model(make_model(20), profile) for profile in PROFILES}

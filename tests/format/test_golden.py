@@ -1,0 +1,72 @@
+"""Files that released versions wrote stay readable, and are still written byte by byte the same."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hyrfpack.format import decode_model, describe, encode_model, load, metadata
+from hyrfpack.format.arrays import to_arrays
+from hyrfpack.model import Frame, HashGridConfig, ModelConfig
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+FILES = sorted(GOLDEN.glob("*.hyrf"))
+REFERENCE_READER = Path(__file__).parents[2] / "tools" / "reference_reader.py"
+
+
+def test_golden_files_are_there():
+    assert {"v1.0_raw.hyrf", "v1.0_paper.hyrf"} <= {file.name for file in FILES}
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_golden_file_decodes_to_the_recorded_numbers(file):
+    recorded = np.load(file.with_suffix(".npz"))
+
+    decoded = {name: value.numpy() for name, value in load(file).state_dict().items()}
+
+    assert sorted(decoded) == sorted(recorded.files)
+    for name, values in decoded.items():
+        # As bits: -0.0 is not 0.0, and denormals count.
+        assert np.array_equal(values.view(np.uint32), recorded[name].view(np.uint32)), name
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_golden_file_has_the_recorded_configuration(file):
+    config = load(file).config
+
+    assert config == ModelConfig(
+        frame=Frame(center=(1e6, -0.1, 3.0), scale=12.5, half_extent=(1.0, 0.75, 0.25)),
+        geometry=HashGridConfig(log2_table_size=4, levels=2, base=2, finest=5),
+        radiance=HashGridConfig(log2_table_size=5, levels=2, base=3, finest=7),
+        hidden=3,
+        solid=(0.0, 0.5, 1.0),
+        antialiased=True,
+    )
+
+
+@pytest.mark.parametrize("profile", ["raw", "paper"])
+def test_golden_model_encodes_to_the_same_bytes(profile, monkeypatch):
+    file = GOLDEN / f"v1.0_{profile}.hyrf"
+    info = describe(file)
+    settings = {"color": (3, 8), "scale": (2, 4), "opacity": (1, 16)} if profile == "paper" else {}
+    monkeypatch.setattr(metadata, "writer", lambda: info["writer"])
+
+    data = encode_model(load(GOLDEN / "v1.0_raw.hyrf"), profile, info["provenance"], **settings)
+
+    assert data == file.read_bytes()
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_reference_reader_agrees_with_the_decoder(file):
+    data = file.read_bytes()
+
+    meta, groups = runpy.run_path(str(REFERENCE_READER))["read"](data)
+
+    model = decode_model(data)
+    assert meta["config"] == json.loads(json.dumps(model.config.to_dict()))
+    for group, values in to_arrays(model).items():
+        assert np.array_equal(values.ravel(), np.array(groups[group], np.float32)), group

@@ -1,0 +1,50 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from hyrfpack.model import Frame, HashGridConfig, ModelConfig
+
+CONFIG = ModelConfig(
+    frame=Frame((1.0, -2.0, 3e5), 0.125, (1.0, 0.25, 0.5)),
+    geometry=HashGridConfig(9, levels=8, base=16, finest=256),
+    radiance=HashGridConfig(10),
+    background=False,
+    solid=(1.0, 0.5, 0.0),
+    scale_rule="product",
+    direction_encoding="frequency",
+    antialiased=True,
+)
+
+
+def test_config_survives_json():
+    assert ModelConfig.from_dict(json.loads(json.dumps(CONFIG.to_dict()))) == CONFIG
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("scale_rule", "max"),
+        ("direction_encoding", "none"),
+        ("hidden", 0),
+        ("hidden", 5000),
+        ("solid", [1.0, 2.0]),
+        ("frame", {"center": [0, 0, 0], "scale": 0.0, "half_extent": [1, 1, 1]}),
+        ("frame", {"center": [0, 0, 0], "scale": 1.0, "half_extent": [1, -1, 1]}),
+        ("frame", {"center": [0, 0, 0], "scale": float("nan"), "half_extent": [1, 1, 1]}),
+        ("geometry", {"log2_table_size": 9, "depth": 3}),
+        ("surprise", 1),
+    ],
+)
+def test_config_refuses_wrong_fields(name, value):
+    with pytest.raises((KeyError, TypeError, ValueError)):
+        ModelConfig.from_dict({**CONFIG.to_dict(), name: value})
+
+
+@pytest.mark.parametrize("name", ["frame", "geometry", "radiance"])
+def test_config_refuses_missing_fields(name):
+    values = CONFIG.to_dict()
+    del values[name]
+    with pytest.raises((KeyError, TypeError, ValueError)):
+        ModelConfig.from_dict(values)

@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import lpmv
+
+from hyrfpack.model.field import DIRECTION_FEATURES, Field, encode_directions, spherical_harmonics
+from hyrfpack.model.hash_grid import HashGridConfig
+
+GRID = HashGridConfig(log2_table_size=7, levels=3, base=3, finest=12)
+
+
+def sphere_quadrature() -> tuple[np.ndarray, np.ndarray]:
+    """Directions and weights that integrate polynomials up to degree 15 over the sphere exactly."""
+    heights, weights = np.polynomial.legendre.leggauss(8)
+    angles = 2 * np.pi * np.arange(16) / 16
+    heights, angles = (grid.ravel() for grid in np.meshgrid(heights, angles, indexing="ij"))
+    ring = np.sqrt(1 - heights**2)
+    directions = np.stack((ring * np.cos(angles), ring * np.sin(angles), heights), axis=1)
+    return directions, np.repeat(weights, 16) * 2 * np.pi / 16
+
+
+def legendre_harmonic(band: int, order: int, directions: np.ndarray) -> np.ndarray:
+    """Real spherical harmonic from associated Legendre functions, Condon-Shortley phase taken out."""
+    x, y, z = directions.T
+    m = abs(order)
+    norm = math.sqrt((2 * band + 1) / (4 * math.pi) * math.factorial(band - m) / math.factorial(band + m))
+    around = np.arctan2(y, x)
+    turn = 1.0 if order == 0 else math.sqrt(2) * (np.cos(m * around) if order > 0 else np.sin(m * around))
+    return (-1) ** m * norm * lpmv(m, band, z) * turn
+
+
+def test_spherical_harmonics_are_orthonormal():
+    directions, weights = sphere_quadrature()
+    values = spherical_harmonics(torch.from_numpy(directions)).numpy()
+    np.testing.assert_allclose(values.T @ (values * weights[:, None]), np.eye(9), atol=1e-12)
+
+
+def test_spherical_harmonics_come_in_the_order_of_bands_and_orders():
+    directions, _ = sphere_quadrature()
+    expected = [legendre_harmonic(l, m, directions) for l in range(3) for m in range(-l, l + 1)]  # noqa: E741
+    values = spherical_harmonics(torch.from_numpy(directions)).numpy()
+    np.testing.assert_allclose(values, np.stack(expected, axis=1), atol=1e-12)
+
+
+def test_frequency_encoding_is_sines_and_cosines_of_four_octaves():
+    direction = np.array([0.48, -0.6, 0.64])
+    expected = [f(math.pi * 2**k * c) for f in (math.sin, math.cos) for k in range(4) for c in direction]
+    encoded = encode_directions(torch.from_numpy(direction)[None], "frequency")
+    np.testing.assert_allclose(encoded[0].numpy(), expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("encoding", ["sh", "frequency"])
+def test_encoded_directions_have_the_promised_width(encoding):
+    directions = torch.nn.functional.normalize(torch.randn(5, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    assert encode_directions(directions, encoding).shape == (5, DIRECTION_FEATURES[encoding])
+
+
+def test_field_starts_near_zero_so_explicit_values_rule():
+    field = Field(GRID, outputs=8, hidden=64, generator=torch.Generator().manual_seed(0))
+    coords = torch.rand(500, 3, generator=torch.Generator().manual_seed(1))
+    assert field(coords).abs().max() < 1e-2
+
+
+def test_field_weights_fill_the_xavier_range():
+    field = Field(GRID, outputs=8, hidden=64, extra_inputs=9, generator=torch.Generator().manual_seed(0))
+    assert [tuple(w.shape) for w in field.weights] == [(64, 15), (64, 64), (8, 64)]
+    for weight in field.weights:
+        bound = math.sqrt(6 / sum(weight.shape))
+        assert 0.95 * bound < weight.abs().max() <= bound
+        assert abs(weight.std() - bound / math.sqrt(3)) < 0.1 * bound
+
+
+def test_field_is_the_same_for_the_same_seed_only():
+    def made(seed: int) -> Field:
+        return Field(GRID, outputs=3, hidden=16, generator=torch.Generator().manual_seed(seed))
+
+    for (_, a), (_, b) in zip(made(3).named_parameters(), made(3).named_parameters(), strict=True):
+        assert torch.equal(a, b)
+    assert not torch.equal(made(3).grid.table, made(4).grid.table)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"log2_table_size": 3},
+        {"log2_table_size": 25},
+        {"log2_table_size": 8, "levels": 0},
+        {"log2_table_size": 8, "levels": 33},
+        {"log2_table_size": 8, "base": 1},
+        {"log2_table_size": 8, "base": 64, "finest": 32},
+        {"log2_table_size": 8, "finest": 65537},
+    ],
+)
+def test_hash_grid_refuses_impossible_shapes(settings):
+    with pytest.raises(ValueError):
+        HashGridConfig(**settings)
+
+
+def test_hash_grid_rows_are_dense_until_the_table_is_full():
+    grid = HashGridConfig(log2_table_size=10, levels=3, base=4, finest=64)  # 4, 16, 64 vertices
+    assert grid.resolutions == (4, 16, 64)
+    assert grid.offsets == (0, 64, 64 + 1024, 64 + 2048) and grid.rows == 2112

@@ -1,0 +1,186 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scenes import camera_at, look_at
+
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.model import Frame, contract
+from hyrfpack.model.frame import THINNEST_AXIS
+from hyrfpack.scene import Camera
+
+
+def contract_float64(u: np.ndarray) -> np.ndarray:
+    """The contraction as the paper defines it (with + 0.5), in numpy; the norm by hypot, which cannot overflow."""
+    u = u.astype(np.float64)
+    radius = np.hypot(np.hypot(u[:, 0], u[:, 1]), u[:, 2])[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        outside = 0.25 * (2 - 1 / radius) * u / radius + 0.5
+    return np.where(radius <= 1, 0.25 * u + 0.5, outside)
+
+
+def random_directions(count: int, seed: int = 0) -> np.ndarray:
+    vectors = np.random.default_rng(seed).normal(size=(count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def a_camera(position=(3.0, -2.0, 1.0), target=(0.1, 0.2, 0.3)) -> Camera:
+    return Camera(64, 48, 70.0, 65.0, 30.0, 25.0, look_at(position, target))
+
+
+def project(points: np.ndarray, pose: np.ndarray, camera: Camera) -> np.ndarray:
+    """(N, 3): column, row and depth, by the pinhole formula."""
+    x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).T
+    return np.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, z), axis=1)
+
+
+@pytest.mark.parametrize("radius", [0.0, 1e-20, 1e-3, 0.5, 0.999999, 1.0, 1.000001, 2.0, 100.0, 1e8, 1e20, 1e30])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_contract_matches_the_formula(radius, dtype):
+    u = torch.from_numpy(radius * random_directions(200)).to(dtype)
+
+    cube = contract(u)
+
+    expected = contract_float64(u.double().numpy())
+    np.testing.assert_allclose(cube.numpy(), expected, rtol=0, atol=1e-6 if dtype == torch.float32 else 1e-14)
+
+
+def test_contract_stays_finite_and_inside_for_float32_up_to_1e30():
+    generator = np.random.default_rng(1)
+    u = np.float32(10.0 ** generator.uniform(-30, 30, (50_000, 1)) * random_directions(50_000))
+    u[:1000] = np.diag([1e30, -1e30, 1e30]).astype(np.float32)[generator.integers(3, size=1000)]  # on the axes
+
+    cube = contract(torch.from_numpy(u))
+
+    assert torch.isfinite(cube).all()
+    assert cube.min() >= 0 and cube.max() <= 1
+
+
+def test_contract_keeps_the_inner_ball_in_the_inner_half():
+    u = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 0, 0.5], [0, 0, 0]])
+    expected = torch.tensor([[0.75, 0.5, 0.5], [0.25, 0.5, 0.5], [0.5, 0.5, 0.625], [0.5, 0.5, 0.5]])
+    assert torch.equal(contract(u), expected)
+
+
+def test_contract_keeps_directions_and_orders_radii():
+    radii = torch.logspace(-3, 6, 200, dtype=torch.float64)
+    direction = torch.tensor([0.48, -0.6, 0.64], dtype=torch.float64)
+
+    offsets = contract(radii[:, None] * direction) - 0.5
+
+    lengths = torch.linalg.vector_norm(offsets, dim=1)
+    assert (lengths.diff() > 0).all() and lengths[-1] < 0.5
+    torch.testing.assert_close(offsets / lengths[:, None], direction.expand(200, 3))
+
+
+def test_contract_is_c1_at_the_unit_sphere():
+    directions = torch.from_numpy(random_directions(50, seed=2))
+    step = 1e-7
+
+    def jacobians(radius: float) -> torch.Tensor:
+        return torch.stack([torch.autograd.functional.jacobian(contract, radius * d) for d in directions])
+
+    below, above = jacobians(1 - step), jacobians(1 + step)
+
+    torch.testing.assert_close(contract((1 - step) * directions), contract((1 + step) * directions), rtol=0, atol=1e-7)
+    torch.testing.assert_close(below, above, rtol=0, atol=1e-6)
+    torch.testing.assert_close(below, 0.25 * torch.eye(3).double().expand(50, 3, 3), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("radius", [0.3, 0.9, 1.1, 3.0, 40.0])
+def test_contract_passes_gradcheck(radius):
+    u = torch.from_numpy(radius * random_directions(6, seed=3)).requires_grad_()
+    assert torch.autograd.gradcheck(contract, (u,), eps=1e-6, atol=1e-7)
+
+
+def test_contract_gradient_is_finite_at_hard_points():
+    u = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 1], [1e30, 1e30, -1e30], [1e-38, 0, 0]], requires_grad=True)
+    contract(u).sum().backward()
+    assert torch.isfinite(u.grad).all()
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_local_pose_sees_the_same_pixels_with_depth_in_local_units(offset):
+    shift = np.array([offset, -offset, offset / 2])
+    points = np.random.default_rng(4).uniform(-1, 1, (100, 3)) + shift
+    camera = a_camera(shift + (3.0, -2.0, 1.0), shift + (0.1, 0.2, 0.3))
+    frame = Frame.from_box(shift - (2, 3, 1), shift + (2.5, 3, 0.5))
+
+    local = project(frame.to_local(points), frame.local_pose(camera), camera)
+
+    world = project(points, camera.camera_from_world, camera)
+    np.testing.assert_allclose(local[:, :2], world[:, :2], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(local[:, 2] * frame.scale, world[:, 2], rtol=0, atol=1e-7)
+
+
+def test_local_pose_keeps_a_close_scene_exact_a_million_units_away():
+    """Even after rounding to float32: the numbers the kernels get are small."""
+    shift = np.array([1e6, 1e6, -1e6])
+    points = np.random.default_rng(5).uniform(-1, 1, (100, 3))
+    near, far = a_camera(), a_camera(shift + (3.0, -2.0, 1.0), shift + (0.1, 0.2, 0.3))
+    frame = Frame.from_box(shift - 1, shift + 1)
+
+    local = frame.to_local(points + shift).astype(np.float32)
+    seen = project(local, frame.local_pose(far).astype(np.float32), far)
+
+    np.testing.assert_allclose(seen[:, :2], project(points, near.camera_from_world, near)[:, :2], rtol=0, atol=1e-3)
+
+
+def test_local_pose_leaves_the_camera_alone():
+    camera = a_camera()
+    before = camera.camera_from_world.copy()
+    Frame.from_box(np.full(3, 3.0), np.full(3, 9.0)).local_pose(camera)
+    assert np.array_equal(camera.camera_from_world, before)
+
+
+def test_millimetres_and_kilometres_give_the_same_local_coordinates():
+    points = np.random.default_rng(6).uniform(-5, 5, (50, 3))
+    low, high = points.min(0), points.max(0)
+    camera = camera_at((7.0, 1.0, 2.0))
+    results = []
+    for unit in (1e3, 1e-3):  # the same metres, said in mm and in km
+        pose = camera.camera_from_world.copy()
+        pose[:3, 3] *= unit
+        frame = Frame.from_box(low * unit, high * unit)
+        local_pose = frame.local_pose(Camera(32, 32, *camera.intrinsics, pose))
+        results.append((frame.to_local(points * unit), local_pose, frame.half_extent))
+
+    for in_mm, in_km in zip(*results, strict=True):
+        np.testing.assert_allclose(in_mm, in_km, rtol=1e-12, atol=1e-12)
+
+
+def test_to_world_undoes_to_local():
+    frame = Frame.from_box(np.array([-1.0, 4, 1e5]), np.array([2.0, 9, 1e5 + 3]))
+    points = np.random.default_rng(7).normal(size=(20, 3)) * 100 + frame.center
+    np.testing.assert_allclose(frame.to_world(frame.to_local(points)), points, rtol=1e-14)
+
+
+def test_from_box_puts_the_corners_at_the_half_extent():
+    low, high = np.array([-1.0, 2, 10]), np.array([3.0, 4, 12])
+
+    frame = Frame.from_box(low, high)
+
+    assert frame.center == (1.0, 3.0, 11.0) and frame.scale == 2.0
+    np.testing.assert_allclose(frame.to_local(np.stack([low, high])), [[-1, -0.5, -0.5], [1, 0.5, 0.5]])
+    u = frame.normalize(torch.from_numpy(frame.to_local(np.stack([low, high]))))
+    np.testing.assert_allclose(u.numpy(), [[-1, -1, -1], [1, 1, 1]])
+
+
+def test_from_box_widens_flat_axes():
+    frame = Frame.from_box(np.array([0.0, 5, -8]), np.array([0.0, 5, 8]))  # a row of cameras
+    assert frame.scale == 8 and frame.half_extent == (THINNEST_AXIS, THINNEST_AXIS, 1.0)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("corner", ["low", "high"])
+def test_from_box_refuses_corners_that_are_not_finite(bad, corner):
+    low, high = np.zeros(3), np.ones(3)
+    (low if corner == "low" else high)[1] = bad
+    with pytest.raises(HyrfDataError, match="not finite"):
+        Frame.from_box(low, high)
+
+
+def test_from_box_refuses_a_box_without_size():
+    with pytest.raises(HyrfDataError, match="no size"):
+        Frame.from_box(np.full(3, 2.5), np.full(3, 2.5))

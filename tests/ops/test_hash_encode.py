@@ -1,0 +1,204 @@
+"""hash_encode: every implementation against the reference in float64, the reference against plain loops."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from hyrfpack.ops.dispatch import has_numba
+from hyrfpack.ops.hash_encode import cells, corner_rows, hash_encode, level_offsets, level_resolutions
+
+IMPLEMENTATIONS = ["reference", pytest.param("cpu", marks=pytest.mark.skipif(not has_numba(), reason="no numba"))]
+
+
+def uniform(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def table_for(resolutions: tuple[int, ...], log2_table_size: int, features: int = 2) -> torch.Tensor:
+    return 2 * uniform(level_offsets(resolutions, log2_table_size)[-1], features, seed=1) - 1
+
+
+def coords_on_cell_boundaries(resolution: int, count: int) -> torch.Tensor:
+    vertices = torch.randint(0, resolution, (count, 3), generator=torch.Generator().manual_seed(2))
+    return vertices / (resolution - 1)
+
+
+# name -> (coords, resolutions, log2_table_size, whether all points lie well inside their cells)
+CASES = {
+    "hashed and dense levels": (uniform(3000, 3), level_resolutions(8, 5, 60), 12, True),
+    "every level hashed, tiny table": (uniform(500, 3), level_resolutions(4, 9, 40), 4, True),
+    "every level dense": (uniform(700, 3), level_resolutions(4, 2, 16), 12, True),
+    "the paper's levels": (uniform(400, 3), level_resolutions(16, 64, 1024), 14, False),
+    "one level of one cell": (uniform(100, 3), (2,), 3, True),
+    "no point": (uniform(0, 3), level_resolutions(4, 8, 32), 8, True),
+    "one point": (uniform(1, 3), level_resolutions(4, 8, 32), 8, True),
+    "all points coincident": (uniform(1, 3).expand(2000, 3), level_resolutions(4, 8, 32), 8, True),
+    "corners of the cube": (torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3), (5, 9, 17), 10, False),
+    "on cell boundaries": (coords_on_cell_boundaries(23, 300), (23, 45), 10, False),
+    "many blocks and ranges": (uniform(40_000, 3), (6, 30), 10, True),
+}
+
+
+def well_inside(coords: torch.Tensor, resolutions: tuple[int, ...]) -> torch.Tensor:
+    """Coordinates moved to where rounding cannot put a point into another cell on any level."""
+    coords = coords.clone()
+    for _ in range(50):
+        x = coords[:, None, :] * (torch.tensor(resolutions) - 1)[None, :, None]
+        near = ((x - x.round()).abs() < 1e-3).any(dim=1)
+        coords[near] = (coords[near] + 0.0137) % 1.0
+    assert not near.any()
+    return coords
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("case", CASES)
+def test_values_and_gradients_match_the_float64_reference(implementation: str, case: str) -> None:
+    coords, resolutions, log2_table_size, inside = CASES[case]
+    coords = well_inside(coords, resolutions) if inside else coords.clone()
+    table = table_for(resolutions, log2_table_size)
+    upstream = torch.randn(coords.shape[0], 2 * len(resolutions), generator=torch.Generator().manual_seed(3))
+
+    def run(dtype: torch.dtype, implementation: str) -> list[torch.Tensor]:
+        inputs = [tensor.detach().to(dtype).requires_grad_() for tensor in (coords, table)]
+        features = hash_encode(*inputs, resolutions, log2_table_size, implementation=implementation)
+        return [features, *torch.autograd.grad(features, inputs, upstream.to(dtype))]
+
+    features, grad_coords, grad_table = run(torch.float32, implementation)
+    expected, expected_coords, expected_table = run(torch.float64, "reference")
+    # float32 places a point to 2^-24 of the level's span, and features in [-1, 1] change by up to 2 along an axis.
+    bound = 1e-6 + 6 * 2**-24 * max(resolutions)
+    torch.testing.assert_close(features.double(), expected, rtol=0, atol=bound)
+    scale = expected_table.abs().max().item() if expected_table.numel() and coords.shape[0] else 1.0
+    torch.testing.assert_close(grad_table.double(), expected_table, rtol=0, atol=1e-3 * scale)
+    if inside and coords.shape[0]:
+        scale = expected_coords.abs().max().item()
+        torch.testing.assert_close(grad_coords.double(), expected_coords, rtol=0, atol=1e-3 * scale)
+
+
+def test_reference_passes_gradcheck() -> None:
+    resolutions, log2_table_size = (3, 6, 11), 6
+    coords = well_inside(uniform(12, 3), resolutions).double().requires_grad_()
+    table = table_for(resolutions, log2_table_size).double().requires_grad_()
+    assert torch.autograd.gradcheck(lambda c, t: hash_encode(c, t, resolutions, log2_table_size), (coords, table))
+
+
+def encode_by_loops(coords: np.ndarray, table: np.ndarray, resolutions: tuple[int, ...], size: int) -> np.ndarray:
+    """Instant-ngp's encoding, one point, level, corner at a time, with 32-bit wrap-around done by Python integers."""
+    result = np.zeros((len(coords), len(resolutions), table.shape[1]))
+    for n, point in enumerate(coords):
+        first = 0
+        for level, resolution in enumerate(resolutions):
+            x = [float(c) * (resolution - 1) for c in point]
+            cell = [min(int(v), resolution - 2) for v in x]
+            rows = min(resolution**3, size)
+            for dx in (0, 1):
+                for dy in (0, 1):
+                    for dz in (0, 1):
+                        cx, cy, cz = cell[0] + dx, cell[1] + dy, cell[2] + dz
+                        if resolution**3 <= size:
+                            row = cx + resolution * cy + resolution * resolution * cz
+                        else:
+                            hashed = cx ^ (cy * 2654435761) % 2**32 ^ (cz * 805459861) % 2**32
+                            row = hashed % size
+                        weight = 1.0
+                        for v, c, d in zip(x, cell, (dx, dy, dz), strict=True):
+                            weight *= (v - c) if d else (1 - (v - c))
+                        result[n, level] += weight * table[first + row]
+            first += rows
+    return result.reshape(len(coords), -1)
+
+
+@pytest.mark.parametrize("features", [1, 2, 4])
+def test_reference_matches_plain_loops(features: int) -> None:
+    resolutions, log2_table_size = (4, 9, 64, 1024), 10
+    coords = torch.cat([uniform(40, 3), torch.tensor([[0.0, 1.0, 0.5], [1.0, 1.0, 1.0]])]).double()
+    table = table_for(resolutions, log2_table_size, features).double()
+    expected = encode_by_loops(coords.numpy(), table.numpy(), resolutions, 2**log2_table_size)
+    encoded = hash_encode(coords, table, resolutions, log2_table_size)
+    np.testing.assert_allclose(encoded.numpy(), expected, rtol=0, atol=1e-12)
+
+
+def test_levels_are_those_of_the_paper() -> None:
+    expected = (64, 77, 93, 112, 135, 162, 195, 234, 281, 338, 407, 489, 589, 708, 852, 1024)
+    assert level_resolutions(16, 64, 1024) == expected
+    assert level_resolutions(1, 16, 16) == (16,)
+    assert level_resolutions(5, 16, 256) == (16, 32, 64, 128, 256)
+
+
+def test_level_offsets_are_dense_where_the_vertices_fit() -> None:
+    assert level_offsets((4, 8, 16), 9) == (0, 64, 64 + 512, 64 + 512 + 512)
+
+
+def test_corner_rows_of_a_dense_level_number_each_vertex_once() -> None:
+    resolution = 5
+    lowest = torch.cartesian_prod(*[torch.arange(resolution - 1)] * 3)[:, None, :]
+    rows = corner_rows(lowest, (resolution,), 7)[:, 0]
+    assert set(rows.flatten().tolist()) == set(range(resolution**3))
+    corner = torch.arange(8)
+    steps = torch.stack([corner % 2, corner // 2 % 2, corner // 4], dim=-1)
+    x, y, z = (lowest + steps).unbind(-1)
+    assert torch.equal(rows, x + resolution * y + resolution**2 * z)
+
+
+def test_corner_rows_are_exactly_the_rows_with_a_gradient() -> None:
+    resolutions, log2_table_size = level_resolutions(6, 4, 50), 9
+    coords = well_inside(uniform(40, 3), resolutions)
+    table = table_for(resolutions, log2_table_size).requires_grad_()
+    features = hash_encode(coords, table, resolutions, log2_table_size)
+    (grad,) = torch.autograd.grad(features.sum(), table)
+    touched = set(grad.any(dim=1).nonzero().flatten().tolist())
+    rows = corner_rows(cells(coords, resolutions), resolutions, log2_table_size)
+    assert touched == set(rows.flatten().tolist())
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_a_constant_table_gives_its_constant_everywhere(implementation: str) -> None:
+    resolutions = level_resolutions(6, 4, 200)
+    table = torch.full((level_offsets(resolutions, 10)[-1], 2), 0.75)
+    features = hash_encode(uniform(200, 3), table, resolutions, 10, implementation=implementation)
+    torch.testing.assert_close(features, torch.full_like(features, 0.75))
+
+
+@pytest.mark.skipif(not has_numba(), reason="no numba")
+def test_coordinates_that_are_not_finite_stay_inside_the_table() -> None:
+    coords = torch.tensor([[float("nan")] * 3, [float("inf")] * 3, [-float("inf")] * 3, [1e30, -1e30, 0.5]])
+    table = table_for((5, 300), 9).requires_grad_()
+    features = hash_encode(coords.requires_grad_(), table, (5, 300), 9, implementation="cpu")
+    features.sum().backward()
+    assert features.shape == (4, 4)
+
+
+@pytest.mark.skipif(not has_numba(), reason="no numba")
+def test_bytes_do_not_depend_on_threads_or_on_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    resolutions, log2_table_size = level_resolutions(8, 8, 128), 10
+    upstream = torch.randn(40_000, 16, generator=torch.Generator().manual_seed(4))
+
+    def run() -> list[bytes]:
+        coords = uniform(40_000, 3).requires_grad_()
+        table = table_for(resolutions, log2_table_size).requires_grad_()
+        features = hash_encode(coords, table, resolutions, log2_table_size, implementation="cpu")
+        features.backward(upstream)
+        return [tensor.detach().numpy().tobytes() for tensor in (features, coords.grad, table.grad)]
+
+    monkeypatch.setenv("HYRFPACK_THREADS", "1")
+    alone = run()
+    monkeypatch.setenv("HYRFPACK_THREADS", "2")
+    assert run() == alone
+    assert run() == alone
+
+
+@pytest.mark.parametrize(
+    ("coords", "rows", "features", "implementation"),
+    [((5, 2), 64, 2, "auto"), ((5, 3), 63, 2, "auto"), ((5, 3), 64, 4, "cpu"), ((5, 3), 64, 2, "cuda")],
+    ids=["coords of two columns", "too few rows", "four features on cpu", "unknown implementation"],
+)
+def test_refuses_what_does_not_fit(coords: tuple, rows: int, features: int, implementation: str) -> None:
+    with pytest.raises(ValueError):
+        hash_encode(torch.rand(coords), torch.rand(rows, features), (4,), 10, implementation=implementation)
+
+
+def test_level_resolutions_refuses_a_finest_level_below_the_base() -> None:
+    with pytest.raises(ValueError, match="finest=8"):
+        level_resolutions(4, 16, 8)

@@ -1,0 +1,409 @@
+"""Rasterising: every implementation against the float64 reference, and the reference against mathematics."""
+
+from __future__ import annotations
+
+import math
+import platform
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+from torch import Tensor
+
+from hyrfpack.ops.rasterize import Rasterization, rasterize
+from hyrfpack.ops.rasterize.reference import blend, project
+
+NAMES = ("means", "quats", "scales", "opacities", "colors")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One call. Gaussians are float32 numbers, so that every precision gets exactly the same input."""
+
+    gaussians: dict[str, Tensor]
+    width: int = 48
+    height: int = 40
+    intrinsics: tuple[float, float, float, float] = (50.0, 50.0, 24.0, 20.0)
+    camera: Tensor = field(default_factory=lambda: _camera(4.0))
+    options: dict = field(default_factory=dict)
+
+
+def _camera(distance: float) -> Tensor:
+    """Looks at the origin along a tilted axis, from a distance."""
+    angle, tilt = 0.4, -0.3
+    turn = torch.tensor([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
+    nod = torch.tensor([[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]])
+    camera = torch.eye(4, dtype=torch.float64)
+    camera[:3, :3] = nod.double() @ turn.double()
+    camera[2, 3] = distance
+    return camera
+
+
+def _gaussians(count: int, seed: int = 0, size: float = 0.1, spread: float = 0.8) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    return {
+        "means": normal(count, 3) * spread,
+        "quats": normal(count, 4),
+        "scales": size * torch.exp(0.5 * normal(count, 3)),
+        "opacities": torch.sigmoid(1.5 * normal(count)),
+        "colors": torch.sigmoid(normal(count, 3)),
+    }
+
+
+def _with(gaussians: dict[str, Tensor], **changes: Tensor) -> dict[str, Tensor]:
+    return {**gaussians, **changes}
+
+
+def _across_near_plane() -> Case:
+    gaussians = _gaussians(60, spread=0.3)
+    depths = torch.linspace(-1, 1, 60)
+    depths[10:14] = torch.tensor([0.25, 0.25 + 1e-6, 0.25 - 1e-6, 0.2500001])
+    gaussians["means"][:, 2] = depths
+    return Case(gaussians, camera=torch.eye(4, dtype=torch.float64), options={"near": 0.25})
+
+
+def _needles_and_pancakes() -> Case:
+    gaussians = _gaussians(40)
+    scales = torch.full((40, 3), 1e-4)
+    scales[:20, 0] = torch.logspace(-1, 2, 20)
+    scales[20:, 1:] = torch.logspace(-1, 1, 20)[:, None]
+    return Case(_with(gaussians, scales=scales))
+
+
+def _all_sizes() -> Case:
+    gaussians = _gaussians(90)
+    return Case(_with(gaussians, scales=torch.logspace(-6, 5, 90)[:, None] * gaussians["scales"] / 0.1))
+
+
+def _opacity_zero_and_one() -> Case:
+    gaussians = _gaussians(40)
+    return Case(_with(gaussians, opacities=torch.tensor([0.0, 1.0, 1.0, 0.995] * 10)))
+
+
+def _ten_thousand_layers() -> Case:
+    gaussians = _gaussians(10_000, size=0.3, spread=0.3)
+    return Case(gaussians, width=20, height=12, intrinsics=(20.0, 20.0, 10.0, 6.0))
+
+
+def _far_from_the_origin() -> Case:
+    gaussians = _gaussians(80, size=2.0, spread=16.0)
+    offset = torch.tensor([1e6, -2e6, 1.5e6])
+    camera = _camera(80.0)
+    camera[:3, 3] -= camera[:3, :3] @ offset.double()
+    return Case(_with(gaussians, means=gaussians["means"] + offset), camera=camera)
+
+
+def _all_coincident() -> Case:
+    gaussians = _gaussians(50)
+    return Case(_with(gaussians, means=torch.full((50, 3), 0.125)))
+
+
+def _equal_depths() -> Case:
+    gaussians = _gaussians(60, size=0.3)
+    gaussians["means"][:, 2] = 3.0
+    return Case(gaussians, camera=torch.eye(4, dtype=torch.float64))
+
+
+def _covers_everything() -> Case:
+    gaussians = _gaussians(5, size=30.0)
+    return Case(_with(gaussians, opacities=torch.tensor([0.3, 0.9, 0.01, 0.5, 0.2])), width=70, height=45)
+
+
+def _smaller_than_a_pixel() -> Case:
+    return Case(_gaussians(60, size=1e-6))
+
+
+def _inside_a_gaussian() -> Case:
+    gaussians = _gaussians(30, spread=0.5)
+    gaussians["means"][0] = torch.tensor([0.0, 0.0, 0.05])
+    gaussians["scales"][0] = torch.tensor([2.0, 1.0, 3.0])
+    return Case(gaussians, camera=torch.eye(4, dtype=torch.float64))
+
+
+def _short_quaternions() -> Case:
+    gaussians = _gaussians(40)
+    lengths = torch.logspace(-9, 9, 40)[:, None] / gaussians["quats"].norm(dim=1, keepdim=True)
+    return Case(_with(gaussians, quats=gaussians["quats"] * lengths))
+
+
+def _wide_angle() -> Case:
+    gaussians = _gaussians(200, size=0.3, spread=3.0)
+    return Case(gaussians, camera=_camera(1.0), intrinsics=(12.0, 15.0, 20.0, 24.0))
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    "random scene": lambda: Case(_gaussians(500)),
+    "random scene, antialiased": lambda: Case(_gaussians(500, size=0.03), options={"antialiased": True}),
+    "off-centre principal point, fx != fy": lambda: Case(_gaussians(200), intrinsics=(45.0, 70.0, 5.5, 33.25)),
+    "Jacobian clamped at a wide angle": _wide_angle,
+    "behind, at and across the near plane": _across_near_plane,
+    "needles and pancakes": _needles_and_pancakes,
+    "scales from 1e-6 to 1e5": _all_sizes,
+    "opacities 0 and 1": _opacity_zero_and_one,
+    "10,000 layers": _ten_thousand_layers,
+    "1e6 from the origin": _far_from_the_origin,
+    "all coincident": _all_coincident,
+    "equal depths": _equal_depths,
+    "one Gaussian": lambda: Case(_gaussians(1)),
+    "no Gaussian": lambda: Case(_gaussians(0)),
+    "all behind the camera": lambda: Case(_gaussians(20), camera=_camera(-9.0)),
+    "covers the whole picture": _covers_everything,
+    "smaller than 1/1000 pixel": _smaller_than_a_pixel,
+    "camera inside a Gaussian": _inside_a_gaussian,
+    "quaternions 1e-9 to 1e9 long": _short_quaternions,
+    "1 x 1 picture": lambda: Case(_gaussians(50), width=1, height=1, intrinsics=(2.0, 2.0, 0.5, 0.5)),
+    "17 x 3 picture": lambda: Case(_gaussians(50), width=17, height=3, intrinsics=(17.0, 17.0, 8.5, 1.5)),
+    "256 x 16 picture": lambda: Case(_gaussians(80), width=256, height=16, intrinsics=(90.0, 90.0, 128.0, 8.0)),
+}
+
+
+def _run(case: Case, implementation: str, dtype: torch.dtype) -> tuple[Rasterization, dict[str, Tensor], Tensor]:
+    """The picture, the gradients under random cotangents, and the abs-gradient."""
+    inputs = {name: case.gaussians[name].to(dtype, copy=True).requires_grad_() for name in NAMES}
+    absgrad = torch.zeros(len(inputs["means"]), 2, dtype=dtype)
+    picture = rasterize(
+        *inputs.values(),
+        case.camera,
+        case.intrinsics,
+        case.width,
+        case.height,
+        depth=True,
+        absgrad=absgrad,
+        implementation=implementation,
+        **case.options,
+    )
+    generator = torch.Generator().manual_seed(7)
+    grad_rgb = torch.randn(case.height, case.width, 3, generator=generator).to(dtype)
+    grad_transmittance = torch.randn(case.height, case.width, generator=generator).to(dtype)
+    torch.autograd.backward([picture.rgb, picture.transmittance], [grad_rgb, grad_transmittance])
+    return picture, {name: tensor.grad for name, tensor in inputs.items()}, absgrad
+
+
+def _assert_picture_close(actual: Tensor, expected: Tensor, tolerance: float = 1e-4) -> None:
+    """All pixels but one in 500 within tolerance of [0, 1]; those few are where rounding turns a threshold over
+    (alpha against 1/255, T against 1e-4) and may be off by what that Gaussian adds, below 0.02."""
+    error = (actual.double() - expected).abs()
+    assert error.max() < 0.02
+    assert (error > tolerance).double().mean() <= 0.002
+
+
+def _assert_gradient_close(actual: Tensor, expected: Tensor, tolerance: float = 1e-3) -> None:
+    """As a whole within tolerance of its length: single numbers can be differences of large ones."""
+    assert torch.isfinite(actual).all()
+    assert (actual.double() - expected).norm() <= tolerance * expected.norm() + 1e-12
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+def test_matches_the_float64_reference(implementation: str, name: str) -> None:
+    case = CASES[name]()
+    expected, expected_grads, expected_absgrad = _run(case, "reference", torch.float64)
+
+    picture, grads, absgrad = _run(case, implementation, torch.float32)
+
+    _assert_picture_close(picture.rgb, expected.rgb)
+    _assert_picture_close(picture.transmittance, expected.transmittance)
+    farthest = float(expected.depth.max()) or 1.0
+    _assert_picture_close(picture.depth / farthest, expected.depth / farthest, 1e-3)
+    for key in NAMES:
+        _assert_gradient_close(grads[key], expected_grads[key])
+    _assert_gradient_close(absgrad, expected_absgrad)
+    # The kernels may keep a tile whose pixel centres an ellipse just misses, never drop one.
+    assert not (expected.visible & ~picture.visible).any()
+    assert expected.pairs <= picture.pairs <= 1.05 * expected.pairs + 2
+
+
+@pytest.mark.parametrize("name", ["random scene", "needles and pancakes", "256 x 16 picture"])
+@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+def test_tiles_and_bounds_do_not_change_the_picture(implementation: str, name: str) -> None:
+    case = CASES[name]()
+    gaussians = {key: value.double() for key, value in case.gaussians.items()}
+    shapes = [gaussians[key] for key in NAMES[:4]]
+    splats = project(*shapes, case.camera, case.intrinsics, case.width, case.height, 0.01, False)
+    splats = splats.select(torch.argsort(splats.depths, stable=True))
+    ys, xs = torch.meshgrid(torch.arange(case.height) + 0.5, torch.arange(case.width) + 0.5, indexing="ij")
+    pixels = torch.stack([xs, ys], -1).view(-1, 2).double()
+    colors = gaussians["colors"][splats.index]
+    rgb, transmittance, _ = blend(splats.means2d, splats.conics, splats.opacities, colors, pixels)
+
+    dtype = torch.float32 if implementation == "cpu" else torch.float64
+    picture, _, _ = _run(case, implementation, dtype)
+
+    _assert_picture_close(picture.rgb, rgb.view(case.height, case.width, 3))
+    _assert_picture_close(picture.transmittance, transmittance.view(case.height, case.width))
+
+
+@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+def test_one_isotropic_gaussian_has_the_closed_form(implementation: str) -> None:
+    focal, sigma, distance, opacity = 60.0, 0.2, 3.0, 0.7
+    gaussian = {
+        "means": torch.tensor([[0.0, 0.0, distance]]),
+        "quats": torch.tensor([[0.3, -0.2, 0.9, 0.1]]),
+        "scales": torch.full((1, 3), sigma),
+        "opacities": torch.tensor([opacity]),
+        "colors": torch.tensor([[0.2, 0.5, 1.0]]),
+    }
+    camera = torch.eye(4, dtype=torch.float64)
+
+    picture = rasterize(
+        *gaussian.values(), camera, (focal, focal, 16.5, 12.5), 33, 25, depth=True, implementation=implementation
+    )
+
+    ys, xs = torch.meshgrid(torch.arange(25.0) - 12, torch.arange(33.0) - 16, indexing="ij")
+    variance = (focal * sigma / distance) ** 2 + 0.3
+    alpha = opacity * torch.exp(-(xs**2 + ys**2) / (2 * variance))
+    alpha = torch.where(alpha >= 1 / 255, alpha, 0)
+    torch.testing.assert_close(picture.transmittance, 1 - alpha, atol=2e-6, rtol=0)
+    torch.testing.assert_close(picture.rgb, alpha[..., None] * gaussian["colors"], atol=2e-6, rtol=0)
+    torch.testing.assert_close(picture.depth, torch.where(alpha > 0, distance, 0.0), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+def test_antialiasing_keeps_the_light_of_a_small_gaussian(implementation: str) -> None:
+    # Its integral over the picture is opacity 2 pi sqrt(det Sigma), with the low-pass or without.
+    focal, sigma, distance, opacity = 60.0, 0.02, 3.0, 0.9
+    gaussian = {
+        "means": torch.tensor([[0.0, 0.0, distance]]),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        "scales": torch.full((1, 3), sigma),
+        "opacities": torch.tensor([opacity]),
+        "colors": torch.ones(1, 3),
+    }
+
+    picture = rasterize(
+        *gaussian.values(),
+        torch.eye(4, dtype=torch.float64),
+        (focal, focal, 8.0, 8.0),
+        16,
+        16,
+        antialiased=True,
+        implementation=implementation,
+    )
+
+    light = opacity * 2 * math.pi * (focal * sigma / distance) ** 2
+    assert picture.rgb[..., 0].sum() == pytest.approx(light, rel=0.02)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_reference_passes_gradcheck(antialiased: bool) -> None:
+    gaussians = _gaussians(3, seed=3, size=0.6, spread=0.4)
+    inputs = [gaussians[name].double().requires_grad_() for name in NAMES]
+
+    def run(*tensors: Tensor) -> tuple[Tensor, Tensor]:
+        picture = rasterize(
+            *tensors, _camera(4.0), (5.0, 6.0, 2.5, 2.0), 5, 4, antialiased=antialiased, implementation="reference"
+        )
+        return picture.rgb, picture.transmittance
+
+    assert torch.autograd.gradcheck(run, inputs)
+
+
+@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+def test_absgrad_is_the_sum_of_absolute_gradients_of_single_pixels(implementation: str) -> None:
+    case = Case(_gaussians(12), width=18, height=17, intrinsics=(18.0, 18.0, 9.0, 8.5))
+    gaussians = [case.gaussians[name].double() for name in NAMES]
+    splats = project(*gaussians[:4], case.camera, case.intrinsics, 18, 17, 0.01, False)
+    splats = splats.select(torch.argsort(splats.depths, stable=True))
+    colors = gaussians[4][splats.index]
+    generator = torch.Generator().manual_seed(7)
+    grad_rgb = torch.randn(17, 18, 3, generator=generator).double()
+    grad_transmittance = torch.randn(17, 18, generator=generator).double()
+    expected = torch.zeros(12, 2, dtype=torch.float64)
+    for y in range(17):
+        for x in range(18):
+            means2d = splats.means2d.clone().requires_grad_()
+            pixel = torch.tensor([[x + 0.5, y + 0.5]], dtype=torch.float64)
+            rgb, left, _ = blend(means2d, splats.conics, splats.opacities, colors, pixel)
+            loss = (rgb[0] * grad_rgb[y, x]).sum() + left[0] * grad_transmittance[y, x]
+            (grad,) = torch.autograd.grad(loss, means2d)
+            expected[splats.index] += grad.abs()
+
+    _, _, absgrad = _run(case, implementation, torch.float32)
+
+    torch.testing.assert_close(absgrad.double(), expected, atol=1e-4, rtol=1e-4)
+
+
+def test_absgrad_is_added_to_what_the_buffer_holds() -> None:
+    case = Case(_gaussians(5))
+    _, _, once = _run(case, "cpu", torch.float32)
+    inputs = [case.gaussians[name].clone().requires_grad_() for name in NAMES]
+    buffer = torch.full((5, 2), 3.0)
+
+    picture = rasterize(*inputs, case.camera, case.intrinsics, 48, 40, absgrad=buffer, implementation="cpu")
+    generator = torch.Generator().manual_seed(7)
+    cotangents = [torch.randn(40, 48, 3, generator=generator), torch.randn(40, 48, generator=generator)]
+    torch.autograd.backward([picture.rgb, picture.transmittance], cotangents)
+
+    torch.testing.assert_close(buffer, once + 3)
+
+
+def test_same_bytes_with_any_number_of_threads_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = Case(_gaussians(3000), width=150, height=90, intrinsics=(150.0, 150.0, 75.0, 45.0))
+    results = []
+    for threads in (1, 2, 2, 5):
+        monkeypatch.setenv("HYRFPACK_THREADS", str(threads))
+        picture, grads, absgrad = _run(case, "cpu", torch.float32)
+        results.append([picture.rgb, picture.transmittance, picture.depth, *grads.values(), absgrad])
+
+    for result in results[1:]:
+        for tensor, first in zip(result, results[0], strict=True):
+            assert torch.equal(tensor, first)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf, 3e38])
+def test_numbers_that_are_not_finite_do_no_harm_to_others_memory(name: str, poison: float) -> None:
+    # Such input is refused at the door; here it must only not crash or hang.
+    case = Case(_gaussians(64))
+    case.gaussians[name][::3] = poison
+
+    picture, grads, _ = _run(case, "cpu", torch.float32)
+
+    assert picture.rgb.shape == (40, 48, 3)
+    assert all(grads[key].shape == case.gaussians[key].shape for key in NAMES)
+
+
+def test_picture_without_gradients_needs_none() -> None:
+    case = Case(_gaussians(30))
+    with torch.no_grad():
+        picture = rasterize(*case.gaussians.values(), case.camera, case.intrinsics, 48, 40)
+
+    assert picture.depth is None
+    assert not picture.rgb.requires_grad
+    assert set(picture.seconds) == {"project", "sort", "bin", "blend"}
+
+
+def test_unfit_arguments_are_refused() -> None:
+    inputs = list(_gaussians(3).values())
+    camera, intrinsics = torch.eye(4), (10.0, 10.0, 5.0, 5.0)
+    with pytest.raises(ValueError, match="quats is"):
+        rasterize(inputs[0], inputs[1][:, :3], *inputs[2:], camera, intrinsics, 10, 10)
+    with pytest.raises(ValueError, match="camera_from_world is"):
+        rasterize(*inputs, camera[:3], intrinsics, 10, 10)
+    with pytest.raises(ValueError, match="no pixels"):
+        rasterize(*inputs, camera, intrinsics, 0, 10)
+    with pytest.raises(ValueError, match="absgrad is"):
+        rasterize(*inputs, camera, intrinsics, 10, 10, absgrad=torch.zeros(3, 3))
+    with pytest.raises(ValueError, match="float32"):
+        rasterize(*(tensor.double() for tensor in inputs), camera, intrinsics, 10, 10, implementation="cpu")
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86 assembly")
+def test_blending_loops_are_vectorised() -> None:
+    # Losing this costs a factor of ten and changes no result, so nothing else would notice.
+    from numba import njit
+
+    from hyrfpack.ops.rasterize import cpu_blend
+
+    _run(Case(_gaussians(3)), "cpu", torch.float32)
+    for kernel, packed in ((cpu_blend.blend_tiles, "mulps"), (cpu_blend.blend_tiles_backward, "divps")):
+        fresh = njit(**{**kernel.targetoptions, "cache": False})(kernel.py_func)
+        fresh.compile(kernel.signatures[0])
+        (assembly,) = fresh.inspect_asm().values()
+        assert re.search(rf"v?{packed}\s+.*%[xyz]mm", assembly)

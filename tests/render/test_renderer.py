@@ -1,0 +1,311 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scenes import ball_points, camera_at, look_at, ring, small_model
+
+from hyrfpack.model import Frame
+from hyrfpack.model.background import RADIUS
+from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.render import RenderSettings, render
+from hyrfpack.scene import Camera
+
+FRAME = Frame((10.0, -20.0, 5.0), 7.0, (1.0, 0.5, 0.5))
+SKY_EVERYWHERE = RenderSettings(background_threshold=0.0)
+
+
+def world(local) -> np.ndarray:
+    return FRAME.to_world(np.asarray(local, np.float64))
+
+
+def an_odd_camera(local_position=(0.2, -3.0, 0.7), local_target=(0.1, 0.0, 0.0)) -> Camera:
+    """fx != fy, a principal point off the centre, a picture that is no multiple of a tile."""
+    return Camera(75, 50, 80.0, 95.0, 33.3, 28.4, look_at(world(local_position), world(local_target)))
+
+
+def ball_model(count: int = 120, **settings):
+    """Balls of Gaussians with fields that say something."""
+    points, colors = ball_points(count)
+    settings = {"scale_logits": -2.5, "opacity_logits": 0.5, "fields": 1.0, **settings}
+    return small_model(points, color_logits=torch.from_numpy(colors) * 4 - 2, **settings)
+
+
+def picture(model, camera, **options) -> torch.Tensor:
+    with torch.no_grad():
+        return render(model, camera, **options).rgb
+
+
+# -- where and how far -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("local", [(0.0, 0.0, 0.0), (0.3, 0.2, -0.25), (-0.4, -0.3, 0.1)])
+def test_a_single_gaussian_lands_where_the_camera_model_says(local):
+    camera = an_odd_camera()
+    model = small_model([local], frame=FRAME, scale_logits=-4.6, opacity_logits=5.0)
+    x, y, z = camera.rotation @ world(local) + camera.camera_from_world[:3, 3]
+
+    with torch.no_grad():
+        rendering = render(model, camera, depth=True)
+
+    weights = rendering.alpha.double().numpy()
+    rows, columns = np.indices(weights.shape) + 0.5
+    found = np.array([(weights * columns).sum(), (weights * rows).sum()]) / weights.sum()
+    np.testing.assert_allclose(found, (camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), atol=0.03)
+    hit = rendering.alpha > 0
+    assert 5 < hit.sum() < hit.numel() / 4
+    np.testing.assert_allclose(rendering.depth[hit].numpy(), z, rtol=1e-5)  # world units: the frame's scale is 7
+    assert (rendering.depth[~hit] == 0).all()
+
+
+def test_a_single_gaussian_is_as_wide_as_projected():
+    """Seen head on, a ball of sigma s at depth z has variance (f s / z)^2 + 0.3 in the picture."""
+    model = small_model([[0.0, 0, 0]], scale_logits=float(np.log(0.05 / 0.95)), opacity_logits=1.0)
+    camera = camera_at((0, -2.0, 0), width=96, height=96, focal=200.0)
+
+    with torch.no_grad():
+        alpha = render(model, camera).alpha.double().numpy()
+
+    variance = (200 * 0.05 / 2) ** 2 + 0.3
+    rows, columns = np.indices(alpha.shape) + 0.5 - 48
+    opacity = 1 / (1 + np.exp(-1.0))
+    expected = opacity * np.exp(-0.5 * (rows**2 + columns**2) / variance)
+    np.testing.assert_allclose(alpha, np.where(expected >= 1 / 255, expected, 0), atol=1e-4)
+
+
+def test_nearer_gaussians_hide_farther_ones_whatever_their_order():
+    camera = camera_at((0, -3.0, 0))
+    positions = np.array([[0, -1.0, 0], [0, 1.0, 0]])
+    colors = torch.tensor([[5.0, -5, -5], [-5, -5, 5]])  # red before blue
+    for order in ([0, 1], [1, 0]):
+        model = small_model(positions[order], color_logits=colors[order], scale_logits=-1.0, opacity_logits=3.0)
+        middle = picture(model, camera)[16, 16]
+        assert middle[0] > 0.9 and middle[2] < 0.1
+
+
+def test_turning_the_camera_upside_down_turns_the_picture():
+    model = ball_model(background=True)
+    camera = camera_at((2.0, -2.5, 1.0))
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    turned = Camera(32, 32, *camera.intrinsics, half_turn @ camera.camera_from_world)
+
+    difference = picture(model, turned).flip(0, 1) - picture(model, camera)
+
+    assert difference.abs().max() < 2e-4
+
+
+def test_the_unit_of_the_world_does_not_matter():
+    camera, moved = camera_at((2.0, -2.5, 1.0)), np.array([4e5, -3e5, 1e5])
+    pose = camera.camera_from_world.copy()
+    pose[:3, 3] = 1000 * pose[:3, 3] - pose[:3, :3] @ moved
+    far = Camera(32, 32, *camera.intrinsics, pose)
+    here = ball_model(background=True)
+    there = ball_model(background=True, frame=Frame(tuple(moved), 1000.0, (1.0, 1.0, 1.0)))
+
+    difference = picture(there, far) - picture(here, camera)
+
+    assert difference.abs().max() < 1e-4
+
+
+@pytest.mark.parametrize(("depth", "seen"), [(0.0099, False), (0.0101, True), (-1.0, False)])
+def test_the_near_plane_is_in_local_units(depth, seen):
+    camera = an_odd_camera()
+    local_pose = FRAME.local_pose(camera)
+    on_axis = local_pose[:3, :3].T @ (np.array([0, 0, depth]) - local_pose[:3, 3])
+    model = small_model([on_axis], frame=FRAME, scale_logits=-6.0)
+    with torch.no_grad():
+        rendering = render(model, camera, RenderSettings(near=0.01))
+    assert len(rendering.decoded) == seen and rendering.visible.sum() == seen and bool(rendering.alpha.max() > 0) == seen
+
+
+# -- hard pictures ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (17, 3), (3, 17), (16, 16), (33, 15)])
+def test_any_picture_size_renders_whole(width, height):
+    model, camera = ball_model(background=True), camera_at((0, -3.0, 0), width=width, height=height, focal=20.0)
+    with torch.no_grad():
+        rendering = render(model, camera, depth=True)
+    assert rendering.rgb.shape == (height, width, 3)
+    assert rendering.alpha.shape == rendering.depth.shape == (height, width)
+    assert torch.isfinite(rendering.rgb).all() and rendering.alpha.max() > 0.2
+
+
+@pytest.mark.parametrize(
+    ("position", "target"),
+    [
+        ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),  # in the middle of everything
+        ((-0.5, 0.0, 0.0), (0.1, -0.5, -0.2)),  # inside a ball
+        ((0.0, 0.0, 90.0), (0.0, 0.1, 0.0)),  # close to the background sphere
+        ((0.0, -3 * RADIUS, 0.0), (0.0, 0.0, 0.0)),  # outside of it
+        ((0.0, -3 * RADIUS, 0.0), (RADIUS, -3 * RADIUS, 0.0)),  # outside, looking past it
+        ((1e6, 1e6, 0.0), (0.0, 0.0, 0.0)),
+    ],
+)
+def test_pictures_stay_in_range_wherever_the_camera_is(position, target):
+    model = ball_model(background=True)
+    with torch.no_grad():
+        rendering = render(model, camera_at(position, target), depth=True)
+    assert rendering.rgb.min() >= 0 and rendering.rgb.max() <= 1 + 1e-5
+    assert torch.isfinite(rendering.depth).all()
+
+
+@pytest.mark.parametrize("background", [True, False])
+@pytest.mark.parametrize("empty", ["no Gaussians", "all behind the camera"])
+def test_nothing_to_draw_leaves_the_background_alone(background, empty):
+    camera = camera_at((0, -3.0, 0), (0, -6.0, 0))
+    positions = ball_points(20)[0] if empty == "all behind the camera" else np.zeros((0, 3))
+    model = small_model(positions, fields=1.0, background=background, solid=(0.25, 0.5, 0.75))
+    pose = torch.from_numpy(model.config.frame.local_pose(camera)).float()
+
+    rendering = render(model, camera, depth=True, absgrad=True)
+
+    if background:
+        expected = model.decode_background(torch.arange(32 * 32), 32, camera.intrinsics, pose).view(32, 32, 3)
+    else:
+        expected = torch.tensor([0.25, 0.5, 0.75]).expand(32, 32, 3)
+    torch.testing.assert_close(rendering.rgb, expected)
+    assert (rendering.alpha == 0).all() and (rendering.depth == 0).all() and rendering.pairs == 0
+    if background:
+        rendering.rgb.sum().backward()
+        assert model.radiance.grid.table.grad.abs().max() > 0
+
+
+# -- background ------------------------------------------------------------------------------------------------------
+
+
+def test_the_background_shines_through_what_light_is_left():
+    """C = C_fg + T c, with the parts rendered apart."""
+    model, camera = ball_model(background=True), ring(8)[1]
+    pose = torch.from_numpy(model.config.frame.local_pose(camera)).float()
+
+    with torch.no_grad():
+        whole = render(model, camera, SKY_EVERYWHERE)
+        gaussians = render(model, camera, background=False)
+        sky = model.decode_background(torch.arange(32 * 32), 32, camera.intrinsics, pose).view(32, 32, 3)
+
+    left = 1 - whole.alpha[..., None]
+    assert 0.2 < left.mean() < 0.95 and left.min() < 0.5
+    torch.testing.assert_close(whole.rgb, gaussians.rgb + left * sky, rtol=0, atol=1e-6)
+
+
+def test_pixels_below_the_threshold_get_no_background():
+    model, camera = ball_model(background=True), ring(8)[1]
+    with torch.no_grad():
+        whole = render(model, camera, SKY_EVERYWHERE)
+        cut = render(model, camera, RenderSettings(background_threshold=0.6))
+        gaussians = render(model, camera, background=False)
+
+    skipped = 1 - whole.alpha <= 0.6
+    assert 10 < skipped.sum() < skipped.numel() - 10
+    torch.testing.assert_close(cut.rgb[skipped], gaussians.rgb[skipped])
+    torch.testing.assert_close(cut.rgb[~skipped], whole.rgb[~skipped], rtol=0, atol=1e-6)
+
+
+def test_the_default_threshold_does_not_show_in_8_bits():
+    model, camera = ball_model(background=True, opacity_logits=6.0, scale_logits=-1.5), ring(8)[1]
+    difference = picture(model, camera) - picture(model, camera, settings=SKY_EVERYWHERE)
+    assert difference.abs().max() < 0.5 / 255
+
+
+def test_a_solid_colour_lies_behind_a_model_without_a_sphere():
+    model, camera = ball_model(solid=(1.0, 0.0, 0.5)), ring(8)[2]
+    with torch.no_grad():
+        black = render(model, camera, solid=torch.zeros(3))
+        own = render(model, camera)
+        asked = render(model, camera, solid=torch.tensor([0.2, 0.4, 0.6]))
+
+    left = 1 - black.alpha[..., None]
+    torch.testing.assert_close(own.rgb, black.rgb + left * torch.tensor([1.0, 0.0, 0.5]), rtol=0, atol=1e-6)
+    torch.testing.assert_close(asked.rgb, black.rgb + left * torch.tensor([0.2, 0.4, 0.6]), rtol=0, atol=1e-6)
+
+
+def test_antialiasing_dims_small_gaussians_by_what_the_low_pass_adds():
+    camera, small = camera_at((0, -3.0, 0)), {"scale_logits": -4.0, "opacity_logits": 3.0}
+    variance = (32 / 3 / (1 + np.exp(4.0))) ** 2  # px^2, before the low-pass of 0.3
+    with torch.no_grad():
+        plain = render(small_model([[0.0, 0, 0]], **small), camera).alpha.max()
+        compensated = render(small_model([[0.0, 0, 0]], antialiased=True, **small), camera).alpha.max()
+    assert float(compensated / plain) == pytest.approx(variance / (variance + 0.3), rel=1e-3)
+
+
+# -- caching, repeatability, statistics ------------------------------------------------------------------------------
+
+
+def test_kept_geometry_gives_the_same_picture():
+    model = ball_model(background=True)
+    with torch.no_grad():
+        geometry = model.decode_geometry()
+    for camera in ring(3):
+        torch.testing.assert_close(
+            picture(model, camera, geometry=geometry), picture(model, camera), rtol=0, atol=1e-6
+        )
+
+
+def test_rendering_twice_gives_the_same_bits():
+    results = []
+    for _ in range(2):
+        model = ball_model(background=True)
+        rendering = render(model, ring(8)[3], depth=True, absgrad=True)
+        rendering.rgb.square().sum().backward()
+        gradients = [p.grad for p in model.parameters()]
+        results.append([rendering.rgb.detach(), rendering.alpha.detach(), rendering.absgrad, *gradients])
+    for first, second in zip(*results, strict=True):
+        assert torch.equal(first, second)
+
+
+def test_statistics_describe_the_picture():
+    model, camera = ball_model(), camera_at((0, -3.0, 0), (0.5, 0, 0), focal=60.0)
+    with torch.no_grad():
+        rendering = render(model, camera)
+    assert 0 < len(rendering.decoded) < len(model)  # the camera sees a part
+    assert 0 < rendering.visible.sum() <= len(rendering.decoded)
+    assert rendering.pairs >= rendering.visible.sum()
+    assert {"cull", "decode", "background"} < set(rendering.seconds)
+    assert all(seconds >= 0 for seconds in rendering.seconds.values())
+    assert rendering.depth is None and rendering.absgrad is None
+
+
+# -- gradients -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("background", [True, False])
+def test_gradients_reach_every_parameter(background):
+    model = ball_model(background=background)
+    rendering = render(model, ring(8)[0], absgrad=True)
+    assert (rendering.absgrad == 0).all()
+
+    (rendering.rgb * torch.linspace(0, 1, 32 * 32 * 3).view(32, 32, 3)).sum().backward()
+
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None and torch.isfinite(parameter.grad).all(), name
+        assert parameter.grad.abs().max() > 0, name
+    assert (rendering.absgrad[rendering.visible].sum(1) > 0).any()
+    assert (rendering.absgrad[~rendering.visible] == 0).all()
+
+
+@pytest.mark.parametrize("part", [*Gaussians.NAMES, "geometry", "radiance"])
+def test_gradients_match_finite_differences_through_the_whole_chain(part):
+    """In float64, fields attached to positions, along one random direction of each parameter group."""
+    model = ball_model(12, background=True, position_gradients=True, scale_logits=-1.8).double()
+    camera = camera_at((0.5, -2.5, 0.8), width=12, height=10, focal=10.0)
+    weights = torch.rand(10, 12, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    owner = getattr(model, part) if part in ("geometry", "radiance") else [getattr(model.gaussians, part)]
+    parameters = list(owner.parameters()) if part in ("geometry", "radiance") else owner
+    generator = torch.Generator().manual_seed(2)
+    directions = [torch.randn(p.shape, generator=generator, dtype=torch.float64) for p in parameters]
+
+    def value(step: float) -> float:
+        with torch.no_grad():
+            for p, d in zip(parameters, directions, strict=True):
+                p.add_(step * d)
+            total = float((render(model, camera, SKY_EVERYWHERE).rgb * weights).sum())
+            for p, d in zip(parameters, directions, strict=True):
+                p.sub_(step * d)
+        return total
+
+    (render(model, camera, SKY_EVERYWHERE).rgb * weights).sum().backward()
+    slope = sum(float((p.grad * d).sum()) for p, d in zip(parameters, directions, strict=True))
+
+    step = 1e-7
+    assert slope == pytest.approx((value(step) - value(-step)) / (2 * step), rel=1e-4, abs=1e-6)

@@ -1,0 +1,125 @@
+"""Tiny worlds for tests: coloured balls, ray-cast in numpy, and cameras around them. Nothing is read from disk."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
+from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.scene import Camera, Picture, Scene, View
+
+BALL_CENTERS = np.array([[-0.5, 0.0, 0.0], [0.45, 0.3, 0.1], [0.1, -0.5, -0.2]])
+BALL_RADII = np.array([0.45, 0.35, 0.3])
+BALL_COLORS = np.array([[0.9, 0.2, 0.1], [0.1, 0.8, 0.3], [0.2, 0.3, 0.9]])
+SKY = np.array([0.5, 0.6, 0.7])
+
+
+def look_at(position, target, up=(0.0, 0.0, 1.0)) -> np.ndarray:
+    """camera_from_world (4, 4) of a camera at `position` that looks at `target`."""
+    position = np.asarray(position, np.float64)
+    forward = np.asarray(target, np.float64) - position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = right, np.cross(forward, right), forward
+    pose[:3, 3] = -pose[:3, :3] @ position
+    return pose
+
+
+def camera_at(position, target=(0, 0, 0), up=(0, 0, 1), *, width=32, height=32, focal=None) -> Camera:
+    """A centred pinhole camera, 53 degrees wide unless a focal length in pixels is given."""
+    focal = float(focal or width)
+    return Camera(width, height, focal, focal, width / 2, height / 2, look_at(position, target, up))
+
+
+def ring(count: int, radius: float = 3.0, elevation: float = 1.0, **options) -> list[Camera]:
+    """Cameras on a circle around the z axis, all looking at the origin."""
+    angles = 2 * np.pi * np.arange(count) / count
+    return [camera_at((radius * np.cos(a), radius * np.sin(a), elevation), **options) for a in angles]
+
+
+def photograph(camera: Camera, *, scale: float = 1.0, offset=(0, 0, 0), alpha: bool = False) -> Picture:
+    """Ray-cast the balls, lit from above, under an even sky (or with no coverage there)."""
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(columns)], -1)
+    rays = rays @ camera.rotation
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    nearest = np.full(columns.shape, np.inf)
+    rgb = np.broadcast_to(SKY, (*columns.shape, 3)).copy()
+    for center, radius, color in zip(BALL_CENTERS * scale + offset, BALL_RADII * scale, BALL_COLORS, strict=True):
+        along = rays @ (center - camera.position)
+        inside = along**2 - np.sum((center - camera.position) ** 2) + radius**2
+        distance = along - np.sqrt(np.maximum(inside, 0))
+        hit = (inside > 0) & (distance > 0) & (distance < nearest)
+        nearest[hit] = distance[hit]
+        normal = (camera.position + distance[..., None] * rays - center) / radius
+        rgb[hit] = (color * (0.75 + 0.25 * normal[..., 2:]))[hit]
+    covered = np.isfinite(nearest)
+    return Picture((rgb * 255).round().astype(np.uint8), (255 * covered).astype(np.uint8) if alpha else None)
+
+
+def ball_points(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) on the balls and their colours (N, 3)."""
+    generator = np.random.default_rng(seed)
+    which = generator.integers(len(BALL_RADII), size=count)
+    normals = generator.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = BALL_CENTERS[which] + BALL_RADII[which, None] * normals
+    return points, (BALL_COLORS[which] * (0.75 + 0.25 * normals[:, 2:])).astype(np.float32)
+
+
+def view_of(name: str, camera: Camera, picture: Picture) -> View:
+    """A view of a picture that is already there."""
+    return View(name, camera, lambda: picture)
+
+
+def ball_scene(
+    views: int = 8, points: int = 100, *, side: int = 32, scale: float = 1.0, offset=(0, 0, 0), alpha: bool = False
+) -> Scene:
+    """The balls seen from a ring; the whole world `scale` times larger and then moved by `offset`."""
+    named = []
+    for number, camera in enumerate(ring(views, width=side, height=side)):
+        pose = camera.camera_from_world.copy()
+        pose[:3, 3] = scale * pose[:3, 3] - pose[:3, :3] @ np.asarray(offset, np.float64)
+        camera = Camera(side, side, *camera.intrinsics, pose)
+        named.append(view_of(f"{number:03d}.png", camera, photograph(camera, scale=scale, offset=offset, alpha=alpha)))
+    positions, colors = ball_points(points)
+    return Scene("balls", "colmap", named, [], positions * scale + offset, colors, has_alpha=alpha)
+
+
+def small_model(
+    positions,
+    *,
+    frame: Frame | None = None,
+    fields: float = 0.0,
+    color_logits=0.0,
+    scale_logits=-3.0,
+    opacity_logits=2.0,
+    seed: int = 0,
+    **settings,
+) -> HybridModel:
+    """A model with little tables. `fields` scales what the two fields say: 0 silences them exactly."""
+    positions = torch.as_tensor(np.asarray(positions), dtype=torch.float32).reshape(-1, 3)
+    count = len(positions)
+    frame = frame or Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
+    grid = HashGridConfig(log2_table_size=7, levels=3, base=3, finest=12)
+    settings = {"background": False, "hidden": 16, **settings}
+    config = ModelConfig(frame=frame, geometry=grid, radiance=grid, **settings)
+
+    def filled(value, width):
+        return torch.as_tensor(value, dtype=torch.float32).expand(count, width).clone()
+
+    gaussians = Gaussians(
+        positions, filled(color_logits, 3), filled(scale_logits, 1), filled(opacity_logits, 1)
+    )
+    model = HybridModel(config, gaussians, torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(seed + 1)
+    with torch.no_grad():
+        for part in (model.geometry, model.radiance):
+            part.grid.table.copy_(torch.rand(part.grid.table.shape, generator=generator) * 2 - 1)
+            part.biases[-1].copy_(torch.rand(part.biases[-1].shape, generator=generator) - 0.5)
+            part.weights[-1].mul_(fields)
+            part.biases[-1].mul_(fields)
+    return model

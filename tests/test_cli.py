@@ -1,0 +1,361 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from hyrfpack.cli import main
+from hyrfpack.cli.files import PROFILES
+from hyrfpack.cli.train import PRESETS, train
+from hyrfpack.data.demo_scene import write_demo_scene
+
+COMMANDS = ("train", "compress", "decompress", "render", "evaluate", "info", "demo")
+
+
+def hyrfpack(*arguments: object):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def succeeded(*arguments: object):
+    result = hyrfpack(*arguments)
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def refused(*arguments: object) -> str:
+    """Run a command that the user got wrong; returns its one sentence."""
+    result = hyrfpack(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stdout == ""
+    assert "Traceback" not in result.stderr
+    (sentence,) = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
+    return sentence
+
+
+def python(code: str) -> subprocess.CompletedProcess:
+    """Run code in a fresh interpreter that finds this package."""
+    root = str(Path(__file__).parents[1])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return write_demo_scene(tmp_path_factory.mktemp("data"), views=10, size=48)
+
+
+@pytest.fixture(scope="module")
+def run(data, tmp_path_factory) -> Path:
+    """A run of 30 steps on ten small pictures."""
+    folder = tmp_path_factory.mktemp("runs") / "tiny"
+    result = succeeded("train", data, "-o", folder, "--steps", 30, "--max-gaussians", 500, "--json")
+    assert json.loads(result.stdout)["complete"] is True
+    return folder
+
+
+@pytest.fixture(scope="module")
+def packed(run, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("packed") / "paper.hyrf"
+    succeeded("compress", run / "model.hyrf", "-o", path, "--profile", "paper")
+    return path
+
+
+# -- the whole chain -------------------------------------------------------------------------------------------------
+
+
+def test_train_leaves_a_model_metrics_and_pictures(run):
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["settings"]["steps"] == 30 and metrics["settings"]["max_gaussians"] == 500
+    assert metrics["bytes"] == (run / "model.hyrf").stat().st_size
+    assert {path.name for path in (run / "views").iterdir()} == {"0000.png", "0008.png"}
+
+
+def test_compress_reports_the_bytes_on_disk(run, tmp_path):
+    report = json.loads(succeeded("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--json").stdout)
+    assert report["profile"] == "paper"
+    assert report["bytes"] == (tmp_path / "p.hyrf").stat().st_size < (run / "model.hyrf").stat().st_size
+    assert sum(section["after"] for section in report["sections"]) < report["bytes"]
+
+
+def test_compress_prints_every_section(run, tmp_path):
+    table = succeeded("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf").stdout
+    for words in ("positions", "geometry hash table", "radiance decoder", "padding", "bits/Gaussian"):
+        assert words in table
+
+
+def test_decompress_of_a_raw_file_is_byte_exact(run, tmp_path):
+    succeeded("decompress", run / "model.hyrf", "-o", tmp_path / "back.hyrf")
+    assert (tmp_path / "back.hyrf").read_bytes() == (run / "model.hyrf").read_bytes()
+
+
+def test_decompressed_files_score_like_the_file_they_come_from(packed, data, tmp_path):
+    succeeded("decompress", packed, "-o", tmp_path / "back.hyrf")
+    scores = [
+        json.loads(succeeded("evaluate", path, "--data", data, "--json").stdout)
+        for path in (packed, tmp_path / "back.hyrf")
+    ]
+    assert scores[0]["views"] == scores[1]["views"]
+    assert scores[0]["bytes"] == packed.stat().st_size != scores[1]["bytes"]
+
+
+def test_evaluate_prints_strict_json_only(packed, data):
+    result = succeeded("evaluate", packed, "--data", data, "--json")
+    values = json.loads(result.stdout, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    assert {"psnr", "ssim", "lpips", "bytes", "gaussians", "views", "seconds_per_frame"} <= set(values)
+    assert [view["name"] for view in values["views"]] == ["0000.png", "0008.png"]
+    assert values["lpips"] is None and values["lpips_reason"]
+    assert values["psnr"] > 12
+
+
+def test_evaluate_scores_the_split_that_is_named(packed, data):
+    values = json.loads(succeeded("evaluate", packed, "--data", data, "--split", "all", "--json").stdout)
+    assert len(values["views"]) == 10
+    held_out = json.loads(succeeded("evaluate", packed, "--data", data, "--test-every", 5, "--json").stdout)
+    assert [view["name"] for view in held_out["views"]] == ["0000.png", "0005.png"]
+
+
+def test_evaluate_prints_a_table_and_writes_pictures(packed, data, tmp_path):
+    printed = succeeded("evaluate", packed, "--data", data, "--pictures", tmp_path / "views").stdout
+    assert "0008.png" in printed and "mean" in printed and "LPIPS: no weights" in printed
+    assert len(list((tmp_path / "views").iterdir())) == 2
+
+
+def test_info_tells_what_the_file_holds_and_why(packed):
+    facts = json.loads(succeeded("info", packed, "--json").stdout)
+    assert facts["profile"] == "paper" and facts["bytes"] == packed.stat().st_size
+    assert facts["provenance"]["choices"]["preset"]
+    printed = succeeded("info", packed).stdout
+    for words in (f"{facts['bytes']:,} bytes", "profile paper", "chosen in training", "preset", "radiance hash table"):
+        assert words in printed
+
+
+def test_render_names_pictures_after_photos(packed, data, tmp_path):
+    succeeded("render", packed, "-o", tmp_path, "--data", data, "--split", "test")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0000.png", "0008.png"]
+    assert Image.open(tmp_path / "0008.png").size == (48, 48)
+
+
+def test_render_goes_around_the_scene_by_itself(packed, tmp_path):
+    result = json.loads(succeeded("render", packed, "-o", tmp_path, "--orbit", 3, "--depth", "--json").stdout)
+    assert [Path(path).name for path in result["pictures"]] == ["0000.png", "0001.png", "0002.png"]
+    assert np.asarray(Image.open(tmp_path / "0001.depth.tiff")).max() > 0.1
+    assert np.asarray(Image.open(tmp_path / "0001.png")).std() > 5
+
+
+def test_render_takes_cameras_from_a_file(packed, tmp_path):
+    camera = {"name": "left/eye", "width": 20, "height": 10, "fx": 15, "camera_from_world": np.eye(4).tolist()}
+    (tmp_path / "cameras.json").write_text(json.dumps([camera]))
+    succeeded("render", packed, "-o", tmp_path / "out", "--cameras", tmp_path / "cameras.json")
+    assert Image.open(tmp_path / "out" / "left" / "eye.png").size == (20, 10)
+
+
+def test_video_without_ffmpeg_is_a_note_beside_the_pictures(packed, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    result = succeeded("render", packed, "-o", tmp_path / "out", "--orbit", 2, "--video", "--json")
+    assert json.loads(result.stdout)["video"] is None
+    assert "no ffmpeg" in result.stderr
+    assert len(list((tmp_path / "out").iterdir())) == 2
+
+
+def test_an_interrupted_training_saves_and_exits_cleanly(data, tmp_path):
+    before = signal.getsignal(signal.SIGINT)
+
+    def interrupt_once_training_listens():
+        while signal.getsignal(signal.SIGINT) is before:
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt_once_training_listens, daemon=True).start()
+    result = succeeded("train", data, "-o", tmp_path, "--steps", 1_000_000, "--max-gaussians", 200, "--json")
+    assert json.loads(result.stdout)["complete"] is False
+    assert "--resume" in result.stderr
+    assert (tmp_path / "checkpoint.pt").is_file() and not (tmp_path / "model.hyrf").exists()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_demo_ends_with_a_table_and_a_picture(tmp_path):
+    from hyrfpack.demo import run_demo
+
+    result = run_demo(tmp_path, steps=10, views=10, size=32)
+    assert Image.open(tmp_path / "demo.png").width > 900
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "scene", "run", "paper.hyrf", "back.hyrf", "renders", "demo.png",
+    }  # fmt: skip
+    assert [profile.bytes for profile in result.profiles] == [
+        (tmp_path / name).stat().st_size for name in ("run/model.hyrf", "paper.hyrf")
+    ]
+    json.dumps(result.to_dict(), allow_nan=False)
+    assert len(result.table()) == 3
+
+
+# -- what users get wrong --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("info", "none.hyrf"),
+        ("info", "."),
+        ("info", "junk.hyrf"),
+        ("compress", "none.hyrf", "-o", "x.hyrf"),
+        ("compress", "junk.hyrf", "-o", "x.hyrf"),
+        ("decompress", "junk.hyrf", "-o", "x.hyrf"),
+        ("render", "junk.hyrf", "-o", "out"),
+        ("render", "none.hyrf", "-o", "out", "--orbit", "2"),
+        ("evaluate", "none.hyrf", "--data", "."),
+        ("train", "nowhere", "-o", "run"),
+        ("train", "junk.hyrf", "-o", "run"),
+        ("train", "empty", "-o", "run"),
+        ("train", "empty", "-o", "run", "--resume"),
+    ],
+)
+def test_a_wrong_input_is_one_sentence_that_names_it(arguments, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "junk.hyrf").write_bytes(b"no model at all" * 20)
+    (tmp_path / "empty").mkdir()
+    sentence = refused(*arguments)
+    assert sentence.removeprefix("Error: ").startswith("run" if "--resume" in arguments else arguments[1])
+    assert not any((tmp_path / name).exists() for name in ("x.hyrf", "out", "run"))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("train", "data"),
+        ("train", "data", "-o", "run", "--steps", "0"),
+        ("train", "data", "-o", "run", "--preset", "huge"),
+        ("train", "data", "-o", "run", "--resume", "--overwrite"),
+        ("compress", "a.hyrf", "-o", "b.hyrf", "--profile", "zip"),
+        ("render", "a.hyrf", "-o", "out", "--orbit", "3", "--data", "d"),
+        ("evaluate", "a.hyrf"),
+        ("fly", "away"),
+    ],
+)
+def test_wrong_usage_exits_with_2(arguments):
+    refused(*arguments)
+
+
+def test_a_second_training_does_not_overwrite_the_first(run, data):
+    before = (run / "model.hyrf").read_bytes()
+    assert "--overwrite" in refused("train", data, "-o", run, "--steps", 5)
+    assert (run / "model.hyrf").read_bytes() == before
+
+
+@pytest.mark.parametrize("command", ["compress", "decompress"])
+def test_the_output_may_not_be_the_input(command, packed, tmp_path):
+    before = packed.read_bytes()
+    (tmp_path / "link.hyrf").symlink_to(packed)
+    for target in (packed, packed.parent / ".." / packed.parent.name / packed.name, tmp_path / "link.hyrf"):
+        assert "input itself" in refused(command, packed, "-o", target)
+    assert packed.read_bytes() == before
+
+
+def test_a_failed_command_leaves_the_old_file_alone(packed, tmp_path):
+    damaged = bytearray(packed.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    (tmp_path / "damaged.hyrf").write_bytes(damaged)
+    (tmp_path / "old.hyrf").write_bytes(b"old")
+    assert "damaged" in refused("decompress", tmp_path / "damaged.hyrf", "-o", tmp_path / "old.hyrf")
+    assert (tmp_path / "old.hyrf").read_bytes() == b"old"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["damaged.hyrf", "old.hyrf"]
+
+
+def test_an_output_folder_that_is_missing_is_named(packed, tmp_path):
+    assert "no folder" in refused("decompress", packed, "-o", tmp_path / "not" / "there.hyrf")
+
+
+def test_pictures_cannot_go_into_a_file(packed, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    refused("render", packed, "-o", tmp_path / "file", "--orbit", 1)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_an_empty_split_and_missing_weights_are_named(packed, data, tmp_path):
+    assert "split 'test'" in refused("evaluate", packed, "--data", data, "--test-every", 0)
+    assert "none.pt" in refused("evaluate", packed, "--data", data, "--lpips-weights", tmp_path / "none.pt")
+
+
+def test_a_bug_of_ours_keeps_its_traceback(packed, monkeypatch):
+    def broken(path):
+        raise ValueError("a bug")
+
+    monkeypatch.setattr("hyrfpack.format.describe", broken)
+    result = hyrfpack("info", packed)
+    assert result.exit_code == 1
+    assert isinstance(result.exception, ValueError) and result.exc_info[2] is not None
+
+
+# -- help, defaults, imports -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself_with_an_example(command):
+    text = succeeded(command, "--help").stdout
+    assert "Example" in text and f"hyrfpack {command}" in text
+
+
+def test_all_commands_are_listed():
+    text = succeeded("--help").stdout
+    assert all(f"\n  {command}" in text for command in COMMANDS)
+
+
+def test_command_line_offers_what_the_library_has():
+    from hyrfpack.format import codec
+    from hyrfpack.train import config
+
+    assert PRESETS == config.PRESETS
+    assert PROFILES == tuple(codec.PROFILES)
+    defaults = config.TrainConfig().to_dict()
+    options = {option.name: option.default for option in train.params if option.name in defaults}
+    assert {"steps", "seed", "preset", "max_gaussians", "antialiased", "background", "log2_table_size"} <= set(options)
+    with train.make_context("train", ["data", "-o", "run"]) as context:
+        assert {name: context.params[name] for name in options} == {name: defaults[name] for name in options}
+
+
+def test_importing_the_package_or_the_command_line_loads_no_numerics():
+    code = "import hyrfpack, hyrfpack.cli, sys; print({'torch', 'numpy', 'numba', 'PIL', 'rich'} & set(sys.modules))"
+    assert python(code).stdout.strip() == "set()"
+
+
+def test_info_loads_no_numerics(packed):
+    code = (
+        "import sys; from hyrfpack.cli import main\n"
+        f"main(['info', {str(packed)!r}, '--json'], standalone_mode=False)\n"
+        "assert not {'torch', 'numpy', 'matplotlib', 'PIL', 'rich'} & set(sys.modules)"
+    )
+    result = python(code)
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["profile"] == "paper"
+
+
+def test_the_module_runs_as_a_program():
+    root = Path(__file__).parents[1]
+    result = subprocess.run([sys.executable, "-m", "hyrfpack", "--version"], capture_output=True, text=True, cwd=root)
+    assert result.returncode == 0 and result.stdout.startswith("hyrfpack")
+
+
+def test_public_names_resolve_and_rooms_are_callable():
+    code = (
+        "import hyrfpack\n"
+        "for name in hyrfpack.__all__: getattr(hyrfpack, name)\n"
+        "from hyrfpack.render import paths\n"
+        "import hyrfpack.train.config\n"
+        "assert callable(hyrfpack.render) and callable(hyrfpack.train) and callable(hyrfpack.evaluate)\n"
+        "assert hyrfpack.render.paths is paths\n"
+        "try: hyrfpack.evaluate(None, [])\n"
+        "except hyrfpack.HyrfError as error: print(error)\n"
+        "try: hyrfpack.nothing\n"
+        "except AttributeError: print('and nothing else')"
+    )
+    result = python(code)
+    assert "no view to score" in result.stdout and "and nothing else" in result.stdout, result.stderr

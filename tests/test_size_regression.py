@@ -1,0 +1,75 @@
+"""Bytes that fixed models take in each profile, held to within 1 % of what is recorded.
+
+python tests/test_size_regression.py        records the sizes anew (after a change that is meant to change them)
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hyrfpack.format import encode_model
+from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
+from hyrfpack.model.gaussians import Gaussians
+
+RECORD = Path(__file__).parent / "golden" / "sizes.json"
+PROFILES = ("raw", "paper")
+# Gaussians and table sizes of a capture with surroundings, of an object on its own, and of next to nothing.
+MODELS = {"scene": (20_000, 12, 13), "object": (4_000, 10, 11), "one": (1, 4, 4)}
+
+
+def make_model(count: int, geometry_size: int, radiance_size: int) -> HybridModel:
+    """A model with the statistics of a trained one.
+
+    Positions lie in clusters on surfaces; colour logits share their brightness; opacity logits have two humps; tables
+    are Laplace-distributed, wider on finer levels, and most rows of the coarse levels were never touched.
+    """
+    rng = np.random.default_rng(7)
+    config = ModelConfig(
+        frame=Frame(center=(0.3, -1.7, 2.9), scale=4.2, half_extent=(1.0, 0.6, 0.9)),
+        geometry=HashGridConfig(log2_table_size=geometry_size),
+        radiance=HashGridConfig(log2_table_size=radiance_size),
+    )
+    centers = rng.normal(size=(50, 3)) * 0.7
+    spread = rng.normal(size=(count, 3)) * (0.2, 0.2, 0.01)
+    positions = centers[rng.integers(50, size=count)] + spread
+    colors = rng.normal(size=(count, 1)) + 0.3 * rng.laplace(size=(count, 3))
+    scales = rng.normal(-4.0, 0.8, size=(count, 1))
+    opacities = np.where(rng.random((count, 1)) < 0.3, rng.normal(4, 2, (count, 1)), rng.normal(-2, 1, (count, 1)))
+    parts = [torch.from_numpy(part).float() for part in (positions, colors, scales, opacities)]
+    model = HybridModel(config, Gaussians(*parts))
+    with torch.no_grad():
+        for field in (model.geometry, model.radiance):
+            grid = field.grid.config
+            for level, (start, stop) in enumerate(zip(grid.offsets, grid.offsets[1:], strict=False)):
+                share = (level + 1) / grid.levels
+                rows = rng.laplace(scale=0.05 * share, size=(stop - start, 2))
+                untouched = rng.random(stop - start) > share
+                rows[untouched] = rng.uniform(-1e-4, 1e-4, size=(int(untouched.sum()), 2))
+                field.grid.table[start:stop] = torch.from_numpy(rows)
+            for parameter in (*field.weights, *field.biases):
+                parameter.copy_(torch.from_numpy(rng.normal(scale=0.2, size=parameter.shape)))
+    return model
+
+
+def measure(name: str, profile: str) -> int:
+    return len(encode_model(make_model(*MODELS[name]), profile))
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("name", MODELS)
+def test_fixed_models_keep_their_size(name, profile):
+    recorded = json.loads(RECORD.read_text())["bytes"][name][profile]
+
+    assert measure(name, profile) == pytest.approx(recorded, rel=0.01)
+
+
+if __name__ == "__main__":
+    sizes = {name: {profile: measure(name, profile) for profile in PROFILES} for name in MODELS}
+    record = {"command": "python tests/test_size_regression.py", "bytes": sizes}
+    RECORD.write_text(json.dumps(record, indent=2) + "\n")
+    print(RECORD.read_text())

@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from scenes import ball_points, small_model
+
+from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.train.config import LearningRates
+from hyrfpack.train.optimizer import Optimizer
+
+RATES = LearningRates(positions=(1e-2, 1e-4), fields=(1e-2, 1e-3))
+
+
+def a_model(count: int = 6, seed: int = 0):
+    return small_model(ball_points(count)[0], fields=1.0, seed=seed)
+
+
+def set_gradients(model, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    for p in model.parameters():
+        p.grad = torch.randn(p.shape, generator=generator)
+
+
+def taken(model, optimizer, steps, total: int = 20) -> None:
+    for step in steps:
+        set_gradients(model, step)
+        optimizer.step(step / total)
+
+
+def test_steps_match_adam_with_the_scheduled_rates():
+    model = a_model()
+    plain = {name: p.detach().clone().requires_grad_() for name, p in model.named_parameters()}
+    adam = torch.optim.Adam([{"params": [p]} for p in plain.values()], eps=1e-15, foreach=False, fused=False)
+    optimizer = Optimizer(model, RATES)
+
+    for step in range(20):
+        progress = step / 20
+        set_gradients(model, step)
+        for group, (name, p) in zip(adam.param_groups, plain.items(), strict=True):
+            p.grad = dict(model.named_parameters())[name].grad.clone()
+            if name == "gaussians.positions":
+                group["lr"] = 1e-2 ** (1 - progress) * 1e-4**progress
+            elif name.startswith("gaussians."):
+                group["lr"] = getattr(RATES, name.removeprefix("gaussians."))
+            else:
+                group["lr"] = 1e-2 ** (1 - progress) * 1e-3**progress
+        adam.step()
+        optimizer.step(progress)
+
+    for name, parameter in model.named_parameters():
+        torch.testing.assert_close(parameter.detach(), plain[name].detach(), rtol=1e-5, atol=1e-6)
+
+
+def test_a_step_clears_the_gradients():
+    model = a_model()
+    taken(model, Optimizer(model, RATES), range(1))
+    assert all(p.grad is None for p in model.parameters())
+
+
+def test_every_parameter_belongs_to_one_group():
+    model = a_model()
+    owned = [p for group in Optimizer(model, RATES).adam.param_groups for p in group["params"]]
+    assert {id(p) for p in owned} == {id(p) for p in model.parameters()} and len(owned) == len(set(map(id, owned)))
+
+
+def test_replacing_keeps_rows_and_moments_and_starts_new_ones_at_zero():
+    model = a_model()
+    optimizer = Optimizer(model, RATES)
+    taken(model, optimizer, range(3))
+    values = {name: getattr(model.gaussians, name).detach().clone() for name in Gaussians.NAMES}
+    moments = {key: value.clone() for key, value in optimizer.state_dict().items()}
+    keep = torch.tensor([4, 0, 2])
+    new = {name: torch.full((2, width), 7.0) for name, width in zip(Gaussians.NAMES, Gaussians.WIDTHS, strict=True)}
+
+    optimizer.replace_gaussians(keep, new)
+
+    after = optimizer.state_dict()
+    for name in Gaussians.NAMES:
+        assert torch.equal(getattr(model.gaussians, name), torch.cat([values[name][keep], new[name]]))
+        for moment in ("exp_avg", "exp_avg_sq"):
+            kept = moments[f"{name}.0.{moment}"][keep]
+            assert kept.abs().min() > 0
+            assert torch.equal(after[f"{name}.0.{moment}"], torch.cat([kept, torch.zeros_like(new[name])]))
+    fields = [key for key in moments if key.startswith("fields.")]
+    assert fields and all(torch.equal(after[key], moments[key]) for key in fields)
+
+
+def test_kept_rows_go_on_as_if_nothing_happened():
+    edited, alone = a_model(), a_model()
+    optimizers = Optimizer(edited, RATES), Optimizer(alone, RATES)
+    for model, optimizer in zip((edited, alone), optimizers, strict=True):
+        taken(model, optimizer, range(3))
+    keep = torch.tensor([1, 5])
+    nothing = {name: torch.zeros(0, width) for name, width in zip(Gaussians.NAMES, Gaussians.WIDTHS, strict=True)}
+
+    optimizers[0].replace_gaussians(keep, nothing)
+    set_gradients(alone, 99)
+    for p, q in zip(edited.gaussians.parameters(), alone.gaussians.parameters(), strict=True):
+        p.grad = q.grad[keep].clone()
+    for optimizer in optimizers:
+        optimizer.step(0.5)
+
+    for p, q in zip(edited.gaussians.parameters(), alone.gaussians.parameters(), strict=True):
+        torch.testing.assert_close(p.detach(), q.detach()[keep], rtol=1e-6, atol=1e-7)
+
+
+def test_replacing_before_the_first_step_works():
+    model = a_model()
+    optimizer = Optimizer(model, RATES)
+    new = {name: torch.zeros(3, width) for name, width in zip(Gaussians.NAMES, Gaussians.WIDTHS, strict=True)}
+    optimizer.replace_gaussians(torch.arange(6), new)
+    taken(model, optimizer, range(2))
+    assert len(model) == 9 and optimizer.state_dict()["positions.0.exp_avg"].shape == (9, 3)
+
+
+def test_resetting_sets_values_and_forgets_moments_of_one_group():
+    model = a_model()
+    optimizer = Optimizer(model, RATES)
+    taken(model, optimizer, range(3))
+    before = {key: value.clone() for key, value in optimizer.state_dict().items()}
+
+    optimizer.reset("opacity_logits", torch.full((6, 1), -3.0))
+
+    assert (model.gaussians.opacity_logits == -3).all()
+    for key, value in optimizer.state_dict().items():
+        if key.startswith("opacity_logits.0.exp_avg"):
+            assert (value == 0).all()
+        else:
+            assert torch.equal(value, before[key])
+
+
+def test_a_state_dict_goes_on_with_the_same_bits():
+    model = a_model()
+    optimizer = Optimizer(model, RATES)
+    taken(model, optimizer, range(5))
+    copy = a_model(seed=9)
+    copy.load_state_dict(model.state_dict())
+    state = {key: value.clone() for key, value in optimizer.state_dict().items()}
+    restored = Optimizer(copy, RATES)
+    restored.load_state_dict(state)
+
+    taken(model, optimizer, range(5, 10))
+    taken(copy, restored, range(5, 10))
+
+    assert all(torch.equal(p, q) for p, q in zip(model.parameters(), copy.parameters(), strict=True))
+    states = optimizer.state_dict(), restored.state_dict()
+    assert states[0].keys() == states[1].keys() and all(torch.equal(states[1][key], states[0][key]) for key in states[0])
+
+
+def test_a_state_of_no_steps_goes_on_too():
+    model, copy = a_model(), a_model()
+    optimizer, restored = Optimizer(model, RATES), Optimizer(copy, RATES)
+    restored.load_state_dict(optimizer.state_dict())
+    taken(model, optimizer, range(2))
+    taken(copy, restored, range(2))
+    assert all(torch.equal(p, q) for p, q in zip(model.parameters(), copy.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+@pytest.mark.parametrize("group", [*Gaussians.NAMES, "fields"])
+def test_the_group_with_a_broken_gradient_is_named(bad, group):
+    model = a_model()
+    set_gradients(model, 0)
+    broken = model.radiance.weights[1] if group == "fields" else getattr(model.gaussians, group)
+    broken.grad.view(-1)[3] = bad
+    assert Optimizer(model, RATES).nonfinite_groups() == [group]
+
+
+def test_healthy_gradients_name_no_group():
+    model = a_model()
+    set_gradients(model, 0)
+    model.radiance.biases[0].grad = None
+    assert Optimizer(model, RATES).nonfinite_groups() == []

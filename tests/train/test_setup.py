@@ -1,0 +1,351 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scenes import ball_points, ball_scene, camera_at, photograph, ring, view_of
+
+from hyrfpack.errors import HyrfDataError, HyrfTrainingError
+from hyrfpack.model import Frame
+from hyrfpack.scene import Picture, Scene
+from hyrfpack.train import TrainConfig
+from hyrfpack.train.setup import (
+    budget_for,
+    build_model,
+    detect_preset,
+    initial_points,
+    scene_frame,
+    table_size_for,
+)
+
+
+def rig(cameras, points=None, **fields) -> Scene:
+    """A scene whose photos are never opened."""
+    points = np.zeros((0, 3)) if points is None else np.asarray(points, np.float64)
+    views = [view_of(f"{i:03d}.png", camera, None) for i, camera in enumerate(cameras)]
+    return Scene("rig", fields.pop("layout", "colmap"), views, [], points, np.full((len(points), 3), 0.5), **fields)
+
+
+def scattered(low, high, count: int = 200) -> np.ndarray:
+    return np.random.default_rng(0).uniform(low, high, (count, 3))
+
+
+def around_an_object() -> Scene:
+    return rig(ring(12), ball_points(200)[0])
+
+
+def aerial_survey() -> Scene:
+    """5 x 5 cameras 50 above the ground, looking down."""
+    cameras = [camera_at((x, y, 50.0), (x, y, 0.0), (0, 1, 0)) for x in range(0, 100, 20) for y in range(0, 100, 20)]
+    return rig(cameras, scattered((-20, -20, 0), (100, 100, 5)))
+
+
+def drive() -> Scene:
+    """A camera that moves 40 ahead in the direction it looks in."""
+    cameras = [camera_at((0.1 * np.sin(y), y, 1.5), (0.1 * np.sin(y), y + 5, 1.5)) for y in np.arange(0.0, 40.0)]
+    return rig(cameras, scattered((-8, 0, 0), (8, 60, 6)))
+
+
+def forward_facing() -> Scene:
+    """Handheld, from nearly one place."""
+    cameras = [camera_at((x, 0.0, z), (x, 10.0, z)) for x in (-0.5, 0, 0.5) for z in (-0.3, 0, 0.3)]
+    return rig(cameras, scattered((-4, 5, -3), (4, 12, 3)))
+
+
+def inside_a_room() -> Scene:
+    """A full turn from one place."""
+    turns = [camera_at((1.0, 2.0, 3.0), (1 + np.cos(a), 2 + np.sin(a), 3.0)) for a in np.arange(0, 6.2, 0.5)]
+    return rig(turns, scattered((-3, -2, 1), (5, 6, 5)))
+
+
+# -- regime and frame ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "preset"),
+    [
+        (around_an_object, "standard"),
+        (aerial_survey, "large"),
+        (drive, "street"),
+        (forward_facing, "standard"),
+        (inside_a_room, "standard"),
+        (lambda: rig(ring(12), has_alpha=True), "synthetic"),
+        (lambda: rig(ring(12), layout="blender"), "synthetic"),
+        (lambda: rig([view.camera for view in aerial_survey().train]), "standard"),  # no points, no height
+        (lambda: rig([camera_at((3, 0, 0))]), "standard"),
+    ],
+)
+def test_the_preset_follows_from_how_the_cameras_stand(make, preset):
+    found, reason = detect_preset(make())
+    assert found == preset and len(reason) > 10
+
+
+@pytest.mark.parametrize("make", [around_an_object, aerial_survey, drive, forward_facing])
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_the_preset_does_not_depend_on_the_unit(make, scale):
+    scene = make()
+    shift = np.array([1e4, -1e4, 3e3]) * scale
+    cameras = [
+        camera_at(
+            c.position * scale + shift, (c.position + c.forward) * scale + shift, up=-c.rotation[1]
+        )
+        for c in (view.camera for view in scene.train)
+    ]
+    assert detect_preset(rig(cameras, scene.points * scale + shift))[0] == detect_preset(scene)[0]
+
+
+def test_synthetic_frames_are_the_known_box():
+    assert scene_frame(around_an_object(), "synthetic") == Frame((0.0, 0.0, 0.0), 1.3, (1.0, 1.0, 1.0))
+
+
+@pytest.mark.parametrize("preset", ["standard", "street"])
+def test_frames_of_captures_are_the_cameras_box(preset):
+    cameras = [camera_at(p) for p in [(4.0, 0, 1), (-2.0, 3, 1), (0.0, -1, 2)]]
+    frame = scene_frame(rig(cameras, scattered(-100, 100)), preset)
+    np.testing.assert_allclose(frame.center, (1, 1, 1.5))
+    np.testing.assert_allclose(frame.scale, 3)
+    np.testing.assert_allclose(frame.half_extent, (1, 2 / 3, 0.25))  # the third axis is widened
+
+
+def test_frames_of_surveys_are_the_points_without_their_outliers():
+    scene = aerial_survey()
+    inner = np.random.default_rng(1).uniform((0, 10, -5), (100, 60, 5), (10_000, 3))
+    scene = rig([view.camera for view in scene.train], np.concatenate([inner, np.full((50, 3), 1e5)]))
+    frame = scene_frame(scene, "large")
+    half = np.array(frame.half_extent) * frame.scale
+    np.testing.assert_allclose(frame.center, (50, 35, 0), atol=1.5)
+    np.testing.assert_allclose(half[:2], (49, 24.5), atol=1.0)
+
+
+def test_cameras_at_one_place_frame_the_points():
+    frame = scene_frame(inside_a_room(), "standard")
+    np.testing.assert_allclose(frame.center, (1, 2, 3), atol=0.2)
+    np.testing.assert_allclose(np.array(frame.half_extent) * frame.scale, (4, 4, 2), rtol=0.05)
+
+
+def test_one_camera_without_points_frames_what_is_in_front_of_it():
+    camera = camera_at((5.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    frame = scene_frame(rig([camera]), "standard")
+    np.testing.assert_allclose(frame.center, (4, 0, 0))
+    assert frame.scale == 1
+
+
+def test_a_camera_that_is_nowhere_is_refused():
+    camera = camera_at((3.0, 0, 0))
+    camera.camera_from_world[0, 3] = np.nan
+    with pytest.raises(HyrfDataError, match="not finite"):
+        scene_frame(rig([camera, *ring(3)]), "standard")
+
+
+# -- sizes -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("views", "side", "steps", "expected"),
+    [
+        (100, 800, 30_000, 100 * 800 * 800 / 80),
+        (100, 800, 7_500, 100 * 800 * 800 / 80 / 2),
+        (100, 800, 120_000, 100 * 800 * 800 / 80),  # longer runs get no more
+        (4, 32, 30_000, 1000),
+    ],
+)
+def test_the_budget_follows_pixels_and_the_root_of_the_steps(views, side, steps, expected):
+    budget, reason = budget_for(rig(ring(views, width=side, height=side)), TrainConfig(steps=steps))
+    assert budget == round(expected)
+    assert f"{steps:,}" in reason
+
+
+def test_an_asked_budget_is_taken():
+    assert budget_for(around_an_object(), TrainConfig(max_gaussians=77)) == (77, "asked for")
+
+
+@pytest.mark.parametrize("budget", [1, 1000, 30_000, 500_000, 3_000_000, 10**9])
+def test_the_table_holds_about_twelve_gaussians_a_row(budget):
+    log2, _ = table_size_for(budget, TrainConfig())
+    assert 8 <= log2 <= 21
+    if 8 < log2 < 21:
+        assert 12 / math.sqrt(2) <= budget / 2**log2 <= 12 * math.sqrt(2)
+
+
+def test_an_asked_table_size_is_taken():
+    assert table_size_for(1000, TrainConfig(log2_table_size=15))[0] == 15
+
+
+# -- the first Gaussians ---------------------------------------------------------------------------------------------
+
+
+def test_points_start_the_gaussians_in_local_units():
+    scene = ball_scene(points=50, scale=3.0, offset=(100, 0, -5))
+    frame = scene_frame(scene, "standard")
+    positions, colors = initial_points(scene, frame, 1000, seed=0)
+    np.testing.assert_allclose(positions * frame.scale + frame.center, scene.points, atol=1e-9)
+    np.testing.assert_allclose(colors, scene.point_colors)
+
+
+def test_too_many_points_are_thinned_to_the_budget():
+    scene = ball_scene(points=500)
+    frame = scene_frame(scene, "standard")
+
+    positions, colors = initial_points(scene, frame, 60, seed=3)
+
+    known = {tuple(point): tuple(color) for point, color in zip(scene.points, scene.point_colors, strict=True)}
+    world = frame.to_world(positions)
+    nearest = np.array([min(known, key=lambda q, p=p: math.dist(p, q)) for p in world])
+    np.testing.assert_allclose(world, nearest, atol=1e-12)
+    assert len({tuple(point) for point in nearest}) == 60  # without repetition
+    np.testing.assert_allclose(colors, [known[tuple(point)] for point in nearest])
+    again, other = initial_points(scene, frame, 60, seed=3)[0], initial_points(scene, frame, 60, seed=4)[0]
+    assert np.array_equal(positions, again) and not np.array_equal(positions, other)
+
+
+def test_without_points_half_a_budget_fills_the_box_at_random():
+    scene = rig(ring(12))
+    frame = Frame.from_box(np.array([-2.0, -1, 0]), np.array([2.0, 1, 3]))
+
+    positions, colors = initial_points(scene, frame, 2000, seed=0)
+
+    assert positions.shape == colors.shape == (1000, 3)
+    half = np.array(frame.half_extent)
+    assert (np.abs(positions) <= half).all()
+    np.testing.assert_allclose(positions.std(0), half / math.sqrt(3), rtol=0.1)  # uniform
+    assert (colors == 0.5).all()
+
+
+def alpha_scene(views: int = 10) -> Scene:
+    scene = ball_scene(views=views, side=48, alpha=True)
+    return Scene("balls", "blender", scene.train, [], np.zeros((0, 3)), np.zeros((0, 3)), has_alpha=True)
+
+
+def test_with_coverage_points_start_inside_the_hull():
+    scene, frame = alpha_scene(), Frame((0.0, 0.0, 0.0), 1.3, (1.0, 1.0, 1.0))
+
+    positions, colors = initial_points(scene, frame, 400, seed=0)
+
+    assert len(positions) == 200
+    for view in scene.train:
+        seen = (positions * 1.3) @ view.camera.rotation.T + view.camera.camera_from_world[:3, 3]
+        column = (view.camera.fx * seen[:, 0] / seen[:, 2] + view.camera.cx).astype(int)
+        row = (view.camera.fy * seen[:, 1] / seen[:, 2] + view.camera.cy).astype(int)
+        assert (view.load().alpha[row, column] == 255).all()
+    assert colors.min() >= 0 and colors.max() <= 1
+    # A hull point's colour is that of the balls, not of the white or black around them.
+    red_ball = np.linalg.norm(positions * 1.3 - (-0.5, 0, 0), axis=1) < 0.25
+    assert red_ball.sum() > 3 and (colors[red_ball, 0] > 0.5).all() and (colors[red_ball, 1] < 0.45).all()
+
+
+@pytest.mark.parametrize("budget", [1, 2, 10, 300])
+def test_empty_silhouettes_still_start_some_gaussians(budget):
+    nothing = Picture(np.zeros((32, 32, 3), np.uint8), np.zeros((32, 32), np.uint8))
+    views = [view_of(f"{i}.png", camera, nothing) for i, camera in enumerate(ring(4))]
+    scene = Scene("empty", "blender", views, [], np.zeros((0, 3)), np.zeros((0, 3)), has_alpha=True)
+    model, _, _ = build_model(scene, TrainConfig(max_gaussians=budget))
+    assert 1 <= len(model) <= budget
+
+
+# -- the model -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale_rule", ["sum", "product"])
+def test_first_gaussians_look_like_the_points(scale_rule):
+    scene = ball_scene(points=80)
+    model, _, _ = build_model(scene, TrainConfig(scale_rule=scale_rule))
+    points = model.config.frame.to_local(scene.points)
+    gaps = np.sort(np.linalg.norm(points[:, None] - points[None], axis=2), axis=1)[:, 1:4]
+
+    with torch.no_grad():
+        geometry, colors = model.decode_geometry(), model.decode_colors(torch.zeros(3))
+
+    sizes = np.sqrt((gaps**2).mean(1))
+    assert sizes.max() < 0.49  # else the cap would be what is tested
+    np.testing.assert_allclose(geometry.scales.numpy(), np.repeat(sizes[:, None], 3, 1), rtol=0.02)
+    np.testing.assert_allclose(geometry.opacities.numpy(), 0.1, rtol=0.02)
+    np.testing.assert_allclose(colors.numpy(), np.clip(scene.point_colors, 0.02, 0.98), atol=0.06)
+
+
+@pytest.mark.parametrize("scale_grows", [True, False])
+def test_first_sizes_outside_the_box_follow_the_gaps_too(scale_grows):
+    """S(p) grows there, so the stored fraction must be smaller."""
+    scene = ball_scene(points=60)
+    far = Scene("far", "colmap", scene.train, [], scene.points + (30, 0, 0), scene.point_colors)
+    model, _, _ = build_model(far, TrainConfig(scale_grows=scale_grows))
+    points = model.config.frame.to_local(far.points)
+    gaps = np.sort(np.linalg.norm(points[:, None] - points[None], axis=2), axis=1)[:, 1:4]
+    with torch.no_grad():
+        scales = model.decode_geometry().scales.numpy()
+    np.testing.assert_allclose(scales, np.repeat(np.sqrt((gaps**2).mean(1))[:, None], 3, 1), rtol=0.02)
+
+
+def test_the_geometry_table_is_half_the_radiance_table():
+    model, _, _ = build_model(ball_scene(), TrainConfig(log2_table_size=11))
+    assert model.config.radiance.log2_table_size == 11 and model.config.geometry.log2_table_size == 10
+
+
+@pytest.mark.parametrize(
+    ("preset", "background"), [("synthetic", False), ("standard", True), ("large", False), ("street", True)]
+)
+def test_the_background_follows_the_preset_unless_asked(preset, background):
+    scene = ball_scene(views=4)
+    assert build_model(scene, TrainConfig(preset=preset))[0].config.background is background
+    asked = TrainConfig(preset=preset, background=not background)
+    assert build_model(scene, asked)[0].config.background is not background
+
+
+@pytest.mark.parametrize(("color", "solid"), [("black", (0, 0, 0)), ("white", (1, 1, 1)), ("random", (0, 0, 0))])
+def test_the_colour_behind_follows_the_background_colour(color, solid):
+    assert build_model(ball_scene(views=4), TrainConfig(background_color=color))[0].config.solid == solid
+
+
+def test_choices_are_recorded_with_reasons():
+    scene = ball_scene(points=50)
+    _, budget, choices = build_model(scene, TrainConfig(steps=3000, max_gaussians=40))
+    assert budget == 40
+    assert set(choices) == {"preset", "max_gaussians", "log2_table_size", "background", "initial_gaussians"}
+    assert choices["preset"].startswith("standard: ") and choices["max_gaussians"] == "40: asked for"
+    assert choices["background"] == "sphere: preset standard"
+    assert choices["initial_gaussians"].startswith("40: points")
+
+
+def test_building_twice_gives_the_same_bits():
+    first, second, other = (build_model(ball_scene(), TrainConfig(seed=seed))[0] for seed in (5, 5, 6))
+    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
+    assert not torch.equal(first.radiance.grid.table, other.radiance.grid.table)
+
+
+def test_building_leaves_the_global_generators_alone():
+    torch.manual_seed(1)
+    np.random.seed(1)
+    expected = torch.rand(3), np.random.rand(3)
+    torch.manual_seed(1)
+    np.random.seed(1)
+    build_model(ball_scene(), TrainConfig())
+    assert torch.equal(torch.rand(3), expected[0]) and np.array_equal(np.random.rand(3), expected[1])
+
+
+def test_a_scene_without_training_views_is_refused():
+    scene = ball_scene()
+    with pytest.raises(HyrfTrainingError, match="no views are left for training"):
+        build_model(Scene("s", "colmap", [], scene.train, scene.points, scene.point_colors), TrainConfig())
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"steps": 0},
+        {"preset": "indoor"},
+        {"background_color": "grey"},
+        {"max_gaussians": 0},
+        {"scale_rule": "max"},
+        {"log2_table_size": 40},
+    ],
+)
+def test_impossible_settings_are_refused(wrong):
+    with pytest.raises(ValueError):
+        build_model(ball_scene(views=2), TrainConfig(**wrong))
+
+
+def test_the_tests_photos_show_the_balls():
+    """The helper's own check: each ball's centre projects onto its colour."""
+    picture = photograph(camera_at((0.0, -3.0, 0.0), width=64, height=64))
+    assert picture.rgb[32, int(64 * -0.5 / 3 + 32)].argmax() == 0

@@ -1,0 +1,358 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scenes import ball_scene, view_of
+
+from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.render import render
+from hyrfpack.scene import Picture, Scene
+from hyrfpack.train import DensityConfig, LearningRates, TrainConfig, Trainer
+
+# Density control acts after steps 2, 7, 12, 17, 22 and 27, with a reset after 12 and 22: it all happens early.
+DENSITY = DensityConfig(start=0.05, stop=0.68, rounds=5, gradient=1e-5, resets=2)
+SHORT = TrainConfig(steps=40, seed=3, max_gaussians=160, density=DENSITY)
+
+
+def a_scene(**options) -> Scene:
+    return ball_scene(**{"views": 6, "points": 60, "side": 24, **options})
+
+
+def trained(config: TrainConfig = SHORT, **options) -> Trainer:
+    trainer = Trainer(a_scene(**options), config)
+    assert trainer.run()
+    return trainer
+
+
+def parameters(trainer: Trainer) -> dict[str, bytes]:
+    return {name: p.detach().numpy().tobytes() for name, p in trainer.model.named_parameters()}
+
+
+def psnr(trainer: Trainer) -> float:
+    """Mean over the training views, from pictures rendered anew."""
+    values = []
+    for view in trainer.scene.train:
+        with torch.no_grad():
+            rgb = render(trainer.model, view.camera).rgb.double().numpy()
+        values.append(-10 * np.log10(np.mean((rgb - view.load().composite()) ** 2)))
+    return float(np.mean(values))
+
+
+@pytest.fixture(scope="module")
+def whole() -> Trainer:
+    """The uninterrupted run."""
+    return trained()
+
+
+# -- a run -----------------------------------------------------------------------------------------------------------
+
+
+def test_training_brings_the_loss_down_and_the_pictures_near():
+    trainer = Trainer(a_scene(side=32), TrainConfig(steps=60, max_gaussians=160))
+    before, losses = psnr(trainer), []
+
+    trainer.run(report=lambda trainer, loss, mse: losses.append(loss))
+
+    assert len(losses) == trainer.step == 60
+    assert np.mean(losses[-6:]) < 0.5 * np.mean(losses[:6])
+    assert psnr(trainer) > before + 4
+
+
+@pytest.mark.parametrize("alpha_color", ["black", "white", "random"])
+def test_objects_with_coverage_train_over_any_colour(alpha_color):
+    config = TrainConfig(steps=40, max_gaussians=160, background_color=alpha_color)
+    trainer = Trainer(a_scene(alpha=True), config)
+    losses = []
+    trainer.run(report=lambda trainer, loss, mse: losses.append(loss))
+    assert trainer.model.config.background is False
+    assert np.mean(losses[-6:]) < 0.75 * np.mean(losses[:6])
+
+
+def test_the_same_seed_gives_the_same_bytes(whole):
+    assert parameters(trained()) == parameters(whole)
+
+
+def test_another_seed_gives_another_model(whole):
+    other = trained(dataclasses.replace(SHORT, seed=4))
+    assert parameters(other) != parameters(whole)
+
+
+def test_the_budget_is_kept_at_every_step():
+    counts = []
+    trainer = Trainer(a_scene(), dataclasses.replace(SHORT, max_gaussians=75))
+    trainer.run(report=lambda trainer, loss, mse: counts.append(len(trainer.model)))
+    assert max(counts) <= 75 and counts[-1] > 60
+
+
+def test_gaussians_are_added_and_reset_in_the_run_that_the_others_compare_with(whole):
+    """Else resume and determinism would say little."""
+    counts = [record["gaussians"] for record in whole.records]
+    assert counts[0] != counts[7] != counts[-1]
+    assert (whole.density.first, whole.density.interval, whole.density.last) == (2, 5, 27)
+
+
+def test_every_epoch_shows_every_view_once_in_an_order_of_its_own():
+    trainer = Trainer(a_scene(views=5), dataclasses.replace(SHORT, steps=20))
+    names = [view.name for view in trainer._order()]
+    epochs = [tuple(names[i : i + 5]) for i in range(0, 20, 5)]
+    assert all(set(epoch) == {view.name for view in trainer.scene.train} for epoch in epochs)
+    assert len(set(epochs)) > 1
+
+
+def test_records_and_times_tell_of_the_run(whole):
+    assert [record["step"] for record in whole.records] == list(range(1, 41))
+    assert whole.records[-1]["gaussians"] == len(whole.model)
+    assert all(set(record) == {"step", "loss", "psnr", "gaussians"} for record in whole.records)
+    assert {"data", "cull", "decode", "loss", "backward", "density", "optimizer"} <= set(whole.seconds)
+
+
+def test_reported_errors_are_those_of_the_picture():
+    """Step 1 of one view, learning nothing: the mean squared error of the untrained model."""
+    trainer = Trainer(a_scene(views=1), TrainConfig(steps=1, max_gaussians=80))
+    before, seen = psnr(trainer), []
+    trainer.run(report=lambda trainer, loss, mse: seen.append(mse))
+    assert -10 * np.log10(seen[0]) == pytest.approx(before, abs=1e-3)
+
+
+def test_masked_pixels_teach_nothing():
+    """Two photos that differ only under the mask train the same model."""
+    scene = a_scene(views=2)
+    mask = np.ones((24, 24), bool)
+    mask[6:18, :10] = False
+    models = []
+    for fill in (0, 255):
+        views = []
+        for view in scene.train:
+            rgb = view.load().rgb.copy()
+            rgb[~mask] = fill
+            views.append(view_of(view.name, view.camera, Picture(rgb, None, mask)))
+        trainer = Trainer(dataclasses.replace(scene, train=views), dataclasses.replace(SHORT, steps=6))
+        trainer.run()
+        models.append(torch.cat([p.detach().flatten() for p in trainer.model.parameters()]))
+    torch.testing.assert_close(models[0], models[1], rtol=0, atol=1e-6)
+
+
+# -- resuming --------------------------------------------------------------------------------------------------------
+
+
+def stopped_at(step: int, path: Path, config: TrainConfig = SHORT, **options) -> Trainer:
+    trainer = Trainer(a_scene(**options), config)
+    assert not trainer.run(checkpoint=path, stop=lambda: trainer.step == step)
+    assert trainer.step == step
+    return trainer
+
+
+# 1: before the first regular checkpoint; 2, 12: right after a round (and a reset); 14: between rounds, with gradients
+# collected; 30: after density control; 39: one step is left.
+@pytest.mark.parametrize("step", [1, 2, 12, 14, 30, 39])
+def test_resuming_gives_the_bytes_of_the_uninterrupted_run(step, whole, tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    stopped_at(step, path)
+
+    resumed = Trainer(a_scene(), SHORT)
+    resumed.load(path)
+    assert resumed.step == step and resumed.run(checkpoint=path)
+
+    assert parameters(resumed) == parameters(whole)
+    assert resumed.records == whole.records
+
+
+def test_resuming_again_and_again_gives_the_same_bytes(whole, tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    stopped_at(5, path)
+    for step in (6, 13, 27):
+        trainer = Trainer(a_scene(), SHORT)
+        trainer.load(path)
+        assert not trainer.run(checkpoint=path, stop=lambda t=trainer, s=step: t.step == s)
+    last = Trainer(a_scene(), SHORT)
+    last.load(path)
+    last.run()
+    assert parameters(last) == parameters(whole)
+
+
+def test_random_backgrounds_resume_too(tmp_path):
+    config = dataclasses.replace(SHORT, steps=16, background_color="random")
+    expected = trained(config, alpha=True)
+    stopped_at(9, tmp_path / "checkpoint.pt", config, alpha=True)
+    resumed = Trainer(a_scene(alpha=True), config)
+    resumed.load(tmp_path / "checkpoint.pt")
+    resumed.run()
+    assert parameters(resumed) == parameters(expected)
+
+
+def test_regular_checkpoints_are_written_while_running(tmp_path):
+    path, found = tmp_path / "checkpoint.pt", []
+    trainer = Trainer(a_scene(), dataclasses.replace(SHORT, steps=12, checkpoint_every=5))
+    trainer.run(checkpoint=path, report=lambda trainer, loss, mse: found.append(path.exists()))
+    assert found == [step > 5 for step in range(1, 13)]
+    trainer.load(path)
+    assert trainer.step == 10
+
+
+def test_saving_what_was_loaded_gives_the_same_state(tmp_path):
+    stopped = stopped_at(14, tmp_path / "a.pt")
+    loaded = Trainer(a_scene(), SHORT)
+    loaded.load(tmp_path / "a.pt")
+    assert parameters(loaded) == parameters(stopped)
+    for name in ("gradients", "views"):
+        assert torch.equal(getattr(loaded.density, name), getattr(stopped.density, name))
+    states = stopped.optimizer.state_dict(), loaded.optimizer.state_dict()
+    assert states[0].keys() == states[1].keys() and all(torch.equal(states[0][key], states[1][key]) for key in states[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"seed": 4}, "seed"),
+        ({"steps": 41}, "steps"),
+        ({"max_gaussians": 161}, "max_gaussians"),
+        ({"learning_rates": LearningRates(color_logits=1e-3)}, "learning_rates"),
+        ({"background": False}, "background"),
+    ],
+)
+def test_a_run_with_other_settings_is_not_resumed(change, named, tmp_path):
+    stopped_at(1, tmp_path / "checkpoint.pt")
+    with pytest.raises(HyrfTrainingError, match=rf"other settings \(.*{named}"):
+        Trainer(a_scene(), dataclasses.replace(SHORT, **change)).load(tmp_path / "checkpoint.pt")
+
+
+@pytest.mark.parametrize("options", [{"views": 5}, {"side": 20}])
+def test_a_run_on_other_photos_is_not_resumed(options, tmp_path):
+    stopped_at(1, tmp_path / "checkpoint.pt")
+    with pytest.raises(HyrfTrainingError, match=r"other settings \(.*views"):
+        Trainer(a_scene(**options), SHORT).load(tmp_path / "checkpoint.pt")
+
+
+def test_a_run_on_moved_cameras_is_not_resumed(tmp_path):
+    stopped_at(1, tmp_path / "checkpoint.pt")
+    with pytest.raises(HyrfTrainingError, match="other settings"):
+        Trainer(a_scene(scale=2.0), SHORT).load(tmp_path / "checkpoint.pt")
+
+
+# -- what is not finite ----------------------------------------------------------------------------------------------
+
+
+def test_a_photo_with_nan_stops_the_run_and_is_named():
+    scene = a_scene()
+    broken = np.array(scene.train[4].load().rgb, np.float32)
+    broken[3, 5, 1] = np.nan
+    scene.train[4] = view_of("bad.png", scene.train[4].camera, Picture(broken))
+    trainer = Trainer(scene, SHORT)
+    step = 1 + next(i for i, view in enumerate(trainer._order()) if view.name == "bad.png")
+
+    with pytest.raises(HyrfTrainingError, match=rf"step {step} on view 'bad.png'.*not finite.*photo"):
+        trainer.run()
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["gaussians.color_logits", "radiance.biases.2", "radiance.grid.table"])
+def test_a_parameter_that_is_not_finite_stops_the_run_and_is_named(name, bad):
+    trainer = Trainer(a_scene(), SHORT)
+    with torch.no_grad():
+        parameter = dict(trainer.model.named_parameters())[name]
+        parameter.fill_(float("nan")) if bad != bad else parameter.fill_(bad)
+    first = next(trainer._order()).name
+    with pytest.raises(HyrfTrainingError) as caught:
+        trainer.run()
+    message = str(caught.value)
+    assert "step 1 " in message and f"'{first}'" in message
+    assert name in message
+
+
+def test_a_gradient_that_is_not_finite_stops_the_run_before_it_spreads():
+    trainer = Trainer(a_scene(), SHORT)
+    trainer.model.gaussians.color_logits.register_hook(lambda grad: grad * float("nan"))
+    before = parameters(trainer)
+    with pytest.raises(HyrfTrainingError, match=r"step 1 on view .*gradient is not finite.*color_logits"):
+        trainer.run()
+    assert parameters(trainer) == before
+
+
+@pytest.mark.parametrize("name", ["positions", "scale_logits", "opacity_logits"])
+def test_one_broken_gaussian_neither_crashes_nor_spreads(name):
+    """The rasteriser drops it; the next round removes it."""
+    trainer = Trainer(a_scene(), SHORT)
+    with torch.no_grad():
+        getattr(trainer.model.gaussians, name)[7] = float("nan")
+    try:
+        trainer.run()
+    except HyrfTrainingError as error:
+        assert name in str(error)
+    else:
+        assert all(torch.isfinite(p).all() for p in trainer.model.parameters())
+
+
+# -- hard starts -----------------------------------------------------------------------------------------------------
+
+
+def with_points(points) -> Scene:
+    scene, points = a_scene(), np.asarray(points, np.float64)
+    return dataclasses.replace(scene, points=points, point_colors=np.full((len(points), 3), 0.5, np.float32))
+
+
+def of_views(views) -> Scene:
+    return dataclasses.replace(a_scene(), train=list(views))
+
+
+def black_scene() -> Scene:
+    black = Picture(np.zeros((24, 24, 3), np.uint8))
+    return of_views(view_of(view.name, view.camera, black) for view in a_scene().train)
+
+
+def same_way_scene() -> Scene:
+    """Six times the very same photo."""
+    view = a_scene().train[0]
+    return of_views(dataclasses.replace(view, name=f"{i}.png") for i in range(6))
+
+
+def invisible_scene() -> Scene:
+    nothing = Picture(np.zeros((24, 24, 3), np.uint8), np.zeros((24, 24), np.uint8))
+    views = [view_of(view.name, view.camera, nothing) for view in a_scene().train]
+    return dataclasses.replace(with_points(np.zeros((0, 3))), train=views, has_alpha=True)
+
+
+HARD_STARTS = {
+    "all points coincident": lambda: with_points(np.tile([0.1, 0.2, 0.3], (50, 1))),
+    "one point": lambda: with_points([[0.0, 0.0, 0.0]]),
+    "ten points": lambda: with_points(np.random.default_rng(0).normal(size=(10, 3)) * 0.3),
+    "no points": lambda: with_points(np.zeros((0, 3))),
+    "points a million units away": lambda: with_points(np.random.default_rng(0).normal(size=(50, 3)) + 1e6),
+    "a few points a million units away": lambda: with_points(np.vstack([a_scene().points, np.full((5, 3), 1e6)])),
+    "points behind every camera": lambda: with_points(np.random.default_rng(0).normal(size=(50, 3)) + (0, 0, 30)),
+    "points on the cameras": lambda: with_points([view.camera.position for view in a_scene().train]),
+    "one view": lambda: of_views(a_scene().train[:1]),
+    "one view and no points": lambda: dataclasses.replace(with_points(np.zeros((0, 3))), train=a_scene().train[:1]),
+    "black pictures": black_scene,
+    "the same view six times": same_way_scene,
+    "nothing covered": invisible_scene,
+}
+
+
+@pytest.mark.parametrize("start", HARD_STARTS)
+def test_hard_starts_train_to_something_finite(start):
+    trainer = Trainer(HARD_STARTS[start](), dataclasses.replace(SHORT, steps=20))
+    losses = []
+    trainer.run(report=lambda trainer, loss, mse: losses.append(loss))
+    assert 1 <= len(trainer.model) <= 160
+    assert all(torch.isfinite(p).all() for p in trainer.model.parameters())
+    assert np.mean(losses[-4:]) <= np.mean(losses[:4])
+
+
+@pytest.mark.parametrize("budget", [1, 2])
+def test_the_smallest_budgets_train(budget):
+    trainer = trained(dataclasses.replace(SHORT, steps=20, max_gaussians=budget))
+    assert len(trainer.model) == budget
+
+
+def test_millimetres_and_kilometres_train_to_the_same_quality(whole):
+    in_mm, in_km = psnr(trained(scale=1e3)), psnr(trained(scale=1e-3))
+    assert in_mm == pytest.approx(in_km, abs=0.1)
+    assert in_mm == pytest.approx(psnr(whole), abs=0.1)
+
+
+def test_a_scene_a_million_units_from_the_origin_trains_as_well(whole):
+    assert psnr(trained(offset=(1e6, -1e6, 5e5))) == pytest.approx(psnr(whole), abs=0.1)

@@ -1,0 +1,112 @@
+"""Times the hot operations: runs `bench()` of every `bench_*.py` beside this file and prints a table of each.
+
+    python tools/bench.py                    all of them
+    python tools/bench.py --only rasterize   one
+    python tools/bench.py --json out.json    the rows for a machine too
+
+`bench()` returns one dictionary a row. Every row says how far off the result is beside how long it took, and ratios
+come from runs interleaved in the same process; a bare time belongs to the machine named on the first line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import os
+import platform
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+FOLDER = Path(__file__).parent
+sys.path.insert(0, str(FOLDER.parent))  # so that it also runs where hyrfpack is not installed
+
+Row = dict[str, object]
+
+
+def benchmarks() -> dict[str, Path]:
+    """The benchmark files beside this one, by name."""
+    return {path.stem.removeprefix("bench_"): path for path in sorted(FOLDER.glob("bench_*.py"))}
+
+
+def machine() -> dict[str, object]:
+    """What the times depend on: processor, usable cores, GPU, versions."""
+    facts: dict[str, object] = {"cpu": _processor(), "cores": _cores(), "python": platform.python_version()}
+    for package in ("torch", "numba", "numpy"):
+        try:
+            facts[package] = version(package)
+        except PackageNotFoundError:
+            facts[package] = None
+    import torch
+
+    if torch.cuda.is_available():
+        facts["gpu"] = torch.cuda.get_device_name()
+    return facts
+
+
+def run(path: Path) -> list[Row]:
+    """Import one benchmark file and return its rows."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    spec.loader.exec_module(module)
+    return module.bench()
+
+
+def table(name: str, rows: list[Row]) -> Table:
+    """Rows as an aligned table: one column a key, in order of first appearance, numbers to the right."""
+    shown = Table(title=name, title_justify="left", title_style="bold")
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    for key in keys:
+        numeric = any(isinstance(row.get(key), (int, float)) for row in rows)
+        shown.add_column(key.replace("_", " "), justify="right" if numeric else "left", overflow="fold")
+    for row in rows:
+        shown.add_row(*(_cell(row.get(key)) for key in keys))
+    return shown
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description="Time the hot operations against their references.")
+    parser.add_argument("--only", action="append", choices=list(benchmarks()), metavar="NAME", help="run this one")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write machine and rows to FILE as well")
+    asked = parser.parse_args(arguments)
+
+    console = Console(width=None if sys.stdout.isatty() else 200, highlight=False)
+    facts = machine()
+    console.print(", ".join(f"{key} {value}" for key, value in facts.items()), markup=False)
+    results = {}
+    for name in asked.only or benchmarks():
+        results[name] = run(benchmarks()[name])
+        console.print(table(name, results[name]))
+    if asked.json:
+        asked.json.write_text(json.dumps({"machine": facts, "results": results}, indent=1) + "\n")
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else escape(str(value))
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,79 @@
+"""Make the golden files under tests/golden: what this version of the format writes, for all later ones to read.
+
+    python tools/make_golden.py
+
+A golden file is never made again once a release has written such files: delete it by hand to replace it before.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import reference_reader
+import torch
+
+from hyrfpack.format import encode_model
+from hyrfpack.format.container import MAJOR, MINOR
+from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
+from hyrfpack.model.gaussians import Gaussians
+
+FOLDER = Path(__file__).parents[1] / "tests" / "golden"
+PROVENANCE = {"preset": "standard", "steps": 100, "why": {"geometry": "one entry a Gaussian", "name": "caf\u00e9"}}
+SETTINGS = {"raw": {}, "paper": {"color": (3, 8), "scale": (2, 4), "opacity": (1, 16)}}
+
+
+def golden_model() -> HybridModel:
+    """A model of 20 Gaussians with one dense and one hashed level in each grid, and no two sizes alike."""
+    rng = np.random.default_rng(20)
+    config = ModelConfig(
+        frame=Frame(center=(1e6, -0.1, 3.0), scale=12.5, half_extent=(1.0, 0.75, 0.25)),
+        geometry=HashGridConfig(log2_table_size=4, levels=2, base=2, finest=5),
+        radiance=HashGridConfig(log2_table_size=5, levels=2, base=3, finest=7),
+        hidden=3,
+        solid=(0.0, 0.5, 1.0),
+        antialiased=True,
+    )
+    values = torch.from_numpy(rng.normal(size=(20, 8)).astype(np.float32))
+    values[0, :3] = torch.tensor([-0.0, 1e-42, -1234.5])
+    model = HybridModel(config, Gaussians(values[:, :3], values[:, 3:6], values[:, 6:7], values[:, 7:] * 4))
+    with torch.no_grad():
+        for parameter in (*model.geometry.parameters(), *model.radiance.parameters()):
+            parameter.copy_(torch.from_numpy(rng.laplace(scale=0.1, size=parameter.shape)))
+    return model
+
+
+def expected(model: HybridModel, name: str) -> np.ndarray:
+    """A parameter as the paper profile must give it back, from the original by the profile's definition."""
+    values = model.state_dict()[name].numpy()
+    if name.endswith("grid.table"):
+        low, high = values.min().astype(np.float64), values.max().astype(np.float64)
+        return (low + np.rint((values - low) / (high - low) * 255) * (high - low) / 255).astype(np.float32)
+    return values.astype(np.float16).astype(np.float32)
+
+
+def main() -> None:
+    model = golden_model()
+    original = {name: value.numpy() for name, value in model.state_dict().items()}
+    for profile, settings in SETTINGS.items():
+        target = FOLDER / f"v{MAJOR}.{MINOR}_{profile}.hyrf"
+        if target.exists():
+            print(f"{target} is there already and is kept")
+            continue
+        data = encode_model(model, profile, PROVENANCE, **settings)
+        _, groups = reference_reader.read(data)
+        explicit = {"COLO": "color_logits", "SCAL": "scale_logits", "OPAC": "opacity_logits"}
+        recorded = dict(original) if profile == "raw" else {name: expected(model, name) for name in original}
+        for group, name in explicit.items():
+            values = np.array(groups[group], np.float32).reshape(original[f"gaussians.{name}"].shape)
+            # Codebooks depend on k-means, so these come from the reference reader, and are near the original.
+            assert np.abs(values - original[f"gaussians.{name}"]).max() < 0.5 * original[f"gaussians.{name}"].std()
+            recorded[f"gaussians.{name}"] = values
+        FOLDER.mkdir(exist_ok=True)
+        target.write_bytes(data)
+        np.savez_compressed(target.with_suffix(".npz"), **recorded)
+        print(f"{target}: {len(data)} bytes")
+
+
+if __name__ == "__main__":
+    main()
