@@ -1,4 +1,4 @@
-"""Shared fixtures: where the real data sets are. Tests may also import `scenes`, the maker of tiny worlds beside this."""
+"""Shared fixtures: where the real data sets are. Tests may also import `scenes`, beside this: tiny made-up worlds."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ from pathlib import Path
 import pytest
 
 sys.path.append(str(Path(__file__).parent))
+
+# OpenMP's threads spin while they wait and take the cores from the kernels' own: tiny pictures train 3 times slower on
+# a quiet machine and 20 times on a busy one. Read once, when torch is loaded.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 @pytest.fixture(scope="session")

@@ -111,9 +111,7 @@ def small_model(
     def filled(value, width):
         return torch.as_tensor(value, dtype=torch.float32).expand(count, width).clone()
 
-    gaussians = Gaussians(
-        positions, filled(color_logits, 3), filled(scale_logits, 1), filled(opacity_logits, 1)
-    )
+    gaussians = Gaussians(positions, filled(color_logits, 3), filled(scale_logits, 1), filled(opacity_logits, 1))
     model = HybridModel(config, gaussians, torch.Generator().manual_seed(seed))
     generator = torch.Generator().manual_seed(seed + 1)
     with torch.no_grad():

@@ -195,7 +195,7 @@ def test_demo_ends_with_a_table_and_a_picture(tmp_path):
         (tmp_path / name).stat().st_size for name in ("run/model.hyrf", "paper.hyrf")
     ]
     json.dumps(result.to_dict(), allow_nan=False)
-    assert len(result.table()) == 3
+    assert len(result.table()) == 4
 
 
 # -- what users get wrong --------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from torch import Tensor
 from hyrfpack.ops.hash_encode import hash_encode, level_offsets, level_resolutions
 from hyrfpack.ops.mlp import mlp
 
-REPEATS = 7
+REPEATS = 5
 HASH_SIZES = ((50_000, 12), (50_000, 14), (50_000, 17), (200_000, 18))  # points, log2 of the table size
 MLP_SIZES = ((50_000, 0.0), (50_000, 0.3), (10_000, 0.3))  # rows, share of them without a gradient
 

@@ -11,7 +11,7 @@ from hyrfpack.cli.common import PATH, json_option, note, print_json
 
 @click.command(short_help="See all of it on a scene made on the spot.")
 @click.option("-o", "--output", type=PATH, default=Path("demo"), show_default=True, metavar="DIR", help="Folder.")
-@click.option("--steps", type=click.IntRange(min=1), default=2000, show_default=True, help="Optimiser steps.")
+@click.option("--steps", type=click.IntRange(min=1), default=3000, show_default=True, help="Optimiser steps.")
 @json_option
 def demo(output: Path, steps: int, as_json: bool) -> None:
     """Make a scene, train on it, compress, decompress, render and measure, and draw one picture of it all.

@@ -6,8 +6,8 @@ import io
 import math
 import os
 from collections.abc import Sequence
-from itertools import accumulate
 from pathlib import Path
+from statistics import fmean
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -19,7 +19,7 @@ from hyrfpack.render.files import make_folder
 ERROR_LIMIT = 0.2  # mean absolute difference over channels that gets the brightest colour
 PANEL_WIDTH = 640  # pixels; larger pictures are shrunk to it
 SMALL_PANEL = 400  # pixels; smaller pictures are enlarged a whole number of times, up to this width
-SMOOTHING = 0.1  # weight of the newest point in the drawn mean of a curve
+SMOOTHING = 7  # points on either side that the drawn mean of a curve takes in
 INK, PAPER, FAINT = (32, 33, 36), (255, 255, 255), (128, 130, 134)
 GAP = 8
 
@@ -129,7 +129,9 @@ def _panel(pixels: np.ndarray, size: tuple[int, int]) -> Image.Image:
 
 
 def _running_mean(values: Sequence[float]) -> list[float]:
-    return list(accumulate(values, lambda mean, value: mean + SMOOTHING * (value - mean)))
+    """Means over windows that shrink towards the ends."""
+    reach = [min(SMOOTHING, place, len(values) - 1 - place) for place in range(len(values))]
+    return [fmean(values[place - near : place + near + 1]) for place, near in enumerate(reach)]
 
 
 def _error_colors(error: np.ndarray) -> np.ndarray:

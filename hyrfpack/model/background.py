@@ -28,12 +28,11 @@ def sphere_points(origin: Tensor, directions: Tensor) -> Tensor:
     return origin + (inside.sqrt() - along)[:, None] * directions
 
 
-def pixel_directions(pixels: Tensor, width: int, intrinsics: tuple[float, float, float, float], pose: Tensor) -> Tensor:
-    """Unit viewing directions through pixel centres.
+def pixel_directions(points: Tensor, intrinsics: tuple[float, float, float, float], pose: Tensor) -> Tensor:
+    """Unit viewing directions through points of the picture.
 
     Args:
-        pixels: (N,) flat indices, row * width + column.
-        width: picture width.
+        points: (N, 2) x and y in pixels; the first pixel's centre is (0.5, 0.5).
         intrinsics: (fx, fy, cx, cy) in pixels.
         pose: (4, 4) camera_from_local.
 
@@ -41,7 +40,6 @@ def pixel_directions(pixels: Tensor, width: int, intrinsics: tuple[float, float,
         (N, 3) unit vectors in local axes.
     """
     fx, fy, cx, cy = intrinsics
-    x = ((pixels % width).to(pose.dtype) + (0.5 - cx)) / fx
-    y = (torch.div(pixels, width, rounding_mode="floor").to(pose.dtype) + (0.5 - cy)) / fy
+    x, y = (points[:, 0] - cx) / fx, (points[:, 1] - cy) / fy
     directions = torch.stack((x, y, torch.ones_like(x)), dim=-1) @ pose[:3, :3]
     return directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True)

@@ -43,7 +43,7 @@ class ModelConfig:
 
     @classmethod
     def from_dict(cls, values: dict) -> ModelConfig:
-        """The inverse of `to_dict`. Raises KeyError, TypeError or ValueError when a field is missing, unknown or wrong."""
+        """The inverse of `to_dict`. Raises KeyError, TypeError or ValueError: a field is missing, unknown or wrong."""
         parts = dict(values)
         frame = parts.pop("frame")
         parts["frame"] = Frame(

@@ -39,7 +39,8 @@ class Field(nn.Module):
         """Raw outputs (N, outputs) at coords (N, 3) in the unit cube, with extra inputs (N, E)."""
         features = self.grid(coords)
         if extra is not None:
-            features = torch.cat((features, extra), dim=-1)
+            # Hash features are stored by columns; joining them that way saves a transposed copy in backward.
+            features = torch.cat((features.T, extra.T)).T
         return mlp(features, list(self.weights), list(self.biases))
 
 

@@ -25,7 +25,7 @@ class HashGridConfig:
 
     log2_table_size: int
     levels: int = 16
-    base: int = 64
+    base: int = 16
     finest: int = 1024
 
     def __post_init__(self) -> None:

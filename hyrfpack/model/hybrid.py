@@ -95,15 +95,13 @@ class HybridModel(nn.Module):
         directions = torch.nn.functional.normalize(positions - viewpoint, dim=-1, eps=1e-12)
         return torch.sigmoid(self._radiance(positions, directions) + logits)
 
-    def decode_background(
-        self, pixels: Tensor, width: int, intrinsics: tuple[float, float, float, float], pose: Tensor
-    ) -> Tensor:
-        """Background colours (n, 3) in (0, 1) of pixels (n,), flat indices into a picture of that width.
+    def decode_background(self, points: Tensor, intrinsics: tuple[float, float, float, float], pose: Tensor) -> Tensor:
+        """Background colours (n, 3) in (0, 1) at points (n, 2) of the picture, in pixels.
 
         Args:
-            pose: (4, 4) camera_from_local, float32.
+            pose: (4, 4) camera_from_local.
         """
-        directions = pixel_directions(pixels, width, intrinsics, pose)
+        directions = pixel_directions(points, intrinsics, pose)
         origin = -(pose[:3, :3].T @ pose[:3, 3])
         return torch.sigmoid(self._radiance(sphere_points(origin, directions), directions))
 

@@ -33,9 +33,7 @@ def choose(implementation: str, available: tuple[str, ...], *tensors: Tensor) ->
     first = tensors[0]
     for tensor in tensors[1:]:
         if tensor.device != first.device or tensor.dtype != first.dtype:
-            raise ValueError(
-                f"tensors disagree: {first.dtype} on {first.device} and {tensor.dtype} on {tensor.device}"
-            )
+            raise ValueError(f"tensors disagree: {first.dtype} on {first.device} and {tensor.dtype} on {tensor.device}")
     if implementation != "auto":
         if implementation not in available:
             raise ValueError(f"no implementation '{implementation}'; there are {', '.join(available)}")

@@ -1,5 +1,5 @@
 """Model + camera -> picture."""
 
-from hyrfpack.render.renderer import RenderSettings, Rendering, render
+from hyrfpack.render.renderer import Rendering, RenderSettings, render
 
 __all__ = ["RenderSettings", "Rendering", "render"]

@@ -24,11 +24,14 @@ class RenderSettings:
         near: Gaussians nearer than this are dropped, local units (the frame's longest half-axis is 1).
         cull_tolerance: how far outside the picture a centre may project, as a fraction of half its size.
         background_threshold: pixels with no more transmittance than this get no background (the paper's tau).
+        background_stride: the background is evaluated at every so-manieth pixel of each axis and interpolated
+            between; 1 is exact.
     """
 
     near: float = 0.01
     cull_tolerance: float = 0.3
     background_threshold: float = 1 / 512
+    background_stride: int = 2
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ class Rendering:
 def render(
     model: HybridModel,
     camera: Camera,
-    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    settings: RenderSettings = RenderSettings(),
     *,
     geometry: Geometry | None = None,
     depth: bool = False,
@@ -109,7 +112,7 @@ def render(
     seconds.update(raster.seconds)
     with _timed(seconds, "background"):
         if model.config.background and background:
-            behind = _background(model, camera, pose, raster.transmittance, settings.background_threshold)
+            behind = _background(model, camera, pose, raster.transmittance, settings)
         else:
             behind = positions.new_tensor(model.config.solid) if solid is None else solid
         rgb = raster.rgb + raster.transmittance[..., None] * behind
@@ -125,15 +128,30 @@ def render(
     )
 
 
-def _background(model: HybridModel, camera: Camera, pose: Tensor, transmittance: Tensor, threshold: float) -> Tensor:
-    """(H, W, 3) colours of the sphere where it shines through, 0 elsewhere."""
-    flat = transmittance.detach().reshape(-1)
-    pixels = torch.nonzero(flat > threshold).squeeze(-1)
-    behind = flat.new_zeros(len(flat), 3)
-    if len(pixels):
-        colors = model.decode_background(pixels, camera.width, camera.intrinsics, pose)
-        behind = behind.index_put((pixels,), colors)
-    return behind.reshape(*transmittance.shape, 3)
+def _background(
+    model: HybridModel, camera: Camera, pose: Tensor, transmittance: Tensor, settings: RenderSettings
+) -> Tensor:
+    """(H, W, 3) colours of the sphere where it shines through; anything where it does not."""
+    height, width = transmittance.shape
+    stride = settings.background_stride
+    rows, columns = (-(-(size - 1) // stride) + 1 for size in (height, width))  # nodes, the last at or past the edge
+    # A node is needed when light passes at any pixel whose colour it takes part in.
+    reach = stride - 1
+    padded = torch.nn.functional.pad(
+        transmittance.detach()[None], (reach, columns * stride - width, reach, rows * stride - height)
+    )
+    light = torch.nn.functional.max_pool2d(padded, kernel_size=2 * stride - 1, stride=stride)[0]
+    nodes = torch.nonzero(light.reshape(-1) > settings.background_threshold).squeeze(-1)
+    colors = transmittance.new_zeros(rows * columns, 3)
+    if len(nodes):
+        places = torch.stack((nodes % columns, torch.div(nodes, columns, rounding_mode="floor")), dim=-1)
+        points = places.to(transmittance.dtype) * stride + 0.5
+        colors = colors.index_put((nodes,), model.decode_background(points, camera.intrinsics, pose))
+    grid = colors.T.reshape(1, 3, rows, columns)
+    if stride > 1:
+        size = ((rows - 1) * stride + 1, (columns - 1) * stride + 1)
+        grid = torch.nn.functional.interpolate(grid, size, mode="bilinear", align_corners=True)
+    return grid[0, :, :height, :width].permute(1, 2, 0)
 
 
 @contextmanager

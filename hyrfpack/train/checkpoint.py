@@ -5,9 +5,9 @@ Order of views, colours and densification draw from generators seeded by (seed, 
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
-import pickle
 from pathlib import Path
 
 import torch
@@ -16,6 +16,7 @@ from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.format.atomic import write_atomic
 
 VERSION = 1
+DIGEST_BYTES = 32  # SHA-256 of all that goes before, at the end of the file
 
 
 def save_checkpoint(path: Path, *, settings: dict, tensors: dict[str, torch.Tensor], progress: dict) -> None:
@@ -29,7 +30,8 @@ def save_checkpoint(path: Path, *, settings: dict, tensors: dict[str, torch.Tens
     buffer = io.BytesIO()
     texts = {"version": VERSION, "settings": json.dumps(settings, sort_keys=True), "progress": json.dumps(progress)}
     torch.save({**texts, "tensors": tensors}, buffer)
-    write_atomic(path, buffer.getvalue())
+    buffer.write(hashlib.sha256(buffer.getbuffer()).digest())
+    write_atomic(path, buffer.getbuffer())
 
 
 def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor], dict]:
@@ -44,15 +46,18 @@ def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor]
     if not path.is_file():
         raise HyrfTrainingError(f"{path}: there is no checkpoint to resume from; train without --resume")
     try:
-        content = torch.load(path, weights_only=True, map_location="cpu")
+        data = path.read_bytes()
+        if hashlib.sha256(data[:-DIGEST_BYTES]).digest() != data[-DIGEST_BYTES:]:
+            raise ValueError("the digest does not match")
+        content = torch.load(io.BytesIO(data[:-DIGEST_BYTES]), weights_only=True, map_location="cpu")
         saved, progress = json.loads(content["settings"]), json.loads(content["progress"])
         tensors = content["tensors"]
         version = content["version"]
-    except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError, OSError) as error:
+        different = sorted(key for key in saved.keys() | settings.keys() if saved.get(key) != _plain(settings.get(key)))
+    except Exception as error:  # torch's unpickler raises whatever it meets
         raise HyrfTrainingError(f"{path}: the checkpoint is damaged; delete it and train anew") from error
     if version != VERSION:
         raise HyrfTrainingError(f"{path}: the checkpoint is of another version of hyrfpack; train anew")
-    different = sorted(key for key in saved.keys() | settings.keys() if saved.get(key) != _plain(settings.get(key)))
     if different:
         raise HyrfTrainingError(
             f"{path}: the run was started with other settings ({', '.join(different)}); "

@@ -10,16 +10,16 @@ FULL_STEPS = 30_000  # the length of a run that the paper's schedule is written 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step sizes. Positions and fields decay exponentially from the first value to the last.
+    """Adam's step sizes at the first and the last step; exponential in between.
 
     Positions are in local units (the frame's longest half-axis is 1), the rest are logits and field weights.
     """
 
-    positions: tuple[float, float] = (1.6e-4, 1.6e-6)
-    fields: tuple[float, float] = (3e-3, 3e-4)
-    color_logits: float = 2.5e-3
-    scale_logits: float = 5e-3
-    opacity_logits: float = 2.5e-2
+    positions: tuple[float, float] = (5e-4, 5e-6)
+    fields: tuple[float, float] = (1e-2, 1e-3)
+    color_logits: tuple[float, float] = (2e-2, 2e-3)
+    scale_logits: tuple[float, float] = (4e-2, 4e-3)
+    opacity_logits: tuple[float, float] = (1e-1, 1e-2)
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,8 @@ class Optimizer:
     def step(self, progress: float) -> None:
         """Take one step with the learning rates due at `progress` in [0, 1], and clear the gradients."""
         for group in self.adam.param_groups:
-            rate = getattr(self.rates, group["name"])
-            group["lr"] = rate if isinstance(rate, float) else rate[0] * (rate[1] / rate[0]) ** progress
+            first, last = getattr(self.rates, group["name"])
+            group["lr"] = first * (last / first) ** progress
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
 

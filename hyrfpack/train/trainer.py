@@ -156,7 +156,7 @@ class Trainer:
 
     def _settings(self) -> dict:
         views = [[view.name, view.camera.width, view.camera.height] for view in self.scene.train]
-        return {"config": self.config.to_dict(), "views": views, "model": self.model.config.to_dict()}
+        return {**self.config.to_dict(), "views": views, "model": self.model.config.to_dict()}
 
     def save(self, path: Path) -> None:
         """Write the run's state to `path`."""

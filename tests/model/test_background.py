@@ -47,16 +47,17 @@ def test_sphere_points_are_finite_however_far_outside(distance):
     assert torch.isfinite(points).all()
 
 
-def test_pixel_directions_project_back_to_their_pixel_centres():
+def test_pixel_directions_project_back_to_their_points():
     width, height, intrinsics = 7, 5, (11.0, 9.0, 3.2, 2.9)
     pose = torch.from_numpy(look_at((1.0, 2.0, 0.5), (0.3, -1.0, 0.2)))
     fx, fy, cx, cy = intrinsics
 
-    directions = pixel_directions(torch.arange(width * height), width, intrinsics, pose)
+    points = torch.rand(50, 2, dtype=torch.float64) * torch.tensor([width, height])
+
+    directions = pixel_directions(points, intrinsics, pose)
 
     x, y, z = (directions @ pose[:3, :3].T).unbind(1)
-    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    np.testing.assert_allclose((fx * x / z + cx).numpy(), columns.ravel(), atol=1e-12)
-    np.testing.assert_allclose((fy * y / z + cy).numpy(), rows.ravel(), atol=1e-12)
+    np.testing.assert_allclose((fx * x / z + cx).numpy(), points[:, 0].numpy(), atol=1e-12)
+    np.testing.assert_allclose((fy * y / z + cy).numpy(), points[:, 1].numpy(), atol=1e-12)
     assert (z > 0).all()
     np.testing.assert_allclose(torch.linalg.vector_norm(directions, dim=1).numpy(), 1, atol=1e-12)

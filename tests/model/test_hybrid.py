@@ -81,9 +81,12 @@ def directions_by_hand(d: np.ndarray, encoding: str) -> np.ndarray:
         phases = np.concatenate([np.pi * 2**k * d for k in range(4)], axis=1)
         return np.concatenate([np.sin(phases), np.cos(phases)], axis=1)
     one, pi = np.ones_like(x), np.pi
-    first = np.stack([y, z, x], 1) * np.sqrt(3 / (4 * pi))
-    second = [x * y, y * z, (3 * z**2 - 1) / np.sqrt(12), x * z, (x**2 - y**2) / 2]
-    return np.concatenate([one[:, None] * np.sqrt(1 / (4 * pi)), first, np.stack(second, 1) * np.sqrt(15 / (4 * pi))], 1)
+    bands = [
+        np.stack([one]) * np.sqrt(1 / (4 * pi)),
+        np.stack([y, z, x]) * np.sqrt(3 / (4 * pi)),
+        np.stack([x * y, y * z, (3 * z**2 - 1) / np.sqrt(12), x * z, (x**2 - y**2) / 2]) * np.sqrt(15 / (4 * pi)),
+    ]
+    return np.concatenate(bands).T
 
 
 # -- aggregation -----------------------------------------------------------------------------------------------------
@@ -123,10 +126,9 @@ def test_colours_are_the_aggregation_seen_from_the_viewpoint(encoding):
 def test_background_is_the_radiance_field_on_the_sphere():
     model = random_model(background=True)
     pose = look_at((0.2, -3.0, 0.4), (0, 0, 0))
-    pixels, width, intrinsics = torch.tensor([0, 5, 17, 23]), 6, (5.0, 6.0, 2.9, 2.1)
+    points, intrinsics = np.array([[0.5, 0.5], [5.5, 0.5], [3.0, 4.2], [-1.0, 9.0]]), (5.0, 6.0, 2.9, 2.1)
     fx, fy, cx, cy = intrinsics
-    column, row = pixels.numpy() % width, pixels.numpy() // width
-    rays = np.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, np.ones(4)], 1) @ pose[:3, :3]
+    rays = np.stack([(points[:, 0] - cx) / fx, (points[:, 1] - cy) / fy, np.ones(4)], 1) @ pose[:3, :3]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     origin = -pose[:3, :3].T @ pose[:3, 3]
     # |origin + t ray| = 100, the positive root of the quadratic equation.
@@ -134,7 +136,7 @@ def test_background_is_the_radiance_field_on_the_sphere():
     on_sphere = origin + np.array(distances)[:, None] * rays
     raw = field_by_hand(model.radiance, cube_by_hand(model, on_sphere), directions_by_hand(rays, "sh"))
 
-    colors = model.decode_background(pixels, width, intrinsics, torch.from_numpy(pose).float())
+    colors = model.decode_background(torch.from_numpy(points).float(), intrinsics, torch.from_numpy(pose).float())
 
     np.testing.assert_allclose(as_float64(colors), sigmoid(raw), atol=2e-4)
 

@@ -12,7 +12,7 @@ from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Camera
 
 FRAME = Frame((10.0, -20.0, 5.0), 7.0, (1.0, 0.5, 0.5))
-SKY_EVERYWHERE = RenderSettings(background_threshold=0.0)
+EXACT = RenderSettings(background_threshold=0.0, background_stride=1)
 
 
 def world(local) -> np.ndarray:
@@ -34,6 +34,15 @@ def ball_model(count: int = 120, **settings):
 def picture(model, camera, **options) -> torch.Tensor:
     with torch.no_grad():
         return render(model, camera, **options).rgb
+
+
+def exact_sky(model, camera) -> torch.Tensor:
+    """(H, W, 3) the background sphere at every pixel."""
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    points = torch.from_numpy(np.stack([columns, rows], -1).reshape(-1, 2)).float()
+    pose = torch.from_numpy(model.config.frame.local_pose(camera)).float()
+    with torch.no_grad():
+        return model.decode_background(points, camera.intrinsics, pose).view(camera.height, camera.width, 3)
 
 
 # -- where and how far -----------------------------------------------------------------------------------------------
@@ -89,7 +98,7 @@ def test_turning_the_camera_upside_down_turns_the_picture():
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     turned = Camera(32, 32, *camera.intrinsics, half_turn @ camera.camera_from_world)
 
-    difference = picture(model, turned).flip(0, 1) - picture(model, camera)
+    difference = picture(model, turned, settings=EXACT).flip(0, 1) - picture(model, camera, settings=EXACT)
 
     assert difference.abs().max() < 2e-4
 
@@ -115,7 +124,8 @@ def test_the_near_plane_is_in_local_units(depth, seen):
     model = small_model([on_axis], frame=FRAME, scale_logits=-6.0)
     with torch.no_grad():
         rendering = render(model, camera, RenderSettings(near=0.01))
-    assert len(rendering.decoded) == seen and rendering.visible.sum() == seen and bool(rendering.alpha.max() > 0) == seen
+    assert len(rendering.decoded) == rendering.visible.sum() == seen
+    assert bool(rendering.alpha.max() > 0) == seen
 
 
 # -- hard pictures ---------------------------------------------------------------------------------------------------
@@ -156,14 +166,10 @@ def test_nothing_to_draw_leaves_the_background_alone(background, empty):
     camera = camera_at((0, -3.0, 0), (0, -6.0, 0))
     positions = ball_points(20)[0] if empty == "all behind the camera" else np.zeros((0, 3))
     model = small_model(positions, fields=1.0, background=background, solid=(0.25, 0.5, 0.75))
-    pose = torch.from_numpy(model.config.frame.local_pose(camera)).float()
 
-    rendering = render(model, camera, depth=True, absgrad=True)
+    rendering = render(model, camera, EXACT, depth=True, absgrad=True)
 
-    if background:
-        expected = model.decode_background(torch.arange(32 * 32), 32, camera.intrinsics, pose).view(32, 32, 3)
-    else:
-        expected = torch.tensor([0.25, 0.5, 0.75]).expand(32, 32, 3)
+    expected = exact_sky(model, camera) if background else torch.tensor([0.25, 0.5, 0.75]).expand(32, 32, 3)
     torch.testing.assert_close(rendering.rgb, expected)
     assert (rendering.alpha == 0).all() and (rendering.depth == 0).all() and rendering.pairs == 0
     if background:
@@ -177,23 +183,20 @@ def test_nothing_to_draw_leaves_the_background_alone(background, empty):
 def test_the_background_shines_through_what_light_is_left():
     """C = C_fg + T c, with the parts rendered apart."""
     model, camera = ball_model(background=True), ring(8)[1]
-    pose = torch.from_numpy(model.config.frame.local_pose(camera)).float()
-
     with torch.no_grad():
-        whole = render(model, camera, SKY_EVERYWHERE)
+        whole = render(model, camera, EXACT)
         gaussians = render(model, camera, background=False)
-        sky = model.decode_background(torch.arange(32 * 32), 32, camera.intrinsics, pose).view(32, 32, 3)
 
     left = 1 - whole.alpha[..., None]
     assert 0.2 < left.mean() < 0.95 and left.min() < 0.5
-    torch.testing.assert_close(whole.rgb, gaussians.rgb + left * sky, rtol=0, atol=1e-6)
+    torch.testing.assert_close(whole.rgb, gaussians.rgb + left * exact_sky(model, camera), rtol=0, atol=1e-6)
 
 
 def test_pixels_below_the_threshold_get_no_background():
     model, camera = ball_model(background=True), ring(8)[1]
     with torch.no_grad():
-        whole = render(model, camera, SKY_EVERYWHERE)
-        cut = render(model, camera, RenderSettings(background_threshold=0.6))
+        whole = render(model, camera, EXACT)
+        cut = render(model, camera, RenderSettings(background_threshold=0.6, background_stride=1))
         gaussians = render(model, camera, background=False)
 
     skipped = 1 - whole.alpha <= 0.6
@@ -202,10 +205,44 @@ def test_pixels_below_the_threshold_get_no_background():
     torch.testing.assert_close(cut.rgb[~skipped], whole.rgb[~skipped], rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("stride", [2, 3, 5])
+@pytest.mark.parametrize(("width", "height"), [(32, 32), (31, 18), (1, 1), (2, 7)])
+def test_a_background_stride_interpolates_between_exact_pixels(stride, width, height):
+    camera = camera_at((0, -3.0, 0), (0, -6.0, 0), width=width, height=height, focal=30.0)
+    model = small_model(np.zeros((0, 3)), fields=1.0, background=True)
+    # Every pixel of a larger picture of the same camera, to interpolate in.
+    larger = Camera(width + stride, height + stride, *camera.intrinsics, camera.camera_from_world)
+    sky = exact_sky(model, larger).double().numpy()
+    expected = np.empty((height, width, 3))
+    for row, column in np.ndindex(height, width):
+        top, left = row // stride * stride, column // stride * stride
+        down, right = (row - top) / stride, (column - left) / stride
+        upper = (1 - right) * sky[top, left] + right * sky[top, left + stride]
+        lower = (1 - right) * sky[top + stride, left] + right * sky[top + stride, left + stride]
+        expected[row, column] = (1 - down) * upper + down * lower
+
+    found = picture(model, camera, settings=RenderSettings(background_stride=stride))
+
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3])
+def test_no_pixel_above_the_threshold_lacks_background(stride):
+    """What a threshold leaves out is only what lies below it, whatever the stride."""
+    model, camera = ball_model(background=True, opacity_logits=5.0), ring(8, width=33, height=29)[1]
+    with torch.no_grad():
+        whole = render(model, camera, RenderSettings(background_threshold=0.0, background_stride=stride))
+        cut = render(model, camera, RenderSettings(background_threshold=0.3, background_stride=stride))
+    seen = 1 - whole.alpha > 0.3
+    assert 50 < seen.sum() < seen.numel() - 50
+    torch.testing.assert_close(cut.rgb[seen], whole.rgb[seen], rtol=0, atol=1e-6)
+
+
 def test_the_default_threshold_does_not_show_in_8_bits():
     model, camera = ball_model(background=True, opacity_logits=6.0, scale_logits=-1.5), ring(8)[1]
-    difference = picture(model, camera) - picture(model, camera, settings=SKY_EVERYWHERE)
-    assert difference.abs().max() < 0.5 / 255
+    threshold = RenderSettings(background_stride=1)
+    difference = picture(model, camera, settings=threshold) - picture(model, camera, settings=EXACT)
+    assert 0 < difference.abs().max() < 0.5 / 255
 
 
 def test_a_solid_colour_lies_behind_a_model_without_a_sphere():
@@ -237,9 +274,7 @@ def test_kept_geometry_gives_the_same_picture():
     with torch.no_grad():
         geometry = model.decode_geometry()
     for camera in ring(3):
-        torch.testing.assert_close(
-            picture(model, camera, geometry=geometry), picture(model, camera), rtol=0, atol=1e-6
-        )
+        torch.testing.assert_close(picture(model, camera, geometry=geometry), picture(model, camera), rtol=0, atol=1e-6)
 
 
 def test_rendering_twice_gives_the_same_bits():
@@ -299,12 +334,12 @@ def test_gradients_match_finite_differences_through_the_whole_chain(part):
         with torch.no_grad():
             for p, d in zip(parameters, directions, strict=True):
                 p.add_(step * d)
-            total = float((render(model, camera, SKY_EVERYWHERE).rgb * weights).sum())
+            total = float((render(model, camera, EXACT).rgb * weights).sum())
             for p, d in zip(parameters, directions, strict=True):
                 p.sub_(step * d)
         return total
 
-    (render(model, camera, SKY_EVERYWHERE).rgb * weights).sum().backward()
+    (render(model, camera, EXACT).rgb * weights).sum().backward()
     slope = sum(float((p.grad * d).sum()) for p, d in zip(parameters, directions, strict=True))
 
     step = 1e-7

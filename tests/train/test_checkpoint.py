@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-import json
+import hashlib
+import io
 import os
 import pickle
 import random
@@ -18,6 +19,13 @@ PROGRESS = {"step": 12, "records": [{"step": 1, "loss": 0.25}], "seconds": {"dat
 def some_tensors() -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     return {"model.a": torch.randn(40, 3, generator=generator), "adam.step": torch.tensor(12.0)}
+
+
+def sealed(content, **options) -> bytes:
+    """What a writer with bad intent would make: any content, with the right digest."""
+    buffer = io.BytesIO()
+    torch.save(content, buffer, **options)
+    return buffer.getvalue() + hashlib.sha256(buffer.getvalue()).digest()
 
 
 @pytest.fixture
@@ -74,35 +82,29 @@ def test_random_bytes_are_refused(tmp_path, length):
             load_checkpoint(path, SETTINGS)
 
 
-def test_a_flipped_byte_is_refused_or_harmless(path):
-    """Never another exception, and never other numbers."""
+def test_a_flipped_bit_anywhere_is_noticed(path):
+    """In the numbers too: a run must not go on from others."""
     data = bytearray(path.read_bytes())
     generator = random.Random(0)
     for _ in range(300):
         place, bit = generator.randrange(len(data)), 1 << generator.randrange(8)
         data[place] ^= bit
         path.write_bytes(data)
-        try:
-            tensors, progress = load_checkpoint(path, SETTINGS)
-        except HyrfTrainingError:
-            pass
-        else:
-            assert progress == PROGRESS
-            assert all(torch.equal(tensors[name], value) for name, value in some_tensors().items())
+        with pytest.raises(HyrfTrainingError, match="damaged"):
+            load_checkpoint(path, SETTINGS)
         data[place] ^= bit
 
 
 @pytest.mark.parametrize(
     "content",
     [
-        torch.zeros(3),
+        (1, 2),
         [1, 2, 3],
         {},
         {"version": 1},
         {"version": 1, "settings": "{", "progress": "{}", "tensors": {}},
         {"version": 1, "settings": 5, "progress": "{}", "tensors": {}},
         {"version": 1, "settings": "[]", "progress": "{}", "tensors": {}},
-        {"version": 1, "settings": json.dumps(SETTINGS), "progress": "{}", "tensors": [1]},
         None,
         "text",
     ],
@@ -110,6 +112,9 @@ def test_a_flipped_byte_is_refused_or_harmless(path):
 )
 def test_other_files_of_torch_are_refused(tmp_path, content):
     path = tmp_path / "checkpoint.pt"
+    path.write_bytes(sealed(content))
+    with pytest.raises(HyrfTrainingError, match="damaged"):
+        load_checkpoint(path, SETTINGS)
     torch.save(content, path)
     with pytest.raises(HyrfTrainingError, match="damaged"):
         load_checkpoint(path, SETTINGS)
@@ -117,7 +122,7 @@ def test_other_files_of_torch_are_refused(tmp_path, content):
 
 def test_another_version_is_refused(tmp_path):
     path = tmp_path / "checkpoint.pt"
-    torch.save({"version": 99, "settings": "{}", "progress": "{}", "tensors": {}}, path)
+    path.write_bytes(sealed({"version": 99, "settings": "{}", "progress": "{}", "tensors": {}}))
     with pytest.raises(HyrfTrainingError, match="another version"):
         load_checkpoint(path, {})
 
@@ -132,15 +137,17 @@ class Malicious:
         return os.mkdir, (str(self.target),)
 
 
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol")
 @pytest.mark.parametrize("how", ["torch", "torch, deep inside", "torch, legacy", "pickle"])
 def test_a_malicious_pickle_is_never_executed(tmp_path, how):
     path, target = tmp_path / "checkpoint.pt", tmp_path / "executed"
     evil = Malicious(target)
     if how == "pickle":
-        path.write_bytes(pickle.dumps(evil))
+        data = pickle.dumps(evil)
+        path.write_bytes(data + hashlib.sha256(data).digest())
     else:
         inside = {"version": 1, "settings": "{}", "progress": "{}", "tensors": {"model.a": evil}}
-        torch.save(inside if "deep" in how else evil, path, _use_new_zipfile_serialization="legacy" not in how)
+        path.write_bytes(sealed(inside if "deep" in how else evil, _use_new_zipfile_serialization="legacy" not in how))
 
     with pytest.raises(HyrfTrainingError, match="damaged"):
         load_checkpoint(path, {})

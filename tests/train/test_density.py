@@ -303,9 +303,7 @@ def test_short_runs_have_a_schedule_too(steps):
 
 
 def seen_by(decoded, visible, absgrad) -> SimpleNamespace:
-    return SimpleNamespace(
-        decoded=torch.tensor(decoded), visible=torch.tensor(visible), absgrad=torch.tensor(absgrad)
-    )
+    return SimpleNamespace(decoded=torch.tensor(decoded), visible=torch.tensor(visible), absgrad=torch.tensor(absgrad))
 
 
 def test_views_add_gradients_in_ndc_for_what_was_visible():

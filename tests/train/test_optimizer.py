@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from scenes import ball_points, small_model
@@ -8,7 +9,13 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.train.config import LearningRates
 from hyrfpack.train.optimizer import Optimizer
 
-RATES = LearningRates(positions=(1e-2, 1e-4), fields=(1e-2, 1e-3))
+RATES = LearningRates(
+    positions=(1e-2, 1e-4),
+    fields=(2e-2, 1e-3),
+    color_logits=(3e-2, 3e-2),
+    scale_logits=(4e-2, 1e-2),
+    opacity_logits=(5e-2, 1e-3),
+)
 
 
 def a_model(count: int = 6, seed: int = 0):
@@ -38,12 +45,8 @@ def test_steps_match_adam_with_the_scheduled_rates():
         set_gradients(model, step)
         for group, (name, p) in zip(adam.param_groups, plain.items(), strict=True):
             p.grad = dict(model.named_parameters())[name].grad.clone()
-            if name == "gaussians.positions":
-                group["lr"] = 1e-2 ** (1 - progress) * 1e-4**progress
-            elif name.startswith("gaussians."):
-                group["lr"] = getattr(RATES, name.removeprefix("gaussians."))
-            else:
-                group["lr"] = 1e-2 ** (1 - progress) * 1e-3**progress
+            first, last = getattr(RATES, name.removeprefix("gaussians.") if "gaussians" in name else "fields")
+            group["lr"] = np.exp((1 - progress) * np.log(first) + progress * np.log(last))
         adam.step()
         optimizer.step(progress)
 
@@ -144,7 +147,8 @@ def test_a_state_dict_goes_on_with_the_same_bits():
 
     assert all(torch.equal(p, q) for p, q in zip(model.parameters(), copy.parameters(), strict=True))
     states = optimizer.state_dict(), restored.state_dict()
-    assert states[0].keys() == states[1].keys() and all(torch.equal(states[1][key], states[0][key]) for key in states[0])
+    assert states[0].keys() == states[1].keys()
+    assert all(torch.equal(states[1][key], states[0][key]) for key in states[0])
 
 
 def test_a_state_of_no_steps_goes_on_too():

@@ -88,9 +88,7 @@ def test_the_preset_does_not_depend_on_the_unit(make, scale):
     scene = make()
     shift = np.array([1e4, -1e4, 3e3]) * scale
     cameras = [
-        camera_at(
-            c.position * scale + shift, (c.position + c.forward) * scale + shift, up=-c.rotation[1]
-        )
+        camera_at(c.position * scale + shift, (c.position + c.forward) * scale + shift, up=-c.rotation[1])
         for c in (view.camera for view in scene.train)
     ]
     assert detect_preset(rig(cameras, scene.points * scale + shift))[0] == detect_preset(scene)[0]

@@ -27,7 +27,9 @@ ROW = 16
 
 HIDDEN = np.uint32(0xFFFFFFFF)  # the sort key of a Gaussian that is not drawn
 _OVERFLOW = 1e30
-_kernel = njit(nogil=True, cache=True, fastmath={"contract", "nsz"}, error_model="numpy")
+_OPTIONS = {"nogil": True, "cache": True, "fastmath": {"contract", "nsz"}, "error_model": "numpy"}
+_kernel = njit(**_OPTIONS)
+_inlined = njit(**_OPTIONS, inline="always")  # what LLVM finds too large to inline by itself
 
 
 @_kernel
@@ -71,7 +73,7 @@ def _columns(q0, q1, q2, q3):
     )
 
 
-@_kernel
+@_inlined
 def _locate(mean, axes, shift):
     """x / z, y / z and z of a mean in the camera with rotation rows `axes`."""
     z = _dot(axes[2], mean) + shift[2]
@@ -79,7 +81,7 @@ def _locate(mean, axes, shift):
     return (_dot(axes[0], mean) + shift[0]) * inv_z, (_dot(axes[1], mean) + shift[1]) * inv_z, z
 
 
-@_kernel
+@_inlined
 def _spread(x_z, y_z, z, quat, axes, lens):
     """The factors of the covariance.
 
@@ -100,7 +102,7 @@ def _spread(x_z, y_z, z, quat, axes, lens):
     return a, b, e, f, (q0, q1, q2, q3), norm
 
 
-@_kernel
+@_inlined
 def _covariance(g, h):
     """xx, xy, yy of the filtered covariance whose root has rows g and h; determinants before and after the filter."""
     xx, xy, yy = _dot(g, g), _dot(g, h), _dot(h, h)

@@ -48,8 +48,8 @@ def photometric_loss(
 ) -> Tensor:
     """How far a rendered picture is from a photo: (1 - w) mean |image - target| + w (1 - mean SSIM).
 
-    Where the mask is False, `image` is first replaced by `target`, and both means leave these pixels out: neither a
-    value nor a gradient comes from them, nor from what either picture holds there in `image`.
+    Where the mask is False, `image` is first replaced by `target` (which is what windows reaching there from counted
+    pixels see), and both means leave these pixels out: neither a value nor a gradient comes from them.
 
     Args:
         image, target: (H, W, 3) in [0, 1], at least one pixel.

@@ -15,9 +15,9 @@ import numpy as np
 from hyrfpack.ops.pool import run_tasks
 from hyrfpack.ops.ssim.reference import C1, C2, RADIUS, window
 
-_FAST = {"contract", "nsz", "nnan", "reassoc", "arcp"}
-# Division must not test for zero, which would keep loops from vectorising.
-njit = numba.njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
+# The error model of numpy: a division that tests for zero would keep its loop from vectorising.
+_FAST_MATH = {"contract", "nsz", "nnan", "reassoc", "arcp"}
+njit = numba.njit(nogil=True, cache=True, fastmath=_FAST_MATH, error_model="numpy")
 
 _TILE, _STRIP = 236, 128  # most columns and rows of a task
 _GROUP = 4  # rows blurred down together: they share most of what they load
@@ -156,7 +156,10 @@ def _read(pixels, row, start, count, buffer, target):
 
 @njit
 def _tile(image, target, weight, l1_scale, ssim_scale, top, bottom, left, right, grad, sums):
-    """Gradient and sums (of |x - y| and of SSIM) of the rows [top, bottom) and columns [left, right)."""
+    """Gradient and sums (of |x - y| and of SSIM) of the rows [top, bottom) and columns [left, right).
+
+    `weight` counts each value 1 or 0; without rows it counts all.
+    """
     buffer = np.zeros(_BUFFER, np.float32)
     height, floats = image.shape[0], image.shape[1]
     weighted = weight.shape[0] == height

@@ -1,0 +1,234 @@
+"""The whole run in a folder: what it leaves, how it stops, and that a kill at any moment costs nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scenes import ball_scene
+
+from hyrfpack import format as hyrf_format
+from hyrfpack.errors import HyrfError, HyrfTrainingError
+from hyrfpack.render import render
+from hyrfpack.scene import Scene
+from hyrfpack.train import DensityConfig, TrainConfig, Trainer, train
+from hyrfpack.train.run import _stop_requests
+
+CONFIG = TrainConfig(
+    steps=60,
+    seed=1,
+    max_gaussians=120,
+    checkpoint_every=1,
+    density=DensityConfig(start=0.05, stop=0.7, rounds=8, gradient=1e-5, resets=1),
+)
+# The same run in a process of its own; says each step on standard output.
+CHILD = """
+import json, sys
+from pathlib import Path
+sys.path.append(sys.argv[1])
+from scenes import ball_scene
+from hyrfpack.train import Trainer, train
+from test_run import CONFIG, a_scene
+out = Path(sys.argv[2])
+if sys.argv[3] == "train":
+    result = train(a_scene(), out, CONFIG, resume=(out / "checkpoint.pt").exists(), quiet=True)
+    print(json.dumps({"complete": result.complete, "step": result.step, "model": result.model}))
+else:
+    trainer = Trainer(a_scene(), CONFIG)
+    if (out / "checkpoint.pt").exists():
+        trainer.load(out / "checkpoint.pt")
+    trainer.run(checkpoint=out / "checkpoint.pt", report=lambda t, loss, mse: print(t.step, flush=True))
+"""
+
+
+def a_scene(views: int = 6) -> Scene:
+    return ball_scene(views=views, points=60, side=24)
+
+
+def split_scene() -> Scene:
+    scene = a_scene(8)
+    return dataclasses.replace(scene, train=scene.train[2:], test=scene.train[:2])
+
+
+def bytes_of(model) -> dict[str, bytes]:
+    return {name: p.detach().numpy().tobytes() for name, p in model.named_parameters()}
+
+
+def start_child(out: Path, how: str) -> subprocess.Popen:
+    here = Path(__file__).parent
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(here), str(here.parents[1])])}
+    command = [sys.executable, "-c", CHILD, str(here.parent), str(out), how]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.fixture(scope="module")
+def whole() -> Trainer:
+    """The uninterrupted run."""
+    trainer = Trainer(a_scene(), CONFIG)
+    trainer.run()
+    return trainer
+
+
+# -- a finished run --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "deep" / "balls"
+    return out, train(split_scene(), out, CONFIG, quiet=True)
+
+
+def test_a_run_leaves_model_metrics_curve_and_views(finished):
+    out, result = finished
+    assert result.complete and result.step == 60 and result.model == out / "model.hyrf"
+    assert {"model.hyrf", "metrics.json", "curve.png", "views"} == {entry.name for entry in out.iterdir()}
+    assert list((out / "views").rglob("*.png"))
+
+
+def test_the_saved_model_is_the_trained_one(finished):
+    """The same bytes as the trainer alone gives, with the scene's held-out views left out."""
+    _, result = finished
+    trainer = Trainer(split_scene(), CONFIG)
+    trainer.run()
+    loaded = hyrf_format.load(result.model)
+    assert bytes_of(loaded) == bytes_of(trainer.model)
+
+
+def test_metrics_are_the_results_and_the_settings(finished):
+    out, result = finished
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics == json.loads(json.dumps(result.metrics))
+    assert metrics["bytes"] == result.model.stat().st_size
+    assert metrics["settings"]["steps"] == 60 and metrics["scene"]["train"] == 6 and metrics["scene"]["test"] == 2
+    assert metrics["gaussians"] == len(hyrf_format.load(result.model)) <= 120
+    assert [record["step"] for record in metrics["curve"]] == list(range(1, 61))
+
+
+def test_the_evaluation_is_of_the_file_on_the_held_out_views(finished):
+    out, result = finished
+    model = hyrf_format.load(result.model)
+    expected = {}
+    for view in split_scene().test:
+        with torch.no_grad():
+            rgb = render(model, view.camera).rgb.double().numpy().clip(0, 1)
+        expected[view.name] = -10 * np.log10(np.mean((rgb - view.load().composite()) ** 2))
+    found = {view["name"]: view["psnr"] for view in result.metrics["evaluation"]["views"]}
+    assert found == pytest.approx(expected, abs=0.05)  # pictures may be rounded to 8 bits
+    assert result.metrics["evaluation"]["psnr"] == pytest.approx(np.mean(list(found.values())))
+
+
+def test_a_folder_with_a_run_is_not_trained_over_unasked(finished):
+    out, _ = finished
+    before = (out / "model.hyrf").read_bytes()
+    with pytest.raises(HyrfError, match="holds an earlier run.*--overwrite"):
+        train(split_scene(), out, CONFIG, quiet=True)
+    assert (out / "model.hyrf").read_bytes() == before
+
+
+def test_overwriting_replaces_the_run(tmp_path):
+    config = dataclasses.replace(CONFIG, steps=3)
+    train(a_scene(), tmp_path, config, quiet=True)
+    train(a_scene(), tmp_path, dataclasses.replace(config, seed=9), overwrite=True, quiet=True)
+    assert json.loads((tmp_path / "metrics.json").read_text())["settings"]["seed"] == 9
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(HyrfError, match="cannot be made"):
+        train(a_scene(), tmp_path / "file" / "run", CONFIG, quiet=True)
+
+
+def test_resuming_nothing_is_one_sentence(tmp_path):
+    with pytest.raises(HyrfTrainingError, match="no checkpoint to resume from"):
+        train(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
+
+
+def test_a_background_that_no_view_sees_is_dropped(tmp_path):
+    """A wall of large opaque Gaussians around everything; balls under a sky keep their sphere."""
+    wall = np.random.default_rng(0).normal(size=(500, 3))
+    wall *= 4 / np.linalg.norm(wall, axis=1, keepdims=True)
+    scene = dataclasses.replace(a_scene(), points=wall, point_colors=np.full((500, 3), 0.5, np.float32))
+    one_step = dataclasses.replace(CONFIG, steps=1, max_gaussians=500)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hyrfpack.train.setup.INITIAL_OPACITY", 0.9999)
+        patch.setattr("hyrfpack.train.setup.INITIAL_SIZE", (0.45, 0.5))
+        closed = train(scene, tmp_path / "closed", one_step, quiet=True)
+    open_air = train(a_scene(), tmp_path / "open", one_step, quiet=True)
+
+    assert hyrf_format.load(closed.model).config.background is False
+    assert closed.metrics["choices"]["background"].startswith("none: no training view")
+    assert hyrf_format.load(open_air.model).config.background is True
+    assert "of a view's light" in open_air.metrics["choices"]["background"]
+
+
+# -- stopping and going on -------------------------------------------------------------------------------------------
+
+
+def test_the_first_interrupt_asks_and_the_second_interrupts():
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), _stop_requests() as stop:
+        assert not stop()
+        signal.raise_signal(signal.SIGINT)
+        assert stop()
+        signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_request_to_terminate_asks_too():
+    before = signal.getsignal(signal.SIGTERM)
+    with _stop_requests() as stop:
+        signal.raise_signal(signal.SIGTERM)
+        assert stop()
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_an_interrupt_saves_exits_cleanly_and_resumes_to_the_same_model(whole, tmp_path):
+    child = start_child(tmp_path, "train")
+    checkpoint = tmp_path / "checkpoint.pt"
+    while child.poll() is None and not checkpoint.exists():
+        time.sleep(0.002)
+    child.send_signal(signal.SIGINT)
+    out, errors = child.communicate(timeout=120)
+
+    assert child.returncode == 0, errors
+    said = json.loads(out)
+    assert said["complete"] is False and said["model"] is None and 1 <= said["step"] < 60
+    assert not (tmp_path / "model.hyrf").exists()
+    result = train(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
+    assert result.complete and bytes_of(hyrf_format.load(result.model)) == bytes_of(whole.model)
+    assert not checkpoint.exists()
+
+
+def test_kills_at_random_moments_leave_a_checkpoint_that_resumes_to_the_same_model(whole, tmp_path):
+    """SIGKILL, with a checkpoint written at every step: it often comes while one is being written."""
+    generator = random.Random(time.time_ns())
+    checkpoint = tmp_path / "checkpoint.pt"
+    for target in (1, generator.randrange(10, 30), generator.randrange(35, 50)):
+        child = start_child(tmp_path, "loop")
+        for line in child.stdout:
+            if int(line) >= target:
+                break
+        time.sleep(generator.random() * 0.03)
+        child.kill()
+        _, errors = child.communicate(timeout=60)
+        assert child.returncode == -signal.SIGKILL, errors
+        if target > 1:
+            assert checkpoint.exists()
+
+    resumed = Trainer(a_scene(), CONFIG)
+    resumed.load(checkpoint)
+    assert 10 <= resumed.step < 60
+    resumed.run()
+
+    assert bytes_of(resumed.model) == bytes_of(whole.model)
+    assert resumed.records == whole.records
