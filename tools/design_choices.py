@@ -54,7 +54,9 @@ def main() -> None:
                 for seed in range(args.seeds)
             ]
             scores = [row["psnr_paper"] for row in rows]
-            mean = {key: statistics.fmean(row[key] for row in rows) for key in rows[0] if key != "set" and key != "preset"}
+            mean = {
+                key: statistics.fmean(row[key] for row in rows) for key in rows[0] if key != "set" and key != "preset"
+            }
             print(
                 f"| {variant} | {name} | {mean['psnr_paper']:.2f} | {max(scores) - min(scores):.2f} | "
                 f"{mean['ssim_paper']:.3f} | {mean['gaussians']:,.0f} | {mean['bytes_paper']:,.0f} | "

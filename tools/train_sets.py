@@ -51,7 +51,7 @@ def measure(folder: Path, out: Path, config: TrainConfig, reuse: bool) -> dict:
 def table(rows: list[dict]) -> str:
     """The rows as Markdown."""
     lines = [
-        "| set | preset | PSNR | SSIM | Gaussians | bytes raw | bytes paper | paper loses | steps/s | train s | frame ms |",
+        "| set | preset | PSNR | SSIM | Gaussians | raw bytes | paper bytes | loss | steps/s | train s | frame ms |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     lines += [

@@ -25,8 +25,8 @@ class HashGridConfig:
 
     log2_table_size: int
     levels: int = 16
-    base: int = 16
-    finest: int = 1024
+    base: int = 8
+    finest: int = 512
 
     def __post_init__(self) -> None:
         if not 1 <= self.levels <= 32:

@@ -18,14 +18,14 @@ from hyrfpack.scene import Camera
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """How exactly to render; every default is far below what an 8-bit picture shows.
+    """How exactly to render; together the defaults change a picture by about half a step of 8 bits.
 
     Attributes:
         near: Gaussians nearer than this are dropped, local units (the frame's longest half-axis is 1).
         cull_tolerance: how far outside the picture a centre may project, as a fraction of half its size.
         background_threshold: pixels with no more transmittance than this get no background (the paper's tau).
-        background_stride: the background is evaluated at every so-manieth pixel of each axis and interpolated
-            between; 1 is exact.
+        background_stride: the background is evaluated at every background_stride-th pixel of each axis and
+            interpolated between; 1 is exact.
     """
 
     near: float = 0.01

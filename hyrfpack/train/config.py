@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field
 
 PRESETS = ("auto", "synthetic", "standard", "large", "street")
 FULL_STEPS = 30_000  # the length of a run that the paper's schedule is written for
+SHORT_STEPS = 1_000  # rates grow no further in runs shorter than this
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step sizes at the first and the last step; exponential in between.
+    """Adam's step sizes at the first and the last step of a full-length run; exponential in between.
 
+    A shorter run has fewer steps to go the same way: its rates are sqrt(FULL_STEPS / steps) times these.
     Positions are in local units (the frame's longest half-axis is 1), the rest are logits and field weights.
     """
 
-    positions: tuple[float, float] = (5e-4, 5e-6)
-    fields: tuple[float, float] = (1e-2, 1e-3)
-    color_logits: tuple[float, float] = (2e-2, 2e-3)
-    scale_logits: tuple[float, float] = (4e-2, 4e-3)
-    opacity_logits: tuple[float, float] = (1e-1, 1e-2)
+    positions: tuple[float, float] = (2e-4, 2e-6)
+    fields: tuple[float, float] = (3e-3, 3e-4)
+    color_logits: tuple[float, float] = (6e-3, 6e-4)
+    scale_logits: tuple[float, float] = (1.2e-2, 1.2e-3)
+    opacity_logits: tuple[float, float] = (3e-2, 3e-3)
+
+    def at(self, name: str, step: int, steps: int) -> float:
+        """The rate of one group for `step` (from 0) of a run of `steps`."""
+        first, last = getattr(self, name)
+        pace = math.sqrt(FULL_STEPS / max(steps, SHORT_STEPS)) if steps < FULL_STEPS else 1.0
+        return pace * first * (last / first) ** (step / steps)
 
 
 @dataclass(frozen=True)

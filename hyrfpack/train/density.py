@@ -43,9 +43,13 @@ class DensityControl:
         self.gradients = torch.zeros(count)
         self.views = torch.zeros(count)
 
-    def observe(self, step: int, rendering: Rendering, width: int, height: int) -> None:
+    def watching(self, step: int) -> bool:
+        """Whether gradients of this step (counted from 1) will still be used."""
+        return step <= self.last
+
+    def observe(self, rendering: Rendering, width: int, height: int) -> None:
         """Collect the gradients of one view, after backward."""
-        if step >= self.last:
+        if rendering.absgrad is None:
             return
         index = rendering.decoded[rendering.visible]
         ndc = rendering.absgrad[rendering.visible] * rendering.absgrad.new_tensor((width / 2, height / 2))

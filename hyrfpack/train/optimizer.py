@@ -25,11 +25,10 @@ class Optimizer:
         groups.append({"name": "fields", "params": [*model.geometry.parameters(), *model.radiance.parameters()]})
         self.adam = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
 
-    def step(self, progress: float) -> None:
-        """Take one step with the learning rates due at `progress` in [0, 1], and clear the gradients."""
+    def step(self, step: int, steps: int) -> None:
+        """Take one step with the learning rates due at `step` (from 0) of `steps`, and clear the gradients."""
         for group in self.adam.param_groups:
-            first, last = getattr(self.rates, group["name"])
-            group["lr"] = first * (last / first) ** progress
+            group["lr"] = self.rates.at(group["name"], step, steps)
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
 

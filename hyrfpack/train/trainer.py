@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.ops.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.render import render
 from hyrfpack.scene import Picture, Scene, View
@@ -70,21 +71,19 @@ class Trainer:
             HyrfTrainingError: the loss or a gradient is not finite; the step, view and parameter group are named.
         """
         every = self.config.checkpoint_every or max(1, self.config.steps // 20)
-        views = self.cache.stream(self._order())
-        try:
+        keep_freed_memory()
+        with closing(self.cache.stream(self._order())) as views, torch_on_one_thread():
             while self.step < self.config.steps:
                 with self._timed("data"):
                     view, picture = next(views)
                 loss, mse = self._train_step(view, picture)
                 report(self, loss, mse)
-                if checkpoint and self.step % every == 0 and self.step < self.config.steps:
+                complete = self.step == self.config.steps
+                stopped = stop() and not complete
+                if checkpoint and (stopped or (self.step % every == 0 and not complete)):
                     self.save(checkpoint)
-                if stop() and self.step < self.config.steps:
-                    if checkpoint:
-                        self.save(checkpoint)
+                if stopped:
                     return False
-        finally:
-            views.close()
         return True
 
     def _order(self) -> Iterator[View]:
@@ -104,7 +103,10 @@ class Trainer:
             target = torch.from_numpy(picture.composite(solid))
             mask = None if picture.mask is None else torch.from_numpy(picture.mask)
         rendering = render(
-            self.model, view.camera, absgrad=True, solid=None if solid is None else torch.from_numpy(solid)
+            self.model,
+            view.camera,
+            absgrad=self.density.watching(self.step),
+            solid=None if solid is None else torch.from_numpy(solid),
         )
         for stage, seconds in rendering.seconds.items():
             self.seconds[stage] += seconds
@@ -116,11 +118,11 @@ class Trainer:
         with self._timed("backward"):
             loss.backward()
         with self._timed("density"):
-            self.density.observe(self.step, rendering, view.camera.width, view.camera.height)
+            self.density.observe(rendering, view.camera.width, view.camera.height)
         with self._timed("optimizer"):
             if broken := self.optimizer.nonfinite_groups():
                 self._refuse(view, "a gradient is not finite", broken)
-            self.optimizer.step((self.step - 1) / config.steps)
+            self.optimizer.step(self.step - 1, config.steps)
         with self._timed("density"):
             self.density.act(self.step, self.model, self.optimizer)
         mse = float(torch.mean((rendering.rgb.detach() - target) ** 2))

@@ -118,6 +118,16 @@ def test_reported_errors_are_those_of_the_picture():
     assert -10 * np.log10(seen[0]) == pytest.approx(before, abs=1e-3)
 
 
+def test_learning_rates_fall_from_the_first_value_to_the_last():
+    rates = []
+    trainer = Trainer(a_scene(), dataclasses.replace(SHORT, steps=20))
+    trainer.run(report=lambda *_: rates.append([group["lr"] for group in trainer.optimizer.adam.param_groups]))
+    asked = trainer.config.learning_rates
+    for group, found in zip(trainer.optimizer.adam.param_groups, np.transpose(rates), strict=True):
+        first, last = getattr(asked, group["name"])
+        np.testing.assert_allclose(found, np.geomspace(first, last, 21)[:20], rtol=1e-9)
+
+
 def test_masked_pixels_teach_nothing():
     """Photos that differ only under the mask train the same model (by the L1 part, which has no window)."""
     scene = a_scene(views=2)

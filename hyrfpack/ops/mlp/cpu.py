@@ -7,29 +7,17 @@ again, for the rows that have a gradient, which costs no more than storing them 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.pool import run_tasks
+from hyrfpack.ops.pool import run_tasks, torch_on_one_thread
 
 _MOST_ROWS, _LEAST_ROWS = 2048, 256  # a chunk's activations (0.5 MiB at width 64) stay in the second cache
 _WORTH_SKIPPING = 0.1  # share of idle rows from which gathering the others is cheaper than computing all
 
 _relu_backward = torch.ops.aten.threshold_backward.grad_input
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Keep torch from splitting sums over threads where tasks run inline; the pool's workers never do."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _chunk_edges(rows: int) -> list[tuple[int, int]]:
@@ -39,7 +27,7 @@ def _chunk_edges(rows: int) -> list[tuple[int, int]]:
 
 
 def _run(task: Callable[[int], None], count: int) -> None:
-    with _one_thread():
+    with torch_on_one_thread():
         run_tasks(task, count)
 
 

@@ -27,7 +27,7 @@ class _View:
     near: float
     antialiased: bool
     depth: bool
-    absgrad: Tensor | None
+    absgrad: np.ndarray | None
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def rasterize(
         near=float(near),
         antialiased=bool(antialiased),
         depth=depth,
-        absgrad=absgrad,
+        absgrad=None if absgrad is None else absgrad.detach().numpy(),
     )
     report: dict = {}
     rgb, transmittance, depths, visible = _Rasterize.apply(means, quats, scales, opacities, colors, view, report)
@@ -213,7 +213,7 @@ def _blend_backward(
     def task(run: int) -> None:
         cpu_blend.blend_tiles_backward(
             *runs[run], tiles.starts, tiles.pairs, blended, tiles.records, view.width, view.height,
-            rgb, transmittance, grad_rgb, grad_transmittance, gradient_rows,
+            rgb, transmittance, grad_rgb, grad_transmittance, view.absgrad, gradient_rows,
         )  # fmt: skip
 
     run_tasks(task, len(runs))
@@ -223,12 +223,11 @@ def _blend_backward(
 def _project_backward(tiles: _Tiles, view: _View, rows: np.ndarray, inputs: list[np.ndarray]) -> tuple[np.ndarray, ...]:
     means, quats, scales, opacities = inputs
     grads = tuple(np.empty_like(array) for array in (means, quats, scales, opacities, means))
-    absgrad = None if view.absgrad is None else view.absgrad.detach().numpy()
 
     def task(start: int, stop: int) -> None:
         cpu_project.project_backward(
             start, stop, tiles.first, rows, means, quats, scales, opacities,
-            view.axes, view.shift, view.lens, view.antialiased, *grads, absgrad,
+            view.axes, view.shift, view.lens, view.antialiased, *grads, view.absgrad,
         )  # fmt: skip
 
     run_ranges(task, len(means))
