@@ -8,7 +8,7 @@ SHELL := bash
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help demo test bench lint format clean
+.PHONY: help demo test bench sets choices lint format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z.]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -32,6 +32,12 @@ test: lint ## check style, then run all tests
 
 bench: $(READY) ## time the hot operations against their references
 	$(BIN)/python tools/bench.py
+
+sets: $(READY) ## train every real set for 1,000 steps and print the table (ten minutes)
+	$(BIN)/python tools/train_sets.py --steps 1000
+
+choices: $(READY) ## the ablations behind the defaults (half an hour)
+	$(BIN)/python tools/design_choices.py
 
 lint: $(READY) ## check style only
 	$(BIN)/ruff check .

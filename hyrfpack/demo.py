@@ -104,7 +104,7 @@ def run_demo(
         HyrfError: something cannot be written.
     """
     folder = Path(folder)
-    make_folder(folder)
+    make_folder(folder / "scene" / "images")
     report(f"making a scene of {views} photos")
     write_demo_scene(folder / "scene", views=views, size=size)
     scene = load_scene(folder / "scene")

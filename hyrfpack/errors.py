@@ -4,6 +4,11 @@ Each message is one sentence that says what is wrong, where, and what to do. The
 exits with code 2; anything else that escapes is a bug of ours and keeps its traceback.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class HyrfError(Exception):
     """Something about the input or the request is wrong and the user can mend it."""
@@ -19,3 +24,17 @@ class HyrfFormatError(HyrfError):
 
 class HyrfTrainingError(HyrfError):
     """Training cannot start or cannot go on (a loss that is not finite, a checkpoint that does not fit)."""
+
+
+@contextmanager
+def needs_package(package: str, task: str) -> Iterator[None]:
+    """Import what one task alone needs inside this block: where it is not installed, that is a HyrfError.
+
+    Args:
+        package: what pip calls it.
+        task: what cannot be done without it, as the sentence starts ("model.hyrf: drawing figures").
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise HyrfError(f"{task} needs {package}; run 'pip install {package}'") from error

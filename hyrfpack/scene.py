@@ -116,7 +116,7 @@ class Scene:
         train, test: views, sorted by name; disjoint.
         points: (P, 3) float64 world positions; P may be 0.
         point_colors: (P, 3) float32 RGB in [0, 1].
-        has_alpha: photos carry coverage (object-centred captures without a background).
+        has_alpha: photos have transparent pixels (object-centred captures without a background).
         notes: sentences for the user about what the reader skipped or assumed.
     """
 

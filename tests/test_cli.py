@@ -93,6 +93,15 @@ def test_compress_prints_every_section(run, tmp_path):
         assert words in table
 
 
+def test_the_last_line_says_what_became_of_the_numbers(run, tmp_path):
+    raw, paper = (
+        succeeded("compress", run / "model.hyrf", "-o", tmp_path / "x.hyrf", "--profile", profile).stdout.splitlines()
+        for profile in ("raw", "paper")
+    )
+    assert raw[-1].endswith("bytes, every number as float32")
+    assert "times smaller than as float32" in paper[-1]
+
+
 def test_decompress_of_a_raw_file_is_byte_exact(run, tmp_path):
     succeeded("decompress", run / "model.hyrf", "-o", tmp_path / "back.hyrf")
     assert (tmp_path / "back.hyrf").read_bytes() == (run / "model.hyrf").read_bytes()
@@ -167,7 +176,7 @@ def test_video_without_ffmpeg_is_a_note_beside_the_pictures(packed, tmp_path, mo
     assert len(list((tmp_path / "out").iterdir())) == 2
 
 
-def test_an_interrupted_training_saves_and_exits_cleanly(data, tmp_path):
+def test_an_interrupted_training_saves_and_exits_with_1(data, tmp_path):
     before = signal.getsignal(signal.SIGINT)
 
     def interrupt_once_training_listens():
@@ -176,7 +185,8 @@ def test_an_interrupted_training_saves_and_exits_cleanly(data, tmp_path):
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt_once_training_listens, daemon=True).start()
-    result = succeeded("train", data, "-o", tmp_path, "--steps", 1_000_000, "--max-gaussians", 200, "--json")
+    result = hyrfpack("train", data, "-o", tmp_path, "--steps", 1_000_000, "--max-gaussians", 200, "--json")
+    assert result.exit_code == 1 and isinstance(result.exception, SystemExit)
     assert json.loads(result.stdout)["complete"] is False
     assert "--resume" in result.stderr
     assert (tmp_path / "checkpoint.pt").is_file() and not (tmp_path / "model.hyrf").exists()

@@ -31,8 +31,10 @@ def make_model(count: int, geometry_size: int, radiance_size: int) -> HybridMode
     rng = np.random.default_rng(7)
     config = ModelConfig(
         frame=Frame(center=(0.3, -1.7, 2.9), scale=4.2, half_extent=(1.0, 0.6, 0.9)),
-        geometry=HashGridConfig(log2_table_size=geometry_size),
-        radiance=HashGridConfig(log2_table_size=radiance_size),
+        geometry=HashGridConfig(geometry_size, levels=16, base=8, finest=512),
+        radiance=HashGridConfig(radiance_size, levels=16, base=8, finest=512),
+        hidden=64,
+        direction_encoding="frequency",
     )
     centers = rng.normal(size=(50, 3)) * 0.7
     spread = rng.normal(size=(count, 3)) * (0.2, 0.2, 0.01)

@@ -31,7 +31,12 @@ def golden_model() -> HybridModel:
         geometry=HashGridConfig(log2_table_size=4, levels=2, base=2, finest=5),
         radiance=HashGridConfig(log2_table_size=5, levels=2, base=3, finest=7),
         hidden=3,
+        background=True,
         solid=(0.0, 0.5, 1.0),
+        scale_rule="sum",
+        scale_grows=True,
+        direction_encoding="sh",
+        position_gradients=False,
         antialiased=True,
     )
     values = torch.from_numpy(rng.normal(size=(20, 8)).astype(np.float32))
@@ -48,7 +53,8 @@ def expected(model: HybridModel, name: str) -> np.ndarray:
     values = model.state_dict()[name].numpy()
     if name.endswith("grid.table"):
         low, high = values.min().astype(np.float64), values.max().astype(np.float64)
-        return (low + np.rint((values - low) / (high - low) * 255) * (high - low) / 255).astype(np.float32)
+        codes = np.rint((values - low) / (high - low) * 255)
+        return (((255 - codes) * low + codes * high) / 255).astype(np.float32)
     return values.astype(np.float16).astype(np.float32)
 
 

@@ -85,7 +85,8 @@ def read_min_max(data: bytes, count: int) -> list[float]:
     low, high, bits = struct.unpack_from("<ffB", data)
     codes = read_huffman(data[9:])
     assert len(codes) == count
-    return [float32(low + code * (high - low) / (2**bits - 1)) for code in codes]
+    last = 2**bits - 1
+    return [float32(((last - code) * low + code * high) / last) for code in codes]
 
 
 def read_huffman(data: bytes) -> list[int]:

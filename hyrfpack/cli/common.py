@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -62,12 +61,6 @@ def split_views(scene: Scene, split: str) -> list[View]:
     if not views:
         raise HyrfError(f"{scene.path}: no photo is in the split '{split}'; name another --split or --test-every")
     return views
-
-
-def refuse_same_file(source: Path, target: Path) -> None:
-    """Raise HyrfError when writing `target` would overwrite `source`."""
-    if os.path.realpath(source) == os.path.realpath(target):
-        raise HyrfError(f"{target}: the output is the input itself; name another file with -o")
 
 
 def note(sentence: str) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from hyrfpack.cli.common import PATH, json_option, print_json, refuse_same_file, table
+from hyrfpack.cli.common import PATH, json_option, print_json, table
+from hyrfpack.errors import HyrfError
 
 if TYPE_CHECKING:
     from hyrfpack.format import CompressionReport
@@ -90,13 +93,12 @@ def info(file: Path, as_json: bool) -> None:
 
 
 def _rewrite(source: Path, target: Path, profile: str, as_json: bool) -> None:
-    refuse_same_file(source, target)
+    if os.path.realpath(source) == os.path.realpath(target):
+        raise HyrfError(f"{target}: the output is the input itself; name another file with -o")
     from hyrfpack.format import compress as rewrite
 
     report: CompressionReport = rewrite(source, target, profile)
-    sections = [
-        {"type": part.type, "holds": part.holds, "before": part.before, "after": part.after} for part in report.sections
-    ]
+    sections = [asdict(part) for part in report.sections]
     if as_json:
         print_json(
             {
@@ -111,7 +113,8 @@ def _rewrite(source: Path, target: Path, profile: str, as_json: bool) -> None:
         return
     click.echo(_section_table(sections, report.bytes_after, report.gaussians))
     ratio = report.bytes_before / report.bytes_after
-    click.echo(f"{target}: {report.bytes_after:,} bytes, {ratio:.2f} times smaller than its numbers as float32")
+    outcome = "every number as float32" if profile == "raw" else f"{ratio:.2f} times smaller than as float32"
+    click.echo(f"{target}: {report.bytes_after:,} bytes, {outcome}")
 
 
 def _section_table(sections: list[dict], total: int, gaussians: int) -> str:

@@ -8,7 +8,6 @@ from typing import Any
 import click
 
 from hyrfpack.cli.common import PATH, json_option, note, print_json, read_scene, scene_options
-from hyrfpack.errors import HyrfError
 
 PRESETS = ("auto", "synthetic", "standard", "large", "street")  # hyrfpack.train.PRESETS, without loading torch
 BACKGROUND_COLORS = ("black", "white", "random")
@@ -52,8 +51,8 @@ def train(
 ) -> None:
     """Train a model on DATA, a folder of photos and poses (COLMAP, NeRF-synthetic, instant-ngp or nerfstudio).
 
-    RUN gets model.hyrf, metrics.json, the training curve and pictures of held-out views. Ctrl-C saves a checkpoint;
-    --resume goes on with it and ends with the same model as an uninterrupted run.
+    RUN gets model.hyrf, metrics.json, the training curve and pictures of held-out views. Ctrl-C saves a checkpoint
+    and exits with code 1; --resume goes on with it and ends with the same model as an uninterrupted run.
 
     \b
     Examples:
@@ -64,8 +63,6 @@ def train(
     """
     if resume and overwrite:
         raise click.UsageError("--resume goes on with a run and --overwrite replaces it; give one of them")
-    if resume and not (out / "checkpoint.pt").is_file():
-        raise HyrfError(f"{out}: there is no checkpoint to resume; leave out --resume to start a run")
     from hyrfpack.data import PictureCache
     from hyrfpack.train import TrainConfig
     from hyrfpack.train import train as run
@@ -86,3 +83,5 @@ def train(
         )
         if scores := metrics.get("evaluation"):
             click.echo(f"held-out views: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}")
+    if not result.complete:
+        click.get_current_context().exit(1)

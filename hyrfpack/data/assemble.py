@@ -8,12 +8,13 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from hyrfpack.data.pictures import Header, PhotoFile, read_header, same_aspect
+from hyrfpack.data.pictures import Header, PhotoFile, read_header, read_pixels, same_aspect
 from hyrfpack.data.undistort import Lens
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera, Scene, View
 
 _RIGID_TOLERANCE = 1e-3
+_ALPHA_LOOKED_AT = 4  # photos, spread over the set; the first with transparency ends the search
 
 
 @dataclass(frozen=True)
@@ -86,8 +87,7 @@ def make_scene(
     if bent:
         notes.append(f"{bent} of {len(photos)} photos are undistorted as they are loaded")
     points, point_colors = _finite_points(points, point_colors, notes)
-    has_alpha = any(photo.header.has_alpha for photo in photos)
-    return Scene(str(path), layout, train, test, points, point_colors, has_alpha, notes)
+    return Scene(str(path), layout, train, test, points, point_colors, _see_through(photos), notes)
 
 
 def safe_name(text: str) -> str:
@@ -154,6 +154,13 @@ def _rigid(pose: np.ndarray, path: Path) -> np.ndarray:
     rigid[:3, :3] = u @ vt
     rigid[:3, 3] = pose[:3, 3]
     return rigid
+
+
+def _see_through(photos: list[Photo]) -> bool:
+    """Whether a photo has a transparent pixel: an alpha channel alone says little, many are opaque throughout."""
+    candidates = [photo for photo in photos if photo.header.has_alpha]
+    looked_at = candidates[:: max(1, len(candidates) // _ALPHA_LOOKED_AT)]
+    return any(read_pixels(photo.path)[1].min() < 255 for photo in looked_at)
 
 
 def _finite_points(

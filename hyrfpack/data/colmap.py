@@ -11,7 +11,7 @@ from hyrfpack.data.assemble import Photo, make_scene, safe_name, skipped_note
 from hyrfpack.data.colmap_binary import check_binary_model
 from hyrfpack.data.pictures import find_mask, find_picture, read_header
 from hyrfpack.data.undistort import Lens, brown
-from hyrfpack.errors import HyrfDataError
+from hyrfpack.errors import HyrfDataError, needs_package
 from hyrfpack.scene import Scene
 
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
@@ -103,10 +103,8 @@ def _read_model(model: Path) -> tuple[dict[int, Lens], list, int, np.ndarray, np
     kind = _model_kind(model)
     if kind == ".bin":
         check_binary_model(model)
-    try:
+    with needs_package("pycolmap", f"{model}: reading COLMAP models"):
         import pycolmap
-    except ModuleNotFoundError as error:
-        raise HyrfDataError(f"{model}: reading COLMAP models needs pycolmap; run 'pip install pycolmap'") from error
     try:
         reconstruction = pycolmap.Reconstruction(str(model))
         images = list(reconstruction.images.values())

@@ -15,6 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from hyrfpack.errors import needs_package
+
 _FAR = np.float32(1e9)
 _SUN = np.array([0.45, -0.55, 0.70]) / np.linalg.norm([0.45, -0.55, 0.70])
 _SUN_COLOR = np.array([[1.0], [0.90], [0.74]], np.float32) * 2.1
@@ -62,7 +64,8 @@ def write_demo_scene(folder: str | os.PathLike[str], *, views: int = 60, size: i
     Raises:
         ValueError: fewer than two views or a size below 8.
     """
-    from PIL import Image
+    with needs_package("pillow", "making photos"):
+        from PIL import Image
 
     if views < 2 or size < 8:
         raise ValueError(f"a scene needs 2 views of 8 pixels or more, not {views} of {size}")

@@ -12,7 +12,7 @@ from hyrfpack.data.assemble import Photo, make_scene, safe_name, skipped_note
 from hyrfpack.data.pictures import Header, find_mask, find_picture, read_header
 from hyrfpack.data.transforms import focal_from_angle, number, pose_from_opengl, read_json
 from hyrfpack.data.undistort import Lens, brown
-from hyrfpack.errors import HyrfDataError
+from hyrfpack.errors import HyrfDataError, needs_package
 from hyrfpack.scene import Scene
 
 _PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
@@ -151,10 +151,8 @@ def _read_ply(path: Path, content: dict[str, Any], file: Path) -> tuple[np.ndarr
     ply = path / str(listed)
     if not isinstance(listed, str) or not ply.is_file():
         raise HyrfDataError(f"{file}: points {str(listed)[:80]} are not on disk; restore them or drop 'ply_file_path'")
-    try:
+    with needs_package("trimesh", f"{ply}: reading points"):
         import trimesh
-    except ModuleNotFoundError as error:
-        raise HyrfDataError(f"{ply}: reading points needs trimesh; run 'pip install trimesh'") from error
     try:
         with ply.open("rb") as stream:
             stated = re.search(rb"element vertex (\d{1,18})\s", stream.read(4096))

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from hyrfpack.data.undistort import Lens, undistort
-from hyrfpack.errors import HyrfDataError
+from hyrfpack.errors import HyrfDataError, needs_package
 from hyrfpack.scene import Picture
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp", ".tif", ".tiff")
@@ -117,7 +117,8 @@ def read_mask(path: Path, height: int, width: int) -> np.ndarray:
 
 def _opened(path: Path):
     """Open with Pillow; every way in which that fails is one sentence."""
-    from PIL import Image
+    with needs_package("pillow", f"{path}: reading pictures"):
+        from PIL import Image
 
     try:
         if os.path.getsize(path) == 0:

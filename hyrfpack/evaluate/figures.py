@@ -13,7 +13,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from hyrfpack.format.atomic import write_atomic
+from hyrfpack.atomic import write_atomic
+from hyrfpack.errors import needs_package
 from hyrfpack.render.files import make_folder
 
 ERROR_LIMIT = 0.2  # mean absolute difference over channels that gets the brightest colour
@@ -85,8 +86,9 @@ def training_curve(records: Sequence[dict], path: str | os.PathLike[str]) -> Non
     Raises:
         HyrfError: the file cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    with needs_package("matplotlib", "drawing figures"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 6), layout="constrained")
     FigureCanvasAgg(figure)
@@ -136,7 +138,8 @@ def _running_mean(values: Sequence[float]) -> list[float]:
 
 def _error_colors(error: np.ndarray) -> np.ndarray:
     """(H, W) errors to (H, W, 3) colours, black at 0 and bright from ERROR_LIMIT on."""
-    from matplotlib import colormaps
+    with needs_package("matplotlib", "drawing figures"):
+        from matplotlib import colormaps
 
     return colormaps["inferno"](np.clip(error / ERROR_LIMIT, 0, 1))[..., :3]
 
@@ -157,7 +160,8 @@ def _color_bar(
 
 def _font(width: int, fraction: float = 0.036, fixed: bool = False) -> ImageFont.FreeTypeFont:
     """Type that fits a picture of that width; matplotlib brings the files on every system."""
-    from matplotlib import get_data_path
+    with needs_package("matplotlib", "drawing figures"):
+        from matplotlib import get_data_path
 
     name = "DejaVuSansMono.ttf" if fixed else "DejaVuSans.ttf"
     size = min(20, max(9, round(width * fraction)))

@@ -8,7 +8,6 @@ The weights are not ours to ship. Anyone who has the `lpips` package makes the f
 from __future__ import annotations
 
 import os
-import pickle
 import re
 from dataclasses import dataclass
 
@@ -79,11 +78,11 @@ class LPIPS:
         Raises:
             ValueError: it is no such dictionary, or a weight is missing or has another shape.
         """
-        first = state.get("net.slice1.0.weight")
         shapes = {(64, 3, 11, 11): "alex", (64, 3, 3, 3): "vgg"}
-        if first is None or tuple(first.shape) not in shapes:
-            raise ValueError("there is no first convolution of AlexNet or VGG-16 under 'net.slice1.0.weight'")
-        self.name = shapes[tuple(first.shape)]
+        shape = tuple(_take(state, "net.slice1.0.weight", 4).shape)
+        if shape not in shapes:
+            raise ValueError("'net.slice1.0.weight' is no first convolution of AlexNet or VGG-16")
+        self.name = shapes[shape]
         self.network = NETWORKS[self.name]
         self._convolutions: dict[int, tuple[Tensor, Tensor]] = {}
         self._channel_weights: list[Tensor] = []
@@ -96,7 +95,7 @@ class LPIPS:
                     raise ValueError(f"'{name}' has the shape {tuple(weight.shape)}")
                 self._convolutions[layer] = weight, bias
                 width = channels
-            key = next((key for key in state if re.fullmatch(rf"lin{stage}\.model\.\d+\.weight", key)), "")
+            key = next((key for key in state if re.fullmatch(rf"lin{stage}\.model\.\d+\.weight", str(key))), "")
             linear = _take(state, key or f"lin{stage}.model.1.weight", 4)
             if linear.shape != (1, channels, 1, 1):
                 raise ValueError(f"'{key}' has the shape {tuple(linear.shape)}")
@@ -112,16 +111,16 @@ class LPIPS:
         advice = 'make it with torch.save(lpips.LPIPS(net="alex").state_dict(), FILE)'
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
-            if not isinstance(state, dict):
-                raise ValueError("it holds no dictionary")
-            return cls(state)
         except OSError as error:
             raise HyrfError(
                 f"{path}: the LPIPS weights cannot be read ({error.strerror or error}); {advice}"
             ) from error
-        except (ValueError, RuntimeError, EOFError, KeyError, pickle.UnpicklingError) as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise HyrfError(f"{path}: these are no LPIPS weights ({reason.rstrip('.')}); {advice}") from error
+        except Exception as error:  # torch's unpickler raises whatever it meets, and paragraphs of advice with it
+            raise HyrfError(f"{path}: these are no LPIPS weights (no tensors saved by torch); {advice}") from error
+        try:
+            return cls(state if isinstance(state, dict) else {})
+        except ValueError as error:
+            raise HyrfError(f"{path}: these are no LPIPS weights ({error}); {advice}") from error
 
     @torch.no_grad()
     def __call__(self, image: Tensor, reference: Tensor) -> float:

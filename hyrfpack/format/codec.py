@@ -8,14 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from hyrfpack.atomic import write_atomic
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import paper, raw
 from hyrfpack.format.arrays import RULES, check_rules, group_shapes, parse_config, to_model
-from hyrfpack.format.atomic import write_atomic
 from hyrfpack.format.container import Container, read_container, write_container
 from hyrfpack.format.info import SECTIONS, SectionSize, section_sizes
 from hyrfpack.format.metadata import Metadata, read_metadata
 from hyrfpack.model.hybrid import HybridModel
+from hyrfpack.quant import DamagedDataError
 
 PROFILES = {"raw": raw.encode, "paper": paper.encode}
 DECODERS = {**raw.DECODERS, **paper.DECODERS}
@@ -69,7 +70,7 @@ def decode_model(data: bytes | memoryview, device: str | torch.device = "cpu", n
     Raises:
         HyrfFormatError: the bytes are damaged, contradict themselves, or come from a newer version.
     """
-    return _decode(read_container(data, SECTIONS, name), name).to(device)
+    return _decode(read_container(data, SECTIONS, name)).to(device)
 
 
 def save(
@@ -94,7 +95,7 @@ def save(
 def load(path: str | os.PathLike[str], device: str | torch.device = "cpu") -> HybridModel:
     """Read a model from a `.hyrf` file. Arguments and errors as `decode_model`, and where no file can be read."""
     with Container.open(path, SECTIONS) as container:
-        return _decode(container, os.fspath(path)).to(device)
+        return _decode(container).to(device)
 
 
 def compress(
@@ -105,13 +106,12 @@ def compress(
     Arguments and errors as `encode_model`, `load` and `save`.
     """
     with Container.open(source, SECTIONS) as container:
-        model = _decode(container, os.fspath(source))
-        provenance = read_metadata(container, os.fspath(source)).provenance
+        model, provenance = _decode(container), read_metadata(container).provenance
     return save(model, target, profile, provenance, **settings)
 
 
-def _decode(container: Container, name: str) -> HybridModel:
-    metadata = read_metadata(container, name)
+def _decode(container: Container) -> HybridModel:
+    name, metadata = container.name, read_metadata(container)
     try:
         check_rules(metadata.rules)
         config = parse_config(metadata.config)
@@ -120,9 +120,9 @@ def _decode(container: Container, name: str) -> HybridModel:
     shapes = group_shapes(config, metadata.gaussians)
     # Every size is checked before the first section is decoded.
     for group, (rows, columns) in shapes.items():
-        if group not in container:
+        entry = container.entries.get(group)
+        if entry is None:
             raise HyrfFormatError(f"{name}: there is no section '{group}'; the file is incomplete, write it again")
-        entry = container.entries[group]
         if entry.codec not in DECODERS:
             raise HyrfFormatError(f"{name}: section '{group}' has the unknown codec {entry.codec}; update hyrfpack")
         if entry.raw_length != 4 * rows * columns:
@@ -135,7 +135,7 @@ def _decode(container: Container, name: str) -> HybridModel:
         section = container[group]
         try:
             arrays[group] = DECODERS[section.codec](section.data, shape)
-        except HyrfFormatError as error:
+        except (HyrfFormatError, DamagedDataError) as error:
             raise HyrfFormatError(f"{name}: section '{group}': {error}") from error
         if not np.isfinite(arrays[group]).all():
             raise HyrfFormatError(f"{name}: section '{group}' holds numbers that are not finite; write the file again")

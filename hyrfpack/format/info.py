@@ -59,15 +59,14 @@ def describe(path: str | os.PathLike[str]) -> dict:
         HyrfFormatError: there is no such file, or its header, table of contents or metadata is damaged.
     """
     with Container.open(path, SECTIONS) as container:
-        metadata = read_metadata(container, os.fspath(path))
+        metadata = read_metadata(container)
         sizes = section_sizes(container)
-        version = ".".join(map(str, container.version))
+        length, version = container.length, ".".join(map(str, container.version))
     count = metadata.gaussians
 
     def bits(length: int) -> float | None:
         return 8 * length / count if count else None
 
-    length = os.path.getsize(path)
     return {
         "bytes": length,
         "version": version,

@@ -75,13 +75,13 @@ def writer() -> str:
     return f"hyrfpack {hyrfpack.__version__}"
 
 
-def read_metadata(container: Container, name: str) -> Metadata:
+def read_metadata(container: Container) -> Metadata:
     """Read and check the metadata: `config` has the right types; the other objects may hold anything.
 
     Raises:
         HyrfFormatError: the section is absent, too long, not JSON, or a field is missing or of the wrong type.
     """
-    entry = container.entries.get(TYPE)
+    name, entry = container.name, container.entries.get(TYPE)
     if entry is not None and (entry.length > MAX_BYTES or entry.codec != CODEC_JSON):
         raise HyrfFormatError(
             f"{name}: the metadata has {entry.length} bytes in codec {entry.codec}, and {MAX_BYTES} bytes at most in "

@@ -20,7 +20,7 @@ class ModelConfig:
         solid: RGB in [0, 1] behind everything when there is no background sphere.
         scale_rule: "sum" S * sigmoid(s_n + s_e), or "product" S * sigmoid(s_n) * sigmoid(s_e).
         scale_grows: whether the largest scale S(p) grows with max(1, |u|) outside the box.
-        direction_encoding: "sh" (real spherical harmonics, bands 0 to 2) or "frequency" (NeRF, 4 octaves).
+        direction_encoding: "frequency" (NeRF, 4 octaves) or "sh" (real spherical harmonics, bands 0 to 2).
         position_gradients: whether the fields pass gradients on to positions (training only).
         antialiased: opacity is compensated for the rasteriser's low-pass filter.
     """
@@ -33,7 +33,7 @@ class ModelConfig:
     solid: tuple[float, float, float] = (0.0, 0.0, 0.0)
     scale_rule: str = "sum"
     scale_grows: bool = True
-    direction_encoding: str = "sh"
+    direction_encoding: str = "frequency"
     position_gradients: bool = False
     antialiased: bool = False
 

@@ -32,6 +32,16 @@ class Geometry:
         return Geometry(self.scales[index], self.quats[index], self.opacities[index])
 
 
+def scale_bounds(positions: Tensor, config: ModelConfig) -> Tensor:
+    """S(p), (N, 1): the largest scale, in local units, that a Gaussian may have at local positions (N, 3).
+
+    S(p) = max(1, |u|) with u = p / half_extent, or 1 everywhere when `config.scale_grows` is off.
+    """
+    if not config.scale_grows:
+        return positions.new_ones(len(positions), 1)
+    return torch.linalg.vector_norm(config.frame.normalize(positions), dim=-1, keepdim=True).clamp_min(1)
+
+
 class HybridModel(nn.Module):
     """A hybrid radiance field (HyRF, NeurIPS 2025).
 
@@ -61,10 +71,8 @@ class HybridModel(nn.Module):
         return contract(self.config.frame.normalize(positions))
 
     def scale_bounds(self, positions: Tensor) -> Tensor:
-        """S(p), (N, 1): the largest scale a Gaussian may have at these local positions (N, 3)."""
-        if not self.config.scale_grows:
-            return positions.new_ones(len(positions), 1)
-        return torch.linalg.vector_norm(self.config.frame.normalize(positions), dim=-1, keepdim=True).clamp_min(1)
+        """S(p), (N, 1), at local positions (N, 3); see `scale_bounds`."""
+        return scale_bounds(positions, self.config)
 
     def _field_positions(self, positions: Tensor) -> Tensor:
         return positions if self.config.position_gradients else positions.detach()

@@ -28,7 +28,7 @@ def choose(implementation: str, available: tuple[str, ...], *tensors: Tensor) ->
         "reference" (plain torch, any device, any dtype) otherwise.
 
     Raises:
-        ValueError: the name is not offered, or the tensors disagree.
+        ValueError: the name is not offered, it cannot take these tensors, or the tensors disagree.
     """
     first = tensors[0]
     for tensor in tensors[1:]:
@@ -37,6 +37,8 @@ def choose(implementation: str, available: tuple[str, ...], *tensors: Tensor) ->
     if implementation != "auto":
         if implementation not in available:
             raise ValueError(f"no implementation '{implementation}'; there are {', '.join(available)}")
+        if implementation == "cpu" and (first.device.type != "cpu" or first.dtype != torch.float32):
+            raise ValueError(f"the cpu kernels take float32 on the CPU, not {first.dtype} on {first.device}")
         return implementation
     if "cpu" in available and first.device.type == "cpu" and first.dtype == torch.float32 and has_numba():
         return "cpu"

@@ -32,6 +32,10 @@ def _executor() -> ThreadPoolExecutor:
     )
 
 
+if hasattr(os, "register_at_fork"):  # a forked child has none of the threads and must start its own
+    os.register_at_fork(after_in_child=_executor.cache_clear)
+
+
 @cache
 def keep_freed_memory() -> None:
     """Ask the C library to reuse large blocks instead of giving them back to the system (glibc only).

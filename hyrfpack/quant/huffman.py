@@ -35,7 +35,7 @@ from functools import cached_property
 
 import numpy as np
 
-from hyrfpack.errors import HyrfFormatError
+from hyrfpack.quant.errors import DamagedDataError
 
 END = -1
 """Stands for the end mark among the symbols of a code."""
@@ -105,18 +105,20 @@ class HuffmanCode:
         return self.left_codes >> (np.uint64(64) - self.lengths.astype(np.uint64))
 
     def check(self) -> None:
-        """Raise HyrfFormatError unless this is a complete prefix code with each symbol once (or the empty code)."""
+        """Raise DamagedDataError unless this is a complete prefix code with each symbol once (or the empty code)."""
         if len(self.symbols) == 0:
             return
         if len(np.unique(self.symbols)) != len(self.symbols):
-            raise HyrfFormatError("Huffman code table: a symbol has two codes; the data is damaged")
+            raise DamagedDataError("Huffman code table: a symbol has two codes; the data is damaged")
         if len(self.symbols) < 2 or self.lengths.min() < 1 or self.lengths.max() > MAX_LENGTH:
-            raise HyrfFormatError(f"Huffman code table: a length is not in 1 to {MAX_LENGTH} bits; the data is damaged")
+            raise DamagedDataError(
+                f"Huffman code table: a length is not in 1 to {MAX_LENGTH} bits; the data is damaged"
+            )
         histogram = np.bincount(self.lengths).tolist()
         if sum(leaves << (MAX_LENGTH - length) for length, leaves in enumerate(histogram)) != 1 << MAX_LENGTH:
-            raise HyrfFormatError("Huffman code table: the lengths make no complete code; the data is damaged")
+            raise DamagedDataError("Huffman code table: the lengths make no complete code; the data is damaged")
         if (self.left_codes << self.lengths.astype(np.uint64)).any():
-            raise HyrfFormatError("Huffman code table: the leaves are not in the order of their codes; it is damaged")
+            raise DamagedDataError("Huffman code table: the leaves are not in the order of their codes; it is damaged")
 
     def by_symbol(self, size: int) -> tuple[np.ndarray, np.ndarray]:
         """Left codes (uint64) and lengths (uint64, 0 = no code) of the symbols 0 to size - 1."""
@@ -165,21 +167,21 @@ class HuffmanStream:
         """Read what `to_bytes` wrote. Nothing is allocated that the length of `data` does not bear out.
 
         Raises:
-            HyrfFormatError: the bytes are truncated, too many, or contradict themselves.
+            DamagedDataError: the bytes are truncated, too many, or contradict themselves.
         """
         if len(data) < _HEADER.size:
-            raise HyrfFormatError(f"Huffman stream: {len(data)} bytes are fewer than its header; it is truncated")
+            raise DamagedDataError(f"Huffman stream: {len(data)} bytes are fewer than its header; it is truncated")
         count, payload_size, leaves, end, width, wide = _HEADER.unpack_from(data)
         if width not in (1, 2) or wide not in (2, 4) or leaves > 256**width + 1 or end > max(leaves - 1, 0):
-            raise HyrfFormatError("Huffman stream: its header says what cannot be; the data is damaged")
+            raise DamagedDataError("Huffman stream: its header says what cannot be; the data is damaged")
         if count > 8 * payload_size or (count > 0) != (payload_size > 0) or (leaves == 0 and count > 0):
-            raise HyrfFormatError(
+            raise DamagedDataError(
                 f"Huffman stream: {count} symbols cannot come from {payload_size} bytes; the data is damaged"
             )
         chunks = -(-count // chunk_length(count))
         sizes = (leaves, max(leaves - 1, 0) * width, chunks * wide, payload_size)
         if len(data) != _HEADER.size + sum(sizes):
-            raise HyrfFormatError(
+            raise DamagedDataError(
                 f"Huffman stream: {len(data)} bytes where {_HEADER.size + sum(sizes)} are announced; it is truncated "
                 "or damaged"
             )
@@ -278,14 +280,14 @@ def huffman_decode(stream: HuffmanStream) -> np.ndarray:
     outside the stream, and any damage that changes where a chunk ends is found.
 
     Raises:
-        HyrfFormatError: a chunk does not end where the next starts, or the end mark comes early.
+        DamagedDataError: a chunk does not end where the next starts, or the end mark comes early.
     """
     count, interval = stream.count, chunk_length(stream.count)
     if count == 0:
         return np.zeros(0, stream.dtype)
     ends = np.cumsum(stream.chunk_bits)
     if (int(ends[-1]) + 7) // 8 != len(stream.payload):
-        raise HyrfFormatError("Huffman stream: its chunks do not add up to its length; the data is damaged")
+        raise DamagedDataError("Huffman stream: its chunks do not add up to its length; the data is damaged")
     steps, lanes = min(interval, count), len(ends)
     left_over = count - (lanes - 1) * interval  # symbols in the last chunk
 
@@ -324,7 +326,7 @@ def huffman_decode(stream: HuffmanStream) -> np.ndarray:
         position[-1] = last_end
     if (position != ends.astype(np.uint64)).any():
         chunk = int(np.argmax(position != ends.astype(np.uint64)))
-        raise HyrfFormatError(f"Huffman stream: chunk {chunk} does not end where it should; the data is damaged")
+        raise DamagedDataError(f"Huffman stream: chunk {chunk} does not end where it should; the data is damaged")
     return decoded.reshape(-1)[:count]
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrfpack.errors import HyrfError, HyrfFormatError
+from hyrfpack.quant.errors import DamagedDataError
 
 _PARAMS = struct.Struct("<ffB")
 
@@ -35,15 +35,15 @@ class MinMaxParams:
         """Read what `to_bytes` wrote.
 
         Raises:
-            HyrfFormatError: not nine bytes, a range that is not finite or not ordered, or bits not in 1 to 16.
+            DamagedDataError: not nine bytes, a range that is not finite or not ordered, or bits not in 1 to 16.
         """
         if len(data) != _PARAMS.size:
-            raise HyrfFormatError(
+            raise DamagedDataError(
                 f"min-max parameters: {len(data)} bytes instead of {_PARAMS.size}; the data is damaged"
             )
         params = cls(*_PARAMS.unpack(data))
         if not (-math.inf < params.minimum <= params.maximum < math.inf and 1 <= params.bits <= 16):
-            raise HyrfFormatError(f"min-max parameters: {params} is no range; the data is damaged")
+            raise DamagedDataError(f"min-max parameters: {params} is no range; the data is damaged")
         return params
 
 
@@ -79,13 +79,13 @@ class MinMaxQuantizer:
             Codes 0 to 2^b - 1 of the same shape, uint8 up to 8 bits, else uint16; and the parameters.
 
         Raises:
-            HyrfError: a value is not finite as float32.
+            ValueError: a value is not finite as float32.
         """
         work = np.array(values, np.float64)  # a copy, worked on in place
         with np.errstate(over="ignore"):
             minimum, maximum = (float(np.float32(f(work))) if work.size else 0.0 for f in (np.min, np.max))
         if not (math.isfinite(minimum) and math.isfinite(maximum)):
-            raise HyrfError("min-max quantisation: a value is NaN or beyond float32; only finite values can be coded")
+            raise ValueError("min-max quantisation: a value is NaN or beyond float32; only finite values can be coded")
         last = 2**self.bits - 1
         if maximum > minimum:
             work -= minimum
@@ -110,11 +110,11 @@ class MinMaxQuantizer:
             float32 of the same shape.
 
         Raises:
-            HyrfFormatError: a code is 2^b or more.
+            DamagedDataError: a code is 2^b or more.
         """
         last = 2**params.bits - 1
         if codes.max(initial=0) > last:
-            raise HyrfFormatError(f"min-max codes: {codes.max()} is more than {params.bits} bits; the data is damaged")
+            raise DamagedDataError(f"min-max codes: {codes.max()} is more than {params.bits} bits; the data is damaged")
         levels = np.arange(last + 1)
         # Both products are exact in float64, so the ends of the range are, however far apart.
         return (((last - levels) * params.minimum + levels * params.maximum) / last).astype(np.float32)[codes]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrfpack.errors import HyrfError, HyrfFormatError
+from hyrfpack.quant.errors import DamagedDataError
 
 _TRAINING_ROWS = 100_000  # rows that k-means looks at
 _SEEDING_ROWS = 16_384  # of these, rows that first centres are drawn from
@@ -61,13 +61,13 @@ class ResidualVectorQuantizer:
             codewords that are not needed repeat another or are zero.
 
         Raises:
-            HyrfError: a value is NaN, infinite, or larger than 1e30 (float32) or 65504 (float16).
+            ValueError: a value is NaN, infinite, or larger than 1e30 (float32) or 65504 (float16).
         """
         if values.ndim != 2 or values.shape[1] == 0:
             raise ValueError(f"values must be (N, D) with D >= 1, got {values.shape}")
         largest = _LARGEST[self.codebook_dtype]
         if not (np.abs(values) <= largest).all():
-            raise HyrfError(
+            raise ValueError(
                 f"residual VQ: a value is NaN or beyond +-{largest:g}, the range of {self.codebook_dtype} codebooks; "
                 "check what the values come from"
             )
@@ -99,14 +99,14 @@ class ResidualVectorQuantizer:
             (N, D) float32.
 
         Raises:
-            HyrfFormatError: the stages disagree, or an index is K or more.
+            DamagedDataError: the stages disagree, or an index is K or more.
         """
         if indices.ndim != 2 or codebooks.ndim != 3 or indices.shape[1] != codebooks.shape[0]:
-            raise HyrfFormatError(
+            raise DamagedDataError(
                 f"residual VQ: indices {indices.shape} and codebooks {codebooks.shape} disagree; the data is damaged"
             )
         if indices.max(initial=0) >= codebooks.shape[1] and indices.size:
-            raise HyrfFormatError(
+            raise DamagedDataError(
                 f"residual VQ: index {indices.max()} in a codebook of {codebooks.shape[1]}; the data is damaged"
             )
         decoded = np.zeros((len(indices), codebooks.shape[2]), np.float32)

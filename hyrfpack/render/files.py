@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from hyrfpack.atomic import write_atomic
 from hyrfpack.errors import HyrfError
-from hyrfpack.format.atomic import write_atomic
 from hyrfpack.model import HybridModel
 from hyrfpack.render.renderer import RenderSettings, render
 from hyrfpack.scene import Camera

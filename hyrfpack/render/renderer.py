@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.model import Geometry, HybridModel
+from hyrfpack.ops.pool import torch_on_one_thread
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.render.cull import frustum_cull
 from hyrfpack.scene import Camera
@@ -32,6 +33,12 @@ class RenderSettings:
     cull_tolerance: float = 0.3
     background_threshold: float = 1 / 512
     background_stride: int = 2
+
+    def __post_init__(self) -> None:
+        if not (self.near >= 0 and self.cull_tolerance >= 0 and self.background_threshold >= 0):
+            raise ValueError("near, cull_tolerance and background_threshold must not be negative")
+        if self.background_stride < 1:
+            raise ValueError(f"background_stride is {self.background_stride}; it must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -59,6 +66,7 @@ class Rendering:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
+@torch_on_one_thread()
 def render(
     model: HybridModel,
     camera: Camera,

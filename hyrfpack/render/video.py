@@ -39,15 +39,15 @@ def write_video(frames: Sequence[Path], path: str | os.PathLike[str], frames_per
     command += ["-framerate", str(frames_per_second), "-i", "-", "-vf", _EVEN, "-movflags", "+faststart"]
     command += ["-f", "mp4", str(partial)]
     try:
-        process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=False
-        )
-        try:
-            for frame in frames:
-                process.stdin.write(frame.read_bytes())
-        except BrokenPipeError:  # ffmpeg gave up; its message says why
-            pass
-        _, complaint = process.communicate()
+        with subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+        ) as process:  # which waits for the program, also when a frame cannot be read
+            try:
+                for frame in frames:
+                    process.stdin.write(frame.read_bytes())
+            except BrokenPipeError:  # ffmpeg gave up; its message says why
+                pass
+            _, complaint = process.communicate()
         if process.returncode:
             lines = complaint.decode(errors="replace").strip().splitlines() or ["it gave no reason"]
             raise HyrfError(f"{path}: ffmpeg could not make the video ({lines[-1]}); the pictures are in place")

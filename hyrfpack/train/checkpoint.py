@@ -12,8 +12,8 @@ from pathlib import Path
 
 import torch
 
+from hyrfpack.atomic import write_atomic
 from hyrfpack.errors import HyrfTrainingError
-from hyrfpack.format.atomic import write_atomic
 
 VERSION = 1
 DIGEST_BYTES = 32  # SHA-256 of all that goes before, at the end of the file

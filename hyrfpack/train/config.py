@@ -72,9 +72,11 @@ class TrainConfig:
         background: whether a background sphere is trained; None lets the preset decide.
         background_color: what transparent pictures are laid over: "black", "white" or "random" (a new colour
             every step; the model then has black behind it).
-        antialiased: compensate opacity for the rasteriser's low-pass filter.
         ssim_weight: w in (1 - w) L1 + w (1 - SSIM).
         checkpoint_every: steps between checkpoints; None for a twentieth of the run.
+        scale_rule, scale_grows, direction_encoding, position_gradients, antialiased: as in ModelConfig.
+        learning_rates, density: see LearningRates and DensityConfig.
+        grid_resolutions: vertices per axis of the coarsest and the finest level of both hash grids.
     """
 
     steps: int = 3000
@@ -89,7 +91,8 @@ class TrainConfig:
     checkpoint_every: int | None = None
     scale_rule: str = "sum"
     scale_grows: bool = True
-    direction_encoding: str = "sh"
+    direction_encoding: str = "frequency"
+    grid_resolutions: tuple[int, int] = (8, 512)
     position_gradients: bool = False
     learning_rates: LearningRates = field(default_factory=LearningRates)
     density: DensityConfig = field(default_factory=DensityConfig)
@@ -101,8 +104,13 @@ class TrainConfig:
             raise ValueError(f"preset is '{self.preset}'; it must be one of {', '.join(PRESETS)}")
         if self.background_color not in ("black", "white", "random"):
             raise ValueError(f"background_color is '{self.background_color}'; it must be black, white or random")
-        if self.max_gaussians is not None and self.max_gaussians < 1:
-            raise ValueError(f"max_gaussians is {self.max_gaussians}; it must be at least 1")
+        for name in ("max_gaussians", "checkpoint_every"):
+            if getattr(self, name) is not None and getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
+        if self.seed < 0:
+            raise ValueError(f"seed is {self.seed}; it must not be negative")
+        if not 0 <= self.ssim_weight <= 1:
+            raise ValueError(f"ssim_weight is {self.ssim_weight}; it must lie in [0, 1]")
 
     def to_dict(self) -> dict:
         """Plain numbers, strings, lists and dictionaries, ready for JSON."""

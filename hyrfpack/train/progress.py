@@ -51,10 +51,11 @@ class ProgressLine:
 
     def update(self, step: int, loss: float, mse: float, gaussians: int) -> None:
         """Take in one finished step."""
-        weight = SMOOTHING if self.loss is not None else 1.0
-        self.loss = loss * weight + (self.loss or 0) * (1 - weight)
-        self.mse = mse * weight + (self.mse or 0) * (1 - weight)
-        if self.quiet:
+        if not math.isnan(mse):
+            weight = SMOOTHING if self.loss is not None else 1.0
+            self.loss = loss * weight + (self.loss or 0) * (1 - weight)
+            self.mse = mse * weight + (self.mse or 0) * (1 - weight)
+        if self.quiet or self.loss is None:
             return
         now = time.monotonic()
         due = self.bar is not None or now - self.last_log >= LOG_EVERY or step == self.steps

@@ -6,7 +6,6 @@ import dataclasses
 import json
 import signal
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,17 +14,18 @@ from pathlib import Path
 import torch
 
 from hyrfpack import format as hyrf_format
+from hyrfpack.atomic import write_atomic
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import Evaluation, evaluate
 from hyrfpack.evaluate.figures import training_curve
-from hyrfpack.format.atomic import write_atomic
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render
 from hyrfpack.render.paths import viewpoint_hint
 from hyrfpack.scene import Scene
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.progress import ProgressLine
+from hyrfpack.train.silhouette import evenly_spaced
 from hyrfpack.train.trainer import Trainer
 
 MODEL, CHECKPOINT, METRICS = "model.hyrf", "checkpoint.pt", "metrics.json"
@@ -84,9 +84,7 @@ def train(
     trainer = Trainer(scene, config, cache)
     if resume:
         trainer.load(checkpoint)
-    start = time.monotonic()
-    first = trainer.step
-    with ProgressLine(config.steps, first, quiet) as line, _stop_requests() as stop:
+    with ProgressLine(config.steps, trainer.step, quiet) as line, _stop_requests() as stop:
         complete = trainer.run(
             checkpoint=checkpoint,
             report=lambda t, loss, mse: line.update(t.step, loss, mse, len(t.model)),
@@ -94,7 +92,6 @@ def train(
         )
     if not complete:
         return TrainResult(False, trainer.step, None, {})
-    seconds = time.monotonic() - start
 
     model = _drop_unseen_background(trainer)
     path = out / MODEL
@@ -112,8 +109,8 @@ def train(
         "notes": scene.notes,
         "gaussians": len(model),
         "bytes": path.stat().st_size,
-        "seconds": seconds,
-        "steps_per_second": (config.steps - first) / max(seconds, 1e-9),
+        "seconds": trainer.elapsed,
+        "steps_per_second": config.steps / max(trainer.elapsed, 1e-9),
         "stage_seconds": {name: round(value, 3) for name, value in sorted(trainer.seconds.items())},
         "curve": trainer.records,
     }
@@ -128,6 +125,8 @@ def train(
 
 
 def _prepare(out: Path, resume: bool, overwrite: bool) -> None:
+    if resume and not (out / CHECKPOINT).is_file():
+        raise HyrfError(f"{out}: there is no checkpoint to resume; leave out --resume to start a run")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -144,7 +143,7 @@ def _drop_unseen_background(trainer: Trainer) -> HybridModel:
     model = trainer.model
     if not model.config.background:
         return model
-    views = trainer.scene.train[:: max(1, len(trainer.scene.train) // 16)]
+    views = evenly_spaced(trainer.scene.train, 16)
     seen = max(float((1 - render(model, view.camera, background=False).alpha).mean()) for view in views)
     if seen >= BACKGROUND_SEEN:
         trainer.choices["background"] += f"; up to {seen:.1%} of a view's light comes from it"

@@ -15,13 +15,18 @@ from scipy.spatial import cKDTree
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
+from hyrfpack.model.hybrid import scale_bounds
 from hyrfpack.scene import Scene
 from hyrfpack.train.config import FULL_STEPS, TrainConfig
 from hyrfpack.train.silhouette import inside_silhouettes
 
 SYNTHETIC_HALF_BOX = 1.3  # NeRF-synthetic objects lie in [-1.3, 1.3]^3
-PIXELS_PER_GAUSSIAN = 80  # training pixels for each Gaussian of a full-length run (Mip-NeRF 360: 200M to 2.5M)
-GAUSSIANS_PER_ROW = 12  # and for each row of the radiance table; the paper's models have 8 to 20
+# Gaussians that a full-length run may have, whichever is more: for each pixel of one photo, or of all of them
+# (Mip-NeRF 360 at 1 megapixel: 0.85 and 0.9 million; published models have up to 2.5).
+PER_PHOTO_PIXEL, PER_PIXEL = 0.85, 1 / 240
+LEAST_BUDGET = 5_000
+GAUSSIANS_PER_ROW = 20  # for each row and level of the radiance table; the paper's models have 8 to 20
+SAME_WAY = 0.9  # length of the mean viewing direction from which cameras count as looking the same way
 INITIAL_OPACITY = 0.1
 INITIAL_SIZE = (1e-5, 0.5)  # local units over S(p)
 ONE_PLACE = 1e-3  # cameras spread by less than this share of their distance to the points see it all from one place
@@ -41,8 +46,9 @@ def detect_preset(scene: Scene) -> tuple[str, str]:
     cameras = [view.camera for view in scene.train]
     mean_forward = np.mean([camera.forward for camera in cameras], axis=0)
     agreement = float(np.linalg.norm(mean_forward))
-    if agreement < 0.8 or len(scene.points) == 0:
-        return "standard", "the cameras look in different directions" if agreement < 0.8 else "the scene has no points"
+    if agreement < SAME_WAY or len(scene.points) == 0:
+        why = "the cameras look in different directions" if agreement < SAME_WAY else "the scene has no points"
+        return "standard", why
     axis = mean_forward / agreement
     positions = np.array([camera.position for camera in cameras])
     offsets = positions - positions.mean(0)
@@ -59,16 +65,17 @@ def detect_preset(scene: Scene) -> tuple[str, str]:
 def scene_frame(scene: Scene, preset: str) -> Frame:
     """The box B0 of a scene under a regime, in the scene's own axes.
 
-    "synthetic" +-1.3 around the origin; "large" the 1st to 99th percentile of the points; otherwise the box of the
-    cameras, or of the points where the cameras share one place.
+    NeRF-synthetic layouts +-1.3 around the origin; "synthetic" ones of other layouts, where the unit is not known,
+    and "large" the 1st to 99th percentile of the points; otherwise the box of the cameras, or of the points where the
+    cameras share one place.
     """
-    if preset == "synthetic":
+    if preset == "synthetic" and scene.layout == "blender":
         return Frame((0.0, 0.0, 0.0), SYNTHETIC_HALF_BOX, (1.0, 1.0, 1.0))
     positions = np.array([view.camera.position for view in scene.train])
     low, high = positions.min(0), positions.max(0)
     if len(scene.points):
         reach = float(np.median(np.linalg.norm(scene.points - positions.mean(0), axis=1)))
-        if preset == "large" or (high - low).max() <= ONE_PLACE * reach:
+        if preset in ("large", "synthetic") or (high - low).max() <= ONE_PLACE * reach:
             low, high = np.percentile(scene.points, [1, 99], axis=0)
     # No points, or all coincident, and one place (up to rounding): a box of unit size in front of the first camera.
     if (high - low).max() <= 1e-9 * np.abs(positions).max():
@@ -80,15 +87,14 @@ def scene_frame(scene: Scene, preset: str) -> Frame:
 def budget_for(scene: Scene, config: TrainConfig) -> tuple[int, str]:
     """The most Gaussians a run may have, and why.
 
-    Published models have about one Gaussian for every 80 training pixels after 30,000 steps; a shorter run can fit
-    fewer, in proportion to the square root of its length.
+    It follows the photos' pixels; a shorter run can fit fewer, in proportion to the square root of its length.
     """
     if config.max_gaussians is not None:
         return config.max_gaussians, "asked for"
     pixels = sum(view.camera.width * view.camera.height for view in scene.train)
+    full = max(PER_PHOTO_PIXEL * pixels / len(scene.train), PER_PIXEL * pixels)
     share = math.sqrt(min(1.0, config.steps / FULL_STEPS))
-    budget = max(1000, round(pixels / PIXELS_PER_GAUSSIAN * share))
-    return budget, f"{pixels:,} training pixels, {config.steps:,} steps"
+    return max(LEAST_BUDGET, round(full * share)), f"{pixels:,} pixels in all, {config.steps:,} steps"
 
 
 def table_size_for(budget: int, config: TrainConfig) -> tuple[int, str]:
@@ -119,12 +125,13 @@ def build_model(scene: Scene, config: TrainConfig) -> tuple[HybridModel, int, di
     if config.background is not None:
         background, why_background = config.background, "asked for"
     else:
-        background, why_background = preset in ("standard", "street"), f"preset {preset}"
+        background, why_background = preset != "synthetic", f"preset {preset}"
 
+    base, finest = config.grid_resolutions
     model_config = ModelConfig(
         frame=frame,
-        geometry=HashGridConfig(max(4, log2 - 1)),
-        radiance=HashGridConfig(log2),
+        geometry=HashGridConfig(max(4, log2 - 1), base=base, finest=finest),
+        radiance=HashGridConfig(log2, base=base, finest=finest),
         background=background,
         solid=BACKGROUND_RGB[config.background_color],
         scale_rule=config.scale_rule,
@@ -134,13 +141,18 @@ def build_model(scene: Scene, config: TrainConfig) -> tuple[HybridModel, int, di
         antialiased=config.antialiased,
     )
     points, colors = initial_points(scene, frame, budget, config.seed)
+    source = (
+        "points of the scene"
+        if len(scene.points)
+        else "random, " + ("inside the silhouettes" if scene.has_alpha else "in the box")
+    )
     model = HybridModel(model_config, _gaussians(points, colors, model_config), _generator(config.seed))
     choices = {
         "preset": f"{preset}: {why_preset}",
         "max_gaussians": f"{budget:,}: {why_budget}",
         "log2_table_size": f"{log2}: {why_log2}",
         "background": f"{'sphere' if background else 'none'}: {why_background}",
-        "initial_gaussians": f"{len(points):,}: {'points of the scene' if len(scene.points) else 'random'}",
+        "initial_gaussians": f"{len(points):,}: {source}",
     }
     return model, budget, choices
 
@@ -168,15 +180,12 @@ def initial_points(scene: Scene, frame: Frame, budget: int, seed: int) -> tuple[
 def _gaussians(points: np.ndarray, colors: np.ndarray, config: ModelConfig) -> Gaussians:
     """Gaussians at points, as large as the gaps between them: sigma is the rms distance to the 3 nearest."""
     positions = torch.from_numpy(points).float()
+    bounds = scale_bounds(positions, config)
     if len(points) > 1:
         distances, _ = cKDTree(points).query(points, k=min(4, len(points)))
         sizes = np.sqrt((distances[:, 1:] ** 2).mean(1))
     else:
         sizes = np.full(len(points), 0.1)
-    # In units of S(p), which grows outside the box.
-    bounds = torch.ones(len(points), 1)
-    if config.scale_grows:
-        bounds = torch.linalg.vector_norm(config.frame.normalize(positions), dim=-1, keepdim=True).clamp_min(1)
     fraction = (torch.from_numpy(sizes).float()[:, None] / bounds).clamp(*INITIAL_SIZE)
     if config.scale_rule == "product":
         fraction = (2 * fraction).clamp(max=0.999)  # the neural factor starts at a half

@@ -5,10 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from hyrfpack.model import Frame
-from hyrfpack.scene import Scene
+from hyrfpack.scene import Scene, View
 
 VIEWS = 24  # silhouettes compared; more would hardly carve more
 AGREEMENT = 0.95  # share of the views that see a point which must see it covered
+
+
+def evenly_spaced(views: list[View], count: int) -> list[View]:
+    """At most `count` of the views, spread over all of them."""
+    places = np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int)
+    return [views[place] for place in places]
 
 
 def inside_silhouettes(
@@ -20,8 +26,7 @@ def inside_silhouettes(
         Local positions (N, 3) and mean pixel colours (N, 3) in [0, 1]; N is `count`, or less when hardly any point
         of the box lies inside the silhouettes (then points of the whole box fill up, in grey).
     """
-    chosen = scene.train[:: max(1, len(scene.train) // VIEWS)]
-    pictures = [(view.camera, view.load()) for view in chosen]
+    pictures = [(view.camera, view.load()) for view in evenly_spaced(scene.train, VIEWS)]
     half = np.array(frame.half_extent)
     kept_points: list[np.ndarray] = []
     kept_colors: list[np.ndarray] = []

@@ -46,7 +46,8 @@ class Trainer:
         self.density = DensityControl(config.density, config.steps, self.budget, len(self.model), config.seed)
         self.step = 0
         self.records: list[dict] = []
-        self.seconds: dict[str, float] = defaultdict(float)
+        self.seconds: dict[str, float] = defaultdict(float)  # by stage, over all parts of a resumed run
+        self.elapsed = 0.0
 
     # -- the loop ------------------------------------------------------------------------------------------------
 
@@ -61,7 +62,8 @@ class Trainer:
 
         Args:
             checkpoint: where to keep the run's state; written every `checkpoint_every` steps and when stopped early.
-            report: called after each step with the loss and the mean squared error of its view.
+            report: called after each step with the loss and the mean squared error of its view (NaN where the whole
+                photo is masked).
             stop: asked after each step.
 
         Returns:
@@ -74,9 +76,11 @@ class Trainer:
         keep_freed_memory()
         with closing(self.cache.stream(self._order())) as views, torch_on_one_thread():
             while self.step < self.config.steps:
+                start = time.perf_counter()
                 with self._timed("data"):
                     view, picture = next(views)
                 loss, mse = self._train_step(view, picture)
+                self.elapsed += time.perf_counter() - start
                 report(self, loss, mse)
                 complete = self.step == self.config.steps
                 stopped = stop() and not complete
@@ -125,7 +129,10 @@ class Trainer:
             self.optimizer.step(self.step - 1, config.steps)
         with self._timed("density"):
             self.density.act(self.step, self.model, self.optimizer)
-        mse = float(torch.mean((rendering.rgb.detach() - target) ** 2))
+        errors = (rendering.rgb.detach() - target) ** 2
+        mse = float((errors if mask is None else errors[mask]).mean())  # NaN where the whole photo is masked
+        if np.isnan(mse):
+            return value, mse
         if self.step % max(1, config.steps // RECORDS) == 0 or self.step == config.steps:
             self.records.append({"step": self.step, "loss": value, "psnr": _psnr(mse), "gaussians": len(self.model)})
         return value, mse
@@ -165,7 +172,7 @@ class Trainer:
         tensors = {f"model.{name}": p.detach() for name, p in self.model.named_parameters()}
         tensors |= {f"adam.{name}": value for name, value in self.optimizer.state_dict().items()}
         tensors |= {"density.gradients": self.density.gradients, "density.views": self.density.views}
-        progress = {"step": self.step, "records": self.records, "seconds": dict(self.seconds)}
+        progress = {"step": self.step, "records": self.records, "seconds": dict(self.seconds), "elapsed": self.elapsed}
         save_checkpoint(path, settings=self._settings(), tensors=tensors, progress=progress)
 
     def load(self, path: Path) -> None:
@@ -186,7 +193,7 @@ class Trainer:
         )
         self.density.gradients, self.density.views = tensors["density.gradients"], tensors["density.views"]
         self.step, self.records = progress["step"], progress["records"]
-        self.seconds = defaultdict(float, progress["seconds"])
+        self.seconds, self.elapsed = defaultdict(float, progress["seconds"]), progress["elapsed"]
 
 
 def _psnr(mse: float) -> float:

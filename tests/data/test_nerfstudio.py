@@ -69,6 +69,16 @@ def test_camera_models_reach_the_lens(nerfstudio_folder, entries, model, coeffic
     assert (lens.model, lens.coefficients) == (model, coefficients)
 
 
+@pytest.mark.parametrize(("lowest", "has_alpha"), [(255, False), (254, True)])
+def test_alpha_that_is_opaque_throughout_is_no_coverage(nerfstudio_folder, lowest, has_alpha):
+    root = nerfstudio_folder(9)
+    for number, path in enumerate(sorted((root / "images").iterdir())):
+        alpha = np.full((24, 32), 255 if number < 8 else lowest, np.uint8)
+        Image.fromarray(np.dstack((np.asarray(Image.open(path)), alpha))).save(path)
+
+    assert load_scene(root).has_alpha is has_alpha
+
+
 def test_listed_frames_without_a_file_are_skipped_with_a_count(nerfstudio_folder):
     root = nerfstudio_folder(5)
     (root / "images" / "003.png").unlink()

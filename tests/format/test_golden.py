@@ -43,7 +43,12 @@ def test_golden_file_has_the_recorded_configuration(file):
         geometry=HashGridConfig(log2_table_size=4, levels=2, base=2, finest=5),
         radiance=HashGridConfig(log2_table_size=5, levels=2, base=3, finest=7),
         hidden=3,
+        background=True,
         solid=(0.0, 0.5, 1.0),
+        scale_rule="sum",
+        scale_grows=True,
+        direction_encoding="sh",
+        position_gradients=False,
         antialiased=True,
     )
 

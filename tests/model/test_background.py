@@ -52,7 +52,8 @@ def test_pixel_directions_project_back_to_their_points():
     pose = torch.from_numpy(look_at((1.0, 2.0, 0.5), (0.3, -1.0, 0.2)))
     fx, fy, cx, cy = intrinsics
 
-    points = torch.rand(50, 2, dtype=torch.float64) * torch.tensor([width, height])
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(50, 2, dtype=torch.float64, generator=generator) * torch.tensor([width, height])
 
     directions = pixel_directions(points, intrinsics, pose)
 

@@ -2,9 +2,12 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
+import torch
 
-from hyrfpack.model import Frame, HashGridConfig, ModelConfig
+from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
+from hyrfpack.model.gaussians import Gaussians
 
 CONFIG = ModelConfig(
     frame=Frame((1.0, -2.0, 3e5), 0.125, (1.0, 0.25, 0.5)),
@@ -13,13 +16,24 @@ CONFIG = ModelConfig(
     background=False,
     solid=(1.0, 0.5, 0.0),
     scale_rule="product",
-    direction_encoding="frequency",
+    direction_encoding="sh",
     antialiased=True,
 )
 
 
 def test_config_survives_json():
     assert ModelConfig.from_dict(json.loads(json.dumps(CONFIG.to_dict()))) == CONFIG
+
+
+def test_by_default_grids_rise_from_8_to_512_vertices_and_directions_have_24_inputs():
+    grid = HashGridConfig(10)
+    ratios = np.divide(grid.resolutions[1:], grid.resolutions[:-1])
+    assert len(grid.resolutions) == 16 and (grid.resolutions[0], grid.resolutions[-1]) == (8, 512)
+    assert np.abs(ratios - 64 ** (1 / 15)).max() < 1 / 8  # geometric, up to whole vertices
+    config = ModelConfig(CONFIG.frame, geometry=grid, radiance=grid)
+    nothing = Gaussians(*(torch.zeros(0, width) for width in Gaussians.WIDTHS))
+    model = HybridModel(config, nothing)
+    assert model.radiance.weights[0].shape == (64, 16 * 2 + 24)
 
 
 @pytest.mark.parametrize(

@@ -123,8 +123,9 @@ def test_colours_are_the_aggregation_seen_from_the_viewpoint(encoding):
     np.testing.assert_allclose(as_float64(colors), sigmoid(raw + c_e), atol=1e-5)
 
 
-def test_background_is_the_radiance_field_on_the_sphere():
-    model = random_model(background=True)
+@pytest.mark.parametrize("encoding", ["sh", "frequency"])
+def test_background_is_the_radiance_field_on_the_sphere(encoding):
+    model = random_model(background=True, direction_encoding=encoding)
     pose = look_at((0.2, -3.0, 0.4), (0, 0, 0))
     points, intrinsics = np.array([[0.5, 0.5], [5.5, 0.5], [3.0, 4.2], [-1.0, 9.0]]), (5.0, 6.0, 2.9, 2.1)
     fx, fy, cx, cy = intrinsics
@@ -134,7 +135,7 @@ def test_background_is_the_radiance_field_on_the_sphere():
     # |origin + t ray| = 100, the positive root of the quadratic equation.
     distances = [max(np.roots([1, 2 * ray @ origin, origin @ origin - 100**2]).real) for ray in rays]
     on_sphere = origin + np.array(distances)[:, None] * rays
-    raw = field_by_hand(model.radiance, cube_by_hand(model, on_sphere), directions_by_hand(rays, "sh"))
+    raw = field_by_hand(model.radiance, cube_by_hand(model, on_sphere), directions_by_hand(rays, encoding))
 
     colors = model.decode_background(torch.from_numpy(points).float(), intrinsics, torch.from_numpy(pose).float())
 

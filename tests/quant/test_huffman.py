@@ -8,7 +8,7 @@ from dahuffman import HuffmanCodec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hyrfpack.errors import HyrfFormatError
+from hyrfpack.quant.errors import DamagedDataError
 from hyrfpack.quant.huffman import END, HuffmanCode, HuffmanStream, chunk_length, huffman_decode, huffman_encode
 
 
@@ -180,9 +180,9 @@ def test_truncation_anywhere_is_refused(name: str) -> None:
     data = huffman_encode(HARD_CASES[name]).to_bytes()
 
     for length in range(len(data)):
-        with pytest.raises(HyrfFormatError):
+        with pytest.raises(DamagedDataError):
             HuffmanStream.from_bytes(data[:length])
-    with pytest.raises(HyrfFormatError):
+    with pytest.raises(DamagedDataError):
         HuffmanStream.from_bytes(data + b"\0")
 
 
@@ -196,7 +196,7 @@ def test_damage_is_refused_or_yields_the_announced_count(data: st.DataObject) ->
     try:
         stream = HuffmanStream.from_bytes(bytes(damaged))
         decoded = huffman_decode(stream)
-    except HyrfFormatError:
+    except DamagedDataError:
         return
     assert len(decoded) == stream.count
     assert stream.count <= 8 * len(damaged)
@@ -206,7 +206,7 @@ def test_damage_is_refused_or_yields_the_announced_count(data: st.DataObject) ->
 def test_random_bytes_are_refused_or_empty(data: bytes) -> None:
     try:
         stream = HuffmanStream.from_bytes(data)
-    except HyrfFormatError:
+    except DamagedDataError:
         return
     assert stream.count <= 8 * len(data)
 
@@ -232,7 +232,7 @@ def forged(**changes: object) -> bytes:
 def test_invalid_code_tables_are_refused(lengths: list[int], symbols: list[int], claim: str) -> None:
     code = HuffmanCode(np.array(symbols, np.int32), np.array(lengths, np.uint8))
 
-    with pytest.raises(HyrfFormatError, match=claim):
+    with pytest.raises(DamagedDataError, match=claim):
         HuffmanStream.from_bytes(forged(code=code))
 
 
@@ -241,20 +241,20 @@ def test_code_table_whose_sum_wraps_around_is_refused() -> None:
     lengths = [*[1] * 256, 1, 1]
     code = HuffmanCode(np.array([*range(257), END], np.int32), np.array(lengths, np.uint8))
 
-    with pytest.raises(HyrfFormatError, match="no complete code"):
+    with pytest.raises(DamagedDataError, match="no complete code"):
         HuffmanStream.from_bytes(forged(code=code, dtype=np.dtype("u2")))
 
 
 @pytest.mark.parametrize("count", [0, 10**3, 2**40, 2**63])
 def test_forged_counts_are_refused_before_anything_is_allocated(count: int) -> None:
-    with pytest.raises(HyrfFormatError):
+    with pytest.raises(DamagedDataError):
         HuffmanStream.from_bytes(forged(count=count))
 
 
 def test_count_that_does_not_fit_the_payload_is_refused_in_decoding() -> None:
     stream = HuffmanStream.from_bytes(forged(count=6))
 
-    with pytest.raises(HyrfFormatError, match="does not end where it should"):
+    with pytest.raises(DamagedDataError, match="does not end where it should"):
         huffman_decode(stream)
 
 
@@ -263,7 +263,7 @@ def test_early_end_mark_is_refused() -> None:
     end_is_one = int(code.codes[code.symbols == END][0])
     stream = HuffmanStream(code, 8, np.dtype("u1"), np.array([8]), bytes([0b00000001 if end_is_one else 0b11111110]))
 
-    with pytest.raises(HyrfFormatError, match="does not end where it should"):
+    with pytest.raises(DamagedDataError, match="does not end where it should"):
         huffman_decode(stream)
 
 
@@ -273,7 +273,7 @@ def test_chunk_sizes_that_do_not_add_up_are_refused() -> None:
     shifted = stream.chunk_bits.copy()
     shifted[:2] += [1, -1]
 
-    with pytest.raises(HyrfFormatError, match="add up"):
+    with pytest.raises(DamagedDataError, match="add up"):
         huffman_decode(HuffmanStream(**{**vars(stream), "chunk_bits": stream.chunk_bits + 8}))
-    with pytest.raises(HyrfFormatError, match="chunk"):
+    with pytest.raises(DamagedDataError, match="chunk"):
         huffman_decode(HuffmanStream(**{**vars(stream), "chunk_bits": shifted}))

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.cluster.vq import kmeans2
 
-from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.quant import ResidualVectorQuantizer
+from hyrfpack.quant.errors import DamagedDataError
 
 
 def attributes(count: int, seed: int = 0) -> np.ndarray:
@@ -190,7 +190,7 @@ def test_values_that_cannot_be_stored_are_refused(bad: float, codebook_dtype: st
     values = np.zeros((10, 3), np.float32)
     values[4, 1] = bad
 
-    with pytest.raises(HyrfError, match="residual VQ"):
+    with pytest.raises(ValueError, match="residual VQ"):
         ResidualVectorQuantizer(codebook_dtype=codebook_dtype).encode(values)
 
 
@@ -204,10 +204,10 @@ def test_impossible_settings_are_refused(settings_: dict) -> None:
 
 
 def test_decoding_refuses_indices_outside_the_codebook() -> None:
-    with pytest.raises(HyrfFormatError, match="index 4 in a codebook of 4"):
+    with pytest.raises(DamagedDataError, match="index 4 in a codebook of 4"):
         ResidualVectorQuantizer.decode(np.array([[0, 4]], np.uint8), np.zeros((2, 4, 3), np.float32))
 
 
 def test_decoding_refuses_stages_that_disagree() -> None:
-    with pytest.raises(HyrfFormatError, match="disagree"):
+    with pytest.raises(DamagedDataError, match="disagree"):
         ResidualVectorQuantizer.decode(np.zeros((5, 3), np.uint8), np.zeros((2, 4, 3), np.float32))

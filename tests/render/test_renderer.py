@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 import torch
@@ -226,6 +228,16 @@ def test_a_background_stride_interpolates_between_exact_pixels(stride, width, he
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-5)
 
 
+def test_every_second_pixel_of_the_background_is_evaluated_by_default(monkeypatch):
+    model, camera = small_model(np.zeros((0, 3)), background=True), camera_at((0, -3.0, 0), width=31, height=18)
+    asked = []
+    decode = model.decode_background
+    monkeypatch.setattr(model, "decode_background", lambda points, *rest: asked.append(points) or decode(points, *rest))
+    picture(model, camera)
+    expected = [(x + 0.5, y + 0.5) for y in range(0, 20, 2) for x in range(0, 32, 2)]
+    assert [tuple(point) for point in asked[0].tolist()] == expected and len(asked) == 1
+
+
 @pytest.mark.parametrize("stride", [1, 2, 3])
 def test_no_pixel_above_the_threshold_lacks_background(stride):
     """What a threshold leaves out is only what lies below it, whatever the stride."""
@@ -301,6 +313,28 @@ def test_statistics_describe_the_picture():
     assert rendering.depth is None and rendering.absgrad is None
 
 
+@pytest.mark.parametrize("fails", [False, True])
+def test_torch_computes_on_one_thread_while_rendering_and_on_as_many_as_before_after(fails, monkeypatch):
+    model, seen = ball_model(), []
+    decode = model.decode_geometry
+
+    def spy(index):
+        seen.append(torch.get_num_threads())
+        if fails:
+            raise RuntimeError("no")
+        return decode(index)
+
+    monkeypatch.setattr(model, "decode_geometry", spy)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        with pytest.raises(RuntimeError, match="no") if fails else nullcontext():
+            picture(model, ring(8)[0])
+        assert seen == [1] and torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
 # -- gradients -------------------------------------------------------------------------------------------------------
 
 
@@ -319,11 +353,13 @@ def test_gradients_reach_every_parameter(background):
     assert (rendering.absgrad[~rendering.visible] == 0).all()
 
 
+@pytest.mark.parametrize("stride", [1, 2, 3])
 @pytest.mark.parametrize("part", [*Gaussians.NAMES, "geometry", "radiance"])
-def test_gradients_match_finite_differences_through_the_whole_chain(part):
+def test_gradients_match_finite_differences_through_the_whole_chain(part, stride):
     """In float64, fields attached to positions, along one random direction of each parameter group."""
     model = ball_model(12, background=True, position_gradients=True, scale_logits=-1.8).double()
     camera = camera_at((0.5, -2.5, 0.8), width=12, height=10, focal=10.0)
+    settings = RenderSettings(background_threshold=0.0, background_stride=stride)
     weights = torch.rand(10, 12, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     owner = getattr(model, part) if part in ("geometry", "radiance") else [getattr(model.gaussians, part)]
     parameters = list(owner.parameters()) if part in ("geometry", "radiance") else owner
@@ -334,12 +370,12 @@ def test_gradients_match_finite_differences_through_the_whole_chain(part):
         with torch.no_grad():
             for p, d in zip(parameters, directions, strict=True):
                 p.add_(step * d)
-            total = float((render(model, camera, EXACT).rgb * weights).sum())
+            total = float((render(model, camera, settings).rgb * weights).sum())
             for p, d in zip(parameters, directions, strict=True):
                 p.sub_(step * d)
         return total
 
-    (render(model, camera, EXACT).rgb * weights).sum().backward()
+    (render(model, camera, settings).rgb * weights).sum().backward()
     slope = sum(float((p.grad * d).sum()) for p, d in zip(parameters, directions, strict=True))
 
     step = 1e-7

@@ -25,7 +25,7 @@ def set_up(count: int = 20, *, budget: int = 1000, config=CONFIG, seed: int = 0,
     optimizer = Optimizer(model, LearningRates())
     for p in model.parameters():
         p.grad = torch.zeros_like(p)
-    optimizer.step(0.0)
+    optimizer.step(0, STEPS)
     density = DensityControl(config, STEPS, budget, count, seed)
     density.gradients = torch.as_tensor(gradients, dtype=torch.float32).expand(count).clone()
     density.views = torch.ones(count)
@@ -309,8 +309,8 @@ def seen_by(decoded, visible, absgrad) -> SimpleNamespace:
 def test_views_add_gradients_in_ndc_for_what_was_visible():
     _, _, density = set_up()
     density.clear(20)
-    density.observe(5, seen_by([3, 7, 9], [True, False, True], [[0.3, 0.0], [9.0, 9.0], [0.03, 0.04]]), 200, 100)
-    density.observe(6, seen_by([3], [True], [[0.0, 0.2]]), 200, 100)
+    density.observe(seen_by([3, 7, 9], [True, False, True], [[0.3, 0.0], [9.0, 9.0], [0.03, 0.04]]), 200, 100)
+    density.observe(seen_by([3], [True], [[0.0, 0.2]]), 200, 100)
 
     assert density.views.tolist() == [0, 0, 0, 2, 0, 0, 0, 0, 0, 1, *[0] * 10]
     expected = torch.zeros(20)
@@ -319,12 +319,31 @@ def test_views_add_gradients_in_ndc_for_what_was_visible():
     torch.testing.assert_close(density.gradients, expected)
 
 
-def test_nothing_is_collected_after_the_last_round():
-    _, _, density = set_up(gradients=0.0)
-    density.clear(20)
-    for step in (50, 51, 100):
-        density.observe(step, seen_by([3], [True], [[1.0, 1.0]]), 10, 10)
-    assert density.views.sum() == 0
+def test_views_without_gradients_leave_no_trace():
+    _, _, density = set_up(gradients=0.25)
+    density.observe(SimpleNamespace(decoded=torch.tensor([3]), visible=torch.tensor([True]), absgrad=None), 10, 10)
+    assert (density.gradients == 0.25).all() and (density.views == 1).all()
+
+
+def test_gradients_are_wanted_until_the_last_round():
+    """Before the first round too: that is what it goes by."""
+    _, _, density = set_up()
+    assert [step for step in range(1, STEPS + 1) if density.watching(step)] == list(range(1, 51))
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 10, 37, 100, 1000, 3001])
+def test_every_round_is_watched(steps):
+    """Also where the part of the run does not divide into rounds evenly."""
+    model, optimizer, _ = set_up()
+    density = DensityControl(DensityConfig(prune_opacity=0.0), steps, 20, len(model), 0)
+    acted = []
+    for step in range(1, steps + 1):
+        density.views = torch.ones(len(model))
+        density.act(step, model, optimizer)
+        if density.views.sum() == 0:
+            acted.append(step)
+    assert acted and all(density.watching(step) for step in range(1, acted[-1] + 1))
+    assert not density.watching(round(0.6 * steps) + 1)
 
 
 def test_the_same_seed_gives_the_same_children():
@@ -350,7 +369,7 @@ def test_new_gaussians_start_without_momentum():
     model, optimizer, density = set_up(gradients=high_for([2, 3]))
     for p in model.parameters():
         p.grad = torch.ones_like(p)
-    optimizer.step(0.1)
+    optimizer.step(10, STEPS)
     density.act(50, model, optimizer)
     moments = optimizer.state_dict()["positions.0.exp_avg"]
     assert (moments[:20] != 0).all() and (moments[20:] == 0).all()

@@ -31,24 +31,44 @@ def set_gradients(model, seed: int) -> None:
 def taken(model, optimizer, steps, total: int = 20) -> None:
     for step in steps:
         set_gradients(model, step)
-        optimizer.step(step / total)
+        optimizer.step(step, total)
 
 
-def test_steps_match_adam_with_the_scheduled_rates():
+# A quarter of the full length doubles the rates; runs shorter than 1,000 steps gain no more.
+PACES = [(20, 30**0.5), (1000, 30**0.5), (7500, 2.0), (30_000, 1.0), (100_000, 1.0)]
+
+
+@pytest.mark.parametrize(("steps", "pace"), PACES)
+@pytest.mark.parametrize("name", [*Gaussians.NAMES, "fields"])
+def test_rates_fall_evenly_in_their_logarithm_and_are_higher_in_short_runs(name, steps, pace):
+    first, last = getattr(RATES, name)
+    assert RATES.at(name, 0, steps) == pytest.approx(pace * first, rel=1e-12)
+    assert RATES.at(name, steps // 2, steps) == pytest.approx(pace * (first * last) ** 0.5, rel=1e-12)
+    assert RATES.at(name, steps - 1, steps) == pytest.approx(pace * last * (first / last) ** (1 / steps), rel=1e-12)
+
+
+def test_rates_fall_tenfold_or_more_by_default():
+    rates = LearningRates()
+    for name in (*Gaussians.NAMES, "fields"):
+        assert rates.at(name, 0, 30_000) >= 9.99 * rates.at(name, 30_000, 30_000) > 0
+
+
+@pytest.mark.parametrize(("steps", "pace"), PACES)
+def test_steps_match_adam_with_the_scheduled_rates(steps, pace):
     model = a_model()
     plain = {name: p.detach().clone().requires_grad_() for name, p in model.named_parameters()}
     adam = torch.optim.Adam([{"params": [p]} for p in plain.values()], eps=1e-15, foreach=False, fused=False)
     optimizer = Optimizer(model, RATES)
 
-    for step in range(20):
-        progress = step / 20
+    for step in range(0, steps, steps // 20):
+        progress = step / steps
         set_gradients(model, step)
         for group, (name, p) in zip(adam.param_groups, plain.items(), strict=True):
             p.grad = dict(model.named_parameters())[name].grad.clone()
             first, last = getattr(RATES, name.removeprefix("gaussians.") if "gaussians" in name else "fields")
-            group["lr"] = np.exp((1 - progress) * np.log(first) + progress * np.log(last))
+            group["lr"] = pace * np.exp((1 - progress) * np.log(first) + progress * np.log(last))
         adam.step()
-        optimizer.step(progress)
+        optimizer.step(step, steps)
 
     for name, parameter in model.named_parameters():
         torch.testing.assert_close(parameter.detach(), plain[name].detach(), rtol=1e-5, atol=1e-6)
@@ -101,7 +121,7 @@ def test_kept_rows_go_on_as_if_nothing_happened():
     for p, q in zip(edited.gaussians.parameters(), alone.gaussians.parameters(), strict=True):
         p.grad = q.grad[keep].clone()
     for optimizer in optimizers:
-        optimizer.step(0.5)
+        optimizer.step(10, 20)
 
     for p, q in zip(edited.gaussians.parameters(), alone.gaussians.parameters(), strict=True):
         torch.testing.assert_close(p.detach(), q.detach()[keep], rtol=1e-6, atol=1e-7)

@@ -171,6 +171,21 @@ def test_a_background_that_no_view_sees_is_dropped(tmp_path):
     assert "of a view's light" in open_air.metrics["choices"]["background"]
 
 
+def test_speed_is_told_of_all_parts_of_a_resumed_run(finished, tmp_path):
+    _, result = finished
+    assert 0 < sum(result.metrics["stage_seconds"].values()) <= 1.02 * result.metrics["seconds"] + 0.02
+    assert result.metrics["steps_per_second"] == pytest.approx(60 / result.metrics["seconds"])
+
+    stopped = Trainer(a_scene(), CONFIG)
+    stopped.run(stop=lambda: stopped.step == 50)
+    stopped.elapsed = 1e6
+    stopped.save(tmp_path / "checkpoint.pt")
+    metrics = train(a_scene(), tmp_path, CONFIG, resume=True, quiet=True).metrics
+
+    assert 1e6 < metrics["seconds"] < 1e6 + 600
+    assert metrics["steps_per_second"] == pytest.approx(60 / metrics["seconds"])
+
+
 # -- stopping and going on -------------------------------------------------------------------------------------------
 
 

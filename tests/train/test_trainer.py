@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +111,76 @@ def test_records_and_times_tell_of_the_run(whole):
     assert {"data", "cull", "decode", "loss", "backward", "density", "optimizer"} <= set(whole.seconds)
 
 
+def test_absolute_gradients_are_asked_for_only_while_they_are_used(monkeypatch):
+    asked = []
+
+    def spy(*arguments, absgrad, **options):
+        asked.append(absgrad)
+        return render(*arguments, absgrad=absgrad, **options)
+
+    monkeypatch.setattr("hyrfpack.train.trainer.render", spy)
+    trained()
+    assert asked == [True] * 27 + [False] * 13
+
+
+class Clock:
+    """Stands in for the time module: time passes only when told."""
+
+    now = 0.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+
+def on_the_clock(trainer: Trainer, clock: Clock, monkeypatch) -> None:
+    """Every step takes 2 seconds, of which the optimiser takes all."""
+    step = trainer.optimizer.step
+
+    def slow(*arguments):
+        step(*arguments)
+        clock.now += 2
+
+    monkeypatch.setattr(trainer.optimizer, "step", slow)
+
+
+def test_elapsed_seconds_are_those_of_the_steps_over_all_parts_of_a_run(tmp_path, monkeypatch):
+    clock, path = Clock(), tmp_path / "checkpoint.pt"
+    monkeypatch.setattr("hyrfpack.train.trainer.time", clock)
+    config = dataclasses.replace(SHORT, steps=12)
+
+    def meanwhile(*_) -> None:
+        clock.now += 1000  # what is done with the report is not training
+
+    first, second = Trainer(a_scene(), config), Trainer(a_scene(), config)
+    on_the_clock(first, clock, monkeypatch)
+    first.run(checkpoint=path, report=meanwhile, stop=lambda: first.step == 5)
+    assert first.elapsed == 10
+    second.load(path)
+    assert second.elapsed == 10 and second.seconds["optimizer"] == 10
+    on_the_clock(second, clock, monkeypatch)
+    second.run(report=meanwhile)
+
+    assert second.elapsed == 24 and second.seconds["optimizer"] == 24 and second.seconds["backward"] == 0
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_torch_computes_on_one_thread_while_training_and_on_as_many_as_before_after(fails):
+    trainer, seen, before = Trainer(a_scene(), dataclasses.replace(SHORT, steps=2)), [], torch.get_num_threads()
+
+    def look(*_) -> None:
+        seen.append(torch.get_num_threads())
+        if fails:
+            raise KeyboardInterrupt
+
+    try:
+        torch.set_num_threads(2)
+        with pytest.raises(KeyboardInterrupt) if fails else nullcontext():
+            trainer.run(report=look)
+        assert set(seen) == {1} and torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_reported_errors_are_those_of_the_picture():
     """Step 1 of one view, learning nothing: the mean squared error of the untrained model."""
     trainer = Trainer(a_scene(views=1), TrainConfig(steps=1, max_gaussians=80))
@@ -125,15 +196,16 @@ def test_learning_rates_fall_from_the_first_value_to_the_last():
     asked = trainer.config.learning_rates
     for group, found in zip(trainer.optimizer.adam.param_groups, np.transpose(rates), strict=True):
         first, last = getattr(asked, group["name"])
-        np.testing.assert_allclose(found, np.geomspace(first, last, 21)[:20], rtol=1e-9)
+        np.testing.assert_allclose(found, 30**0.5 * np.geomspace(first, last, 21)[:20], rtol=1e-9)
 
 
 def test_masked_pixels_teach_nothing():
-    """Photos that differ only under the mask train the same model (by the L1 part, which has no window)."""
+    """Photos that differ only under the mask train the same model (by the L1 part, which has no window)
+    and say the same of themselves."""
     scene = a_scene(views=2)
     mask = np.ones((24, 24), bool)
     mask[6:18, :10] = False
-    models = []
+    models, records = [], []
     for fill in (0, 255):
         views = []
         for view in scene.train:
@@ -144,7 +216,34 @@ def test_masked_pixels_teach_nothing():
         trainer = Trainer(dataclasses.replace(scene, train=views), config)
         trainer.run()
         models.append(parameters(trainer))
+        records.append(trainer.records)
     assert models[0] == models[1]
+    assert records[0] == records[1]
+
+
+def test_reported_errors_are_those_outside_the_mask():
+    scene = a_scene(views=1)
+    view, mask = scene.train[0], np.zeros((24, 24), bool)
+    mask[4:15, 7:20] = True
+    masked = view_of(view.name, view.camera, Picture(view.load().rgb, None, mask))
+    trainer = Trainer(dataclasses.replace(scene, train=[masked]), TrainConfig(steps=1, max_gaussians=80))
+    with torch.no_grad():
+        rgb = render(trainer.model, view.camera).rgb.double().numpy()
+    seen = []
+    trainer.run(report=lambda trainer, loss, mse: seen.append(mse))
+    errors = (rgb - view.load().rgb / 255) ** 2
+    assert seen[0] == pytest.approx(errors[4:15, 7:20].mean(), rel=1e-4)
+    assert abs(seen[0] - errors.mean()) > 0.01 * errors.mean()  # else it would not matter
+
+
+def test_a_photo_that_is_masked_all_over_teaches_nothing():
+    scene = a_scene(views=1)
+    view = scene.train[0]
+    masked = view_of(view.name, view.camera, Picture(view.load().rgb, None, np.zeros((24, 24), bool)))
+    trainer = Trainer(dataclasses.replace(scene, train=[masked]), dataclasses.replace(SHORT, steps=1))
+    before, said = parameters(trainer), []
+    trainer.run(report=lambda trainer, loss, mse: said.append((loss, mse)))
+    assert said == [(0.0, 0.0)] and parameters(trainer) == before
 
 
 # -- resuming --------------------------------------------------------------------------------------------------------

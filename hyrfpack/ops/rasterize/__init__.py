@@ -99,8 +99,6 @@ def rasterize(
 
     chosen = choose(implementation, ("reference", "cpu"), *inputs)
     if chosen == "cpu":
-        if means.device.type != "cpu" or means.dtype != torch.float32:
-            raise ValueError(f"the cpu kernels take float32 on the CPU, not {means.dtype} on {means.device}")
         from hyrfpack.ops.rasterize.cpu import rasterize as run
     else:
         from hyrfpack.ops.rasterize.reference import rasterize as run

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from hyrfpack.atomic import write_atomic
 from hyrfpack.errors import HyrfError
-from hyrfpack.format.atomic import write_atomic
 
 
 def files_in(folder: Path) -> dict[str, bytes]:
@@ -108,7 +108,7 @@ def test_process_killed_at_a_step_leaves_one_whole_file(tmp_path, step, expected
     path.write_bytes(b"old")
     script = (
         "import os, signal, sys\n"
-        "from hyrfpack.format import atomic\n"
+        "from hyrfpack import atomic\n"
         f"owner = atomic if '{step}'.startswith('_') else os\n"
         f"setattr(owner, '{step}', lambda *_: os.kill(os.getpid(), signal.SIGKILL))\n"
         "atomic.write_atomic(sys.argv[1], b'new' * 999)\n"

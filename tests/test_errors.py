@@ -1,0 +1,67 @@
+"""A package that one task alone needs, and that is not installed, is one sentence."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from scenes import small_model
+
+from hyrfpack.data import load_scene
+from hyrfpack.data.demo_scene import write_demo_scene
+from hyrfpack.errors import HyrfError, needs_package
+from hyrfpack.evaluate.figures import training_curve
+from hyrfpack.format import save
+
+
+@pytest.fixture
+def without(monkeypatch):
+    """Makes packages impossible to import."""
+
+    def hide(package: str) -> None:
+        for name in [name for name in sys.modules if name.split(".")[0] == package]:
+            monkeypatch.delitem(sys.modules, name)
+        monkeypatch.setitem(sys.modules, package, None)
+
+    return hide
+
+
+def test_a_missing_package_is_named_with_the_task_and_the_remedy():
+    with pytest.raises(HyrfError, match="^flying needs nowhere-at-all; run 'pip install nowhere-at-all'$"):
+        with needs_package("nowhere-at-all", "flying"):
+            import nowhere_at_all  # noqa: F401
+
+
+def test_profile_paper_without_dahuffman_writes_nothing(without, tmp_path):
+    without("dahuffman")
+
+    with pytest.raises(HyrfError, match="profile 'paper' needs dahuffman; run 'pip install dahuffman'"):
+        save(small_model([(0, 0, 0)]), tmp_path / "model.hyrf", "paper")
+
+    assert not list(tmp_path.iterdir())
+
+
+def test_points_without_trimesh_are_refused_by_file(without, tmp_path):
+    write_demo_scene(tmp_path, views=2, size=8)
+    without("trimesh")
+
+    with pytest.raises(HyrfError, match="sparse_pc.ply: reading points needs trimesh"):
+        load_scene(tmp_path)
+
+
+def test_a_model_without_pycolmap_is_refused_by_folder(without, tmp_path):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "sparse").mkdir()
+    for table in ("cameras", "images", "points3D"):
+        (tmp_path / "sparse" / f"{table}.txt").touch()
+    without("pycolmap")
+
+    with pytest.raises(HyrfError, match="sparse: reading COLMAP models needs pycolmap"):
+        load_scene(tmp_path)
+
+
+def test_figures_without_matplotlib_are_refused(without, tmp_path):
+    without("matplotlib")
+
+    with pytest.raises(HyrfError, match="drawing figures needs matplotlib"):
+        training_curve([{"step": 1, "psnr": 20.0, "loss": 0.1, "gaussians": 1}], tmp_path / "curve.png")
