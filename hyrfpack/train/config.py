@@ -41,7 +41,7 @@ class DensityConfig:
         gradient: least mean absolute gradient of a Gaussian's projected centre (NDC units) to clone or split it.
         split_scale: Gaussians larger than this (local units, divided by max(1, |u|)) are split, others cloned.
         prune_opacity: Gaussians fainter than this are removed.
-        prune_scale: Gaussians larger than this (as split_scale) are removed.
+        prune_scale: Gaussians larger than this (as split_scale) are removed, unless they are more than a tenth of all.
         resets: how many times opacities are capped at reset_opacity, evenly spread over the part that density
             control acts in, not counting its end.
         reset_opacity: the cap.

@@ -17,6 +17,7 @@ from hyrfpack.train.config import DensityConfig
 from hyrfpack.train.optimizer import Optimizer
 
 SPLIT_SHRINK = 1.6
+FEW = 0.1  # huge Gaussians are outliers, to be removed, up to this share of all
 
 
 class DensityControl:
@@ -73,7 +74,10 @@ class DensityControl:
         bounds = model.scale_bounds(explicit.positions)
         sizes = (geometry.scales / bounds).amax(-1)
 
-        alive = (geometry.opacities >= self.config.prune_opacity) & (sizes <= self.config.prune_scale)
+        huge = ~(sizes <= self.config.prune_scale)  # also where it is not a number
+        if huge.sum() > FEW * len(huge):  # they carry the scene, as over an even sky without a background sphere
+            huge = torch.zeros_like(huge)
+        alive = (geometry.opacities >= self.config.prune_opacity) & ~huge
         if not alive.any():  # never end with an empty scene: keep the most opaque
             alive[geometry.opacities.argmax()] = True
 

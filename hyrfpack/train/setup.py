@@ -125,7 +125,8 @@ def build_model(scene: Scene, config: TrainConfig) -> tuple[HybridModel, int, di
     if config.background is not None:
         background, why_background = config.background, "asked for"
     else:
-        background, why_background = preset != "synthetic", f"preset {preset}"
+        background = preset != "synthetic" or not scene.has_alpha
+        why_background = f"preset {preset}" + ("" if background else ", photos with transparency")
 
     base, finest = config.grid_resolutions
     model_config = ModelConfig(

@@ -74,6 +74,21 @@ def test_field_weights_fill_the_xavier_range():
         assert abs(weight.std() - bound / math.sqrt(3)) < 0.1 * bound
 
 
+# A squared length of the inputs of 9 / (4 pi) or 24 / 2, through Xavier layers with ReLUs, which halve it:
+# |x|^2 * 2 / (inputs + 64) / 2 * 64 * 2 / 128 / 2 * 64 * 2 / 67.
+@pytest.mark.parametrize(("encoding", "deviation"), [("sh", 0.0807), ("frequency", 0.309)])
+def test_an_untrained_field_of_directions_is_as_loud_as_its_inputs(encoding, deviation):
+    directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    extra = encode_directions(directions, encoding)
+    squares = []
+    for seed in range(40):
+        generator = torch.Generator().manual_seed(seed)
+        field = Field(HashGridConfig(8), outputs=3, hidden=64, extra_inputs=extra.shape[1], generator=generator)
+        with torch.no_grad():
+            squares.append(float(field(torch.full((500, 3), 0.5), extra).square().mean()))
+    assert math.sqrt(np.mean(squares)) == pytest.approx(deviation, rel=0.2)
+
+
 def test_field_is_the_same_for_the_same_seed_only():
     def made(seed: int) -> Field:
         return Field(GRID, outputs=3, hidden=16, generator=torch.Generator().manual_seed(seed))

@@ -278,6 +278,15 @@ def test_antialiasing_dims_small_gaussians_by_what_the_low_pass_adds():
     assert float(compensated / plain) == pytest.approx(variance / (variance + 0.3), rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [{"near": -0.1}, {"cull_tolerance": -0.1}, {"background_threshold": -0.1}, {"background_stride": 0}],
+)
+def test_impossible_settings_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        RenderSettings(**wrong)
+
+
 # -- caching, repeatability, statistics ------------------------------------------------------------------------------
 
 

@@ -190,12 +190,21 @@ def test_far_gaussians_are_judged_by_their_share_of_what_may_be():
     assert len(model) == 20
 
 
-@pytest.mark.parametrize("bad", [{"opacity_logits": -9.0}, {"scale_logits": 5.0}])
-def test_the_scene_is_never_emptied(bad):
-    values = {name: torch.full((20, 1), value) for name, value in bad.items()}
-    opacities = values.setdefault("opacity_logits", torch.full((20, 1), 1.0))
+@pytest.mark.parametrize(("huge", "left"), [(1, 19), (2, 18), (3, 20), (20, 20)])
+def test_huge_gaussians_are_removed_only_while_they_are_few(huge, left):
+    """Where most are huge they carry the scene; without them there would be nothing."""
+    sizes = torch.full((20, 1), SMALL)
+    sizes[:huge] = 5.0
+    model, optimizer, density = set_up(gradients=0.0, scale_logits=sizes)
+    for step in (10, 20, 30, 40, 50):
+        density.act(step, model, optimizer)
+    assert len(model) == left
+
+
+def test_the_scene_is_never_emptied():
+    opacities = torch.full((20, 1), -9.0)
     opacities[7] += 0.5  # the most opaque
-    model, optimizer, density = set_up(gradients=0.0, **values)
+    model, optimizer, density = set_up(gradients=0.0, opacity_logits=opacities)
     before = copied(model)
 
     for step in (10, 20, 30, 40, 50):

@@ -44,6 +44,17 @@ def test_running_means_start_at_the_first_value_and_follow():
     assert line.loss == pytest.approx(0.95**100) and line.mse == pytest.approx(0.5 * 0.95**100)
 
 
+def test_steps_without_an_error_leave_the_means_alone(capsys, monkeypatch):
+    """A photo that is masked all over has none."""
+    monkeypatch.setattr(progress, "LOG_EVERY", 0.0)
+    with ProgressLine(10, 0) as line:
+        line.update(1, 0.0, float("nan"), 5)
+        assert capsys.readouterr().err == ""
+        line.update(2, 1.0, 0.01, 5)
+        line.update(3, 0.0, float("nan"), 5)
+    assert (line.loss, line.mse) == (1.0, 0.01) and "PSNR 20.00" in capsys.readouterr().err
+
+
 def test_a_perfect_picture_does_not_break_the_line(capsys):
     with ProgressLine(1, 0) as line:
         line.update(1, 0.0, 0.0, 5)

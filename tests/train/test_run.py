@@ -18,7 +18,7 @@ import torch
 from scenes import ball_scene
 
 from hyrfpack import format as hyrf_format
-from hyrfpack.errors import HyrfError, HyrfTrainingError
+from hyrfpack.errors import HyrfError
 from hyrfpack.render import render
 from hyrfpack.scene import Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer, train
@@ -149,8 +149,9 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
 
 
 def test_resuming_nothing_is_one_sentence(tmp_path):
-    with pytest.raises(HyrfTrainingError, match="no checkpoint to resume from"):
-        train(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
+    with pytest.raises(HyrfError, match="no checkpoint to resume; leave out --resume"):
+        train(a_scene(), tmp_path / "run", CONFIG, resume=True, quiet=True)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_background_that_no_view_sees_is_dropped(tmp_path):
