@@ -23,6 +23,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+# The torch references run on torch's own threads, which would go on spinning on the cores of the kernels timed next.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 FOLDER = Path(__file__).parent
 sys.path.insert(0, str(FOLDER.parent))  # so that it also runs where hyrfpack is not installed
 
