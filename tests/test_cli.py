@@ -226,13 +226,15 @@ def test_demo_ends_with_a_table_and_a_picture(tmp_path):
         ("train", "nowhere", "-o", "run"),
         ("train", "junk.hyrf", "-o", "run"),
         ("train", "empty", "-o", "run"),
-        ("train", "empty", "-o", "run", "--resume"),
+        ("train", "data", "-o", "run", "--resume"),
     ],
 )
 def test_a_wrong_input_is_one_sentence_that_names_it(arguments, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "junk.hyrf").write_bytes(b"no model at all" * 20)
     (tmp_path / "empty").mkdir()
+    if "data" in arguments:
+        write_demo_scene(tmp_path / "data", views=9, size=16)
     sentence = refused(*arguments)
     assert sentence.removeprefix("Error: ").startswith("run" if "--resume" in arguments else arguments[1])
     assert not any((tmp_path / name).exists() for name in ("x.hyrf", "out", "run"))

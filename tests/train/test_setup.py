@@ -325,7 +325,7 @@ def test_the_geometry_table_is_half_the_radiance_table():
     ("preset", "background"), [("synthetic", False), ("standard", True), ("large", True), ("street", True)]
 )
 def test_the_background_follows_the_preset_unless_asked(preset, background):
-    scene = ball_scene(views=4)
+    scene = dataclasses.replace(ball_scene(views=4), has_alpha=preset == "synthetic")
     assert build_model(scene, TrainConfig(preset=preset))[0].config.background is background
     asked = TrainConfig(preset=preset, background=not background)
     assert build_model(scene, asked)[0].config.background is not background

@@ -18,6 +18,9 @@ from hyrfpack.ops.ssim.reference import C1, C2, RADIUS, window
 # The error model of numpy: a division that tests for zero would keep its loop from vectorising.
 _FAST_MATH = {"contract", "nsz", "nnan", "reassoc", "arcp"}
 njit = numba.njit(nogil=True, cache=True, fastmath=_FAST_MATH, error_model="numpy")
+# Helpers leave no symbols behind: one that stays a call is found in its own object right after compiling and in its
+# caller's when that comes from the cache, and the two may round differently.
+inlined = numba.njit(fastmath=_FAST_MATH, error_model="numpy", forceinline=True)
 
 _TILE, _STRIP = 236, 128  # most columns and rows of a task
 _GROUP = 4  # rows blurred down together: they share most of what they load
@@ -40,12 +43,12 @@ _W5, _W4, _W3, _W2, _W1, _W0 = (np.float32(weight) for weight in window()[: RADI
 _C1, _C2, _TWO = np.float32(C1), np.float32(C2), np.float32(2)
 
 
-@njit
+@inlined
 def _blur(a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, a10):
     return _W0 * a5 + _W1 * (a4 + a6) + _W2 * (a3 + a7) + _W3 * (a2 + a8) + _W4 * (a1 + a9) + _W5 * (a0 + a10)
 
 
-@njit
+@inlined
 def _blur_across(buffer, source, target, count):
     """Blur one row along its pixels."""
     for j in range(count):
@@ -65,7 +68,7 @@ def _blur_across(buffer, source, target, count):
         )
 
 
-@njit
+@inlined
 def _pair(buffer, i, k):
     """Sums of x, y, xx + yy and xy over the two pixels k floats either side of the window's middle."""
     left, right = i + np.uint64(15) - k, i + np.uint64(15) + k
@@ -73,7 +76,7 @@ def _pair(buffer, i, k):
     return x0 + x1, y0 + y1, x0 * x0 + x1 * x1 + (y0 * y0 + y1 * y1), x0 * y0 + x1 * y1
 
 
-@njit
+@inlined
 def _moments_across(buffer, target, count):
     """Blur x, y, xx + yy and xy of the row just read along its pixels."""
     for j in range(count):
@@ -92,7 +95,7 @@ def _moments_across(buffer, target, count):
         buffer[i + _U3 * _PLANE] = _W0 * (x * y) + _W1 * p1 + _W2 * p2 + _W3 * p3 + _W4 * p4 + _W5 * p5
 
 
-@njit
+@inlined
 def _blur_down(buffer, source, target, count):
     """Blur 14 rows down into a group of 4."""
     for j in range(count):
@@ -110,7 +113,7 @@ def _blur_down(buffer, source, target, count):
         buffer[o + _U3 * _ROW] = _blur(a3, a4, a5, a6, a7, a8, a9, a10, a11, a12, a13)
 
 
-@njit
+@inlined
 def _derive(buffer, source, start, count):
     """SSIM and its derivatives by E[x], E[xx] and E[xy] along one row of moments."""
     for j in range(count):
@@ -131,7 +134,7 @@ def _derive(buffer, source, start, count):
         buffer[_BY_X + j] = y * (_TWO * a2 * scale - by_product) - _TWO * x * (ssim * b2 * scale + by_square)
 
 
-@njit
+@inlined
 def _keep(buffer, plane):
     """Move the last rows of a plane to its start."""
     step = np.uint64(_STEP) * _ROW
@@ -139,13 +142,13 @@ def _keep(buffer, plane):
         buffer[plane + np.uint64(j)] = buffer[plane + step + np.uint64(j)]
 
 
-@njit
+@inlined
 def _clear(buffer, target, count):
     for j in range(count):
         buffer[target + np.uint64(j)] = np.float32(0)
 
 
-@njit
+@inlined
 def _read(pixels, row, start, count, buffer, target):
     """Copy `count` floats of a row from `start` on, with zeros outside the picture."""
     for j in range(count):

@@ -1,0 +1,42 @@
+"""Kernels give the same bytes right after they are compiled and when they come from the cache."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+SCRIPT = """
+import hashlib
+import torch
+from hyrfpack.ops.hash_encode import hash_encode, level_offsets, level_resolutions
+from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.ssim import photometric_loss
+
+g = torch.Generator().manual_seed(0)
+count, resolutions = 500, level_resolutions(4, 8, 64)
+table = torch.randn(level_offsets(resolutions, 10)[-1], 2, generator=g).requires_grad_()
+features = hash_encode(torch.rand(count, 3, generator=g), table, resolutions, 10)
+means = (torch.randn(count, 3, generator=g) + torch.tensor([0, 0, 4.0])).requires_grad_()
+scales, opacities = torch.rand(count, 3, generator=g) * 0.2, torch.rand(count, generator=g)
+colors, quats = torch.rand(count, 3, generator=g), torch.randn(count, 4, generator=g)
+camera = (torch.eye(4), (60.0, 60.0, 32.0, 32.0), 64, 64)
+picture = rasterize(means, quats, scales, opacities, colors, *camera, absgrad=torch.zeros(count, 2)).rgb
+loss = photometric_loss(picture, torch.rand(64, 64, 3, generator=g)) + features.square().mean()
+loss.backward()
+for result in (features, picture, loss, table.grad, means.grad):
+    print(hashlib.sha256(result.detach().contiguous().numpy().tobytes()).hexdigest())
+"""
+
+
+def test_compiled_and_cached_kernels_agree_in_every_bit(tmp_path):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+
+    cold, warm = (
+        subprocess.run(
+            [sys.executable, "-c", SCRIPT], env=environment, capture_output=True, text=True, check=True
+        ).stdout
+        for _ in range(2)
+    )
+
+    assert len(cold.split()) == 5 and cold == warm
