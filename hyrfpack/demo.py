@@ -21,7 +21,7 @@ from hyrfpack.format import compress, load
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render
 from hyrfpack.render.files import make_folder, render_files, save_picture
-from hyrfpack.scene import Scene
+from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train import TrainConfig, train
 
 DRAWN_VIEWS = 4
@@ -145,8 +145,7 @@ def _draw(model: HybridModel, scene: Scene, result: DemoResult) -> Image.Image:
     geometry = model.decode_geometry()
     solid = np.array(model.config.solid, np.float32)
     rows = []
-    for number in np.linspace(0, len(scene.test) - 1, min(DRAWN_VIEWS, len(scene.test))).round().astype(int):
-        view = scene.test[number]
+    for view in evenly_spaced(scene.test, DRAWN_VIEWS):
         photo = torch.from_numpy(view.load().composite(solid))
         image = to_8bit(render(model, view.camera, geometry=geometry).rgb)
         rows.append(comparison(photo, image, caption=f"{view.name}   {psnr(image, photo):.2f} dB"))

@@ -6,10 +6,13 @@ Readers in `hyrfpack.data` bring every input to this form; nothing after them kn
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -133,3 +136,9 @@ class Scene:
     def views(self) -> list[View]:
         """All views, sorted by name."""
         return sorted(self.train + self.test, key=lambda view: view.name)
+
+
+def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
+    """At most `count` of the items (views, say), spread over all of them, the first and the last among them."""
+    places = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[place] for place in places]

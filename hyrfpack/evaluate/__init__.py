@@ -19,7 +19,7 @@ from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.model import HybridModel
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.render.files import file_names, save_picture
-from hyrfpack.scene import View
+from hyrfpack.scene import View, evenly_spaced
 
 NO_LPIPS = (
     "no weights: LPIPS needs the trained network of the lpips package; "
@@ -98,7 +98,7 @@ def evaluate(
     solid = np.array(model.config.solid, dtype=np.float32)
     device = model.gaussians.positions.device
     names = file_names([view.name for view in views])
-    drawn = _spread(len(views), picture_count) if pictures is not None else set()
+    drawn = evenly_spaced(range(len(views)), picture_count) if pictures is not None else []
 
     render(model, views[0].camera, settings, geometry=geometry)  # compiles kernels and fills caches
     scores: list[ViewScore] = []
@@ -136,11 +136,6 @@ def evaluate(
         views=scores,
         skipped=skipped,
     )
-
-
-def _spread(count: int, wanted: int) -> set[int]:
-    """`wanted` whole numbers below `count`, evenly spaced, the first and the last among them."""
-    return set(np.linspace(0, count - 1, min(wanted, count)).round().astype(int).tolist())
 
 
 def _caption(score: ViewScore) -> str:

@@ -27,7 +27,7 @@ class LearningRates:
     def at(self, name: str, step: int, steps: int) -> float:
         """The rate of one group for `step` (from 0) of a run of `steps`."""
         first, last = getattr(self, name)
-        pace = math.sqrt(FULL_STEPS / max(steps, SHORT_STEPS)) if steps < FULL_STEPS else 1.0
+        pace = math.sqrt(FULL_STEPS / min(max(steps, SHORT_STEPS), FULL_STEPS))
         return pace * first * (last / first) ** (step / steps)
 
 

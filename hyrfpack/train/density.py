@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hyrfpack.model import HybridModel
+from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.render import Rendering
 from hyrfpack.train.config import DensityConfig
@@ -97,7 +97,9 @@ class DensityControl:
         optimizer.replace_gaussians(keep, {name: torch.cat((clones[name], children[name])) for name in Gaussians.NAMES})
         self.clear(len(model))
 
-    def _split(self, step: int, model: HybridModel, geometry, bounds: Tensor, split: Tensor) -> dict[str, Tensor]:
+    def _split(
+        self, step: int, model: HybridModel, geometry: Geometry, bounds: Tensor, split: Tensor
+    ) -> dict[str, Tensor]:
         """Two children for each Gaussian at `split`, drawn from it, 1.6 times smaller on every axis as decoded."""
         explicit = model.gaussians
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + step)

@@ -22,10 +22,9 @@ from hyrfpack.evaluate.figures import training_curve
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render
 from hyrfpack.render.paths import viewpoint_hint
-from hyrfpack.scene import Scene
+from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.progress import ProgressLine
-from hyrfpack.train.silhouette import evenly_spaced
 from hyrfpack.train.trainer import Trainer
 
 MODEL, CHECKPOINT, METRICS = "model.hyrf", "checkpoint.pt", "metrics.json"

@@ -142,11 +142,10 @@ def build_model(scene: Scene, config: TrainConfig) -> tuple[HybridModel, int, di
         antialiased=config.antialiased,
     )
     points, colors = initial_points(scene, frame, budget, config.seed)
-    source = (
-        "points of the scene"
-        if len(scene.points)
-        else "random, " + ("inside the silhouettes" if scene.has_alpha else "in the box")
-    )
+    if len(scene.points):
+        source = "points of the scene"
+    else:
+        source = "random, inside the silhouettes" if scene.has_alpha else "random, in the box"
     model = HybridModel(model_config, _gaussians(points, colors, model_config), _generator(config.seed))
     choices = {
         "preset": f"{preset}: {why_preset}",

@@ -5,16 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from hyrfpack.model import Frame
-from hyrfpack.scene import Scene, View
+from hyrfpack.scene import Scene, evenly_spaced
 
 VIEWS = 24  # silhouettes compared; more would hardly carve more
 AGREEMENT = 0.95  # share of the views that see a point which must see it covered
-
-
-def evenly_spaced(views: list[View], count: int) -> list[View]:
-    """At most `count` of the views, spread over all of them."""
-    places = np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int)
-    return [views[place] for place in places]
 
 
 def inside_silhouettes(

@@ -290,14 +290,20 @@ def test_resets_come_where_they_are_due_and_never_at_the_end():
 # -- when, and from what ---------------------------------------------------------------------------------------------
 
 
-def test_density_acts_at_its_rounds_only():
-    model, optimizer, density = set_up(gradients=0.0)
+def steps_of_rounds(density, model, optimizer, steps):
+    """The steps after which density control acts: a round forgets what was collected."""
     acted = []
-    for step in range(1, STEPS + 1):
+    for step in range(1, steps + 1):
         density.views = torch.ones(len(model))
         density.act(step, model, optimizer)
         if density.views.sum() == 0:
             acted.append(step)
+    return acted
+
+
+def test_density_acts_at_its_rounds_only():
+    model, optimizer, density = set_up(gradients=0.0)
+    acted = steps_of_rounds(density, model, optimizer, STEPS)
     assert acted == [10, 20, 30, 40, 50]
 
 
@@ -345,12 +351,7 @@ def test_every_round_is_watched(steps):
     """Also where the part of the run does not divide into rounds evenly."""
     model, optimizer, _ = set_up()
     density = DensityControl(DensityConfig(prune_opacity=0.0), steps, 20, len(model), 0)
-    acted = []
-    for step in range(1, steps + 1):
-        density.views = torch.ones(len(model))
-        density.act(step, model, optimizer)
-        if density.views.sum() == 0:
-            acted.append(step)
+    acted = steps_of_rounds(density, model, optimizer, steps)
     assert acted and all(density.watching(step) for step in range(1, acted[-1] + 1))
     assert not density.watching(round(0.6 * steps) + 1)
 

@@ -10,7 +10,7 @@ from scenes import ball_points, ball_scene, camera_at, photograph, ring, view_of
 
 from hyrfpack.errors import HyrfDataError, HyrfTrainingError
 from hyrfpack.model import Frame
-from hyrfpack.scene import Picture, Scene
+from hyrfpack.scene import Picture, Scene, evenly_spaced
 from hyrfpack.train import TrainConfig
 from hyrfpack.train.setup import (
     budget_for,
@@ -20,7 +20,6 @@ from hyrfpack.train.setup import (
     scene_frame,
     table_size_for,
 )
-from hyrfpack.train.silhouette import evenly_spaced
 
 
 def rig(cameras, points=None, **fields) -> Scene:
