@@ -13,6 +13,7 @@ from torch import Tensor
 from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.ops.pool import torch_on_one_thread
 from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
 from hyrfpack.render.cull import frustum_cull
 from hyrfpack.scene import Camera
 
@@ -27,18 +28,22 @@ class RenderSettings:
         background_threshold: pixels with no more transmittance than this get no background (the paper's tau).
         background_stride: the background is evaluated at every background_stride-th pixel of each axis and
             interpolated between; 1 is exact.
+        transmittance_min: a pixel is finished once no more light than this passes; 0 blends every Gaussian.
     """
 
     near: float = 0.01
     cull_tolerance: float = 0.3
     background_threshold: float = 1 / 512
     background_stride: int = 2
+    transmittance_min: float = TRANSMITTANCE_MIN
 
     def __post_init__(self) -> None:
         if not (self.near >= 0 and self.cull_tolerance >= 0 and self.background_threshold >= 0):
             raise ValueError("near, cull_tolerance and background_threshold must not be negative")
         if self.background_stride < 1:
             raise ValueError(f"background_stride is {self.background_stride}; it must be at least 1")
+        if not 0 <= self.transmittance_min < 1:
+            raise ValueError(f"transmittance_min is {self.transmittance_min}; it must lie in [0, 1)")
 
 
 @dataclass(frozen=True)
@@ -114,6 +119,7 @@ def render(
         camera.height,
         near=settings.near,
         antialiased=model.config.antialiased,
+        transmittance_min=settings.transmittance_min,
         depth=depth,
         absgrad=gradients,
     )

@@ -92,6 +92,11 @@ def _ten_thousand_layers() -> Case:
     return Case(gaussians, width=20, height=12, intrinsics=(20.0, 20.0, 10.0, 6.0))
 
 
+def _thick_fog(transmittance_min: float) -> Case:
+    options = {"transmittance_min": transmittance_min}
+    return Case(_gaussians(600, size=0.3, spread=0.4), width=33, height=20, options=options)
+
+
 def _far_from_the_origin() -> Case:
     gaussians = _gaussians(80, size=2.0, spread=16.0)
     offset = torch.tensor([1e6, -2e6, 1.5e6])
@@ -148,6 +153,8 @@ CASES: dict[str, Callable[[], Case]] = {
     "scales from 1e-6 to 1e5": _all_sizes,
     "opacities 0 and 1": _opacity_zero_and_one,
     "10,000 layers": _ten_thousand_layers,
+    "thick fog, all of it": lambda: _thick_fog(0.0),
+    "thick fog, until a twentieth of the light is left": lambda: _thick_fog(0.05),
     "1e6 from the origin": _far_from_the_origin,
     "all coincident": _all_coincident,
     "equal depths": _equal_depths,
@@ -193,7 +200,7 @@ def _expected(name: str) -> tuple[Rasterization, dict[str, Tensor], Tensor]:
 
 def _assert_picture_close(actual: Tensor, expected: Tensor, tolerance: float = 1e-4) -> None:
     """All pixels but one in 500 within tolerance of [0, 1]; those few are where rounding turns a threshold over
-    (alpha against 1/255, T against 1e-4) and may be off by what that Gaussian adds, below 0.02."""
+    (alpha against 1/255, T against transmittance_min) and may be off by what that Gaussian adds, below 0.02."""
     error = (actual.double() - expected).abs()
     assert error.max() < 0.02
     assert (error > tolerance).double().mean() <= 0.002
@@ -296,6 +303,20 @@ def test_antialiasing_keeps_the_light_of_a_small_gaussian(implementation: str) -
 
     light = opacity * 2 * math.pi * (focal * sigma / distance) ** 2
     assert picture.rgb[..., 0].sum() == pytest.approx(light, rel=0.02)
+
+
+@pytest.mark.parametrize("transmittance_min", [1e-4, 1 / 512, 0.05])
+@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+def test_stopping_early_misses_no_more_than_the_light_that_is_left(
+    implementation: str, transmittance_min: float
+) -> None:
+    whole, _, _ = _run(_thick_fog(0.0), implementation, torch.float32)
+
+    picture, _, _ = _run(_thick_fog(transmittance_min), implementation, torch.float32)
+
+    for name in ("rgb", "transmittance"):
+        missed = (getattr(picture, name) - getattr(whole, name)).abs().max()
+        assert 0.1 * transmittance_min < missed <= transmittance_min + 1e-6
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
@@ -403,6 +424,9 @@ def test_unfit_arguments_are_refused() -> None:
         rasterize(inputs[0], inputs[1][:, :3], *inputs[2:], camera, intrinsics, 10, 10)
     with pytest.raises(ValueError, match="camera_from_world is"):
         rasterize(*inputs, camera[:3], intrinsics, 10, 10)
+    for transmittance_min in (-1e-3, 1.0, math.nan):
+        with pytest.raises(ValueError, match="transmittance_min is"):
+            rasterize(*inputs, camera, intrinsics, 10, 10, transmittance_min=transmittance_min)
     with pytest.raises(ValueError, match="no pixels"):
         rasterize(*inputs, camera, intrinsics, 0, 10)
     with pytest.raises(ValueError, match="absgrad is"):

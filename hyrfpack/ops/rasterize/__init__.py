@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
 
 __all__ = ["Rasterization", "rasterize"]
 
@@ -46,6 +47,7 @@ def rasterize(
     *,
     near: float = 0.01,
     antialiased: bool = False,
+    transmittance_min: float = TRANSMITTANCE_MIN,
     depth: bool = False,
     absgrad: Tensor | None = None,
     implementation: str = "auto",
@@ -58,9 +60,10 @@ def rasterize(
         alpha = min(0.99, opacity exp(-1/2 d^T Sigma^-1 d)),  skipped below 1/255
         rgb = sum_i T_i alpha_i color_i,   T_i = product over j < i of (1 - alpha_j)
 
-    and a pixel is finished before the Gaussian that would take T below 1e-4. Gradients reach means, quats, scales,
-    opacities and colors, not the camera; none passes through an alpha that is cut at 0.99 (as autograd has it; the
-    3DGS kernels let it through). Results do not depend on the number of threads.
+    and a pixel is finished once T <= transmittance_min, so that less than this of its light is missed (the 3DGS kernels
+    also leave out the Gaussian that would take T there, and with it up to 1 % of the light). Gradients reach means,
+    quats, scales, opacities and colors, not the camera; none passes through an alpha that is cut at 0.99 (as autograd
+    has it; the 3DGS kernels let it through). Results do not depend on the number of threads.
 
     Args:
         means: (N, 3) centres in world units.
@@ -73,6 +76,7 @@ def rasterize(
         width, height: picture size in pixels.
         near: Gaussians with camera z <= near, in world units and >= 0, are left out.
         antialiased: scale opacities by sqrt(det(Sigma) / det(Sigma + 0.3 I)), so that the low-pass adds no light.
+        transmittance_min: T at which a pixel is finished, in [0, 1); 0 blends all.
         depth: also return depth.
         absgrad: (N, 2) buffer to which backward adds the sums over pixels of |dL/d mean2d| (x, y) in 1/px,
             the signal of abs-gradient densification.
@@ -93,6 +97,8 @@ def rasterize(
         raise ValueError(f"absgrad is {absgrad.dtype} {tuple(absgrad.shape)}, expected {means.dtype} {(count, 2)}")
     if not near >= 0:
         raise ValueError(f"near is {near}, expected a distance in front of the camera")
+    if not 0 <= transmittance_min < 1:
+        raise ValueError(f"transmittance_min is {transmittance_min}; it must lie in [0, 1)")
     if width < 1 or height < 1:
         raise ValueError(f"a picture of {width} x {height} has no pixels")
 
@@ -110,6 +116,7 @@ def rasterize(
             height,
             near=near,
             antialiased=antialiased,
+            transmittance_min=transmittance_min,
             depth=depth,
             absgrad=absgrad,
         )

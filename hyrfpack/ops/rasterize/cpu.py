@@ -26,6 +26,7 @@ class _View:
     height: int
     near: float
     antialiased: bool
+    transmittance_min: np.float32
     depth: bool
     absgrad: np.ndarray | None
 
@@ -60,6 +61,7 @@ def rasterize(
     *,
     near: float,
     antialiased: bool,
+    transmittance_min: float,
     depth: bool,
     absgrad: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, int, dict[str, float]]:
@@ -76,6 +78,7 @@ def rasterize(
         height=int(height),
         near=float(near),
         antialiased=bool(antialiased),
+        transmittance_min=np.float32(transmittance_min),
         depth=depth,
         absgrad=None if absgrad is None else absgrad.detach().numpy(),
     )
@@ -190,7 +193,7 @@ def _blend(tiles: _Tiles, view: _View) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
     def task(run: int) -> None:
         cpu_blend.blend_tiles(
-            *runs[run], tiles.starts, tiles.pairs, tiles.records, view.width, view.height,
+            *runs[run], tiles.starts, tiles.pairs, tiles.records, view.width, view.height, view.transmittance_min,
             rgb, transmittance, depths, blended,
         )  # fmt: skip
 
@@ -213,7 +216,7 @@ def _blend_backward(
     def task(run: int) -> None:
         cpu_blend.blend_tiles_backward(
             *runs[run], tiles.starts, tiles.pairs, blended, tiles.records, view.width, view.height,
-            rgb, transmittance, grad_rgb, grad_transmittance, view.absgrad, gradient_rows,
+            view.transmittance_min, rgb, transmittance, grad_rgb, grad_transmittance, view.absgrad, gradient_rows,
         )  # fmt: skip
 
     run_tasks(task, len(runs))

@@ -36,11 +36,10 @@ from hyrfpack.ops.rasterize.cpu_project import (
     U_Y,
     V_Y,
 )
-from hyrfpack.ops.rasterize.reference import ALPHA_MAX, TILE, TRANSMITTANCE_MIN
+from hyrfpack.ops.rasterize.reference import ALPHA_MAX, TILE
 
 _kernel = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "nnan", "reassoc", "arcp"}, error_model="numpy")
 _CAP = np.float32(ALPHA_MAX)
-_T_MIN = np.float32(TRANSMITTANCE_MIN)
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _PIXELS = TILE * TILE
 _SIDE, _U1, _FOUR, _U15 = np.uint64(TILE), np.uint64(1), np.uint64(4), np.uint64(15)
@@ -76,7 +75,7 @@ def _scratch(planes):
 
 @_kernel
 def blend_tiles(
-    first_tile, last_tile, tile_starts, pairs, records, width, height,
+    first_tile, last_tile, tile_starts, pairs, records, width, height, transmittance_min,
     rgb, transmittance, depth, blended,
 ):  # fmt: skip
     """Blend tiles first_tile to last_tile into rgb (H, W, 3), transmittance (H, W) and depth (H, W), if not None.
@@ -88,7 +87,7 @@ def blend_tiles(
     for tile in range(first_tile, last_tile):
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         columns, lines = min(TILE, width - left), min(TILE, height - top)
-        # T < 0 marks a pixel that is finished (or outside of the picture) and keeps what was left.
+        # T < 0 marks a pixel outside of the picture; it takes as little as one that is finished.
         for k in range(np.uint64(_PIXELS)):
             inside = (k & _U15) < np.uint64(columns) and k // _SIDE < np.uint64(lines)
             s[k + _T] = _ONE if inside else -_ONE
@@ -111,11 +110,8 @@ def blend_tiles(
                 alpha = min(opacity * _exp8(x), _CAP)
                 alpha = alpha if x >= cut else _ZERO
                 t = s[k + _T]
-                weight = alpha * t
-                after = t - weight
-                goes_on = after >= _T_MIN
-                weight = weight if goes_on else _ZERO
-                s[k + _T] = after if goes_on else -abs(t)
+                weight = alpha * t if t > transmittance_min else _ZERO
+                s[k + _T] = t - weight
                 s[k + _P0] += weight * red
                 s[k + _P1] += weight * green
                 s[k + _P2] += weight * blue
@@ -125,14 +121,14 @@ def blend_tiles(
             if (pair - begin) & _CHECK_EVERY == np.uint64(0):
                 going = _ZERO  # a sum, for a maximum would not be vectorised
                 for k in range(np.uint64(_PIXELS)):
-                    going += max(s[k + _T], _ZERO)
+                    going += max(s[k + _T] - transmittance_min, _ZERO)
                 if going == _ZERO:
                     break
         blended[tile] = pair - begin
         for row in range(lines):
             for column in range(columns):
                 k = np.uint64(row * TILE + column)
-                t = abs(s[k + _T])
+                t = s[k + _T]
                 transmittance[top + row, left + column] = t
                 rgb[top + row, left + column, 0] = s[k + _P0]
                 rgb[top + row, left + column, 1] = s[k + _P1]
@@ -143,7 +139,7 @@ def blend_tiles(
 
 @_kernel
 def blend_tiles_backward(
-    first_tile, last_tile, tile_starts, pairs, blended, records, width, height,
+    first_tile, last_tile, tile_starts, pairs, blended, records, width, height, transmittance_min,
     rgb, transmittance, grad_rgb, grad_transmittance, absgrad, gradient_rows,
 ):  # fmt: skip
     """Write the gradient row of each pair of tiles first_tile to last_tile at the pair's slot.
@@ -191,13 +187,10 @@ def blend_tiles_backward(
                 x = -(u * u + v * v)
                 uncut = opacity * _exp8(x)
                 alpha = min(uncut, _CAP)
-                alpha = alpha if x >= cut else _ZERO
                 t = s[k + _T]
-                after = t - alpha * t
-                goes_on = after >= _T_MIN
-                alpha = alpha if goes_on else _ZERO
-                s[k + _T] = after if goes_on else -abs(t)
+                alpha = alpha if x >= cut and t > transmittance_min else _ZERO
                 weight = alpha * t
+                s[k + _T] = t - weight
                 g_0, g_1, g_2 = s[k + _P0], s[k + _P1], s[k + _P2]
                 light = weight * (red * g_0 + green * g_1 + blue * g_2)
                 rest = s[k + _P3] - light

@@ -19,7 +19,7 @@ TILE = 16
 LOW_PASS = 0.3  # px^2 added to the diagonal of every 2D covariance
 ALPHA_MAX = 0.99
 ALPHA_MIN = 1 / 255
-TRANSMITTANCE_MIN = 1e-4
+TRANSMITTANCE_MIN = 1 / 512  # half a step of 8 bits
 COMPENSATION_MIN = 2.5e-5  # of the determinant ratio under `antialiased`
 QUAT_NORM_MIN = 1e-12
 _PIXEL_PAIRS_AT_ONCE = 1 << 21
@@ -109,11 +109,12 @@ def blend(
     values: Tensor,
     pixels: Tensor,
     on_grad: Callable[[Tensor], None] | None = None,
+    transmittance_min: float = TRANSMITTANCE_MIN,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Blend 2D Gaussians, nearest first, at some pixels.
 
         alpha_i = min(0.99, opacity_i exp(-1/2 d^T conic_i d)), left out below 1/255
-        T_i = product over j < i of (1 - alpha_j);  a pixel ends before the Gaussian that would take T below 1e-4
+        T_i = product over j < i of (1 - alpha_j);  a pixel is finished once T_i <= transmittance_min
 
     No gradient passes through an alpha that is cut at 0.99.
 
@@ -122,6 +123,7 @@ def blend(
         values: (M, C) what to blend.
         pixels: (P, 2) pixel centres.
         on_grad: called in backward with dL/d means2d apart for each pixel, (P, M, 2).
+        transmittance_min: in [0, 1).
 
     Returns:
         (P, C) sum of T_i alpha_i values_i; (P,) transmittance left; (P, M) whether alpha_i >= 1/255.
@@ -135,10 +137,15 @@ def blend(
     alphas = (opacities * torch.exp(power)).clamp_max(ALPHA_MAX)
     hits = alphas >= ALPHA_MIN
     alphas = torch.where(hits, alphas, 0)
-    alphas = torch.where((1 - alphas.detach()).cumprod(-1) >= TRANSMITTANCE_MIN, alphas, 0)
-    after = (1 - alphas).cumprod(-1)
-    after = torch.cat([after.new_ones(len(pixels), 1), after], -1)
-    return (after[:, :-1] * alphas) @ values, after[:, -1], hits
+    before = _transmittances(alphas.detach())[:, :-1]
+    alphas = torch.where(before > transmittance_min, alphas, 0)
+    transmittances = _transmittances(alphas)
+    return (transmittances[:, :-1] * alphas) @ values, transmittances[:, -1], hits
+
+
+def _transmittances(alphas: Tensor) -> Tensor:
+    """(P, M + 1) what light is left before each of the Gaussians (P, M), and after the last."""
+    return torch.cat([alphas.new_ones(len(alphas), 1), (1 - alphas).cumprod(-1)], -1)
 
 
 def rasterize(
@@ -154,6 +161,7 @@ def rasterize(
     *,
     near: float,
     antialiased: bool,
+    transmittance_min: float,
     depth: bool,
     absgrad: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, int, dict[str, float]]:
@@ -183,7 +191,9 @@ def rasterize(
             right, bottom = min(left + TILE, width), min(top + TILE, height)
             first, last = means.new_tensor([left, top]), means.new_tensor([right, bottom])
             reaches = torch.nonzero(possible & (lower <= last).all(-1) & (upper >= first).all(-1))[:, 0]
-            tile, touched = _blend_tile(projected.select(reaches), values[reaches], left, top, right, bottom, absgrad)
+            tile, touched = _blend_tile(
+                projected.select(reaches), values[reaches], left, top, right, bottom, absgrad, transmittance_min
+            )
             tiles.append(tile)
             visible[projected.index[reaches[touched]]] = True
             pairs += int(touched.sum())
@@ -199,7 +209,14 @@ def rasterize(
 
 
 def _blend_tile(
-    splats: Projected, values: Tensor, left: int, top: int, right: int, bottom: int, absgrad: Tensor | None
+    splats: Projected,
+    values: Tensor,
+    left: int,
+    top: int,
+    right: int,
+    bottom: int,
+    absgrad: Tensor | None,
+    transmittance_min: float,
 ) -> tuple[Tensor, Tensor]:
     """(h, w, C + 1) blended values and transmittance of one tile; (M,) which Gaussians reach alpha 1/255 in it."""
     like = {"device": values.device, "dtype": values.dtype}
@@ -216,7 +233,15 @@ def _blend_tile(
     for some in pixels.split(max(1, _PIXEL_PAIRS_AT_ONCE // max(1, len(values)))):
         # Recomputed in backward, so that the whole picture's pairs never lie in memory at once.
         blended, transmittance, hits = checkpoint(
-            blend, splats.means2d, splats.conics, splats.opacities, values, some, on_grad, use_reentrant=False
+            blend,
+            splats.means2d,
+            splats.conics,
+            splats.opacities,
+            values,
+            some,
+            on_grad,
+            transmittance_min,
+            use_reentrant=False,
         )
         parts.append(torch.cat([blended, transmittance[:, None]], -1))
         touched |= hits.any(0)
