@@ -34,6 +34,7 @@ _PUBLIC = {
     "load_scene": "hyrfpack.data",
     "HybridModel": "hyrfpack.model",
     "ModelConfig": "hyrfpack.model",
+    "BenchReport": "hyrfpack.bench",
     "RenderSettings": "hyrfpack.render",
     "Rendering": "hyrfpack.render",
     "TrainConfig": "hyrfpack.train",
@@ -46,7 +47,7 @@ _PUBLIC = {
     "save": "hyrfpack.format",
 }
 # Sub-packages that are also the one function they are about: `hyrfpack.render(...)` calls `hyrfpack.render.render`.
-_CALLABLE = ("evaluate", "render", "train")
+_CALLABLE = ("bench", "evaluate", "render", "train")
 
 __all__ = ["__version__", *_CALLABLE, *_PUBLIC]
 

@@ -20,7 +20,7 @@ from hyrfpack.evaluate.metrics import psnr, to_8bit
 from hyrfpack.format import compress, load
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render
-from hyrfpack.render.files import make_folder, render_files, save_picture
+from hyrfpack.render.files import render_files, save_picture
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train import TrainConfig, train
 
@@ -104,7 +104,6 @@ def run_demo(
         HyrfError: something cannot be written.
     """
     folder = Path(folder)
-    make_folder(folder / "scene" / "images")
     report(f"making a scene of {views} photos")
     write_demo_scene(folder / "scene", views=views, size=size)
     scene = load_scene(folder / "scene")

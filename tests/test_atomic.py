@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import re
 import stat
 import subprocess
 import sys
@@ -10,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from hyrfpack.atomic import write_atomic
+from hyrfpack import atomic
+from hyrfpack.atomic import replacing, write_atomic
 from hyrfpack.errors import HyrfError
 
 
@@ -75,14 +78,25 @@ def test_failure_leaves_the_old_file_and_no_temporary_one(tmp_path, monkeypatch,
     assert files_in(tmp_path) == {"model.hyrf": b"old"}
 
 
-def test_full_disk_is_one_sentence_with_the_bytes_needed(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("number", "sentence"),
+    [
+        (errno.ENOSPC, "the disk is full and this file was not written; free 1,234 bytes and try again"),
+        (errno.EDQUOT, "your quota is used up and this file was not written; free 1,234 bytes and try again"),
+        (errno.EIO, "the file cannot be written (Input/output error); choose another place or mend this one"),
+        (errno.EROFS, "the file cannot be written (Read-only file system); choose another place or mend this one"),
+    ],
+)
+def test_disk_that_takes_no_more_is_one_sentence(tmp_path, monkeypatch, number, sentence):
     def fail(_):
-        raise OSError(28, "No space left on device")
+        raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(os, "fsync", fail)
 
-    with pytest.raises(HyrfError, match="model.hyrf: the disk is full; free 1,234 bytes"):
+    with pytest.raises(HyrfError, match=re.escape(f"model.hyrf: {sentence}") + "$"):
         write_atomic(tmp_path / "model.hyrf", bytes(1234))
+
+    assert files_in(tmp_path) == {}
 
 
 def test_write_that_stops_half_way_leaves_the_old_file(tmp_path):
@@ -93,7 +107,7 @@ def test_write_that_stops_half_way_leaves_the_old_file(tmp_path):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
     try:
-        with pytest.raises(HyrfError, match="model.hyrf: the file cannot be written"):
+        with pytest.raises(HyrfError, match="model.hyrf: so large a file is not allowed here"):
             write_atomic(path, bytes(100_000))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -113,7 +127,7 @@ def test_process_killed_at_a_step_leaves_one_whole_file(tmp_path, step, expected
         f"setattr(owner, '{step}', lambda *_: os.kill(os.getpid(), signal.SIGKILL))\n"
         "atomic.write_atomic(sys.argv[1], b'new' * 999)\n"
     )
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[1]
 
     done = subprocess.run(
         [sys.executable, "-c", script, path], env={**os.environ, "PYTHONPATH": str(root)}, check=False
@@ -121,6 +135,124 @@ def test_process_killed_at_a_step_leaves_one_whole_file(tmp_path, step, expected
 
     assert done.returncode == -9
     assert path.read_bytes() == expected
+    litter = [name for name in files_in(tmp_path) if name != "model.hyrf"]
+    assert len(litter) == (expected == b"old") and all(re.fullmatch(r"\.hyrfpack-\w+\.tmp", name) for name in litter)
+    write_atomic(tmp_path / "another", b"next")  # the next one to write into the folder cleans up
+    assert files_in(tmp_path) == {"model.hyrf": expected, "another": b"next"}
+
+
+# -- several writers -------------------------------------------------------------------------------------------------
+
+needs_locks = pytest.mark.skipif(atomic.fcntl is None, reason="needs the locks of Unix")
+
+
+@needs_locks
+def test_file_of_a_living_writer_is_not_litter(tmp_path):
+    with replacing(tmp_path / "slow") as temporary:
+        temporary.write_bytes(b"half")
+        write_atomic(tmp_path / "quick", b"whole")
+        assert temporary.read_bytes() == b"half"
+
+    assert files_in(tmp_path) == {"slow": b"half", "quick": b"whole"}
+
+
+@needs_locks
+def test_folder_without_locks_keeps_litter_and_takes_files(tmp_path, monkeypatch):
+    def unsupported(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    (tmp_path / ".hyrfpack-0.tmp").write_bytes(b"perhaps somebody's")
+    monkeypatch.setattr(atomic.fcntl, "flock", unsupported)
+
+    write_atomic(tmp_path / "model.hyrf", b"new")
+
+    assert files_in(tmp_path) == {".hyrfpack-0.tmp": b"perhaps somebody's", "model.hyrf": b"new"}
+
+
+def test_system_without_locks_keeps_litter_and_takes_files(tmp_path, monkeypatch):
+    (tmp_path / ".hyrfpack-0.tmp").write_bytes(b"perhaps somebody's")
+    monkeypatch.setattr(atomic, "fcntl", None)
+
+    write_atomic(tmp_path / "model.hyrf", b"new")
+
+    assert files_in(tmp_path) == {".hyrfpack-0.tmp": b"perhaps somebody's", "model.hyrf": b"new"}
+
+
+@needs_locks
+def test_file_taken_for_litter_before_it_was_locked_is_made_anew(tmp_path, monkeypatch):
+    taken = []
+
+    def steal_the_first(descriptor, operation):
+        if not taken:
+            taken.extend(tmp_path.glob(".hyrfpack-*"))
+            taken[0].unlink()
+
+    monkeypatch.setattr(atomic.fcntl, "flock", steal_the_first)
+
+    with replacing(tmp_path / "model.hyrf") as temporary:
+        assert len(taken) == 1 and temporary not in taken and temporary.exists()
+        temporary.write_bytes(b"new")
+
+    assert files_in(tmp_path) == {"model.hyrf": b"new"}
+
+
+@needs_locks
+def test_writers_of_one_file_at_once_never_mix(tmp_path):
+    """Four processes, which also look for each other's litter; whoever reads finds the whole of one of them."""
+    path, rounds, length = tmp_path / "model.hyrf", 60, 100_000
+    path.write_bytes(b"0" * length)
+    script = (
+        "import sys\n"
+        "from hyrfpack.atomic import write_atomic\n"
+        f"for _ in range({rounds}): write_atomic(sys.argv[1], sys.argv[2].encode() * {length})\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    writers = [
+        subprocess.Popen([sys.executable, "-c", script, path, letter], env=environment, stderr=subprocess.PIPE)
+        for letter in "abcd"
+    ]
+
+    seen = set()
+    while any(writer.poll() is None for writer in writers):
+        data = path.read_bytes()
+        seen.add(data[:1])
+        assert data == data[:1] * length
+
+    assert [writer.communicate()[1].decode() for writer in writers] == [""] * 4
+    assert [writer.returncode for writer in writers] == [0] * 4
+    assert len(seen) > 1 and files_in(tmp_path).keys() == {"model.hyrf"}
+
+
+# -- places that take no file ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_pipe_is_refused_also_behind_a_link(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "pipe")
+
+    for name in ("pipe", "link"):
+        with pytest.raises(HyrfError, match=f"{name}: this is a device or a pipe; name a file"):
+            write_atomic(tmp_path / name, b"new")
+
+    assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")
+def test_device_is_refused_and_stays():
+    with pytest.raises(HyrfError, match="/dev/full: this is a device or a pipe; name a file"):
+        write_atomic("/dev/full", b"new")
+
+    assert stat.S_ISCHR(os.stat("/dev/full").st_mode)
+
+
+def test_working_folder_that_was_removed_is_one_sentence(tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+
+    with pytest.raises(HyrfError, match="model.hyrf: the file cannot be written .No such file or directory"):
+        write_atomic("model.hyrf", b"new")
 
 
 def test_missing_folder_is_named(tmp_path):

@@ -19,7 +19,7 @@ from hyrfpack.cli.files import PROFILES
 from hyrfpack.cli.train import PRESETS, train
 from hyrfpack.data.demo_scene import write_demo_scene
 
-COMMANDS = ("train", "compress", "decompress", "render", "evaluate", "info", "demo")
+COMMANDS = ("train", "compress", "decompress", "render", "evaluate", "info", "bench", "demo")
 
 
 def hyrfpack(*arguments: object):

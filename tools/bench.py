@@ -14,9 +14,7 @@ import argparse
 import importlib.util
 import json
 import os
-import platform
 import sys
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from rich.console import Console
@@ -29,27 +27,14 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 FOLDER = Path(__file__).parent
 sys.path.insert(0, str(FOLDER.parent))  # so that it also runs where hyrfpack is not installed
 
+from hyrfpack.bench.machine import machine, machine_line  # noqa: E402 - after both of the above
+
 Row = dict[str, object]
 
 
 def benchmarks() -> dict[str, Path]:
     """The benchmark files beside this one, by name."""
     return {path.stem.removeprefix("bench_"): path for path in sorted(FOLDER.glob("bench_*.py"))}
-
-
-def machine() -> dict[str, object]:
-    """What the times depend on: processor, usable cores, GPU, versions."""
-    facts: dict[str, object] = {"cpu": _processor(), "cores": _cores(), "python": platform.python_version()}
-    for package in ("torch", "numba", "numpy"):
-        try:
-            facts[package] = version(package)
-        except PackageNotFoundError:
-            facts[package] = None
-    import torch
-
-    if torch.cuda.is_available():
-        facts["gpu"] = torch.cuda.get_device_name()
-    return facts
 
 
 def run(path: Path) -> list[Row]:
@@ -81,7 +66,7 @@ def main(arguments: list[str] | None = None) -> None:
 
     console = Console(width=None if sys.stdout.isatty() else 200, highlight=False)
     facts = machine()
-    console.print(", ".join(f"{key} {value}" for key, value in facts.items()), markup=False)
+    console.print(machine_line(facts), markup=False)
     results = {}
     for name in asked.only or benchmarks():
         results[name] = run(benchmarks()[name])
@@ -96,19 +81,6 @@ def _cell(value: object) -> str:
     if isinstance(value, float):
         return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
     return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else escape(str(value))
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 if __name__ == "__main__":

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from timing import interleaved_medians
 from torch import Tensor
 
+from hyrfpack.bench.timing import take_turns
 from hyrfpack.ops.hash_encode import hash_encode, level_offsets, level_resolutions
 from hyrfpack.ops.mlp import mlp
 
@@ -57,15 +57,15 @@ def compare(passes: Callable[[str, torch.dtype], Passes], items: int) -> list[di
     exact = passes("reference", torch.float64)
     rows = []
     for index, way in enumerate(("forward", "backward")):
-        times = interleaved_medians({"cpu": ours[index], "reference": reference[index]}, REPEATS)
+        times, _ = take_turns({"cpu": ours[index], "reference": reference[index]}, REPEATS)
         expected = exact[index]()
         rows.append(
             {
                 "pass": way,
-                "ms": times["cpu"],
-                "ns_an_item": 1e6 * times["cpu"] / items,
-                "reference_ms": times["reference"],
-                "times_faster": times["reference"] / times["cpu"],
+                "ms": times["cpu"].ms,
+                "ns_an_item": 1e6 * times["cpu"].ms / items,
+                "reference_ms": times["reference"].ms,
+                "times_faster": times["reference"].ms / times["cpu"].ms,
                 "max_error": ((ours[index]() - expected).abs().max() / expected.abs().max()).item(),
             }
         )

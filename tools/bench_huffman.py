@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from statistics import median
-
 import numpy as np
 from dahuffman import HuffmanCodec
 
+from hyrfpack.bench.timing import take_turns
 from hyrfpack.quant import MinMaxQuantizer, huffman_decode, huffman_encode
 
 COUNT = 3_400_000
@@ -28,12 +25,6 @@ def entropy_bits(symbols: np.ndarray) -> float:
     """Zeroth-order entropy in bits a symbol."""
     shares = np.bincount(symbols)[np.unique(symbols)] / len(symbols)
     return float(-(shares * np.log2(shares)).sum())
-
-
-def seconds(task: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    task()
-    return time.perf_counter() - start
 
 
 def bench() -> list[dict]:
@@ -56,9 +47,8 @@ def bench() -> list[dict]:
     }
     rows = []
     for name, (ours, theirs) in tasks.items():
-        times = [(seconds(ours), seconds(theirs)) for _ in range(REPEATS)]
-        our_rate = COUNT / median(pair[0] for pair in times) / 1e6
-        peer_rate = len(head) / median(pair[1] for pair in times) / 1e6
+        times, _ = take_turns({"ours": ours, "dahuffman": theirs}, REPEATS)
+        our_rate, peer_rate = COUNT / times["ours"].ms / 1e3, len(head) / times["dahuffman"].ms / 1e3
         rows.append(
             {
                 "operation": name,

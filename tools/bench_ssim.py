@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import torch
-from timing import interleaved_medians
 from torch import Tensor
 
+from hyrfpack.bench.timing import take_turns
 from hyrfpack.ops.ssim import photometric_loss
 
 REPEATS = 7
@@ -31,14 +31,14 @@ def value_and_gradient(image: Tensor, target: Tensor, mask: Tensor | None, imple
 def compare(image: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, float]:
     """Times of loss and gradient together, and errors against float64 (the gradient's over its largest value)."""
     tasks = {way: lambda way=way: value_and_gradient(image, target, mask, way) for way in ("cpu", "reference")}
-    times = interleaved_medians(tasks, REPEATS)
+    times, _ = take_turns(tasks, REPEATS)
     value, gradient = tasks["cpu"]()
     expected, slope = value_and_gradient(image.double(), target.double(), mask, "reference")
     return {
-        "ms": times["cpu"],
-        "ns_a_pixel": 1e6 * times["cpu"] / image[..., 0].numel(),
-        "reference_ms": times["reference"],
-        "times_faster": times["reference"] / times["cpu"],
+        "ms": times["cpu"].ms,
+        "ns_a_pixel": 1e6 * times["cpu"].ms / image[..., 0].numel(),
+        "reference_ms": times["reference"].ms,
+        "times_faster": times["reference"].ms / times["cpu"].ms,
         "value_error": abs(value - expected),
         "gradient_error": ((gradient - slope).abs().max() / slope.abs().max()).item(),
     }

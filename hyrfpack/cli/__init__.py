@@ -6,11 +6,13 @@ Nothing here imports torch or numpy before a command needs it, so that `hyrfpack
 
 from __future__ import annotations
 
+import errno
 from typing import Any
 
 import click
 
 import hyrfpack
+from hyrfpack.cli.bench import bench
 from hyrfpack.cli.demo import demo
 from hyrfpack.cli.files import compress, decompress, info
 from hyrfpack.cli.train import train
@@ -25,12 +27,21 @@ class _Commands(click.Group):
         try:
             return super().invoke(ctx)
         except HyrfError as error:
-            failure = click.ClickException(str(error))
-            failure.exit_code = 2
-            raise failure from error
+            raise _failure(str(error)) from error
+        except OSError as error:
+            # Files are written by functions that raise HyrfError: what is left is printing onto a full disk.
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            raise _failure(f"what was to be said cannot be printed ({error.strerror}); lead it elsewhere") from error
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(self.commands)  # in the order of use, not of the alphabet
+
+
+def _failure(sentence: str) -> click.ClickException:
+    failure = click.ClickException(sentence)
+    failure.exit_code = 2
+    return failure
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -47,5 +58,5 @@ def main() -> None:
     """
 
 
-for _command in (train, compress, decompress, render, evaluate, info, demo):
+for _command in (train, compress, decompress, render, evaluate, bench, info, demo):
     main.add_command(_command)

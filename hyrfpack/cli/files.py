@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hyrfpack.cli.common import PATH, json_option, print_json, table
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfError, printable
 
 if TYPE_CHECKING:
     from hyrfpack.format import CompressionReport
@@ -73,23 +73,28 @@ def info(file: Path, as_json: bool) -> None:
         return
     config, provenance = facts["config"], facts["provenance"]
     click.echo(f"{file}: {facts['bytes']:,} bytes, {facts['gaussians']:,} Gaussians")
-    click.echo(f"written by {facts['writer']}, format {facts['version']}, profile {facts['profile']}\n")
-    click.echo(_section_table(facts["sections"], facts["bytes"], facts["gaussians"]))
+    _say(f"written by {facts['writer']}, format {facts['version']}, profile {facts['profile']}")
+    click.echo("\n" + _section_table(facts["sections"], facts["bytes"], facts["gaussians"]))
     click.echo("\nmodel")
     frame = config["frame"]
     center = ", ".join(f"{value:.4g}" for value in frame["center"])
-    half = " x ".join(f"{2 * value * frame['scale']:.4g}" for value in frame["half_extent"])
-    click.echo(f"  {'box':<18}  {half} around ({center}), world units")
+    half = " x ".join(f"{2.0 * value * frame['scale']:.4g}" for value in frame["half_extent"])
+    _say(f"  {'box':<18}  {half} around ({center}), world units")
     for name in ("geometry", "radiance"):
-        click.echo(f"  {name + ' grid':<18}  {_in_words(config[name])}")
+        _say(f"  {name + ' grid':<18}  {_in_words(config[name])}")
     for name, value in config.items():
         if name not in ("frame", "geometry", "radiance"):
-            click.echo(f"  {name.replace('_', ' '):<18}  {value}")
-    choices = provenance.get("choices", {})
-    if choices:
+            _say(f"  {name.replace('_', ' '):<18}  {value}")
+    choices = provenance.get("choices")
+    if choices and isinstance(choices, dict):
         click.echo("\nchosen in training")
         for name, reason in choices.items():
-            click.echo(f"  {name.replace('_', ' '):<18}  {reason}")
+            _say(f"  {name.replace('_', ' '):<18}  {reason}")
+
+
+def _say(line: str) -> None:
+    """Print a line with words of the file in it."""
+    click.echo(printable(line))
 
 
 def _rewrite(source: Path, target: Path, profile: str, as_json: bool) -> None:

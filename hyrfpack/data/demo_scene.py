@@ -6,6 +6,7 @@ metres, z up. Vectors are (3, N) float32, so that each component is contiguous.
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hyrfpack.atomic import make_folder, write_atomic
 from hyrfpack.errors import needs_package
 
 _FAR = np.float32(1e9)
@@ -63,6 +65,7 @@ def write_demo_scene(folder: str | os.PathLike[str], *, views: int = 60, size: i
 
     Raises:
         ValueError: fewer than two views or a size below 8.
+        HyrfError: the folder or a file cannot be written.
     """
     with needs_package("pillow", "making photos"):
         from PIL import Image
@@ -70,7 +73,7 @@ def write_demo_scene(folder: str | os.PathLike[str], *, views: int = 60, size: i
     if views < 2 or size < 8:
         raise ValueError(f"a scene needs 2 views of 8 pixels or more, not {views} of {size}")
     folder = Path(folder)
-    (folder / "images").mkdir(parents=True, exist_ok=True)
+    make_folder(folder / "images")
     rng = np.random.default_rng(seed)
     noise = _noise_tile(rng)
     frames, points, colors = [], [], []
@@ -78,7 +81,9 @@ def write_demo_scene(folder: str | os.PathLike[str], *, views: int = 60, size: i
     for index in range(views):
         world_from_camera, focal = _place_camera(index, views, size, rng)
         picture, surface = _render(world_from_camera, focal, size, noise)
-        Image.fromarray(picture).save(folder / "images" / f"{index:04d}.png")
+        photo = io.BytesIO()
+        Image.fromarray(picture).save(photo, format="png")
+        write_atomic(folder / "images" / f"{index:04d}.png", photo.getbuffer())
         frames.append(
             {
                 "file_path": f"images/{index:04d}.png",
@@ -100,7 +105,7 @@ def write_demo_scene(folder: str | os.PathLike[str], *, views: int = 60, size: i
         colors.append(picture[rows, columns][near])
     _write_ply(folder / "sparse_pc.ply", np.concatenate(points), np.concatenate(colors))
     content = {"camera_model": "PINHOLE", "ply_file_path": "sparse_pc.ply", "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(content, indent=1))
+    write_atomic(folder / "transforms.json", json.dumps(content, indent=1).encode())
     return folder
 
 
@@ -352,4 +357,4 @@ def _write_ply(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
     vertices["position"], vertices["color"] = points, colors
     fields = [f"property float {axis}" for axis in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *fields, "end_header", ""]
-    path.write_bytes("\n".join(header).encode() + vertices.tobytes())
+    write_atomic(path, "\n".join(header).encode() + vertices.tobytes())

@@ -13,9 +13,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from hyrfpack.atomic import write_atomic
+from hyrfpack.atomic import make_folder, write_atomic
 from hyrfpack.errors import needs_package
-from hyrfpack.render.files import make_folder
 
 ERROR_LIMIT = 0.2  # mean absolute difference over channels that gets the brightest colour
 PANEL_WIDTH = 640  # pixels; larger pictures are shrunk to it

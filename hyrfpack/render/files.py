@@ -11,8 +11,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from hyrfpack.atomic import write_atomic
-from hyrfpack.errors import HyrfError
+from hyrfpack.atomic import make_folder, write_atomic
 from hyrfpack.model import HybridModel
 from hyrfpack.render.renderer import RenderSettings, render
 from hyrfpack.scene import Camera
@@ -90,13 +89,3 @@ def save_picture(path: str | os.PathLike[str], image: Image.Image) -> None:
     image.save(data, format=Image.registered_extensions()[Path(path).suffix.lower()])
     make_folder(Path(path).parent)
     write_atomic(path, data.getbuffer())
-
-
-def make_folder(path: Path) -> None:
-    """Make a folder and those above it. Raises HyrfError when that cannot be done."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise HyrfError(
-            f"{path}: the folder cannot be made ({error.strerror or error}); choose another place"
-        ) from error

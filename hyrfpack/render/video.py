@@ -8,6 +8,7 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
+from hyrfpack.atomic import replacing
 from hyrfpack.errors import HyrfError
 
 # Chroma is stored at half resolution, so both sides must be even; a black row or column is added when they are not.
@@ -33,14 +34,11 @@ def write_video(frames: Sequence[Path], path: str | os.PathLike[str], frames_per
     program = shutil.which("ffmpeg")
     if program is None:
         raise HyrfError(f"{path}: no video was made because there is no ffmpeg program; install ffmpeg and try again")
-    target = Path(path)
-    partial = target.with_name(f".{target.name}.tmp")
     command = [program, "-hide_banner", "-loglevel", "error", "-y", "-f", "image2pipe", "-c:v", "png"]
-    command += ["-framerate", str(frames_per_second), "-i", "-", "-vf", _EVEN, "-movflags", "+faststart"]
-    command += ["-f", "mp4", str(partial)]
-    try:
+    command += ["-framerate", str(frames_per_second), "-i", "-", "-vf", _EVEN, "-movflags", "+faststart", "-f", "mp4"]
+    with replacing(path) as partial:
         with subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+            [*command, str(partial)], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
         ) as process:  # which waits for the program, also when a frame cannot be read
             try:
                 for frame in frames:
@@ -51,10 +49,3 @@ def write_video(frames: Sequence[Path], path: str | os.PathLike[str], frames_per
         if process.returncode:
             lines = complaint.decode(errors="replace").strip().splitlines() or ["it gave no reason"]
             raise HyrfError(f"{path}: ffmpeg could not make the video ({lines[-1]}); the pictures are in place")
-        os.replace(partial, target)
-    except OSError as error:
-        raise HyrfError(
-            f"{path}: the video cannot be written ({error.strerror or error}); choose another place"
-        ) from error
-    finally:
-        partial.unlink(missing_ok=True)

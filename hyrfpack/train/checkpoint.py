@@ -26,6 +26,9 @@ def save_checkpoint(path: Path, *, settings: dict, tensors: dict[str, torch.Tens
         settings: plain values that must be the same on resuming.
         tensors: by name.
         progress: plain values (step, records).
+
+    Raises:
+        HyrfError: the file cannot be written; one that was there before stays.
     """
     buffer = io.BytesIO()
     texts = {"version": VERSION, "settings": json.dumps(settings, sort_keys=True), "progress": json.dumps(progress)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from contextlib import suppress
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -49,6 +50,13 @@ class ProgressLine:
         if self.bar:
             self.bar.stop()
 
+    def note(self, sentence: str) -> None:
+        """Tell the person something between the steps."""
+        if self.bar:
+            self.bar.console.print(sentence, markup=False, highlight=False)
+        elif not self.quiet:
+            _print(sentence)
+
     def update(self, step: int, loss: float, mse: float, gaussians: int) -> None:
         """Take in one finished step."""
         if not math.isnan(mse):
@@ -69,4 +77,9 @@ class ProgressLine:
         else:
             self.last_log = now
             left = (self.steps - step) / max(rate, 1e-9)
-            print(f"step {step:,}/{self.steps:,}  {line}  {left:.0f} s left", file=sys.stderr, flush=True)
+            _print(f"step {step:,}/{self.steps:,}  {line}  {left:.0f} s left")
+
+
+def _print(line: str) -> None:
+    with suppress(OSError):  # a log file on a full disk does not end the training
+        print(line, file=sys.stderr, flush=True)

@@ -14,9 +14,9 @@ from pathlib import Path
 import torch
 
 from hyrfpack import format as hyrf_format
-from hyrfpack.atomic import write_atomic
+from hyrfpack.atomic import check_writable, make_folder, write_atomic
 from hyrfpack.data import PictureCache
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate import Evaluation, evaluate
 from hyrfpack.evaluate.figures import training_curve
 from hyrfpack.model import HybridModel
@@ -74,7 +74,8 @@ def train(
         quiet: print nothing.
 
     Raises:
-        HyrfError: the folder holds another run, or training cannot start or go on.
+        HyrfError: the folder holds another run, training cannot start or go on, no photo has a pixel to train on, or
+            the results cannot be written (a checkpoint that cannot, while training, is a line on standard error).
     """
     out = Path(out)
     config = config or TrainConfig()
@@ -83,16 +84,31 @@ def train(
     trainer = Trainer(scene, config, cache)
     if resume:
         trainer.load(checkpoint)
-    with ProgressLine(config.steps, trainer.step, quiet) as line, _stop_requests() as stop:
-        complete = trainer.run(
-            checkpoint=checkpoint,
-            report=lambda t, loss, mse: line.update(t.step, loss, mse, len(t.model)),
-            stop=stop,
+    with _naming_the_checkpoint(trainer):
+        with ProgressLine(config.steps, trainer.step, quiet) as line, _stop_requests() as stop:
+            complete = trainer.run(
+                checkpoint=checkpoint,
+                report=lambda t, loss, mse: line.update(t.step, loss, mse, len(t.model)),
+                stop=stop,
+                warn=line.note,
+            )
+        if not complete:
+            return TrainResult(False, trainer.step, None, {})
+        metrics = _finish(trainer, out)
+    checkpoint.unlink(missing_ok=True)
+    return TrainResult(True, trainer.step, out / MODEL, metrics)
+
+
+def _finish(trainer: Trainer, out: Path) -> dict:
+    """Write what a finished run leaves, the model first; returns the metrics."""
+    scene, config = trainer.scene, trainer.config
+    if not trainer.records:
+        raise HyrfTrainingError(
+            f"{scene.path}: the masks of all photos leave no pixel to train on; check that white means 'use this pixel'"
         )
-    if not complete:
-        return TrainResult(False, trainer.step, None, {})
 
     model = _drop_unseen_background(trainer)
+    make_folder(out)  # should it have been removed meanwhile
     path = out / MODEL
     provenance = {
         "steps": config.steps,
@@ -100,14 +116,14 @@ def train(
         "choices": trainer.choices,
         "viewpoint": viewpoint_hint([view.camera for view in scene.train]),
     }
-    hyrf_format.save(model, path, profile="raw", provenance=provenance)
+    report = hyrf_format.save(model, path, profile="raw", provenance=provenance)
     metrics = {
         "settings": config.to_dict(),
         "scene": {"path": scene.path, "layout": scene.layout, "train": len(scene.train), "test": len(scene.test)},
         "choices": trainer.choices,
         "notes": scene.notes,
         "gaussians": len(model),
-        "bytes": path.stat().st_size,
+        "bytes": report.bytes_after,
         "seconds": trainer.elapsed,
         "steps_per_second": config.steps / max(trainer.elapsed, 1e-9),
         "stage_seconds": {name: round(value, 3) for name, value in sorted(trainer.seconds.items())},
@@ -119,17 +135,27 @@ def train(
         metrics["evaluation"] = scores.to_dict()
     training_curve(trainer.records, out / "curve.png")
     write_atomic(out / METRICS, json.dumps(metrics, indent=1).encode())
-    checkpoint.unlink(missing_ok=True)
-    return TrainResult(True, trainer.step, path, metrics)
+    return metrics
+
+
+@contextmanager
+def _naming_the_checkpoint(trainer: Trainer) -> Iterator[None]:
+    """Add to an error of reading or writing what is there to go on from."""
+    try:
+        yield
+    except HyrfError as error:
+        if isinstance(error, HyrfTrainingError) or trainer.saved is None:
+            raise
+        raise type(error)(
+            f"{error}; the checkpoint of step {trainer.saved:,} is kept, --resume goes on from there"
+        ) from error
 
 
 def _prepare(out: Path, resume: bool, overwrite: bool) -> None:
     if resume and not (out / CHECKPOINT).is_file():
         raise HyrfError(f"{out}: there is no checkpoint to resume; leave out --resume to start a run")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise HyrfError(f"{out}: the folder cannot be made ({error.strerror}); name another with -o") from error
+    make_folder(out)
+    check_writable(out)
     left = [name for name in (MODEL, CHECKPOINT) if (out / name).exists()]
     if left and not (resume or overwrite):
         hint = "--resume goes on with it, " if CHECKPOINT in left else ""

@@ -29,6 +29,7 @@ GAUSSIANS_PER_ROW = 20  # for each row and level of the radiance table; the pape
 SAME_WAY = 0.9  # length of the mean viewing direction from which cameras count as looking the same way
 INITIAL_OPACITY = 0.1
 INITIAL_SIZE = (1e-5, 0.5)  # local units over S(p)
+FARTHEST = 1e4  # local units per axis; to pull in what is farther turns it by 2e-4 radians at most, seen from the box
 ONE_PLACE = 1e-3  # cameras spread by less than this share of their distance to the points see it all from one place
 BACKGROUND_RGB = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": (0.0, 0.0, 0.0)}
 
@@ -161,7 +162,8 @@ def initial_points(scene: Scene, frame: Frame, budget: int, seed: int) -> tuple[
     """Local positions (N, 3) float64 and colours (N, 3) in [0, 1] to start from, N at most the budget.
 
     The scene's points (a random part of them if they are too many), or without points half a budget of random ones
-    in the box - for photos with coverage only where all silhouettes agree.
+    in the box - for photos with coverage only where all silhouettes agree. Points that a reconstruction flung far out
+    are pulled in, along the line to the frame's centre, to where half precision still holds them.
     """
     generator = np.random.default_rng(seed)
     if len(scene.points):
@@ -169,7 +171,7 @@ def initial_points(scene: Scene, frame: Frame, budget: int, seed: int) -> tuple[
         if len(points) > budget:
             chosen = np.sort(generator.choice(len(points), budget, replace=False))
             points, colors = points[chosen], colors[chosen]
-        return points, colors
+        return points / np.maximum(1, np.abs(points).max(axis=1, keepdims=True) / FARTHEST), colors
     count = max(1, budget // 2)
     half = np.array(frame.half_extent)
     if not scene.has_alpha:

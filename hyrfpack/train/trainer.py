@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -12,7 +13,7 @@ import numpy as np
 import torch
 
 from hyrfpack.data import PictureCache
-from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.pool import keep_freed_memory, torch_on_one_thread
@@ -45,6 +46,7 @@ class Trainer:
         self.optimizer = Optimizer(self.model, config.learning_rates)
         self.density = DensityControl(config.density, config.steps, self.budget, len(self.model), config.seed)
         self.step = 0
+        self.saved: int | None = None  # the step that the checkpoint on disk is of
         self.records: list[dict] = []
         self.seconds: dict[str, float] = defaultdict(float)  # by stage, over all parts of a resumed run
         self.elapsed = 0.0
@@ -57,6 +59,7 @@ class Trainer:
         checkpoint: Path | None = None,
         report: Callable[[Trainer, float, float], None] = lambda trainer, loss, mse: None,
         stop: Callable[[], bool] = lambda: False,
+        warn: Callable[[str], None] = warnings.warn,
     ) -> bool:
         """Train until the last step, or until `stop()` says so.
 
@@ -65,12 +68,15 @@ class Trainer:
             report: called after each step with the loss and the mean squared error of its view (NaN where the whole
                 photo is masked).
             stop: asked after each step.
+            warn: told when a checkpoint cannot be written, as on a full disk. Training goes on and tries again at the
+                next one, for hours of work are worth more than a checkpoint.
 
         Returns:
             Whether the run is complete.
 
         Raises:
-            HyrfTrainingError: the loss or a gradient is not finite; the step, view and parameter group are named.
+            HyrfTrainingError: a parameter, the loss or a gradient is not finite; step, view and group are named.
+            HyrfError: stopped early, and the checkpoint cannot be written.
         """
         every = self.config.checkpoint_every or max(1, self.config.steps // 20)
         keep_freed_memory()
@@ -85,7 +91,12 @@ class Trainer:
                 complete = self.step == self.config.steps
                 stopped = stop() and not complete
                 if checkpoint and (stopped or (self.step % every == 0 and not complete)):
-                    self.save(checkpoint)
+                    try:
+                        self.save(checkpoint)
+                    except HyrfError as error:
+                        if stopped:
+                            raise
+                        warn(f"{error}; training goes on, without the checkpoint of step {self.step:,}")
                 if stopped:
                     return False
         return True
@@ -106,12 +117,15 @@ class Trainer:
             solid = self._solid()
             target = torch.from_numpy(picture.composite(solid))
             mask = None if picture.mask is None else torch.from_numpy(picture.mask)
-        rendering = render(
-            self.model,
-            view.camera,
-            absgrad=self.density.watching(self.step),
-            solid=None if solid is None else torch.from_numpy(solid),
-        )
+        try:
+            rendering = render(
+                self.model,
+                view.camera,
+                absgrad=self.density.watching(self.step),
+                solid=None if solid is None else torch.from_numpy(solid),
+            )
+        except HyrfError:
+            self._refuse(view, "a number to be rendered is not finite", self._nonfinite_parameters())
         for stage, seconds in rendering.seconds.items():
             self.seconds[stage] += seconds
         with self._timed("loss"):
@@ -174,6 +188,7 @@ class Trainer:
         tensors |= {"density.gradients": self.density.gradients, "density.views": self.density.views}
         progress = {"step": self.step, "records": self.records, "seconds": dict(self.seconds), "elapsed": self.elapsed}
         save_checkpoint(path, settings=self._settings(), tensors=tensors, progress=progress)
+        self.saved = self.step
 
     def load(self, path: Path) -> None:
         """Go on from the state at `path`; the result is the one an uninterrupted run gives.
@@ -193,6 +208,7 @@ class Trainer:
         )
         self.density.gradients, self.density.views = tensors["density.gradients"], tensors["density.views"]
         self.step, self.records = progress["step"], progress["records"]
+        self.saved = self.step
         self.seconds, self.elapsed = defaultdict(float, progress["seconds"]), progress["elapsed"]
 
 

@@ -8,15 +8,15 @@ points (coordinates), which also fixes the order of every sum.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
+from hyrfpack.ops.compiled import compiled
 from hyrfpack.ops.hash_encode.reference import PRIME_Y, PRIME_Z, level_offsets
 from hyrfpack.ops.pool import run_tasks
 
-njit = numba.njit(nogil=True, cache=True, fastmath={"contract", "nsz", "nnan", "reassoc", "arcp"})
+njit = compiled(fastmath={"contract", "nsz", "nnan", "reassoc", "arcp"})
 
 _BLOCK = 64  # points whose rows and weights (4 KiB) stay in the first cache
 _POINTS_PER_TASK = 16384

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from hyrfpack.ops.compiled import compiled
 from hyrfpack.ops.rasterize.cpu_project import COV_XX, COV_YY, HIDDEN, MEAN_X, MEAN_Y, REACH, RECORD, U_X, U_Y
 from hyrfpack.ops.rasterize.reference import TILE
 
@@ -22,7 +22,7 @@ SLOT_MASK = np.uint64(PAIRS_MAX - 1)
 _DIGIT_BITS = 11
 _BLOCK = 64
 _PAD = 0.01  # pixels by which spans are widened against rounding; blending decides pixel by pixel
-_kernel = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "nnan"}, error_model="numpy")
+_kernel = compiled(fastmath={"contract", "nsz", "nnan"}, error_model="numpy")
 
 
 @_kernel

@@ -7,8 +7,8 @@ buffer at constant offsets: LLVM vectorises nothing less. `fastmath` must allow 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from hyrfpack.ops.compiled import compiled
 from hyrfpack.ops.rasterize.cpu_bin import POSITION_SHIFT, SLOT_MASK, SLOT_SHIFT
 from hyrfpack.ops.rasterize.cpu_prefetch import prefetch_row, prefetch_row_for_write
 from hyrfpack.ops.rasterize.cpu_project import (
@@ -38,7 +38,7 @@ from hyrfpack.ops.rasterize.cpu_project import (
 )
 from hyrfpack.ops.rasterize.reference import ALPHA_MAX, TILE
 
-_kernel = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "nnan", "reassoc", "arcp"}, error_model="numpy")
+_kernel = compiled(fastmath={"contract", "nsz", "nnan", "reassoc", "arcp"}, error_model="numpy")
 _CAP = np.float32(ALPHA_MAX)
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _PIXELS = TILE * TILE

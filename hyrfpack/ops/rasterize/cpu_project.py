@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from hyrfpack.ops.compiled import compiled
 from hyrfpack.ops.rasterize.reference import ALPHA_MIN, COMPENSATION_MIN, LOW_PASS, QUAT_NORM_MIN, TILE
 
 # One record of a projected Gaussian: 16 float32, one cache line. With Sigma = its 2D covariance,
@@ -27,9 +27,9 @@ ROW = 16
 
 HIDDEN = np.uint32(0xFFFFFFFF)  # the sort key of a Gaussian that is not drawn
 _OVERFLOW = 1e30
-_OPTIONS = {"nogil": True, "cache": True, "fastmath": {"contract", "nsz"}, "error_model": "numpy"}
-_kernel = njit(**_OPTIONS)
-_inlined = njit(**_OPTIONS, inline="always")  # what LLVM finds too large to inline by itself
+_OPTIONS = {"fastmath": {"contract", "nsz"}, "error_model": "numpy"}
+_kernel = compiled(**_OPTIONS)
+_inlined = compiled(**_OPTIONS, inline="always")  # what LLVM finds too large to inline by itself
 
 
 @_kernel

@@ -12,12 +12,13 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from hyrfpack.ops.compiled import compiled
 from hyrfpack.ops.pool import run_tasks
 from hyrfpack.ops.ssim.reference import C1, C2, RADIUS, window
 
 # The error model of numpy: a division that tests for zero would keep its loop from vectorising.
 _FAST_MATH = {"contract", "nsz", "nnan", "reassoc", "arcp"}
-njit = numba.njit(nogil=True, cache=True, fastmath=_FAST_MATH, error_model="numpy")
+njit = compiled(fastmath=_FAST_MATH, error_model="numpy")
 # Helpers leave no symbols behind: one that stays a call is found in its own object right after compiling and in its
 # caller's when that comes from the cache, and the two may round differently.
 inlined = numba.njit(fastmath=_FAST_MATH, error_model="numpy", forceinline=True)

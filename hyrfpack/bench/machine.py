@@ -1,0 +1,44 @@
+"""What a measured time belongs to."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import torch
+
+import hyrfpack
+from hyrfpack.ops.pool import thread_count
+
+
+def machine() -> dict[str, object]:
+    """What times depend on: processor, cores in use, GPU, versions."""
+    facts: dict[str, object] = {
+        "cpu": _processor(),
+        "cores": thread_count(),
+        "python": platform.python_version(),
+        "hyrfpack": hyrfpack.__version__,
+    }
+    for package in ("torch", "numba", "numpy"):
+        try:
+            facts[package] = version(package)
+        except PackageNotFoundError:
+            facts[package] = None
+    if torch.cuda.is_available():
+        facts["gpu"] = torch.cuda.get_device_name()
+    return facts
+
+
+def machine_line(facts: dict[str, object]) -> str:
+    """One line that names the machine."""
+    return ", ".join(f"{key} {value}" for key, value in facts.items())
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()

@@ -1,0 +1,90 @@
+"""`hyrfpack bench`."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import click
+
+from hyrfpack.cli.common import PATH, note, print_json, read_scene, scene_options, table
+from hyrfpack.errors import HyrfError
+
+GROUPS = ("rasterize", "hash_encode", "mlp", "render", "codec")  # hyrfpack.bench.GROUPS, without loading torch
+
+
+@click.command(short_help="Measure speed against error.")
+@click.argument("model", type=PATH, required=False)
+@click.option("--data", type=PATH, metavar="DIR", help="Photos to measure quality against (held-out ones).")
+@scene_options
+@click.option("--repeats", type=click.IntRange(min=1), default=7, show_default=True, help="Turns of each contender.")
+@click.option("--only", type=click.Choice(GROUPS), multiple=True, help="Measure this group; may be given again.")
+@click.option("-o", "--output", type=PATH, default=Path("bench.png"), show_default=True, help="The plot to write.")
+@click.option("--markdown", type=PATH, metavar="FILE", help="Also write the tables, into the places FILE has for them.")
+@click.option("--json", "json_file", type=click.Path(allow_dash=True), metavar="FILE", help="Also write all numbers.")
+def bench(
+    model: Path | None,
+    data: Path | None,
+    test_every: int,
+    images: str | None,
+    layout: str | None,
+    repeats: int,
+    only: tuple[str, ...],
+    output: Path,
+    markdown: Path | None,
+    json_file: str | None,
+) -> None:
+    """Measure each operation and each setting that trades accuracy for time, and print time beside error.
+
+    MODEL is a .hyrf file, best a run's model.hyrf; without it a small one is trained on a made-up scene first (about
+    a minute). Losses are told in PSNR and SSIM against held-out photos of --data, or without photos against the
+    model's own exact pictures. --json - prints the numbers alone on standard output.
+
+    \b
+    Examples:
+      hyrfpack bench
+      hyrfpack bench runs/bonsai/model.hyrf --data photos/bonsai -o bonsai-speed.png
+      hyrfpack bench runs/bonsai/model.hyrf --only render --only codec --json numbers.json
+    """
+    if data is not None and model is None:
+        raise click.UsageError("--data are the photos of MODEL; name the model too")
+    # The references run on torch's own threads, which would go on spinning on the cores of the kernels timed next.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    from hyrfpack.atomic import write_atomic
+    from hyrfpack.bench import bench as measure
+    from hyrfpack.bench import tables as words
+    from hyrfpack.bench.figure import picture_format, plot
+    from hyrfpack.bench.machine import machine_line
+
+    picture_format(output)
+    page = _read_page(markdown)
+    if page:  # does it have all places? Better asked now than after minutes
+        words.fill(page, dict.fromkeys(("machine", *(only or GROUPS)), ""), str(markdown))
+    scene = None if data is None else read_scene(data, test_every, images, layout)
+    result = measure(model, scene, repeats=repeats, only=only or None, report=note)
+    if json_file == "-":
+        print_json(result.to_dict())
+    else:
+        click.echo(f"{machine_line(result.machine)}\n{result.subject}")
+        for part in words.tables(result.rows):
+            click.echo(f"\n{part.title}\n{table(part.header, part.cells)}")
+        for sentence in result.notes:
+            click.echo(f"\nnote: {sentence}")
+    if json_file not in (None, "-"):
+        write_atomic(json_file, json.dumps(result.to_dict(), indent=1, allow_nan=False).encode())
+    if markdown is not None:
+        blocks = words.markdown(result)
+        write_atomic(markdown, words.fill(page or words.empty_page(blocks), blocks, str(markdown)).encode())
+    plot(result.rows, output)
+    note(f"{output}: time against error")
+
+
+def _read_page(path: Path | None) -> str:
+    """What a Markdown file says now; empty when there is none."""
+    if path is None or not path.exists():
+        return ""
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise HyrfError(f"{path}: the page cannot be read ({error}); name another with --markdown") from error

@@ -1,0 +1,37 @@
+"""Compiled kernels, kept on the disk where there is room for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numba
+from numba.core.caching import FunctionCache
+
+
+class _Cache(FunctionCache):
+    """Numba's cache of one function, for which a full disk is no reason to stop: the kernel is in memory already."""
+
+    def save_overload(self, sig, data):
+        try:
+            super().save_overload(sig, data)
+        except OSError:
+            # Numba writes the index before the code: it may name a file left by an older source, which would be run.
+            with suppress(OSError):
+                Path(self._cache_file._index_path).unlink()
+
+
+def compiled(**options: object) -> Callable[[Callable], Callable]:
+    """A decorator: `numba.njit(nogil=True, **options)`, with the machine code cached on the disk.
+
+    Where nothing can be kept (disk full, no folder that may be written), the kernel is compiled anew by each process.
+    """
+
+    def decorate(function: Callable) -> Callable:
+        kernel = numba.njit(nogil=True, **options)(function)
+        with suppress(RuntimeError):  # no folder that may be written
+            kernel._cache = _Cache(function)
+        return kernel
+
+    return decorate

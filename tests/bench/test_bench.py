@@ -1,0 +1,292 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections import defaultdict
+
+import numpy as np
+import pytest
+import torch
+from scenes import ball_points, ball_scene, ring, small_model
+
+import hyrfpack
+from hyrfpack.bench import GROUPS, bench, subject
+from hyrfpack.bench.codec import KNOBS, codec_rows, parameter_errors
+from hyrfpack.bench.operations import hash_encode_rows, mlp_rows, rasterize_rows
+from hyrfpack.bench.rendering import EXACT, SWEEPS, render_rows
+from hyrfpack.bench.subject import Subject
+from hyrfpack.errors import HyrfError
+from hyrfpack.format import encode_model, save
+from hyrfpack.format.arrays import to_arrays
+from hyrfpack.format.codec import PROFILES
+from hyrfpack.format.paper import PaperSettings
+from hyrfpack.ops.hash_encode import hash_encode
+from hyrfpack.ops.mlp import mlp
+from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.render import RenderSettings, render
+
+CAMERAS = ring(3, width=24, height=24)
+
+
+def model_of(count: int = 60, **settings):
+    settings = {"background": True, "fields": 0.3, "scale_logits": -2.0, **settings}
+    return small_model(ball_points(count)[0], **settings)
+
+
+def subject_of(model, photos=None) -> Subject:
+    return Subject("tiny", "raw", model, CAMERAS, photos)
+
+
+def ignore(sentence: str) -> None:
+    pass
+
+
+def by_setting(rows) -> dict[str, dict]:
+    found = defaultdict(dict)
+    for row in rows:
+        found[row.setting][row.value] = row
+    return dict(found)
+
+
+def pictures(model, settings=RenderSettings()) -> torch.Tensor:  # noqa: B008 - frozen
+    with torch.no_grad():
+        return torch.stack([render(model, camera, settings).rgb for camera in CAMERAS])
+
+
+def rms(values) -> float:
+    return float(np.sqrt(np.mean(np.square(np.asarray(values, np.float64)))))
+
+
+@pytest.mark.parametrize("measure", [rasterize_rows, hash_encode_rows, mlp_rows, render_rows])
+def test_every_setting_has_one_reference_without_error_and_one_default(measure):
+    for values in by_setting(measure(subject_of(model_of()), 1, ignore)).values():
+        (reference,) = [row for row in values.values() if row.is_reference]
+        assert reference.error.max == reference.error.rms == 0 and reference.ratio.wall == 1
+        assert sum(row.is_default for row in values.values()) == 1
+        assert all(row.time.ms > 0 and row.time.repeats == 1 for row in values.values())
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_rasterize_errors_are_against_float64_with_the_same_antialiasing(antialiased):
+    model, camera = model_of(), CAMERAS[1]
+    pose = torch.as_tensor(model.config.frame.local_pose(camera))
+    with torch.no_grad():
+        geometry = model.decode_geometry()
+        colors = model.decode_colors(-(pose[:3, :3].T @ pose[:3, 3]).float())
+    tensors = (model.gaussians.positions.detach(), geometry.quats, geometry.scales, geometry.opacities, colors)
+    found = []
+    for dtype, implementation in ((torch.float32, "cpu"), (torch.float64, "reference")):
+        view = (pose, camera.intrinsics, camera.width, camera.height)
+        cast = [tensor.to(dtype) for tensor in tensors]
+        picture = rasterize(*cast, *view, antialiased=antialiased, implementation=implementation)
+        found.append(np.concatenate([picture.rgb.flatten(), picture.transmittance.flatten()]).astype(np.float64))
+
+    rows = by_setting(rasterize_rows(subject_of(model), 1, ignore))
+    row = rows["antialiased, forward" if antialiased else "forward"]["cpu"]
+    assert row.error.max == pytest.approx(np.abs(found[0] - found[1]).max()) and row.error.max > 0
+    assert row.error.rms == pytest.approx(rms(found[0] - found[1]))
+
+
+def test_gradient_errors_are_told_for_each_input_and_as_the_worst_of_them():
+    rows = by_setting(rasterize_rows(subject_of(model_of()), 1, ignore))
+    row = rows["forward + backward"]["cpu"]
+    assert set(row.parts) == {"means", "quats", "scales", "opacities", "colors"}
+    assert row.error.max == max(part.max for part in row.parts.values())
+    assert 0 < row.error.rms == max(part.rms for part in row.parts.values()) < 1e-3
+
+
+def test_half_precision_errors_of_the_fields_are_relative_to_float64():
+    model = model_of()
+    coords = model.cube_coords(model.gaussians.positions).detach()
+    grid, part = model.geometry.grid, model.geometry
+    settings = grid.config.resolutions, grid.config.log2_table_size
+    table = grid.table.detach()
+    exact = hash_encode(coords.double(), table.double(), *settings)
+    rounded = hash_encode(coords, table.bfloat16().float(), *settings)
+    row = by_setting(hash_encode_rows(subject_of(model), 1, ignore))["geometry, forward"]["cpu, bfloat16 table"]
+    assert row.error.rms == pytest.approx(rms(rounded - exact) / rms(exact), rel=1e-4)
+    assert 1e-4 < row.error.max == pytest.approx(float((rounded - exact).abs().max() / exact.abs().max()), rel=1e-4)
+
+    features = hash_encode(coords, table, *settings)
+    outputs = [
+        mlp(features.to(dtype), [w.to(dtype) for w in part.weights], [b.to(dtype) for b in part.biases]).detach()
+        for dtype in (torch.bfloat16, torch.float64)
+    ]
+    row = by_setting(mlp_rows(subject_of(model), 1, ignore))["geometry, forward"]["bfloat16 reference"]
+    assert row.error.rms == pytest.approx(rms(outputs[0].double() - outputs[1]) / rms(outputs[1]), rel=0.05)
+
+
+def test_every_field_of_render_settings_is_swept_but_near():
+    assert set(SWEEPS) == {field.name for field in dataclasses.fields(RenderSettings)} - {"near"}
+    assert EXACT.background_stride == 1 and EXACT.background_threshold == EXACT.transmittance_min == 0
+
+
+def test_the_default_is_among_what_is_tried_of_each_setting():
+    rows = by_setting(render_rows(subject_of(model_of()), 1, ignore))
+    for name, values in SWEEPS.items():
+        assert len(rows[name]) == len({*values, getattr(RenderSettings(), name)})
+
+
+def test_the_error_of_a_render_setting_is_that_setting_s_own():
+    model = model_of()
+    row = by_setting(render_rows(subject_of(model), 1, ignore))["background_threshold"]["0.3"]
+    exact, cut = (pictures(model, RenderSettings(background_threshold=tau)).double() for tau in (0, 0.3))
+    assert row.error.max == pytest.approx(float((cut - exact).abs().max()), rel=1e-5) and row.error.max > 0.01
+    assert row.error.rms == pytest.approx(rms(cut - exact), rel=1e-5)
+    assert row.psnr is not None and row.psnr_drop is None
+
+
+def test_all_defaults_together_are_compared_with_everything_exact():
+    model = model_of()
+    row = by_setting(render_rows(subject_of(model), 1, ignore))["all"]["defaults"]
+    assert row.error.rms == pytest.approx(rms(pictures(model).double() - pictures(model, EXACT).double()), rel=1e-4)
+
+
+def test_without_a_background_sphere_its_settings_are_left_out_and_named():
+    notes = []
+    rows = by_setting(render_rows(subject_of(model_of(background=False)), 1, notes.append))
+    assert "background_stride" not in rows and "cull_tolerance" in rows
+    assert len(notes) == 2 and all("no background sphere" in sentence for sentence in notes)
+
+
+def test_quality_drops_are_differences_of_what_evaluate_scores():
+    model, scene = model_of(), ball_scene(views=3, side=24)
+    views = scene.train
+    photos = [(torch.from_numpy(view.load().composite()), None) for view in views]
+    tested = Subject("tiny", "raw", model, [view.camera for view in views], photos)
+    row = by_setting(render_rows(tested, 1, ignore))["background_threshold"]["0.3"]
+    exact, cut = (
+        hyrfpack.evaluate(model, views, settings=RenderSettings(background_threshold=tau)) for tau in (0, 0.3)
+    )
+    assert row.psnr == pytest.approx(cut.psnr, abs=1e-4)
+    assert abs(row.psnr_drop) > 0.001 and row.psnr_drop == pytest.approx(exact.psnr - cut.psnr, abs=1e-4)
+    assert row.ssim_drop == pytest.approx(exact.ssim - cut.ssim, abs=1e-5)
+
+
+def test_raw_is_the_exact_codec_and_bytes_are_those_of_the_file():
+    model = model_of()
+    rows = by_setting(codec_rows(subject_of(model), 1, ignore))
+    raw, paper = rows["profile"]["raw"], rows["profile"]["paper"]
+    assert raw.is_reference and raw.error.max == 0 and all(part.max == 0 for part in raw.parts.values())
+    assert raw.bytes == len(encode_model(model)) and paper.bytes == len(encode_model(model, "paper"))
+    assert paper.is_default and paper.error.rms > 0 and paper.decode.ms > 0
+    assert paper.decode_ratio.wall == pytest.approx(paper.decode.ms / raw.decode.ms)
+
+
+def test_parameter_errors_of_the_paper_profile_follow_its_precision():
+    model = model_of()
+    row = by_setting(codec_rows(subject_of(model), 1, ignore))["profile"]["paper"]
+    arrays = to_arrays(model)
+    halves = arrays["POSI"].astype(np.float16).astype(np.float64)
+    assert row.parts["positions"].max == pytest.approx(np.abs(halves - arrays["POSI"]).max(), rel=1e-6)
+    step = np.ptp(arrays["GTAB"]) / 255  # 8 bits between the extremes
+    assert 0.2 * step < row.parts["geometry hash table"].rms < row.parts["geometry hash table"].max <= 0.51 * step
+    assert len(row.parts) == 8
+
+
+def test_every_knob_of_the_paper_profile_is_tried_with_its_default_marked():
+    assert set(KNOBS["paper"]) == {field.name for field in dataclasses.fields(PaperSettings)} - {"seed"}
+    model = model_of()
+    rows = by_setting(codec_rows(subject_of(model), 1, ignore))
+    for knob in KNOBS["paper"]:
+        (default,) = [row for row in rows[f"paper, {knob}"].values() if row.is_default]
+        assert default.bytes == rows["profile"]["paper"].bytes
+    few = rows["paper, color"]["1 x 64"]
+    assert few.bytes == len(encode_model(model, "paper", color=(1, 64)))
+    assert few.parts["scale logits"] == rows["profile"]["paper"].parts["scale logits"]
+
+
+def test_a_new_profile_appears_by_itself_and_may_reorder_gaussians(monkeypatch):
+    def shuffled(model):
+        order = torch.from_numpy(np.random.default_rng(0).permutation(len(model)))
+        other = model_of()
+        other.load_state_dict(model.state_dict())
+        for name in other.gaussians.NAMES:
+            getattr(other.gaussians, name).data = getattr(model.gaussians, name)[order]
+        return PROFILES["raw"](other)
+
+    monkeypatch.setitem(PROFILES, "shuffled", shuffled)
+    generator = torch.Generator().manual_seed(5)
+    model = model_of(color_logits=torch.randn(60, 3, generator=generator))
+    row = by_setting(codec_rows(subject_of(model), 1, ignore))["profile"]["shuffled"]
+    assert all(part.max == 0 for part in row.parts.values())
+    assert row.error.max < 1e-5
+
+
+def test_parameters_of_another_number_of_gaussians_are_not_compared():
+    errors = parameter_errors(model_of(60), model_of(50))
+    assert set(errors) == {
+        "geometry hash table",
+        "geometry decoder",
+        "radiance hash table",
+        "radiance decoder",
+    }
+
+
+def test_a_profile_that_cannot_write_the_model_is_left_out_with_its_reason():
+    model = model_of()
+    with torch.no_grad():
+        model.gaussians.positions[0, 0] = 1e6  # beyond half precision
+    notes = []
+    rows = by_setting(codec_rows(subject_of(model), 1, notes.append))
+    assert set(rows["profile"]) == set(PROFILES) - {"paper"} and "paper, color" not in rows
+    assert any("'paper' is left out" in sentence and "half precision" in sentence for sentence in notes)
+
+
+def test_a_result_that_is_not_finite_stops_the_measurement():
+    model = model_of()
+    with torch.no_grad():
+        model.geometry.biases[-1][0] = torch.nan
+    with pytest.raises(HyrfError, match="mlp, geometry, forward"):
+        list(mlp_rows(subject_of(model), 1, ignore))
+
+
+def test_a_file_is_measured_from_an_orbit_and_the_report_survives_json(tmp_path):
+    save(model_of(), tmp_path / "tiny.hyrf")
+    said = []
+    report = bench(tmp_path / "tiny.hyrf", repeats=1, only=["mlp"], report=said.append)
+    assert {row.group for row in report.rows} == {"mlp"} and said == ["measuring mlp"]
+    assert "60 Gaussians" in report.subject and "6 viewpoints" in report.subject
+    assert {"cpu", "cores", "torch"} <= set(report.machine)
+    values = report.to_dict()
+    assert json.loads(json.dumps(values, allow_nan=False)) == values
+
+
+def test_the_built_in_model_brings_its_own_photos(monkeypatch):
+    monkeypatch.setattr(subject, "BUILT_IN_STEPS", 2)
+    monkeypatch.setattr(subject, "BUILT_IN_PHOTOS", 9)
+    monkeypatch.setattr(subject, "BUILT_IN_SIDE", 32)
+    said = []
+    report = bench(only=["mlp"], repeats=1, report=said.append)
+    assert "built-in" in report.subject and "2 held-out photos" in report.subject
+    assert "2 steps" in said[0] and "minute" in said[0]
+
+
+def test_coding_a_quantised_model_again_is_remarked(tmp_path):
+    save(model_of(), tmp_path / "tiny.hyrf", "paper")
+    read = subject.read_subject(tmp_path / "tiny.hyrf", None)
+    notes = []
+    next(iter(codec_rows(dataclasses.replace(read, cameras=CAMERAS), 1, notes.append)))
+    assert any("quantised already" in sentence for sentence in notes)
+
+
+def test_a_model_without_gaussians_is_refused(tmp_path):
+    save(small_model(np.zeros((0, 3))), tmp_path / "empty.hyrf")
+    with pytest.raises(HyrfError, match="no Gaussians"):
+        bench(tmp_path / "empty.hyrf")
+
+
+def test_a_scene_without_held_out_photos_is_refused(tmp_path):
+    save(model_of(), tmp_path / "tiny.hyrf")
+    with pytest.raises(HyrfError, match="balls: no held-out photo"):
+        bench(tmp_path / "tiny.hyrf", ball_scene(views=2))
+
+
+def test_wrong_calls_are_value_errors():
+    with pytest.raises(ValueError, match="no group 'nothing'.*rasterize"):
+        bench(only=["nothing"])
+    with pytest.raises(ValueError, match="repeats is 0"):
+        bench(repeats=0)
+    with pytest.raises(ValueError, match="without the model"):
+        bench(scene=ball_scene(views=2))
+    assert callable(hyrfpack.bench) and tuple(GROUPS) == ("rasterize", "hash_encode", "mlp", "render", "codec")

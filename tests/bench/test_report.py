@@ -1,0 +1,171 @@
+"""What is made of the rows: tables, pages, plots, and the command."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+from scenes import ball_points, small_model
+
+from hyrfpack.bench import GROUPS, BenchReport, Error, Row
+from hyrfpack.bench.figure import panels, plot
+from hyrfpack.bench.tables import fill, markdown, tables
+from hyrfpack.bench.timing import Ratio, Timing
+from hyrfpack.cli import main
+from hyrfpack.cli.bench import GROUPS as CHOICES
+from hyrfpack.errors import HyrfError
+from hyrfpack.format import save
+
+
+def row(group, setting, value, ms=1.0, rms=1e-3, **more) -> Row:
+    settings = {"is_reference": False, "is_default": False, **more}
+    time = Timing(ms, 0.25, 2 * ms, 7)
+    return Row(group, setting, value, time=time, ratio=Ratio(ms, ms), error=Error(2 * rms, rms), **settings)
+
+
+def rows() -> list[Row]:
+    sweep = [
+        row("render", "background_stride", str(n), 4 / n, (n - 1) * 1e-3, is_reference=n == 1) for n in range(1, 5)
+    ]
+    decode = {"decode": Timing(3, None, 3, 1), "decode_ratio": Ratio(3, 3)}
+    return [
+        *sweep,
+        row("render", "geometry", "decoded once", 1, 0, is_default=True, psnr=50.0, ssim=0.99),
+        row("codec", "profile", "raw", 1, 0, is_reference=True, bytes=4000, psnr=30.0, psnr_drop=0.0, **decode),
+        row("codec", "profile", "paper", 90, is_default=True, bytes=1000, psnr=29.9, psnr_drop=0.1, **decode),
+        row("codec", "paper, color", "1 x 64", 80, bytes=900, parts={"positions": Error(0.5, 0.25)}, **decode),
+    ]
+
+
+def report() -> BenchReport:
+    return BenchReport({"cpu": "slide rule", "cores": 2}, "a model", ["a note"], rows())
+
+
+def hyrfpack(*arguments: object):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def refused(*arguments: object) -> str:
+    result = hyrfpack("bench", *arguments)
+    assert result.exit_code == 2 and result.stdout == "", result.output
+    (sentence,) = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
+    return sentence
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "tiny.hyrf"
+    save(small_model(ball_points(50)[0], background=True, fields=0.3), path)
+    return path
+
+
+def test_every_row_is_in_a_table_beside_its_error_and_its_time():
+    render, codec, parts = tables(rows())
+    assert [table.title.partition(":")[0] for table in (render, codec, parts)] == ["render", "codec", "codec"]
+    assert (len(render.cells), len(codec.cells), len(parts.cells)) == (5, 3, 1)
+    stride = dict(zip(render.header, render.cells[2], strict=True))
+    assert (stride["value"], stride["ms"], stride["rms error"], stride["cpu ms"]) == (
+        "3",
+        "1.33 ± 0.25",
+        "2.0e-03",
+        "2.67",
+    )
+    paper = dict(zip(codec.header, codec.cells[1], strict=True))
+    assert (paper[""], paper["bytes"], paper["PSNR drop"], paper["decode ms"]) == ("default", "1,000", "0.100", "3")
+    assert parts.cells[0][-1] == "5.0e-01 / 2.5e-01"
+    assert "bytes" not in render.header and "PSNR" in render.header
+
+
+def test_a_page_gets_its_tables_and_keeps_its_words():
+    words = "# Title\nWords about `<!-- bench codec -->` and `<!-- end -->`.\n"
+    places = "<!-- bench machine -->\nold\n<!-- end -->\nbetween\n<!-- bench codec -->\n<!-- end -->\nlast"
+    blocks = {name: block for name, block in markdown(report()).items() if name != "render"}
+    filled = fill(words + places, blocks)
+    assert filled.startswith(words) and "\nbetween\n" in filled and filled.endswith("last")
+    assert "old" not in filled and "slide rule" in filled and "| profile | paper | default |" in filled
+    assert fill(filled, blocks) == filled
+    assert "Error of each group of parameters, max / rms:\n\n| setting | value | positions |" in filled
+
+
+def test_a_page_without_a_place_is_refused():
+    with pytest.raises(HyrfError, match="page.md: there is no place for render"):
+        fill("<!-- bench machine -->\n<!-- end -->\n<!-- bench codec -->\n<!-- end -->", markdown(report()), "page.md")
+    with pytest.raises(HyrfError, match="no place for machine"):
+        fill("<!-- bench machine --> and no end", markdown(report()))
+
+
+def test_every_row_is_drawn_and_codec_sizes_too():
+    drawn = panels(rows())
+    titles = [panel.title for panel in drawn]
+    assert titles == [
+        "render: background_stride",
+        "render: other settings",
+        "codec: profile, encoding",
+        "codec: profile, size",
+        "codec: paper, encoding",
+        "codec: paper, size",
+    ]
+    assert sum(len(panel.rows) for panel in drawn) == 5 + 2 * 3
+    (size,) = [panel for panel in drawn if panel.title == "codec: paper, size"]
+    assert size.across(size.rows[0]) == 900 / 4000
+
+
+def test_the_plot_is_a_picture_in_the_format_of_its_name(tmp_path):
+    plot(rows(), tmp_path / "new" / "plot.png")
+    assert Image.open(tmp_path / "new" / "plot.png").size[0] > 1000
+    plot(rows(), tmp_path / "plot.svg")
+    drawing = (tmp_path / "plot.svg").read_text()
+    assert drawing.startswith("<?xml") and len(drawing) > 10_000
+    with pytest.raises(HyrfError, match=r"plot.txt: a plot is written as png"):
+        plot(rows(), tmp_path / "plot.txt")
+
+
+def test_a_plot_of_one_row_without_error_is_drawn(tmp_path):
+    plot([row("mlp", "forward", "float64 reference", rms=0, is_reference=True)], tmp_path / "plot.png")
+    assert (tmp_path / "plot.png").stat().st_size > 1000
+
+
+def test_json_to_standard_output_is_all_there_is_on_it(model, tmp_path):
+    result = hyrfpack("bench", model, "--only", "mlp", "--repeats", 2, "--json", "-", "-o", tmp_path / "b.png")
+    assert result.exit_code == 0, result.output
+    values = json.loads(result.stdout, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    assert {item["group"] for item in values["rows"]} == {"mlp"}
+    assert values["rows"][0]["is_reference"] and values["rows"][0]["time"]["repeats"] == 2
+    assert (tmp_path / "b.png").exists() and "measuring mlp" in result.stderr
+
+
+def test_one_run_leaves_the_table_the_numbers_the_page_and_the_plot(model, tmp_path):
+    chosen = ("--only", "hash_encode", "--only", "mlp", "--repeats", 1)
+    files = ("--json", tmp_path / "b.json", "--markdown", tmp_path / "b.md", "-o", tmp_path / "b.png")
+    result = hyrfpack("bench", model, *chosen, *files)
+    assert result.exit_code == 0, result.output
+    assert "bfloat16 reference" in result.stdout and "cores" in result.stdout
+    numbers = json.loads((tmp_path / "b.json").read_text())
+    page = (tmp_path / "b.md").read_text()
+    assert page.count("| float64 reference |") == len([item for item in numbers["rows"] if item["is_reference"]])
+    (tmp_path / "b.md").write_text(page.replace("## mlp", "## mlp\n\nMy own words."))
+    assert hyrfpack("bench", model, *chosen[2:], *files).exit_code == 0
+    assert "My own words." in (tmp_path / "b.md").read_text()
+
+
+def test_what_the_user_got_wrong_is_one_sentence(model, tmp_path):
+    assert "no such file" in refused(tmp_path / "missing.hyrf")
+    (tmp_path / "bad.hyrf").write_bytes(b"not a model")
+    assert "not a .hyrf file" in refused(tmp_path / "bad.hyrf")
+    assert "nowhere" in refused(model, "--data", tmp_path / "nowhere")
+    assert "'nothing' is not one of" in refused(model, "--only", "nothing")
+    assert "name the model too" in refused("--data", tmp_path)
+    assert "plot is written as" in refused(model, "-o", tmp_path / "plot.txt")
+
+
+def test_a_page_without_places_is_refused_before_anything_is_measured(model, tmp_path):
+    (tmp_path / "page.md").write_text("# Nothing here")
+    sentence = refused(model, "--only", "mlp", "--markdown", tmp_path / "page.md", "-o", tmp_path / "b.png")
+    assert "no place for machine" in sentence and (tmp_path / "page.md").read_text() == "# Nothing here"
+    assert not (tmp_path / "b.png").exists()
+
+
+def test_the_command_knows_the_groups_without_loading_torch():
+    assert CHOICES == tuple(GROUPS)
