@@ -8,7 +8,6 @@ every row is the mean over the seeds, and the spread between seeds of the defaul
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import sys
 from dataclasses import replace
@@ -17,7 +16,7 @@ from pathlib import Path
 from hyrfpack.train import TrainConfig
 
 sys.path.insert(0, str(Path(__file__).parent))
-from train_sets import DATA, measure
+from train_sets import measure, study_arguments
 
 VARIANTS: dict[str, dict] = {
     "default": {},
@@ -32,14 +31,9 @@ VARIANTS: dict[str, dict] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=2000)
-    parser.add_argument("--sets", nargs="*", default=["mipnerf360_bonsai", "gerrard_hall"])
-    parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--out", type=Path, default=Path("runs/design"))
-    parser.add_argument("--only", nargs="*", help="parts of the names of the rows wanted")
-    args = parser.parse_args()
+    args = study_arguments(
+        __doc__, steps=2000, sets=["mipnerf360_bonsai", "gerrard_hall"], out=Path("runs/design")
+    ).parse_args()
     print("| variant | set | PSNR | spread | SSIM | Gaussians | bytes | steps/s |\n|---|---|---|---|---|---|---|---|")
     for number, (variant, changes) in enumerate(VARIANTS.items()):
         if args.only and not any(part in variant for part in args.only):
@@ -48,7 +42,7 @@ def main() -> None:
             rows = [
                 measure(
                     args.data / name,
-                    args.out / f"{number}-{name}-{seed}",
+                    args.out / str(args.steps) / f"{number}-{name}-{seed}",
                     replace(TrainConfig(steps=args.steps, seed=seed), **changes),
                     reuse=True,
                 )

@@ -13,6 +13,7 @@ import argparse
 import json
 import os
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import hyrfpack
@@ -61,6 +62,18 @@ def table(rows: list[dict]) -> str:
         for r in rows
     ]
     return "\n".join(lines)
+
+
+def study_arguments(text: str, steps: int, sets: Sequence[str], out: Path) -> argparse.ArgumentParser:
+    """The options of a study that trains variants on sets; `text` is its help, the rest are defaults."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=steps)
+    parser.add_argument("--sets", nargs="*", default=list(sets))
+    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--out", type=Path, default=out)
+    parser.add_argument("--only", nargs="*", help="parts of the names of the rows wanted")
+    return parser
 
 
 def main() -> None:
