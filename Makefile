@@ -8,10 +8,10 @@ SHELL := bash
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help demo test bench sets choices lint format clean
+.PHONY: help demo test bench sets choices ablations kill fuzz lint format clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z.]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z.]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo "  PYTHON=python3.12 and the like choose the interpreter of a new .venv"
 
 .venv: $(READY) ## make or refresh the environment
@@ -38,6 +38,15 @@ sets: $(READY) ## train every real set for 1,000 steps and print the table (ten 
 
 choices: $(READY) ## the ablations behind the defaults (half an hour)
 	$(BIN)/python tools/design_choices.py
+
+ablations: $(READY) ## what each part of the model is worth, beside the paper (under an hour)
+	$(BIN)/python tools/ablations.py
+
+kill: $(READY) ## kill the commands at random moments and check what is left (ten minutes)
+	$(BIN)/python tools/kill.py
+
+fuzz: $(READY) ## feed the .hyrf reader a million hostile files (ten minutes)
+	$(BIN)/python tools/fuzz.py
 
 lint: $(READY) ## check style only
 	$(BIN)/ruff check .

@@ -10,8 +10,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 
+def printable(text: str) -> str:
+    """Text out of a file as one line that any terminal can show: what is not printable becomes an escape ("\\n")."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
 class HyrfError(Exception):
-    """Something about the input or the request is wrong and the user can mend it."""
+    """Something about the input or the request is wrong and the user can mend it.
+
+    Sentences quote what hostile files say, so they are made `printable`.
+    """
+
+    def __init__(self, sentence: str) -> None:
+        super().__init__(printable(sentence))
 
 
 class HyrfDataError(HyrfError):

@@ -25,6 +25,9 @@ class Camera:
         cx, cy: principal point in pixels; the top-left corner of the picture is (0, 0), the centre of its first
             pixel (0.5, 0.5).
         camera_from_world: (4, 4) float64 rigid transform, row-major, last row (0, 0, 0, 1).
+
+    Raises:
+        ValueError: no pixels, a focal length that is not positive, or a number that is not finite.
     """
 
     width: int
@@ -34,6 +37,14 @@ class Camera:
     cx: float
     cy: float
     camera_from_world: np.ndarray
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"a camera of {self.width} x {self.height} pixels; each side needs at least one")
+        if not (np.isfinite(self.intrinsics).all() and self.fx > 0 and self.fy > 0):
+            raise ValueError(f"the intrinsics {self.intrinsics} must be finite, the focal lengths positive")
+        if np.shape(self.camera_from_world) != (4, 4) or not np.isfinite(self.camera_from_world).all():
+            raise ValueError("camera_from_world must be 4 x 4 finite numbers")
 
     @property
     def rotation(self) -> np.ndarray:
@@ -121,6 +132,9 @@ class Scene:
         point_colors: (P, 3) float32 RGB in [0, 1].
         has_alpha: photos have transparent pixels (object-centred captures without a background).
         notes: sentences for the user about what the reader skipped or assumed.
+
+    Raises:
+        ValueError: a point or its colour is not finite.
     """
 
     path: str
@@ -131,6 +145,10 @@ class Scene:
     point_colors: np.ndarray
     has_alpha: bool = False
     notes: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.points).all() and np.isfinite(self.point_colors).all()):
+            raise ValueError("points and their colours must be finite; leave out those that are not")
 
     @property
     def views(self) -> list[View]:

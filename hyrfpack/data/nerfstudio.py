@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -149,14 +150,15 @@ def _read_ply(path: Path, content: dict[str, Any], file: Path) -> tuple[np.ndarr
     if listed is None:
         return None, None
     ply = path / str(listed)
-    if not isinstance(listed, str) or not ply.is_file():
+    if not isinstance(listed, str) or not os.path.isfile(ply):  # Path.is_file raises where a name is too long
         raise HyrfDataError(f"{file}: points {str(listed)[:80]} are not on disk; restore them or drop 'ply_file_path'")
     with needs_package("trimesh", f"{ply}: reading points"):
         import trimesh
     try:
         with ply.open("rb") as stream:
             stated = re.search(rb"element vertex (\d{1,18})\s", stream.read(4096))
-        cloud = trimesh.load(str(ply), file_type="ply", process=False)
+        # A texture that the file names is of no use here, and would be opened.
+        cloud = trimesh.load(str(ply), file_type="ply", process=False, skip_materials=True)
         points = np.asarray(getattr(cloud, "vertices", np.zeros((0, 3))), dtype=np.float64)
         mesh = isinstance(cloud, trimesh.Trimesh)
         rgba = np.asarray(cloud.visual.vertex_colors if mesh else getattr(cloud, "colors", ()))

@@ -75,7 +75,7 @@ def read_header(path: Path) -> Header:
         HyrfDataError: the file is missing, empty, or no picture.
     """
     with _opened(path) as image:
-        has_alpha = image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
+        has_alpha = _has_alpha(image)
         return Header(*image.size, has_alpha)
 
 
@@ -96,7 +96,7 @@ def read_pixels(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
                 wide = np.asarray(image).astype(np.float64)
                 grey = (np.clip(wide, 0, 65535) / 257 + 0.5).astype(np.uint8)
                 return np.repeat(grey[..., None], 3, axis=2), None
-            if image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info:
+            if _has_alpha(image):
                 pixels = np.array(image.convert("RGBA"))
                 return np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3])
             return np.array(image.convert("RGB")), None
@@ -115,6 +115,12 @@ def read_mask(path: Path, height: int, width: int) -> np.ndarray:
     return usable[rows[:, None], columns]
 
 
+def _has_alpha(image) -> bool:
+    # A grey level that stands for "transparent" in 16-bit pictures is not honoured: it would not survive 8 bits.
+    transparent = "transparency" in image.info and image.mode not in _SIXTEEN_BIT
+    return transparent or image.mode in ("RGBA", "LA", "PA", "La", "RGBa")
+
+
 def _opened(path: Path):
     """Open with Pillow; every way in which that fails is one sentence."""
     with needs_package("pillow", f"{path}: reading pictures"):
@@ -124,6 +130,8 @@ def _opened(path: Path):
         if os.path.getsize(path) == 0:
             raise HyrfDataError(f"{path}: the picture file is empty (0 bytes); copy it again")
         image = Image.open(path)
+        if image.format == "EPS":  # a program, which Pillow would have Ghostscript run
+            raise HyrfDataError(f"{path}: PostScript is no photo; save it as PNG or JPEG")
     except HyrfDataError:
         raise
     except FileNotFoundError as error:

@@ -45,7 +45,7 @@ def number(entries: dict[str, Any], key: str, path: Path) -> float | None:
 
 def focal_from_angle(angle: float, size: int, path: Path) -> float:
     """Focal length in pixels of a picture `size` pixels wide that spans `angle` radians: size / (2 tan(angle / 2))."""
-    if not 0 < angle < math.pi:
+    if not 0 < angle < math.pi or 0.5 * angle == 0:  # half of the smallest number is 0
         raise HyrfDataError(f"{path}: a field of view of {angle:g} radians is outside (0, pi); mend 'camera_angle_x'")
     return 0.5 * size / math.tan(0.5 * angle)
 

@@ -93,8 +93,8 @@ def check_rules(rules: dict) -> None:
     for name in sorted({*rules, *RULES}):
         if rules.get(name) != RULES.get(name):
             raise HyrfFormatError(
-                f"rule '{name}' is {rules.get(name)!r:.40} and this hyrfpack knows only {RULES.get(name)!r}; update "
-                "hyrfpack"
+                f"rule {name!r:.40} is {rules.get(name)!r:.40} and this hyrfpack knows only {RULES.get(name)!r}; "
+                "update hyrfpack"
             )
 
 
@@ -103,4 +103,6 @@ def parse_config(values: dict) -> ModelConfig:
     try:
         return ModelConfig.from_dict(values)
     except (TypeError, ValueError, KeyError) as error:
-        raise HyrfFormatError(f"the model's configuration is not valid ({error}); write the file again") from error
+        raise HyrfFormatError(
+            f"the model's configuration is not valid ({error!s:.200}); write the file again"
+        ) from error

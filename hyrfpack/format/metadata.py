@@ -8,12 +8,14 @@ import sys
 from dataclasses import dataclass, field, fields
 
 import hyrfpack
-from hyrfpack.errors import HyrfFormatError
+from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format.container import Container, Section
 
 TYPE = "META"
 CODEC_JSON = 0
 MAX_BYTES = 1 << 20
+MAX_DEPTH = 64  # objects and lists within each other; what walks them calls itself once for each
+MAX_INTEGER = 1 << 63
 
 # Types of the configuration's values, as JSON has them; a tuple is a list of that length. `ModelConfig` checks ranges.
 _GRID = {"log2_table_size": int, "levels": int, "base": int, "finest": int}
@@ -58,15 +60,18 @@ class Metadata:
         """The section, same values, same bytes: keys sorted, no spaces, ASCII.
 
         Raises:
-            ValueError: a value is not JSON (NaN and infinity are not), or all are more than MAX_BYTES.
+            ValueError: a value is not JSON (NaN and infinity are not).
+            HyrfError: all are more than MAX_BYTES, or nested deeper than MAX_DEPTH.
         """
         values = {item.name: getattr(self, item.name) for item in fields(self)}
+        if _is_deep(values):
+            raise HyrfError(f"the metadata is nested deeper than {MAX_DEPTH} levels; flatten the provenance")
         try:
             text = json.dumps(values, sort_keys=True, separators=(",", ":"), allow_nan=False)
         except TypeError as error:
             raise ValueError(f"the metadata is not JSON: {error}") from error
         if len(text) > MAX_BYTES:
-            raise ValueError(f"the metadata takes {len(text)} bytes and may take {MAX_BYTES}; shorten the provenance")
+            raise HyrfError(f"the metadata takes {len(text)} bytes and may take {MAX_BYTES}; shorten the provenance")
         return Section(TYPE, CODEC_JSON, text.encode("ascii"), len(text))
 
 
@@ -87,6 +92,11 @@ def read_metadata(container: Container) -> Metadata:
             f"{name}: the metadata has {entry.length} bytes in codec {entry.codec}, and {MAX_BYTES} bytes at most in "
             f"codec {CODEC_JSON} can be read; the file is damaged or newer than this hyrfpack"
         )
+    if entry is not None and entry.raw_length != entry.length:
+        raise HyrfFormatError(
+            f"{name}: the metadata has {entry.length} bytes and says it decodes to {entry.raw_length}; the file is "
+            "damaged, write it again"
+        )
     data = bytes(container[TYPE].data)
     try:
         values = json.loads(data.decode("utf-8"), parse_constant=_finite, parse_float=_finite)
@@ -95,6 +105,8 @@ def read_metadata(container: Container) -> Metadata:
         raise HyrfFormatError(f"{name}: the metadata is not valid JSON ({error}); write the file again") from error
     if not isinstance(values, dict):
         raise HyrfFormatError(f"{name}: the metadata is not a JSON object; write the file again")
+    if _is_deep(values):
+        raise HyrfFormatError(f"{name}: the metadata is nested deeper than {MAX_DEPTH} levels; write the file again")
     values = {item.name: values.get(item.name) for item in fields(Metadata)}
     try:
         for key, kind in (("gaussians", int), ("rules", dict), ("settings", dict), ("provenance", dict)):
@@ -122,8 +134,21 @@ def _check(value: object, kind: type | tuple | dict, path: str) -> None:
     elif kind is float:
         if type(value) not in (int, float) or abs(value) > sys.float_info.max:
             raise ValueError(f"'{path}' must be a finite number")
+    elif kind is int and type(value) is int and abs(value) >= MAX_INTEGER:
+        raise ValueError(f"'{path}' is an integer of more than 64 bits")
     elif type(value) is not kind:
         raise ValueError(f"'{path}' must be of type {kind.__name__}")
+
+
+def _is_deep(value: object) -> bool:
+    """Whether objects and lists are nested deeper than MAX_DEPTH; found level by level, so that any depth can be."""
+    level = [value]
+    for _ in range(MAX_DEPTH + 1):
+        level = [item for item in level if isinstance(item, (dict, list, tuple))]
+        if not level:
+            return False
+        level = [inner for item in level for inner in (item.values() if isinstance(item, dict) else item)]
+    return True
 
 
 def _finite(text: str) -> float:

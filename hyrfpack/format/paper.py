@@ -33,6 +33,7 @@ from hyrfpack.quant import (
 CODEC_FLOAT16, CODEC_RESIDUAL_VQ, CODEC_MIN_MAX = 2, 3, 4
 FLOAT16_MAX = 65504.0
 TABLE_BITS = 8
+MAX_STAGES = 16  # of a residual quantiser: each costs a decoder some milliseconds, however few the rows
 
 _VQ_HEADER = struct.Struct("<BBH")  # stages, columns, codewords of a stage
 _STREAM_LENGTH = struct.Struct("<Q")
@@ -47,7 +48,7 @@ class PaperSettings:
     for the same: colours go together, scales and opacities go their own ways.
 
     Attributes:
-        color, scale, opacity: (stages, codewords of a stage) of the residual quantiser of these logits; 1 to 255 stages
+        color, scale, opacity: (stages, codewords of a stage) of the residual quantiser of these logits; 1 to 16 stages
             of 1 to 256 codewords.
         seed: of the quantisers' k-means.
     """
@@ -59,9 +60,10 @@ class PaperSettings:
 
     def __post_init__(self) -> None:
         for stages, size in (self.color, self.scale, self.opacity):
-            if not (1 <= stages <= 255 and 1 <= size <= 256):
+            if not (1 <= stages <= MAX_STAGES and 1 <= size <= 256):
                 raise HyrfError(
-                    f"the paper profile was asked for {stages} stages of {size} codewords; use 1 to 255 of 1 to 256"
+                    f"the paper profile was asked for {stages} stages of {size} codewords; use 1 to {MAX_STAGES} "
+                    "stages of 1 to 256"
                 )
 
 
@@ -76,16 +78,18 @@ def encode(model: HybridModel, **settings: object) -> tuple[list[Section], dict]
     with needs_package("dahuffman", "profile 'paper'"):
         import dahuffman  # noqa: F401 - builds the Huffman codes; asked for here, before the work starts
     arrays = to_arrays(model)
+    # First: what these refuse could overflow the field, which the opacities are cut by.
+    halves = {group: _encode_float16(group, arrays[group]) for group in ("POSI", "GMLP", "RMLP")}
     arrays["OPAC"] = _without_tails(model, arrays["OPAC"])
     return [
-        _encode_float16("POSI", arrays["POSI"]),
+        halves["POSI"],
         _encode_residual_vq("COLO", arrays["COLO"], chosen.color, chosen.seed),
         _encode_residual_vq("SCAL", arrays["SCAL"], chosen.scale, chosen.seed),
         _encode_residual_vq("OPAC", arrays["OPAC"], chosen.opacity, chosen.seed),
         _encode_min_max("GTAB", arrays["GTAB"]),
-        _encode_float16("GMLP", arrays["GMLP"]),
+        halves["GMLP"],
         _encode_min_max("RTAB", arrays["RTAB"]),
-        _encode_float16("RMLP", arrays["RMLP"]),
+        halves["RMLP"],
     ], asdict(chosen)
 
 
@@ -96,6 +100,11 @@ def _without_tails(model: HybridModel, opacity_logits: np.ndarray) -> np.ndarray
     It is the sum with the field's part that is cut, to +-LOGIT_LIMIT, within 7e-6 of opacity 0 and 1.
     """
     neural = model.geometry(model.cube_coords(model.gaussians.positions))[:, :1].cpu().numpy()
+    if not np.isfinite(neural).all():
+        raise HyrfError(
+            "the model's geometry field gives opacities that are NaN or infinite; train it again with lower learning "
+            "rates"
+        )
     return np.clip(opacity_logits, -LOGIT_LIMIT - neural, LOGIT_LIMIT - neural)
 
 
@@ -103,8 +112,8 @@ def _check_half_range(type: str, values: np.ndarray) -> None:
     largest = np.abs(values).max(initial=0)
     if largest > FLOAT16_MAX:
         raise HyrfError(
-            f"the model's {SECTIONS[type]} reach {largest:.6g} and half precision ends at {FLOAT16_MAX:.0f}; keep this "
-            "model as profile raw, or train it again without such outliers"
+            f"numbers in the model's {SECTIONS[type]} reach {largest:.6g} and half precision ends at "
+            f"{FLOAT16_MAX:.0f}; keep this model as profile raw, or train it again without such outliers"
         )
 
 
@@ -146,19 +155,22 @@ def _decode_residual_vq(data: memoryview, shape: tuple[int, int]) -> np.ndarray:
         raise HyrfFormatError(f"it has {len(data)} bytes, fewer than the header of a residual quantiser")
     stages, columns, size = _VQ_HEADER.unpack_from(data)
     position = _VQ_HEADER.size + 2 * stages * size * columns
-    if not (stages and size) or columns != shape[1] or position > len(data):
+    if not (1 <= stages <= MAX_STAGES and size) or columns != shape[1] or position > len(data):
         raise HyrfFormatError(f"it says {stages} codebooks of {size} codewords of {columns} numbers; it is damaged")
     codebooks = np.frombuffer(data[_VQ_HEADER.size : position], "<f2").reshape(stages, size, columns)
-    indices = np.empty((shape[0], stages), np.uint16)
+    if not np.isfinite(codebooks).all():
+        raise HyrfFormatError("its codebooks hold numbers that are not finite; it is damaged")
+    decoded = np.zeros(shape, np.float32)
     for stage in range(stages):
         start = position + _STREAM_LENGTH.size
         position = start + (_STREAM_LENGTH.unpack_from(data, position)[0] if start <= len(data) else 0)
         if not start <= position <= len(data):
             raise HyrfFormatError(f"it ends within stage {stage} of {stages}; it is damaged")
-        indices[:, stage] = _decode_huffman(data[start:position], shape[0])
+        indices = _decode_huffman(data[start:position], shape[0])
+        decoded += ResidualVectorQuantizer.decode(indices[:, None], codebooks[stage : stage + 1])
     if position != len(data):
         raise HyrfFormatError(f"{len(data) - position} bytes follow its last stage; it is damaged")
-    return ResidualVectorQuantizer.decode(indices, codebooks)
+    return decoded
 
 
 def _decode_huffman(data: memoryview, count: int) -> np.ndarray:

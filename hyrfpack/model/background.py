@@ -11,10 +11,10 @@ RADIUS = 100.0  # local units, around the frame's centre
 def sphere_points(origin: Tensor, directions: Tensor) -> Tensor:
     """Where rays leave the background sphere.
 
-        p = o + t d,  t = -(o.d) + sqrt(max((o.d)^2 - |o|^2 + R^2, 0))
+        p = q + sqrt(max(R^2 - |q|^2, 0)) d,  q = o - (o.d) d the ray's point nearest to the centre
 
-    A ray from outside that misses the sphere gives its point nearest to the centre, so every ray has a finite
-    answer.
+    A ray from outside that misses the sphere gives q, so every ray has a finite answer. The textbook root
+    -(o.d) + sqrt((o.d)^2 - |o|^2 + R^2) subtracts squares of the distance: from 1e5 away float32 would miss by R / 4.
 
     Args:
         origin: (3,) the camera, local units.
@@ -23,9 +23,9 @@ def sphere_points(origin: Tensor, directions: Tensor) -> Tensor:
     Returns:
         (N, 3) local units.
     """
-    along = directions @ origin
-    inside = (along * along - origin @ origin + RADIUS**2).clamp_min(0)
-    return origin + (inside.sqrt() - along)[:, None] * directions
+    nearest = origin - (directions @ origin)[:, None] * directions
+    inside = (RADIUS**2 - nearest.square().sum(-1)).clamp_min(0)
+    return nearest + inside.sqrt()[:, None] * directions
 
 
 def pixel_directions(points: Tensor, intrinsics: tuple[float, float, float, float], pose: Tensor) -> Tensor:

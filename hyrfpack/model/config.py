@@ -45,10 +45,10 @@ class ModelConfig:
     def from_dict(cls, values: dict) -> ModelConfig:
         """The inverse of `to_dict`. Raises KeyError, TypeError or ValueError: a field is missing, unknown or wrong."""
         parts = dict(values)
-        frame = parts.pop("frame")
-        parts["frame"] = Frame(
-            center=_triple(frame["center"]), scale=float(frame["scale"]), half_extent=_triple(frame["half_extent"])
-        )
+        frame = dict(parts["frame"])
+        for name, convert in (("center", _triple), ("scale", float), ("half_extent", _triple)):
+            frame[name] = convert(frame[name])
+        parts["frame"] = Frame(**frame)
         for name in ("geometry", "radiance"):
             parts[name] = HashGridConfig(**parts[name])
         parts["solid"] = _triple(parts["solid"])

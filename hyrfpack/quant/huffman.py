@@ -293,7 +293,7 @@ def huffman_decode(stream: HuffmanStream) -> np.ndarray:
 
     halves = np.frombuffer(stream.payload + bytes(20 + -len(stream.payload) % 4), ">u4").astype(np.uint64)
     windows = halves[:-1] << np.uint64(32) | halves[1:]  # the 64 bits that start at each 32nd bit
-    table, leaf_entries = _decoding_tables(stream.code)
+    table, leaf_entries = _decoding_tables(stream.code, count)
     has_long = len(leaf_entries) > 0
     peek_shift = np.uint64(64 - int(table.size).bit_length() + 1)
 
@@ -330,18 +330,18 @@ def huffman_decode(stream: HuffmanStream) -> np.ndarray:
     return decoded.reshape(-1)[:count]
 
 
-def _decoding_tables(code: HuffmanCode) -> tuple[np.ndarray, np.ndarray]:
+def _decoding_tables(code: HuffmanCode, count: int) -> tuple[np.ndarray, np.ndarray]:
     """What the next bits mean: entries with the symbol in the 16 lowest bits and the code's length above.
 
     Returns:
-        (2^p,) entries by the next p = min(longest code, 16) bits, 0 where a code is longer; and (n,) the entries by
-        leaf, empty if no code is longer.
+        (2^p,) entries by the next p bits, 0 where a code is longer: p is the longest code, but no more than 16 nor than
+        `count` symbols pay for; and (n,) the entries by leaf, empty if no code is longer.
     """
     advance = code.lengths.astype(np.uint64)
     advance[code.symbols == END] = 1 << 40  # out of the stream: no chunk can end there
     leaf_entries = advance << np.uint64(16) | (code.symbols & 0xFFFF).astype(np.uint64)
     longest = int(code.lengths.max())
-    peek = min(longest, _PEEK)
+    peek = min(longest, _PEEK, max(8, count.bit_length()))
     # Leaves are in the order of their codes: the one that holds some bits is the last that starts at or before them.
     next_bits = np.arange(1 << peek, dtype=np.uint64) << np.uint64(64 - peek)
     leaf = np.searchsorted(code.left_codes, next_bits, side="right") - 1

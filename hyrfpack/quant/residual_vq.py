@@ -78,9 +78,10 @@ class ResidualVectorQuantizer:
             return indices, codebooks
 
         residual = values.astype(np.float32)
-        resolution = np.abs(residual).max(axis=0) * np.finfo(self.codebook_dtype).eps
+        stored = np.finfo(self.codebook_dtype)
+        resolution = np.maximum(np.abs(residual).max(axis=0) * stored.eps, stored.smallest_subnormal)
         sigma = np.maximum(residual.std(axis=0, dtype=np.float64), resolution)
-        weights = np.divide(1.0, sigma, out=np.zeros(dims), where=sigma > 0)
+        weights = 1 / sigma
         rng = np.random.default_rng(self.seed)
         for stage in range(self.stages):
             indices[:, stage], codebooks[stage] = self._encode_stage(residual, weights, rng)

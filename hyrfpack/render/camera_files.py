@@ -75,8 +75,8 @@ def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
             cameras.append(parse({**shared, **item}, f"{number:04d}"))
         except KeyError as error:
             raise HyrfDataError(f"{path}: camera {number} has no {error}; add it") from error
-        except (TypeError, ValueError, OverflowError) as error:
-            raise HyrfDataError(f"{path}: camera {number} makes no sense ({error}); correct it") from error
+        except (TypeError, ValueError, ArithmeticError) as error:
+            raise HyrfDataError(f"{path}: camera {number} makes no sense ({error!s:.160}); correct it") from error
     if not cameras:
         raise HyrfDataError(f"{path}: there is no camera in it; add at least one")
     return cameras
@@ -111,8 +111,9 @@ def rigid_pose(values: Any) -> np.ndarray:
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise ValueError("its pose is not 4 x 4 finite numbers")
     rotation = pose[:3, :3]
-    off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(pose[3] - (0, 0, 0, 1)).max())
-    if off > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(pose[3] - (0, 0, 0, 1)).max())
+    if not off <= RIGID_TOLERANCE or np.linalg.det(rotation) < 0:  # NaN, from squares that overflow, is refused too
         raise ValueError("its pose is not a rotation and a translation")
     return pose
 

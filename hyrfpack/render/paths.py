@@ -116,9 +116,10 @@ def orbit(viewpoint: dict, frames: int) -> list[Camera]:
         fx, fy = focal_length(fx), focal_length(fy)
         width, height = side_length(viewpoint["width"]), side_length(viewpoint["height"])
         first, last = (float(value) for value in viewpoint["arc"])
-        if center.shape != (3,) or not np.isfinite([*center, cx, cy, first, last]).all():
+        # The squares of larger numbers overflow.
+        if center.shape != (3,) or not (np.abs([*center, *pose.flat, cx, cy, first, last]) < 1e150).all():
             raise ValueError("a number is missing or not finite")
-        if up.shape != (3,) or not np.linalg.norm(up) > 0:
+        if up.shape != (3,) or not 0 < np.linalg.norm(up) < np.inf:
             raise ValueError("'up' is no direction")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise HyrfDataError(

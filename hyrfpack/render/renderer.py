@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from hyrfpack.errors import HyrfError
 from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.ops.pool import torch_on_one_thread
 from hyrfpack.ops.rasterize import rasterize
@@ -95,10 +96,14 @@ def render(
         absgrad: also collect absolute gradients of the projected centres during backward.
         solid: (3,) colour behind everything instead of the model's own; for models without a background sphere.
         background: False leaves the background sphere out.
+
+    Raises:
+        HyrfError: a number that the view needs is NaN or infinite.
     """
     seconds: dict[str, float] = {}
     positions = model.gaussians.positions
     pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=positions.dtype, device=positions.device)
+    _refuse_nonfinite(pose=pose, positions=positions)
     with _timed(seconds, "cull"), torch.no_grad():
         index = frustum_cull(
             positions, pose, camera.intrinsics, camera.width, camera.height, settings.near, settings.cull_tolerance
@@ -106,6 +111,7 @@ def render(
     with _timed(seconds, "decode"):
         geometry = model.decode_geometry(index) if geometry is None else geometry[index]
         colors = model.decode_colors(-(pose[:3, :3].T @ pose[:3, 3]), index)
+    _refuse_nonfinite(scales=geometry.scales, rotations=geometry.quats, opacities=geometry.opacities, colours=colors)
     gradients = positions.new_zeros(len(index), 2) if absgrad else None
     raster = rasterize(
         positions[index],
@@ -129,6 +135,7 @@ def render(
             behind = _background(model, camera, pose, raster.transmittance, settings)
         else:
             behind = positions.new_tensor(model.config.solid) if solid is None else solid
+        _refuse_nonfinite(background=behind)
         rgb = raster.rgb + raster.transmittance[..., None] * behind
     return Rendering(
         rgb=rgb,
@@ -140,6 +147,16 @@ def render(
         pairs=raster.pairs,
         seconds=seconds,
     )
+
+
+def _refuse_nonfinite(**values: Tensor) -> None:
+    """Raise HyrfError for NaN and infinity: further on they fail every comparison and are left out without a word."""
+    for name, tensor in values.items():
+        if tensor.numel() and not torch.stack(tensor.detach().aminmax()).isfinite().all():
+            raise HyrfError(
+                f"the view's {name} hold NaN or infinity, from a broken model or a pose beyond float32; "
+                "train the model again or mend the pose"
+            )
 
 
 def _background(

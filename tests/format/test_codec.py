@@ -47,7 +47,9 @@ def rewrite(data: bytes, **changes: bytes | None) -> bytes:
         for section in read_container(data).sections
         if changes.get(section.type, b"") is not None
     ]
-    return write_container(sections)
+    return write_container(
+        [replace(section, raw_length=len(section.data)) if section.type == "META" else section for section in sections]
+    )
 
 
 def metadata_of(data: bytes) -> dict:

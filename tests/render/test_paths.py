@@ -89,7 +89,7 @@ def test_cameras_that_look_the_same_way_get_a_small_swing_in_front_of_them():
 
 
 def test_cameras_that_look_outwards_do_not_orbit_the_point_behind_them():
-    cameras = [camera_at(camera.position, 2 * camera.position) for camera in ring(8, height=0.0)]
+    cameras = [camera_at(camera.position, 2 * camera.position) for camera in ring(8, elevation=0.0)]
     path = orbit(viewpoint_hint(cameras), 8)
     assert all(camera.forward @ path[0].forward > 0.9 for camera in path)
 

@@ -1,0 +1,179 @@
+"""Hostile `.hyrf` files: a corpus of them, and a taste of what tools/fuzz.py makes by the million.
+
+`corpus/bugs` holds one file for each defect that was found, `corpus/sentences` one for each complaint of the reader,
+both named after what they are about.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import tracemalloc
+from collections import Counter
+from contextlib import redirect_stdout
+from pathlib import Path
+
+import pytest
+import torch
+from fuzz import allowance, check_file, check_model, decode
+from fuzz_mutate import GROUPS, KINDS, assemble, disassemble, mutant, seeds
+
+from hyrfpack.cli.files import info
+from hyrfpack.errors import HyrfError
+from hyrfpack.format import compress, encode_model
+
+CORPUS = Path(__file__).parent / "corpus"
+
+# What the reader says of the files that are not to be decoded; None for those that are.
+BUGS = {
+    "integer_of_1000_digits": "'config.hidden' is an integer of more than 64 bits",
+    "line_end_and_escape_in_scale_rule": r"scale_rule is 'a\\nb\\x1b\[2J'",
+    "line_end_and_surrogate_in_key": r"'a\\n\\ud800'",
+    "line_end_in_rule": r"rule 'a\\nb'",
+    "metadata_with_wrong_raw_length": "has 615 bytes and says it decodes to 12345",
+    "provenance_900_deep": "nested deeper than 64",
+    "rule_of_3000_letters": "rule 'a{39} is 1 and",
+    "shown_box_beyond_float64": None,
+    "shown_choices_are_a_list": None,
+    "shown_surrogate_in_scale_rule": r"scale_rule is '\\ud800'",
+    "shown_surrogate_in_writer": None,
+    "unknown_key_in_frame": "'x'",
+    "vq_of_16_stages_and_8_million_rows": "'POSI': Huffman stream: 8 bytes are fewer than its header",
+    "vq_of_255_stages_and_8_million_rows": "'POSI': it says 255 codebooks",
+    "vq_of_infinite_codewords": "'COLO': its codebooks hold numbers that are not finite",
+}
+
+
+def test_every_file_of_the_corpus_is_replayed():
+    assert {file.stem for file in (CORPUS / "bugs").iterdir()} == set(BUGS)
+    assert sum(file.stat().st_size for file in CORPUS.rglob("*")) < 300_000
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", BUGS)
+def test_a_file_that_was_mishandled_is_decoded_or_refused_in_one_line(name, tmp_path):
+    data = (CORPUS / "bugs" / f"{name}.hyrf").read_bytes()
+
+    tracemalloc.start()
+    outcome = decode(data)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+
+    assert peak < 97 << 20  # the positions that two of the files declare; one of them once took 4 GB
+    if BUGS[name] is None:
+        check_model(outcome)
+    else:
+        assert re.search(BUGS[name], outcome)
+    check_file(data, outcome, tmp_path)
+
+
+@pytest.mark.parametrize("name", sorted(file.stem for file in (CORPUS / "sentences").iterdir()))
+def test_a_forged_file_is_refused_with_the_sentence_it_is_named_after(name):
+    sentence = decode((CORPUS / "sentences" / f"{name}.hyrf").read_bytes())
+
+    words = re.sub(r"\W+", " ", sentence.replace("'", "")).lower()
+    assert re.search(".*".join(filter(None, name.split("_"))), words), sentence
+
+
+@pytest.mark.filterwarnings("error")
+def test_mutants_are_decoded_or_refused_in_one_line():
+    outcomes = Counter()
+    for number in range(3000):
+        kind, data = mutant(number)
+        outcome = decode(data)
+        outcomes[kind, isinstance(outcome, str)] += 1
+        if not isinstance(outcome, str) and number % 10 == 0:
+            check_model(outcome)
+
+    assert {kind for kind, _ in outcomes} == set(KINDS)
+    # Forged content gets past the checksums, to where it is decoded; damage does not.
+    for kind in KINDS:
+        assert (outcomes[kind, False] > 10) == kind.startswith("forged"), kind
+
+
+def test_mutants_depend_on_nothing_but_their_numbers():
+    first = [mutant(number, 7) for number in range(50)]
+
+    assert [mutant(number, 7) for number in reversed(range(50))] == first[::-1]
+    assert [mutant(number, 8) for number in range(50)] != first
+
+
+def test_what_is_taken_apart_is_put_together_the_same():
+    for data in seeds()[0]:
+        assert assemble(disassemble(data)) == data
+
+
+@pytest.mark.parametrize("codec", [1, 2, 3, 4])
+@pytest.mark.parametrize("kept", [0, 40, 4000])
+def test_a_small_file_that_declares_a_huge_model_takes_little_memory(codec, kept):
+    """All that the limits allow for so small a file, 2^28 bytes, and none of it there."""
+    parts = disassemble(encode_model(decode(seeds()[0][0]), "raw"))
+    count = (1 << 28) // 32 - 1000
+    metadata = json.loads(parts[0].data) | {"gaussians": count}
+    parts[0].data = json.dumps(metadata).encode()
+    parts[0].raw_length = len(parts[0].data)
+    for part, width in zip(parts[1:5], (3, 3, 1, 1), strict=True):
+        part.raw_length, part.codec = 4 * width * count, codec
+        part.data = bytes([1, width, 1, 0])[: kept or None] * (kept // 4)
+    data = assemble(parts)
+    assert allowance(data) > 10 << 28  # within what the container allows
+
+    tracemalloc.start()
+    outcome = decode(data)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+
+    assert isinstance(outcome, str) and "'POSI'" in outcome
+    assert peak < 4 * 3 * count + (1 << 20)  # at most the one array that was promised
+
+
+def test_provenance_that_grows_in_writing_is_refused_in_one_line(tmp_path):
+    """2 bytes of UTF-8 become 6 of ASCII: what may be read may not be written again."""
+    parts = disassemble(seeds()[0][2])
+    metadata = json.loads(parts[0].data) | {"provenance": {"name": "\u00e9" * 400_000}}
+    parts[0].data = json.dumps(metadata, ensure_ascii=False).encode()
+    parts[0].raw_length = len(parts[0].data)
+    (tmp_path / "model.hyrf").write_bytes(assemble(parts))
+
+    with pytest.raises(HyrfError, match="may take 1048576; shorten the provenance"):
+        compress(tmp_path / "model.hyrf", tmp_path / "packed.hyrf", "raw")
+
+    assert not (tmp_path / "packed.hyrf").exists()
+
+
+def test_what_a_writer_nests_too_deep_to_be_read_is_not_written():
+    model = decode(seeds()[0][2])
+    deep: list = []
+    for _ in range(62):  # within the list, `provenance` and the metadata
+        deep = [deep]
+
+    assert not isinstance(decode(encode_model(model, provenance={"deep": deep[0]})), str)
+    with pytest.raises(HyrfError, match="nested deeper than 64 levels"):
+        encode_model(model, provenance={"deep": deep})
+
+
+def test_seeds_reach_every_group_and_codec():
+    met = {(part.type.decode(), part.codec) for data in seeds()[0] for part in disassemble(data)[1:]}
+
+    assert {group for group, _ in met} == set(GROUPS)
+    assert {codec for _, codec in met} == {1, 2, 3, 4}
+    assert all(not isinstance(decode(data), str) for data in seeds()[0])
+
+
+def test_info_shows_what_a_file_says_without_acting_on_it():
+    shown = io.StringIO()
+    with redirect_stdout(shown):
+        info.callback(CORPUS / "bugs" / "shown_surrogate_in_writer.hyrf", False)
+
+    assert r"written by \ud800\x1b[2J" in shown.getvalue()
+
+
+def test_every_group_may_have_stages_up_to_the_limit_and_not_one_more():
+    """Each stage costs milliseconds whatever it holds, so that 255 of them in 8 groups were 13 seconds from 300 kB."""
+    model = decode(seeds()[0][4])
+    data = encode_model(model, "paper", color=(16, 2))
+
+    assert torch.isfinite(decode(data).gaussians.color_logits).all()
+    with pytest.raises(HyrfError, match="17 stages"):
+        encode_model(model, "paper", color=(17, 2))

@@ -1,0 +1,433 @@
+"""Hostile scenes, pictures, points, cameras and checkpoints: they are read, or refused in one line.
+
+What tests/data does already (COLMAP's three binary tables, transforms.json, single damaged bytes of pictures) is not
+done again; here are COLMAP's text tables, rigs and frames, Blender's JSON, PLY, camera files, headers of pictures with
+their checksums repaired, and checkpoints with their digest repaired.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import logging
+import math
+import struct
+import tracemalloc
+import zlib
+from pathlib import Path
+from random import Random
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+import trimesh
+from fuzz_mutate import EXTREMES, HOSTILE_JSON, edit_bytes, places
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from hyrfpack.data import load_scene
+from hyrfpack.data.pictures import read_header, read_pixels
+from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.render.camera_files import cameras_from_json
+from hyrfpack.render.paths import frame_viewpoint, orbit
+from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
+
+numbers = st.integers(0, 2**32 - 1).map(Random)  # hypothesis chooses the seed: mutants are cheap, and small already
+search = settings(max_examples=150, deadline=None)
+
+BAD_VALUES = (*HOSTILE_JSON, math.nan, math.inf, "x" * 5000, "a\0b", [[1.0] * 4] * 4, [[1e200] * 4] * 4, [[]] * 4)
+POSE = np.eye(4).tolist()
+INTRINSICS = {"fl_x": 30.0, "fl_y": 31.0, "cx": 17.0, "cy": 11.0, "w": 32, "h": 24}
+
+
+def check(read) -> bool:
+    """Whether `read()` works; fails unless it does or raises a HyrfError of one printable line."""
+    try:
+        read()
+    except HyrfError as error:
+        assert str(error).isprintable() and 10 < len(str(error)) < 6000
+        return False
+    return True
+
+
+def load_pictures(root: Path, layout: str | None = None) -> None:
+    for view in load_scene(root, layout=layout, test_every=0).views:
+        view.load()
+
+
+def forge_json(values: dict | list, rng: Random) -> bytes:
+    """Values with one or two places deleted, doubled or replaced, as text; now and then the text is damaged too."""
+    values = json.loads(json.dumps(values))
+    for _ in range(rng.randint(1, 2)):
+        node, key = rng.choice(places(values))
+        kind = rng.randrange(4)
+        if kind == 0:
+            del node[key]
+        elif kind == 1 and isinstance(node, list):
+            node.append(node[key])
+        else:
+            node[key] = json.loads(json.dumps(rng.choice(BAD_VALUES)))
+        if not values:
+            break
+    text = json.dumps(values).encode()
+    return edit_bytes(text, rng) if rng.random() < 0.1 else text
+
+
+def frames(names: list[str]) -> list[dict]:
+    return [{"file_path": name, "transform_matrix": POSE} for name in names]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory, folders) -> Path:
+    """A folder with three pictures, for transforms files to name."""
+    root = tmp_path_factory.mktemp("hostile")
+    folders.write_pictures(root, [f"images/{index}.png" for index in range(3)])
+    return root
+
+
+def test_what_is_forged_here_is_read_as_it_is(root, colmap):
+    for tables in colmap[2:]:
+        write_tables(colmap[1], tables)
+        load_pictures(colmap[0])
+    (root / "transforms_train.json").write_text(json.dumps(BLENDER))
+    load_pictures(root, "blender")
+    for cameras in (OURS, THEIRS, BY_ANGLE):
+        (root / "cameras.json").write_text(json.dumps(cameras))
+        assert len(cameras_from_json(root / "cameras.json")) == len(cameras if cameras is OURS else cameras["frames"])
+    (root / "transforms.json").write_text(json.dumps(WITH_POINTS))
+    for data in ply_files():
+        (root / "points.ply").write_bytes(data)
+        assert len(load_scene(root, layout="nerfstudio", test_every=0).points) == 5
+    for suffix, data in PICTURES:
+        (root / f"a.{suffix}").write_bytes(data)
+        assert read_header(root / f"a.{suffix}").width == 32
+
+
+# --- COLMAP ---
+
+
+@pytest.fixture(scope="module")
+def colmap(tmp_path_factory, folders):
+    """(root, model folder, tables as text, tables as bytes), rigs and frames among them."""
+    root = tmp_path_factory.mktemp("colmap")
+    folder = folders.ColmapFolder(root, count=3, model=4, params=(30.0, 31, 17, 11, 0.1, 0.01, 0.001, 0.002))
+    model = pycolmap.Reconstruction(str(folder.model))
+    tables = []
+    for write in (model.write_text, model.write_binary):
+        for old in folder.model.iterdir():
+            old.unlink()
+        write(str(folder.model))
+        tables.append({file.name: file.read_bytes() for file in folder.model.iterdir()})
+    return root, folder.model, *tables
+
+
+def write_tables(model: Path, tables: dict[str, bytes]) -> None:
+    for old in model.iterdir():
+        old.unlink()
+    for name, content in tables.items():
+        (model / name).write_bytes(content)
+
+
+WORDS = (
+    b"nan",
+    b"inf",
+    b"-1",
+    b"0",
+    b"1e400",
+    b"9" * 30,
+    b"9223372036854775807",
+    b"4294967295",
+    b"x",
+    b"",
+    b"\0",
+    b"FOV",
+)
+
+
+@search
+@given(rng=numbers)
+def test_forged_colmap_text_tables_are_read_or_refused(colmap, rng):
+    root, model, tables, _ = colmap
+    forged = dict(tables)
+    for _ in range(rng.randint(1, 2)):
+        name = rng.choice(list(forged))
+        lines = forged[name].split(b"\n")
+        at = rng.randrange(len(lines))
+        words = lines[at].split(b" ")
+        words[rng.randrange(len(words))] = rng.choice(WORDS)
+        kind = rng.randrange(5)
+        lines[at : at + 1] = [[], [lines[at]] * 2, [b" ".join(words)]][min(kind, 2)]
+        forged[name] = b"\n".join(lines)
+    write_tables(model, forged)
+
+    check(lambda: load_pictures(root))
+
+
+@search
+@given(rng=numbers)
+def test_forged_colmap_binary_tables_with_rigs_are_read_or_refused(colmap, rng):
+    root, model, _, tables = colmap
+    forged = dict(tables)
+    for _ in range(rng.randint(1, 3)):
+        name = rng.choice(["rigs.bin", "frames.bin", *tables])
+        content = bytearray(forged[name])
+        width, at = rng.choice((4, 8)), rng.randrange(len(content) + 1)
+        value = rng.choice((*EXTREMES, *struct.unpack("<2Q", struct.pack("<2d", math.nan, 1e300))))
+        content[at : at + width] = (value % 256**width).to_bytes(width, "little")
+        forged[name] = bytes(content)
+    write_tables(model, forged)
+
+    check(lambda: load_pictures(root))
+
+
+# --- transforms files and cameras ---
+
+BLENDER = {"camera_angle_x": 0.9, "frames": frames([f"images/{index}" for index in range(3)])}
+
+
+@search
+@given(rng=numbers)
+def test_forged_blender_sets_are_read_or_refused(root, rng):
+    (root / "transforms_train.json").write_bytes(forge_json(BLENDER, rng))
+
+    check(lambda: load_pictures(root, "blender"))
+
+
+@pytest.mark.parametrize("angle", [5e-324, 1e-320, 0, -1, 3.2, 1e308])
+def test_angles_without_a_focal_length_are_refused(root, angle):
+    content = {"camera_angle_x": angle, "frames": frames(["images/0"])}
+    (root / "transforms_train.json").write_text(json.dumps(content))
+
+    with pytest.raises(HyrfDataError):
+        load_scene(root, layout="blender", test_every=0)
+
+
+def test_points_under_a_name_too_long_for_a_file_are_not_on_disk(root):
+    content = {**INTRINSICS, "frames": frames(["images/0.png"]), "ply_file_path": "x" * 5000}
+    (root / "transforms.json").write_text(json.dumps(content))
+
+    with pytest.raises(HyrfDataError, match="are not on disk"):
+        load_scene(root, layout="nerfstudio", test_every=0)
+
+
+OURS = [{"name": "a", "width": 40, "height": 30, "fx": 25, "fy": 2, "cx": 2, "cy": 1, "camera_from_world": POSE}] * 2
+THEIRS = {"w": 40, "h": 30, "fl_x": 25, "cx": 1, "cy": 2, "fl_y": 3, "frames": [{"transform_matrix": POSE}] * 2}
+BY_ANGLE = {"w": 40, "h": 30, "camera_angle_x": 0.7, "frames": [{"file_path": "x.png", "transform_matrix": POSE}]}
+
+
+@settings(max_examples=600, deadline=None)
+@given(rng=numbers)
+def test_forged_camera_files_are_read_or_refused(root, rng):
+    path = root / "cameras.json"
+    path.write_bytes(forge_json(rng.choice((OURS, THEIRS, BY_ANGLE)), rng))
+
+    def read() -> None:
+        for _, camera in cameras_from_json(path):
+            assert np.isfinite([*camera.intrinsics, *camera.camera_from_world.flat]).all()
+            assert np.abs(camera.rotation @ camera.rotation.T - np.eye(3)).max() < 1e-2
+
+    check(read)
+
+
+def test_a_field_of_view_of_nothing_is_refused(tmp_path):
+    (tmp_path / "c.json").write_text(json.dumps(BY_ANGLE | {"camera_angle_x": 0}))
+
+    with pytest.raises(HyrfDataError, match="camera 0 makes no sense"):
+        cameras_from_json(tmp_path / "c.json")
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_pose_whose_squares_overflow_is_refused(tmp_path):
+    """inf - inf among the products is NaN, which is not above any tolerance."""
+    pose = np.eye(4)
+    pose[:2, :2] = [[1e200, -1e200], [1e200, 1e200]]
+    (tmp_path / "c.json").write_text(json.dumps([OURS[0] | {"camera_from_world": pose.tolist()}]))
+
+    with pytest.raises(HyrfDataError, match="not a rotation"):
+        cameras_from_json(tmp_path / "c.json")
+
+
+def test_what_a_camera_file_says_is_quoted_in_short(tmp_path):
+    (tmp_path / "c.json").write_text(json.dumps([OURS[0] | {"fx": "\n" * 5000}]))
+
+    with pytest.raises(HyrfDataError) as caught:
+        cameras_from_json(tmp_path / "c.json")
+
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 1000
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+@settings(max_examples=300, deadline=None)
+@given(rng=numbers)
+def test_a_forged_viewpoint_is_followed_or_refused(rng):
+    viewpoint = json.loads(json.dumps(frame_viewpoint((0, 0, 0), 1.0)))
+    node, key = rng.choice(places(viewpoint))
+    node[key] = rng.choice((*HOSTILE_JSON, 1e160, [1e200] * 3, [5e-324] * 3))
+
+    check(lambda: orbit(viewpoint, 3))  # a camera refuses to be made of NaN
+
+
+# --- points ---
+
+WITH_POINTS = {**INTRINSICS, "frames": frames(["images/0.png"]), "ply_file_path": "points.ply"}
+
+
+def ply_files() -> list[bytes]:
+    points = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    colors = np.full((5, 3), 7, np.uint8)
+    shapes = trimesh.PointCloud(points, colors), trimesh.Trimesh(points, [[0, 1, 2], [1, 2, 3]], process=False)
+    return [shape.export(file_type="ply", encoding=encoding) for shape in shapes for encoding in ("ascii", "binary")]
+
+
+PLY_FORGERIES = [
+    (b"float", b"double"),
+    (b"float", b"int"),
+    (b"uchar", b"list uchar int"),
+    (b"property", b"property list int float"),
+    *((b"vertex 5", b"vertex %d" % count) for count in (-1, 0, 4, 6, 10**11, 2**63)),
+    *((b"face 2", b"face %d" % count) for count in (-1, 10**11, 2**63)),
+    (b"end_header", b"element x 4000000000\nend_header"),
+    (b"end_header", b"element x 4000000000\nproperty uchar a\nend_header"),
+    (b"end_header", b"element x 4000000000\nproperty list uchar int a\nend_header"),
+    (b"ascii", b"binary_little_endian"),
+    (b"binary_little_endian", b"ascii"),
+    (b"little", b"big"),
+    (b"property float x\n", b""),
+    (b"float x", b"float s"),
+    (b"red", b"y"),
+    (b"\n", b"\r\n"),
+]
+
+
+@search
+@given(rng=numbers)
+def test_forged_points_are_read_or_refused(root, rng):
+    (root / "transforms.json").write_text(json.dumps(WITH_POINTS))
+    data = rng.choice(ply_files())
+    for _ in range(rng.randint(0, 2)):
+        data = data.replace(*rng.choice(PLY_FORGERIES), rng.choice((1, -1)))
+    if rng.random() < 0.6:
+        data = edit_bytes(data, rng)
+    (root / "points.ply").write_bytes(data)
+
+    tracemalloc.start()
+    check(lambda: load_scene(root, layout="nerfstudio", test_every=0))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+
+    assert peak < 64 << 20  # the file has 500 bytes, whatever it says
+
+
+def test_a_texture_named_in_a_file_of_points_is_not_opened(root, caplog):
+    (root / "transforms.json").write_text(json.dumps(WITH_POINTS))
+    data = ply_files()[0].replace(b"element vertex", b"comment TextureFile gone.png\nelement vertex")
+    (root / "points.ply").write_bytes(data)
+
+    with caplog.at_level(logging.WARNING):
+        assert len(load_scene(root, layout="nerfstudio", test_every=0).points) == 5
+
+    assert not caplog.records  # trimesh complains of a picture that it cannot open
+
+
+# --- pictures ---
+
+
+def picture_files() -> list[tuple[str, bytes]]:
+    ramp = np.arange(24 * 32).reshape(24, 32)
+    image = Image.fromarray((ramp % 256).astype(np.uint8))
+    wide = Image.fromarray((ramp * 80).astype(np.uint16))
+    kinds = [("png", mode, {}) for mode in ("RGB", "P", "RGBA", "L", "1")]
+    kinds += [("png", "L", {"transparency": 5}), ("png", "I;16", {"transparency": 5})]
+    kinds += [("jpeg", "RGB", {}), ("jpeg", "CMYK", {}), ("webp", "RGBA", {}), ("gif", "P", {"transparency": 0})]
+    kinds += [("tiff", mode, {}) for mode in ("RGB", "I;16", "F", "CMYK")]
+    kinds += [("bmp", "RGB", {}), ("ppm", "RGB", {})]
+    files = []
+    for suffix, mode, options in kinds:
+        buffer = io.BytesIO()
+        (wide if mode == "I;16" else image.convert("RGB").convert(mode)).save(buffer, suffix.upper(), **options)
+        files.append((suffix, buffer.getvalue()))
+    return files
+
+
+PICTURES = picture_files()
+
+
+def resealed_png(data: bytes) -> bytes:
+    """The picture with the checksum of every chunk right."""
+    whole, at = bytearray(data[:8]), 8
+    while at + 8 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        chunk = data[at + 4 : at + 8 + length]
+        whole += data[at : at + 4] + chunk + struct.pack(">I", zlib.crc32(chunk))
+        at += 12 + length
+    return bytes(whole)
+
+
+@pytest.mark.filterwarnings("ignore")  # Pillow's own
+@search
+@given(rng=numbers)
+def test_forged_picture_headers_are_read_or_refused(tmp_path_factory, rng):
+    suffix, data = rng.choice(PICTURES)
+    data = edit_bytes(data[:60], rng, 2) + data[60:]
+    path = tmp_path_factory.getbasetemp() / f"forged.{suffix}"
+    path.write_bytes(resealed_png(data) if suffix == "png" else data)
+
+    def read() -> None:
+        header = read_header(path)
+        rgb, alpha = read_pixels(path)
+        assert rgb.shape == (header.height, header.width, 3)
+        assert (alpha is not None) == header.has_alpha
+
+    check(read)
+
+
+def test_sixteen_bit_grey_with_a_transparent_level_is_opaque(root, tmp_path, folders):
+    """Its header says that it has alpha, and its pixels have none."""
+    folders.write_pictures(tmp_path, ["images/0.png"])
+    data = next(data for suffix, data in PICTURES if b"tRNS" in data and Image.open(io.BytesIO(data)).mode == "I;16")
+    (tmp_path / "images" / "0.png").write_bytes(data)
+    (tmp_path / "transforms.json").write_text(json.dumps({**INTRINSICS, "frames": frames(["images/0.png"])}))
+
+    scene = load_scene(tmp_path, test_every=0)
+
+    assert not scene.has_alpha
+    assert scene.train[0].load().alpha is None
+
+
+def test_postscript_under_the_name_of_a_photo_is_not_run(tmp_path):
+    Image.new("RGB", (32, 24)).save(tmp_path / "a.eps")
+    (tmp_path / "a.eps").rename(tmp_path / "a.png")
+
+    with pytest.raises(HyrfDataError, match="PostScript"):
+        read_pixels(tmp_path / "a.png")
+
+
+def test_a_small_picture_that_declares_a_huge_one_is_refused(tmp_path):
+    data = bytearray(next(data for suffix, data in PICTURES if suffix == "png"))
+    struct.pack_into(">II", data, 16, 1 << 30, 1 << 30)
+    (tmp_path / "a.png").write_bytes(resealed_png(bytes(data)))
+
+    with pytest.raises(HyrfDataError, match="decompression bomb"):
+        read_header(tmp_path / "a.png")
+
+
+# --- checkpoints ---
+
+
+@search
+@given(rng=numbers)
+def test_a_forged_checkpoint_with_its_digest_right_is_read_or_refused(tmp_path_factory, rng):
+    path = tmp_path_factory.getbasetemp() / "checkpoint.pt"
+    save_checkpoint(path, settings={"steps": 3}, tensors={"a": torch.arange(6.0)}, progress={"step": 1})
+    data = edit_bytes(path.read_bytes()[:-32], rng)
+    path.write_bytes(data + hashlib.sha256(data).digest())
+
+    tracemalloc.start()
+    check(lambda: load_checkpoint(path, {"steps": 3}))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+
+    assert peak < 16 << 20

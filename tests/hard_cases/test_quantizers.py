@@ -1,0 +1,346 @@
+"""Quantisers and whole files where numbers are few, all the same, huge, tiny, skewed, or very many."""
+
+from __future__ import annotations
+
+import dataclasses
+import tracemalloc
+from collections.abc import Callable
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import camera_at, small_model
+
+from hyrfpack.errors import HyrfError
+from hyrfpack.format import decode_model, encode_model
+from hyrfpack.model import HashGridConfig, HybridModel
+from hyrfpack.model.hash_grid import FEATURES
+from hyrfpack.quant import (
+    HuffmanCode,
+    HuffmanStream,
+    MinMaxParams,
+    MinMaxQuantizer,
+    ResidualVectorQuantizer,
+    huffman_decode,
+    huffman_encode,
+)
+from hyrfpack.quant.huffman import MAX_LENGTH
+from hyrfpack.render import render
+
+LARGEST = float(np.finfo(np.float32).max)
+SMALLEST = 2.0**-149
+PROFILES = ("raw", "paper")
+
+
+def through_bytes(symbols: np.ndarray, code: HuffmanCode | None = None) -> tuple[np.ndarray, int]:
+    """The symbols decoded from their bytes, and how many bytes these are."""
+    data = huffman_encode(symbols, code).to_bytes()
+    return huffman_decode(HuffmanStream.from_bytes(data)), len(data)
+
+
+def fibonacci(count: int) -> np.ndarray:
+    numbers = [1, 1]
+    while len(numbers) < count:
+        numbers.append(numbers[-1] + numbers[-2])
+    return np.array(numbers[:count])
+
+
+# -- Huffman codes ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("place", [0, 1023, 1024, 777_777, 1_000_000])
+def test_one_symbol_in_a_million_round_trips_in_a_bit_each(dtype, place):
+    symbols = np.full(1_000_001, 7, dtype)
+    symbols[place] = 200
+
+    decoded, size = through_bytes(symbols)
+
+    np.testing.assert_array_equal(decoded, symbols)
+    assert size <= 1_000_001 / 8 + 2100  # a bit each, and at most 1,024 chunk sizes of 2 bytes
+
+
+@given(st.lists(st.integers(1, 10**9) | st.integers(1, 3), min_size=1, max_size=80))
+@settings(max_examples=150, deadline=None)
+def test_no_histogram_needs_longer_codes_than_the_fibonacci_numbers(counts):
+    """A code of L bits needs F(L + 2) - 1 symbols or more (the end mark is one more leaf, of weight 1)."""
+    lengths = HuffmanCode.from_frequencies(np.array(counts)).lengths
+
+    assert sum(counts) >= fibonacci(int(lengths.max()) + 2)[-1] - 1
+
+
+def test_the_largest_table_that_a_file_may_hold_needs_no_longer_codes_than_the_codec_has():
+    """Less than 2^30 symbols: 42 bits at most, and the codec has 57."""
+    grid = HashGridConfig(log2_table_size=24, levels=32, base=256, finest=65536)
+    for past in ({"log2_table_size": 25}, {"levels": 33}):
+        with pytest.raises(ValueError, match="must lie in"):
+            dataclasses.replace(grid, **past)
+
+    longest = max(length for length in range(1, 90) if fibonacci(length + 2)[-1] - 1 <= grid.rows * FEATURES)
+
+    assert longest == 42 < MAX_LENGTH
+    assert fibonacci(MAX_LENGTH + 3)[-1] - 1 > 1000 * grid.rows * FEATURES  # what a bit past the codec's would take
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_the_longest_codes_round_trip_at_every_bit_of_a_byte(dtype):
+    code = HuffmanCode.from_frequencies(fibonacci(MAX_LENGTH))
+    assert code.lengths.max() == MAX_LENGTH
+    rare = np.flatnonzero(code.by_symbol(256)[1] >= MAX_LENGTH - 1).astype(dtype)
+    fillers = [np.full(count, MAX_LENGTH - 1, dtype) for count in range(65)]  # of one bit each
+    symbols = np.concatenate([part for filler in fillers for part in (filler, rare)])
+
+    decoded, _ = through_bytes(symbols, code)
+
+    np.testing.assert_array_equal(decoded, symbols)
+
+
+def test_a_histogram_one_bit_past_the_longest_code_is_refused():
+    with pytest.raises(ValueError, match="so skewed that a code is longer than 57 bits"):
+        HuffmanCode.from_frequencies(fibonacci(MAX_LENGTH + 1))
+
+
+@pytest.mark.parametrize("code", [None, HuffmanCode.from_frequencies(np.array([5, 3, 1]))])
+def test_no_symbols_take_a_header_whatever_the_code(code):
+    decoded, size = through_bytes(np.zeros(0, np.uint8), code)
+
+    assert decoded.shape == (0,)
+    assert size <= 26 + (2 * len(code.symbols) - 1 if code else 0)
+
+
+# -- min-max ---------------------------------------------------------------------------------------------------------
+
+
+def min_max_error(values: np.ndarray, bits: int = 8) -> np.ndarray:
+    codes, params = MinMaxQuantizer(bits).encode(values)
+    decoded = MinMaxQuantizer.decode(codes, MinMaxParams.from_bytes(params.to_bytes()))
+    assert decoded.dtype == np.float32 and np.isfinite(decoded).all()
+    return np.abs(decoded.astype(np.float64) - values)
+
+
+@pytest.mark.parametrize("bits", [1, 8, 16])
+def test_extremes_farther_apart_than_float32_reaches_keep_half_a_step(bits):
+    """max - min is 6.8e38: as float32 it is infinite, and every code zero or NaN."""
+    values = np.float32([-LARGEST, -1.0, 0.0, 1e38, LARGEST])
+
+    error = min_max_error(values, bits)
+
+    assert error.max() <= 2 * LARGEST / (2 * (2**bits - 1)) * (1 + 2.0**-22)
+    assert error[[0, -1]].max() == 0
+
+
+def test_subnormal_ranges_keep_half_a_step():
+    """The step is below the smallest float32 here: in float32 arithmetic it would be zero, a division by zero."""
+    values = np.arange(-100, 101).astype(np.float32) * np.float32(SMALLEST)
+
+    assert min_max_error(values, 8).max() <= 200 * SMALLEST / 510 + SMALLEST / 2
+    assert min_max_error(values[:2], 8).max() == 0
+
+
+def test_zeros_of_both_signs_are_a_constant_channel():
+    codes, params = MinMaxQuantizer().encode(np.float32([0.0, -0.0, 0.0, -0.0]))
+
+    decoded = MinMaxQuantizer.decode(codes, params)
+
+    assert decoded.tolist() == [0, 0, 0, 0]
+    assert not codes.any()
+
+
+def test_one_outlier_costs_the_others_what_the_bound_says():
+    """Known and kept, as the paper has it: one range for the whole table."""
+    values = np.append(np.random.default_rng(0).uniform(-1, 1, 10_000), 510.0).astype(np.float32)
+
+    error = min_max_error(values, 8)
+
+    half_a_step = (510.0 - values.min()) / 510
+    assert 0.9 * half_a_step < error.max() <= half_a_step * (1 + 1e-6)
+
+
+# -- residual vector quantisation ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float16"])
+@pytest.mark.parametrize("rows", [1, 2, 3])
+@pytest.mark.parametrize("size", [1, 256, 65536])
+def test_codebooks_of_any_size_for_a_few_rows(rows, size, dtype):
+    values = np.float32([[1.5, -2.0], [-0.0, 2.0**-24], [65504.0, 3.0]])[:rows]
+
+    indices, codebooks = ResidualVectorQuantizer(2, size, dtype).encode(values)
+    decoded = ResidualVectorQuantizer.decode(indices, codebooks)
+
+    assert indices.shape == (rows, 2) and codebooks.shape == (2, size, 2)
+    if size >= rows:
+        np.testing.assert_array_equal(decoded, values)  # each number is a half
+    assert np.abs(decoded - values).max() <= np.ptp(values)
+
+
+def errors_beside(column: np.ndarray, dtype: str) -> tuple[float, np.ndarray]:
+    """Mean square of two normal columns' errors, and errors of the column between them."""
+    values = np.random.default_rng(1).standard_normal((len(column), 2)).astype(np.float32)
+    values = np.insert(values, 1, column.astype(np.float32), axis=1)
+    quantizer = ResidualVectorQuantizer(3, 64, dtype)
+    errors = quantizer.decode(*quantizer.encode(values)).astype(np.float64) - values
+    return float((errors[:, [0, 2]] ** 2).mean()), np.abs(errors[:, 1])
+
+
+@pytest.mark.parametrize("size", [1e-10, 1e-40, SMALLEST])
+def test_a_column_below_the_steps_of_float16_is_rounded_to_zero_and_costs_the_others_nothing(size):
+    digits = np.random.default_rng(2).integers(1, 10, 3000)
+
+    others, error = errors_beside(digits * size, "float16")
+
+    assert error.max() <= 9 * size * (1 + 1e-6)
+    assert others < 1.1 * errors_beside(np.zeros(3000), "float16")[0]
+
+
+@pytest.mark.parametrize("size", [2.0**-140, 2.0**90])
+def test_a_column_of_any_size_is_coded_alike(size):
+    digits = np.random.default_rng(2).integers(1, 10, 3000)
+
+    others, error = errors_beside(digits * size, "float32")
+
+    usual_others, usual = errors_beside(digits, "float32")
+    assert others == pytest.approx(usual_others, rel=0.3)
+    assert (error / size).mean() == pytest.approx(usual.mean(), rel=0.3)
+
+
+def test_two_values_are_exact_whatever_their_share():
+    values = np.full((50_000, 3), [0.5, -8.0, 100.0], np.float32)
+    values[31_415] = -1.0, 2.0, 4000.0
+
+    decoded = ResidualVectorQuantizer.decode(*ResidualVectorQuantizer(1, 2, "float16").encode(values))
+
+    np.testing.assert_array_equal(decoded, values)
+
+
+def test_largest_numbers_of_both_signs_stay_finite_and_near():
+    values = np.random.default_rng(2).choice(np.float32([-1e30, -1e29, 0, 1e29, 1e30]), (500, 2))
+
+    decoded = ResidualVectorQuantizer.decode(*ResidualVectorQuantizer(3, 64).encode(values))
+
+    np.testing.assert_allclose(decoded, values, atol=1e24)
+
+
+# -- ten million values ----------------------------------------------------------------------------------------------
+
+MANY = 10_000_000
+
+
+@contextmanager
+def memory_below(bytes_per_value: float):
+    """Everything allocated inside, at its peak, results included."""
+    tracemalloc.start()
+    try:
+        yield
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak <= bytes_per_value * MANY
+
+
+# Bytes a value at the peak were 4.1 and 4.8 (8 bits), 8.1 and 7.8 (16 bits).
+@pytest.mark.parametrize(("dtype", "allowed"), [(np.uint8, 6), (np.uint16, 11)])
+def test_ten_million_symbols_round_trip_in_bounded_memory(dtype, allowed):
+    rng = np.random.default_rng(3)
+    symbols = np.clip(rng.laplace(np.iinfo(dtype).max / 2, 10, MANY), 0, np.iinfo(dtype).max).astype(dtype)
+
+    with memory_below(allowed):
+        stream = huffman_encode(symbols)
+    with memory_below(allowed):
+        decoded = huffman_decode(stream)
+
+    assert np.array_equal(decoded, symbols)
+
+
+def test_ten_million_numbers_keep_half_a_step_in_bounded_memory():
+    values = np.random.default_rng(4).standard_normal(MANY).astype(np.float32)
+
+    with memory_below(10):
+        codes, params = MinMaxQuantizer().encode(values)
+    with memory_below(6):
+        decoded = MinMaxQuantizer.decode(codes, params)
+
+    half_a_step = (params.maximum - params.minimum) / 510
+    assert np.abs(decoded - values).max() <= half_a_step * (1 + 1e-5)
+
+
+def test_ten_million_rows_are_vector_quantised_in_bounded_memory():
+    """As near as Lloyd's quantiser of 16 levels comes to a normal distribution: a mean square of 0.0095 (Max 1960)."""
+    values = np.random.default_rng(5).standard_normal((MANY, 1)).astype(np.float32)
+
+    with memory_below(30):
+        indices, codebooks = ResidualVectorQuantizer(1, 16, "float16").encode(values)
+    with memory_below(11):
+        decoded = ResidualVectorQuantizer.decode(indices, codebooks)
+
+    assert ((decoded - values) ** 2).mean() < 1.05 * 0.009497
+
+
+# -- whole files -----------------------------------------------------------------------------------------------------
+
+
+def constant(value: float) -> Callable[[HybridModel], None]:
+    def fill(model: HybridModel) -> None:
+        for parameter in model.parameters():
+            parameter.fill_(value)
+
+    return fill
+
+
+def wide_tables(model: HybridModel) -> None:
+    """Tables from one end of float32 to the other; decoders that stay silent about them."""
+    for field in (model.geometry, model.radiance):
+        field.grid.table[0], field.grid.table[-1] = -LARGEST, LARGEST
+        for weights in field.weights:
+            weights.zero_()
+
+
+FILLS = {
+    "drawn": lambda model: None,
+    "all zero": constant(0.0),
+    "all minus zero": constant(-0.0),
+    "all an eighth": constant(0.125),
+    "all the smallest": constant(SMALLEST),
+    "tables as wide as float32": wide_tables,
+}
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("fill", FILLS)
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_models_of_hardly_any_gaussians_survive_and_render(profile, fill, count):
+    model = small_model(np.random.default_rng(count).normal(size=(count, 3)), fields=1.0, background=True)
+    with torch.no_grad():
+        FILLS[fill](model)
+
+    data = encode_model(model, profile)
+    decoded = decode_model(data)
+
+    assert len(decoded) == count and encode_model(model, profile) == data
+    for name, expected in model.state_dict().items():
+        got = decoded.state_dict()[name]
+        if profile == "raw":
+            assert np.array_equal(got.numpy().view(np.uint32), expected.numpy().view(np.uint32)), name
+        elif "table" in name:
+            half_a_step = (float(expected.max()) - float(expected.min())) / 510
+            assert (got.double() - expected.double()).abs().max() <= half_a_step * (1 + 1e-6), name
+        else:
+            assert ((got - expected).abs() <= expected.abs() * 2.0**-10 + 2.0**-24).all(), name
+    with torch.no_grad():
+        rgb = render(decoded, camera_at((0, -4, 0), width=9, height=7)).rgb
+    assert torch.isfinite(rgb).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("profile", PROFILES)
+def test_one_number_that_is_not_finite_is_refused_in_every_group(profile, value):
+    for name in small_model(np.zeros((2, 3))).state_dict():
+        model = small_model(np.zeros((2, 3)))
+        with torch.no_grad():
+            model.state_dict()[name].view(-1)[-1] = value
+
+        with pytest.raises(HyrfError, match="^1 of [0-9]+ numbers in the model's [a-z ]+ are NaN or infinite; "):
+            encode_model(model, profile)
