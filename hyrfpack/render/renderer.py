@@ -21,7 +21,7 @@ from hyrfpack.scene import Camera
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """How exactly to render; together the defaults change a picture by about half a step of 8 bits.
+    """How exactly to render. What each default costs and saves is in `docs/speed-and-accuracy.md`.
 
     Attributes:
         near: Gaussians nearer than this are dropped, local units (the frame's longest half-axis is 1).
