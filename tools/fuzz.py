@@ -166,12 +166,9 @@ def check_file(data: bytes, outcome: HybridModel | str, folder: Path) -> None:
 
 
 def check_picture(model: HybridModel) -> None:
-    """Render; a frame that no camera can be placed by is refused in a sentence."""
-    try:
+    """Render; a frame that no camera can be placed by, and numbers that overflow, are refused in a sentence."""
+    with contextlib.suppress(HyrfError), torch.no_grad():
         (camera,) = orbit(frame_viewpoint(model.config.frame.center, model.config.frame.scale) | SMALL, 1)
-    except HyrfError:
-        return
-    with torch.no_grad():
         render(model, camera)
 
 
