@@ -212,7 +212,7 @@ def main() -> None:
     out = args.out / str(args.steps)
     out.mkdir(parents=True, exist_ok=True)
     results: Results = defaultdict(list)
-    for name, seed in product(args.sets, range(args.seeds)):
+    for seed, name in product(range(args.seeds), args.sets):
         scene, cache = hyrfpack.load_scene(args.data / name), PictureCache()
         for variant in chosen:
             path = out / f"{name}-{seed}-{variant.name.replace(' ', '-')}.json"
