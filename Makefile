@@ -8,7 +8,7 @@ SHELL := bash
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help demo test bench sets choices ablations kill fuzz lint format clean
+.PHONY: help demo test bench speed sets choices ablations precision kill fuzz lint format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z.]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -30,8 +30,11 @@ demo: $(READY) ## train, compress and render a small made-up scene; results in d
 test: lint ## check style, then run all tests
 	$(BIN)/python -m pytest
 
-bench: $(READY) ## time the hot operations against their references
+bench: $(READY) ## time each hot operation at several sizes against its references
 	$(BIN)/python tools/bench.py
+
+speed: $(READY) ## time beside error of every setting, on a small model; plot in runs/speed.png (two to four minutes)
+	$(BIN)/hyrfpack bench -o runs/speed.png
 
 sets: $(READY) ## train every real set for 1,000 steps and print the table (ten minutes)
 	$(BIN)/python tools/train_sets.py --steps 1000
@@ -41,6 +44,9 @@ choices: $(READY) ## the ablations behind the defaults (half an hour)
 
 ablations: $(READY) ## what each part of the model is worth, beside the paper (under an hour)
 	$(BIN)/python tools/ablations.py
+
+precision: $(READY) ## the same training in float32 and in float64, whole and in parts (an hour)
+	$(BIN)/python tools/precision.py
 
 kill: $(READY) ## kill the commands at random moments and check what is left (ten minutes)
 	$(BIN)/python tools/kill.py

@@ -335,11 +335,11 @@ def _forge_fields(rng: Random) -> bytes:
             fields[name] = (new % 256**width, width)
         elif name.startswith("chunks") and len(value) >= 4 and rng.random() < 0.5:
             # Bits moved from one chunk to another: the sum, and with it the length, stays right.
-            sizes = np.frombuffer(value[: len(value) // 2 * 2], "<u2").copy()
+            sizes = np.frombuffer(value[: len(value) // 2 * 2], "<u2").astype(np.int64)
             one, other, moved = rng.randrange(len(sizes)), rng.randrange(len(sizes)), rng.randint(1, 9)
             sizes[one] -= min(moved, sizes[one])
             sizes[other] += moved
-            fields[name] = sizes.tobytes()
+            fields[name] = sizes.astype("<u2").tobytes()
         else:
             fields[name] = edit_bytes(value, rng, 2)
     if rng.random() < 0.8:

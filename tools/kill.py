@@ -225,10 +225,10 @@ def prepare(work: Path, names: Sequence[str]) -> list[Case]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=50, help="of each command")
-    parser.add_argument("--commands", nargs="+", choices=COMMANDS, default=COMMANDS)
-    parser.add_argument("--seed", type=int, default=0, help="of the moments")
-    parser.add_argument("--jobs", type=int, default=2, help="trials at once")
+    parser.add_argument("--kills", type=int, default=50, help="of each command (50)")
+    parser.add_argument("--commands", nargs="+", choices=COMMANDS, default=COMMANDS, help="which to kill (all)")
+    parser.add_argument("--seed", type=int, default=0, help="of the moments (0)")
+    parser.add_argument("--jobs", type=int, default=2, help="trials at once (2)")
     args = parser.parse_args()
     work = Path(tempfile.mkdtemp(prefix="hyrfpack-kill-"))
     header = ("command", "seconds", "kills", *MOMENTS, "temporary files", "run again", "violations")

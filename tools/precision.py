@@ -106,11 +106,13 @@ def train(scene: Scene, config: TrainConfig, row: str) -> tuple[HybridModel, flo
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--sets", nargs="*", default=["nerf_synthetic_lego", "indoor_room"])
+    parser.add_argument("--steps", type=int, default=1000, help="of each run (1,000)")
+    parser.add_argument(
+        "--sets", nargs="*", default=["nerf_synthetic_lego", "indoor_room"], help="folders below --data"
+    )
     parser.add_argument("--only", nargs="*", default=ROWS, help="parts of the names of the rows wanted")
-    parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--out", type=Path, default=Path("runs/precision.json"))
+    parser.add_argument("--data", type=Path, default=DATA, help="where the sets are")
+    parser.add_argument("--out", type=Path, default=Path("runs/precision.json"), help="scores; those it holds are kept")
     args = parser.parse_args()
     scores = json.loads(args.out.read_text()) if args.out.exists() else {}
     print("| set | row | PSNR | against float32 | SSIM | Gaussians | seconds |\n|---|---|---|---|---|---|---|")
