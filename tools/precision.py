@@ -49,7 +49,7 @@ OPERATIONS = {
     "hyrfpack.train.trainer.photometric_loss": photometric_loss,
 }
 RASTERIZE = "hyrfpack.render.renderer.rasterize"
-ROWS = ("float32", "nudged 1", "nudged 2", "nudged 3", "adam", "rasterizer", "float64")
+ROWS = ("float32", *(f"nudged {n}" for n in range(1, 7)), "adam", "rasterizer", "float64")
 NUDGE = 1e-7
 
 

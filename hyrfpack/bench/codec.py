@@ -73,8 +73,6 @@ def codec_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> I
     best = subject.scores(exact, exact)
     for name, case in names.items():
         pictures = _pictures(subject, models[name])
-        psnr, ssim = subject.scores(pictures, exact)
-        flat = [torch.cat([picture.flatten() for picture in many]) for many in (pictures, exact)]
         yield Row(
             group="codec",
             setting=case.setting,
@@ -83,15 +81,11 @@ def codec_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> I
             is_default=case.is_default,
             time=encoding[name],
             ratio=encoding[name].over(encoding[first]),
-            error=difference(*flat, f"codec, {name}"),
             parts=parameter_errors(subject.model, models[name]),
-            psnr=psnr,
-            ssim=ssim,
-            psnr_drop=best[0] - psnr if subject.photos else None,
-            ssim_drop=best[1] - ssim if subject.photos else None,
             bytes=len(files[name]),
             decode=decoding[name],
             decode_ratio=decoding[name].over(decoding[first]),
+            **subject.losses(pictures, exact, best, f"codec, {name}"),
         )
 
 

@@ -153,6 +153,8 @@ def _compare(
             for name in trained:
                 tensors[name].requires_grad_(run is with_gradients)
             tasks[way.name] = partial(run, way, tensors)
+            if way.implementation == "cpu":
+                tasks[way.name]()  # compiles kernels that are not cached: not to be taken for a slow first run
         times, results = take_turns(tasks, repeats)
         exact = results[ways[0].name]
         if run is forward:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from hyrfpack.bench.rows import Row, difference, in_words
+from hyrfpack.bench.rows import Row, in_words
 from hyrfpack.bench.subject import Subject
 from hyrfpack.bench.timing import take_turns
 from hyrfpack.model import HybridModel
@@ -45,6 +45,7 @@ def render_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> 
         kept = geometry if keep else None
         return lambda: [render(model, camera, settings, geometry=kept).rgb for camera in subject.cameras]
 
+    pictures(defaults)()  # compiles kernels that are not cached: not to be taken for a slow first run
     for name, values in SWEEPS.items():
         if name in NEEDS_BACKGROUND and not model.config.background:
             note(f"the model has no background sphere, so {name} is left out")
@@ -71,8 +72,6 @@ def _compare(subject: Subject, setting: str, tried: dict[str, Pictures], default
     exact = results[reference]
     best = subject.scores(exact, exact)
     for value, pictures in results.items():
-        psnr, ssim = subject.scores(pictures, exact)
-        flat = [torch.cat([picture.flatten() for picture in many]) for many in (pictures, exact)]
         yield Row(
             group="render",
             setting=setting,
@@ -81,9 +80,5 @@ def _compare(subject: Subject, setting: str, tried: dict[str, Pictures], default
             is_default=value == default,
             time=times[value],
             ratio=times[value].over(times[reference]),
-            error=difference(*flat, f"render, {setting} {value}"),
-            psnr=psnr,
-            ssim=ssim,
-            psnr_drop=best[0] - psnr if subject.photos else None,
-            ssim_drop=best[1] - ssim if subject.photos else None,
+            **subject.losses(pictures, exact, best, f"render, {setting} {value}"),
         )

@@ -13,6 +13,7 @@ from hyrfpack.bench.rendering import render_rows
 from hyrfpack.bench.rows import Row
 from hyrfpack.bench.subject import Subject, built_in_subject, read_subject
 from hyrfpack.bench.timing import ENOUGH_SECONDS
+from hyrfpack.errors import needs_package
 from hyrfpack.scene import Scene
 
 # What is measured, in order: functions of a subject, a number of repeats, and what to call with what was left out.
@@ -71,7 +72,7 @@ def bench(
         report: called with a sentence before each part.
 
     Raises:
-        HyrfError: the model or the photos cannot be used, or a result is not finite.
+        HyrfError: the model or the photos cannot be used, a result is not finite, or Numba is missing.
         ValueError: there is no such group, no repeat, or a scene without a model.
     """
     for name in only or ():
@@ -81,6 +82,8 @@ def bench(
         raise ValueError(f"repeats is {repeats}; it must be at least 1")
     if scene is not None and model is None:
         raise ValueError("a scene was given without the model of it; the built-in model has its own photos")
+    with needs_package("numba", "measuring the compiled kernels"):
+        import numba  # noqa: F401 - asked for here, before the work starts
     subject = built_in_subject(report) if model is None else read_subject(model, scene)
     notes: list[str] = []
     rows: list[Row] = []

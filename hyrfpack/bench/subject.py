@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hyrfpack.bench.rows import difference
 from hyrfpack.data import load_scene
 from hyrfpack.data.demo_scene import write_demo_scene
 from hyrfpack.errors import HyrfError
@@ -53,6 +54,25 @@ class Subject:
             fmean(score(image, target, mask) for image, (target, mask) in zip(images, against, strict=True))
             for score in (psnr, ssim)
         )
+
+    def losses(
+        self, pictures: Sequence[Tensor], exact: Sequence[Tensor], best: tuple[float, float], what: str
+    ) -> dict[str, object]:
+        """What a `Row` says of pictures: `error` and the scores, and their drops from `best` where there are photos.
+
+        Args:
+            pictures: (H, W, 3) of each camera.
+            exact: the reference's.
+            best: `scores` of those.
+            what: was measured, for the message.
+
+        Raises:
+            HyrfError: a picture holds NaN or infinity.
+        """
+        psnr, ssim = self.scores(pictures, exact)
+        flat = [torch.cat([picture.flatten() for picture in many]) for many in (pictures, exact)]
+        drops = {"psnr_drop": best[0] - psnr, "ssim_drop": best[1] - ssim} if self.photos else {}
+        return {"error": difference(*flat, what), "psnr": psnr, "ssim": ssim, **drops}
 
     def in_words(self) -> str:
         """What is measured on, and what quality is measured against, in one sentence."""
@@ -95,7 +115,7 @@ def built_in_subject(report: Callable[[str], None]) -> Subject:
     with tempfile.TemporaryDirectory(prefix="hyrfpack-bench-") as folder:
         scene = load_scene(write_demo_scene(Path(folder) / "scene", views=BUILT_IN_PHOTOS, size=BUILT_IN_SIDE))
         trained = train(scene, Path(folder) / "run", TrainConfig(steps=BUILT_IN_STEPS), quiet=True)
-        if trained.model is None:
+        if trained.model is None:  # Ctrl-C: training took it for a request to stop
             raise KeyboardInterrupt
         subject = read_subject(trained.model, scene)
     return Subject("built-in", subject.profile, subject.model, subject.cameras, subject.photos)

@@ -46,12 +46,10 @@ class Timing:
         return Ratio(self.ms / reference.ms, self.work_ms / reference.work_ms if reference.work_ms else None)
 
 
-def take_turns(
-    tasks: Mapping[str, Callable[[], Any]], repeats: int, enough_seconds: float = ENOUGH_SECONDS
-) -> tuple[dict[str, Timing], dict[str, Any]]:
+def take_turns(tasks: Mapping[str, Callable[[], Any]], repeats: int) -> tuple[dict[str, Timing], dict[str, Any]]:
     """Time tasks against each other: each runs once unmeasured, then all take turns.
 
-    A task leaves the round once it has been measured for `enough_seconds`. One whose first run alone took that long
+    A task leaves the round once it has been measured for ENOUGH_SECONDS. One whose first run alone took that long
     is not run again: that run is its time.
 
     Args:
@@ -65,11 +63,11 @@ def take_turns(
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in tasks}
     for name, task in tasks.items():
         results[name], *first = _measure(task)
-        if first[0] >= enough_seconds:
+        if first[0] >= ENOUGH_SECONDS:
             times[name].append(tuple(first))
     for _ in range(repeats):
         for name, task in tasks.items():
-            if sum(wall for wall, _ in times[name]) < enough_seconds:
+            if sum(wall for wall, _ in times[name]) < ENOUGH_SECONDS:
                 _, *measured = _measure(task)
                 times[name].append(tuple(measured))
     return {name: _summary(measured) for name, measured in times.items()}, results

@@ -135,7 +135,7 @@ def render(
             behind = _background(model, camera, pose, raster.transmittance, settings)
         else:
             behind = positions.new_tensor(model.config.solid) if solid is None else solid
-        _refuse_nonfinite(background=behind)
+            _refuse_nonfinite(background=behind)
         rgb = raster.rgb + raster.transmittance[..., None] * behind
     return Rendering(
         rgb=rgb,
@@ -177,7 +177,9 @@ def _background(
     if len(nodes):
         places = torch.stack((nodes % columns, torch.div(nodes, columns, rounding_mode="floor")), dim=-1)
         points = places.to(transmittance.dtype) * stride + 0.5
-        colors = colors.index_put((nodes,), model.decode_background(points, camera.intrinsics, pose))
+        shades = model.decode_background(points, camera.intrinsics, pose)
+        _refuse_nonfinite(background=shades)
+        colors = colors.index_put((nodes,), shades)
     grid = colors.T.reshape(1, 3, rows, columns)
     if stride > 1:
         size = ((rows - 1) * stride + 1, (columns - 1) * stride + 1)

@@ -53,8 +53,8 @@ class DensityControl:
         if rendering.absgrad is None:
             return
         index = rendering.decoded[rendering.visible]
-        ndc = rendering.absgrad[rendering.visible].float() * torch.tensor((width / 2, height / 2))
-        self.gradients.index_add_(0, index, torch.linalg.vector_norm(ndc, dim=-1))
+        ndc = rendering.absgrad[rendering.visible] * rendering.absgrad.new_tensor((width / 2, height / 2))
+        self.gradients.index_add_(0, index, torch.linalg.vector_norm(ndc, dim=-1).to(self.gradients.dtype))
         self.views.index_add_(0, index, torch.ones_like(index, dtype=torch.float32))
 
     def act(self, step: int, model: HybridModel, optimizer: Optimizer) -> None:

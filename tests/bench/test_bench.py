@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from collections import defaultdict
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from scenes import ball_points, ball_scene, ring, small_model
 
 import hyrfpack
-from hyrfpack.bench import GROUPS, bench, subject
+from hyrfpack.bench import GROUPS, bench, operations, rendering, subject, timing
 from hyrfpack.bench.codec import KNOBS, codec_rows, parameter_errors
 from hyrfpack.bench.operations import hash_encode_rows, mlp_rows, rasterize_rows
 from hyrfpack.bench.rendering import EXACT, SWEEPS, render_rows
@@ -239,6 +240,32 @@ def test_a_result_that_is_not_finite_stops_the_measurement():
         model.geometry.biases[-1][0] = torch.nan
     with pytest.raises(HyrfError, match="mlp, geometry, forward"):
         list(mlp_rows(subject_of(model), 1, ignore))
+
+
+@pytest.mark.parametrize(
+    ("measure", "module", "operation"),
+    [(hash_encode_rows, operations, "hash_encode"), (render_rows, rendering, "render")],
+)
+def test_time_to_compile_kernels_is_nobodys_time(monkeypatch, measure, module, operation):
+    now, compiled, run = [0.0], [], getattr(module, operation)
+
+    def slow_at_first(*arguments, **settings):
+        compiles = settings.get("implementation", "cpu") == "cpu" and torch.is_grad_enabled() not in compiled
+        if compiles:
+            compiled.append(torch.is_grad_enabled())
+        now[0] += 60.0 if compiles else 0.001
+        return run(*arguments, **settings)
+
+    monkeypatch.setattr(timing, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(module, operation, slow_at_first)
+    rows = list(measure(subject_of(model_of()), 2, ignore))
+    assert compiled and all(row.time.ms < 10 and row.time.repeats == 2 for row in rows)
+
+
+def test_without_numba_there_is_one_sentence(monkeypatch):
+    monkeypatch.setitem(sys.modules, "numba", None)
+    with pytest.raises(HyrfError, match="pip install numba"):
+        bench()
 
 
 def test_a_file_is_measured_from_an_orbit_and_the_report_survives_json(tmp_path):
