@@ -7,6 +7,7 @@ what was forged reaches the decoder it was meant for.
 
 from __future__ import annotations
 
+import copy
 import json
 import struct
 import zlib
@@ -289,9 +290,9 @@ def _forge_metadata(rng: Random) -> bytes:
             if kind == 4 and isinstance(node, dict):
                 del node[key]
             elif kind == 5 and isinstance(node, dict):
-                node[rng.choice(HOSTILE_TEXT)] = rng.choice(HOSTILE_JSON)
+                node[rng.choice(HOSTILE_TEXT)] = copy.deepcopy(rng.choice(HOSTILE_JSON))
             else:
-                node[key] = rng.choice(HOSTILE_JSON)
+                node[key] = copy.deepcopy(rng.choice(HOSTILE_JSON))
     text = json.dumps(values).encode()
     if rng.random() < 0.1:
         deep = rng.choice((60, 70, 300, 950, 100_000))
