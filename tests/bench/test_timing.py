@@ -41,9 +41,19 @@ def test_median_and_interquartile_range_are_of_the_measured_runs_alone(monkeypat
 
 def test_a_task_that_takes_long_enough_leaves_the_round(monkeypatch):
     clock = Clock(monkeypatch)
-    tasks = {"slow": clock.task("slow", [1.6] * 9), "fast": clock.task("fast", [0.001] * 9)}
+    tasks = {"slow": clock.task("slow", [1.6] * 9), "fast": clock.task("fast", [0.2] * 9)}
     timings, _ = take_turns(tasks, 6)
     assert (timings["slow"].repeats, timings["fast"].repeats) == (2, 6)
+
+
+def test_a_quick_task_is_warmed_before_each_of_its_turns(monkeypatch):
+    monkeypatch.setattr(timing, "WARM_SECONDS", 0.1)
+    clock = Clock(monkeypatch)
+    warm = [0.03, 0.03, 0.03, 0.03]  # the fourth begins before a tenth of a second is over
+    tasks = {"slow": clock.task("slow", [0.1] * 3), "quick": clock.task("quick", [0.05, *warm, 0.02, *warm, 0.01])}
+    timings, _ = take_turns(tasks, 2)
+    assert clock.calls == ["slow", "quick", "slow", *["quick"] * 5, "slow", *["quick"] * 5]
+    assert timings["quick"].ms == pytest.approx(15) and timings["quick"].repeats == 2
 
 
 def test_the_first_run_is_the_time_of_a_task_that_is_too_slow_to_repeat(monkeypatch):
