@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hyrfpack.atomic import make_folder, write_atomic
 from hyrfpack.bench.rows import Row
-from hyrfpack.errors import HyrfError, needs_package
+from hyrfpack.errors import HyrfError
+from hyrfpack.evaluate.figures import blank_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,15 +48,10 @@ def plot(rows: Sequence[Row], path: str | os.PathLike[str]) -> None:
     Raises:
         HyrfError: the file cannot be written, or its extension names no such format.
     """
-    with needs_package("matplotlib", "drawing figures"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
     drawn = panels(rows)
     across = min(COLUMNS, len(drawn))
     down = -(-len(drawn) // across)
-    figure = Figure(figsize=(5.2 * across, 4.2 * down), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(5.2 * across, 4.2 * down)
     places = list(figure.subplots(down, across, squeeze=False).flat)
     marked = [_draw(axes, panel) for axes, panel in zip(places, drawn, strict=False)]
     for axes in places[len(drawn) :]:
@@ -66,10 +60,7 @@ def plot(rows: Sequence[Row], path: str | os.PathLike[str]) -> None:
     figure.set_layout_engine("none")
     for axes, labels in zip(places, marked, strict=False):
         _label(axes, labels)
-    data = io.BytesIO()
-    figure.savefig(data, format=picture_format(path), dpi=120)
-    make_folder(Path(path).parent)
-    write_atomic(path, data.getbuffer())
+    save_figure(path, figure, format=picture_format(path))
 
 
 def picture_format(path: str | os.PathLike[str]) -> str:

@@ -8,6 +8,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -15,6 +16,9 @@ from torch import Tensor
 
 from hyrfpack.atomic import make_folder, write_atomic
 from hyrfpack.errors import needs_package
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ERROR_LIMIT = 0.2  # mean absolute difference over channels that gets the brightest colour
 PANEL_WIDTH = 640  # pixels; larger pictures are shrunk to it
@@ -85,12 +89,7 @@ def training_curve(records: Sequence[dict], path: str | os.PathLike[str]) -> Non
     Raises:
         HyrfError: the file cannot be written.
     """
-    with needs_package("matplotlib", "drawing figures"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(9, 6)
     axes = figure.subplots(3, 1, sharex=True)
     steps = [record["step"] for record in records]
     for axis, key, label, color in zip(
@@ -111,8 +110,28 @@ def training_curve(records: Sequence[dict], path: str | os.PathLike[str]) -> Non
     axes[1].set_yscale("log")
     axes[2].set_ylim(bottom=0)
     axes[2].set_xlabel("step")
+    save_figure(path, figure, format="png", metadata={"Software": None})
+
+
+def blank_figure(width: float, height: float) -> Figure:
+    """A matplotlib figure to draw on, drawn by Agg whatever the screen; inches."""
+    with needs_package("matplotlib", "drawing figures"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_figure(path: str | os.PathLike[str], figure: Figure, **options: object) -> None:
+    """Write a figure in one step, making its folder; `options` as matplotlib's `savefig` takes them.
+
+    Raises:
+        HyrfError: the folder or the file cannot be written.
+    """
     data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=120, metadata={"Software": None})
+    figure.savefig(data, dpi=120, **options)
     make_folder(Path(path).parent)
     write_atomic(path, data.getbuffer())
 
