@@ -12,10 +12,12 @@ from torch import Tensor
 from hyrfpack.bench.rows import Row, difference, relative_difference, worst
 from hyrfpack.bench.subject import Subject
 from hyrfpack.bench.timing import take_turns
+from hyrfpack.model import HybridModel, viewpoint_of
 from hyrfpack.model.field import Field, encode_directions
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.scene import Camera
 
 
 @dataclass(frozen=True)
@@ -52,15 +54,14 @@ DEFAULT_WAY = "cpu"
 @torch.no_grad()
 def rasterize_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
     """Draw the model's Gaussians as one view sees them; antialiased and not, forward and with all gradients."""
-    model, camera = subject.model, subject.cameras[len(subject.cameras) // 2]
-    pose = torch.as_tensor(model.config.frame.local_pose(camera))
+    model, camera, pose = _one_view(subject)
     geometry = model.decode_geometry()
     inputs = {
         "means": model.gaussians.positions,
         "quats": geometry.quats,
         "scales": geometry.scales,
         "opacities": geometry.opacities,
-        "colors": model.decode_colors(-(pose[:3, :3].T @ pose[:3, 3]).float()),
+        "colors": model.decode_colors(viewpoint_of(pose).float()),
     }
 
     def draw(antialiased: bool, implementation: str, **tensors: Tensor) -> Tensor:
@@ -96,17 +97,14 @@ def hash_encode_rows(subject: Subject, repeats: int, note: Callable[[str], None]
 @torch.no_grad()
 def mlp_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
     """Run both fields' decoders on the features of all Gaussians; the radiance field's as one view sees them."""
-    model, camera = subject.model, subject.cameras[len(subject.cameras) // 2]
+    model, _, pose = _one_view(subject)
     positions = model.gaussians.positions
-    viewpoint = positions.new_tensor(model.config.frame.to_local(camera.position[None])[0])
-    directions = torch.nn.functional.normalize(positions - viewpoint, dim=-1, eps=1e-12)
+    directions = torch.nn.functional.normalize(positions - viewpoint_of(pose).float(), dim=-1, eps=1e-12)
+    extra = {"geometry": None, "radiance": encode_directions(directions, model.config.direction_encoding)}
     for name, part in _fields(subject):
-        features = [part.grid(model.cube_coords(positions)).T]
-        if name == "radiance":
-            features.append(encode_directions(directions, model.config.direction_encoding).T)
         layers = len(part.weights)
         inputs = {
-            "features": torch.cat(features).T,
+            "features": part.features(model.cube_coords(positions), extra[name]),
             **{f"weights {layer}": part.weights[layer] for layer in range(layers)},
             **{f"biases {layer}": part.biases[layer] for layer in range(layers)},
         }
@@ -116,6 +114,12 @@ def mlp_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Ite
             return mlp(x, parameters[:layers], parameters[layers:], implementation=implementation)
 
         yield from _compare("mlp", f"{name}, ", decode, inputs, tuple(inputs), MLP_WAYS, relative_difference, repeats)
+
+
+def _one_view(subject: Subject) -> tuple[HybridModel, Camera, Tensor]:
+    """The model, a camera, and its pose (4, 4) camera_from_local, float64."""
+    camera = subject.cameras[len(subject.cameras) // 2]
+    return subject.model, camera, torch.as_tensor(subject.model.config.frame.local_pose(camera))
 
 
 def _fields(subject: Subject) -> list[tuple[str, Field]]:

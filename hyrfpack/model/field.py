@@ -37,11 +37,15 @@ class Field(nn.Module):
 
     def forward(self, coords: Tensor, extra: Tensor | None = None) -> Tensor:
         """Raw outputs (N, outputs) at coords (N, 3) in the unit cube, with extra inputs (N, E)."""
+        return mlp(self.features(coords, extra), list(self.weights), list(self.biases))
+
+    def features(self, coords: Tensor, extra: Tensor | None = None) -> Tensor:
+        """What the decoder reads (N, 2 levels + E): hash features, then the extra inputs."""
         features = self.grid(coords)
-        if extra is not None:
-            # Hash features are stored by columns; joining them that way saves a transposed copy in backward.
-            features = torch.cat((features.T, extra.T)).T
-        return mlp(features, list(self.weights), list(self.biases))
+        if extra is None:
+            return features
+        # Hash features are stored by columns; joining them that way saves a transposed copy in backward.
+        return torch.cat((features.T, extra.T)).T
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:

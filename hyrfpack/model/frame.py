@@ -79,6 +79,11 @@ class Frame:
         return local / local.new_tensor(self.half_extent)
 
 
+def viewpoint_of(pose: Tensor) -> Tensor:
+    """Where a camera stands (3,), local units, by its pose camera_from_local (4, 4): -R^T t."""
+    return -(pose[:3, :3].T @ pose[:3, 3])
+
+
 def contract(u: Tensor) -> Tensor:
     """Map normalised coordinates into the open unit cube.
 

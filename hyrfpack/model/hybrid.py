@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from hyrfpack.model.background import pixel_directions, sphere_points
 from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.field import DIRECTION_FEATURES, Field, encode_directions
-from hyrfpack.model.frame import contract
+from hyrfpack.model.frame import contract, viewpoint_of
 from hyrfpack.model.gaussians import Gaussians
 
 
@@ -110,8 +110,7 @@ class HybridModel(nn.Module):
             pose: (4, 4) camera_from_local.
         """
         directions = pixel_directions(points, intrinsics, pose)
-        origin = -(pose[:3, :3].T @ pose[:3, 3])
-        return torch.sigmoid(self._radiance(sphere_points(origin, directions), directions))
+        return torch.sigmoid(self._radiance(sphere_points(viewpoint_of(pose), directions), directions))
 
     def _radiance(self, positions: Tensor, directions: Tensor) -> Tensor:
         return self.radiance(self.cube_coords(positions), encode_directions(directions, self.config.direction_encoding))

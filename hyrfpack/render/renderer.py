@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.model import Geometry, HybridModel
+from hyrfpack.model import Geometry, HybridModel, viewpoint_of
 from hyrfpack.ops.pool import torch_on_one_thread
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
@@ -110,7 +110,7 @@ def render(
         )
     with _timed(seconds, "decode"):
         geometry = model.decode_geometry(index) if geometry is None else geometry[index]
-        colors = model.decode_colors(-(pose[:3, :3].T @ pose[:3, 3]), index)
+        colors = model.decode_colors(viewpoint_of(pose), index)
     _refuse_nonfinite(scales=geometry.scales, rotations=geometry.quats, opacities=geometry.opacities, colours=colors)
     gradients = positions.new_zeros(len(index), 2) if absgrad else None
     raster = rasterize(
