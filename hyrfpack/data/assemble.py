@@ -11,7 +11,7 @@ import numpy as np
 from hyrfpack.data.pictures import Header, PhotoFile, read_header, read_pixels, same_aspect
 from hyrfpack.data.undistort import Lens
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.scene import Camera, Scene, View
+from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 
 _RIGID_TOLERANCE = 1e-3
 _ALPHA_LOOKED_AT = 4  # photos, spread over the set; the first with transparency ends the search
@@ -159,8 +159,7 @@ def _rigid(pose: np.ndarray, path: Path) -> np.ndarray:
 def _see_through(photos: list[Photo]) -> bool:
     """Whether a photo has a transparent pixel: an alpha channel alone says little, many are opaque throughout."""
     candidates = [photo for photo in photos if photo.header.has_alpha]
-    looked_at = candidates[:: max(1, len(candidates) // _ALPHA_LOOKED_AT)]
-    return any(read_pixels(photo.path)[1].min() < 255 for photo in looked_at)
+    return any(read_pixels(photo.path)[1].min() < 255 for photo in evenly_spaced(candidates, _ALPHA_LOOKED_AT))
 
 
 def _finite_points(
