@@ -1,4 +1,4 @@
-"""Shared fixtures: where the real data sets are. Tests may also import `scenes`, beside this: tiny made-up worlds."""
+"""Shared fixtures: photos. Tests may also import what lies beside this: `scenes`, tiny made-up worlds; `commands`."""
 
 from __future__ import annotations
 
@@ -13,6 +13,14 @@ sys.path.append(str(Path(__file__).parent))
 # OpenMP's threads spin while they wait and take the cores from the kernels' own: tiny pictures train 3 times slower on
 # a quiet machine and 20 times on a busy one. Read once, when torch is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+
+@pytest.fixture(scope="session")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten small photos of the demo's scene, with poses; not to be changed."""
+    from hyrfpack.data.demo_scene import write_demo_scene
+
+    return write_demo_scene(tmp_path_factory.mktemp("data"), views=10, size=48)
 
 
 @pytest.fixture(scope="session")

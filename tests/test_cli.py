@@ -11,35 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import hyrfpack, refused, succeeded
 from PIL import Image
 
-from hyrfpack.cli import main
-from hyrfpack.cli.files import PROFILES
+from hyrfpack.cli.files import DEFAULT_PROFILE, PROFILES
 from hyrfpack.cli.train import PRESETS, train
 from hyrfpack.data.demo_scene import write_demo_scene
 
 COMMANDS = ("train", "compress", "decompress", "render", "evaluate", "info", "bench", "demo")
-
-
-def hyrfpack(*arguments: object):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
-
-
-def succeeded(*arguments: object):
-    result = hyrfpack(*arguments)
-    assert result.exit_code == 0, result.output
-    return result
-
-
-def refused(*arguments: object) -> str:
-    """Run a command that the user got wrong; returns its one sentence."""
-    result = hyrfpack(*arguments)
-    assert result.exit_code == 2, result.output
-    assert result.stdout == ""
-    assert "Traceback" not in result.stderr
-    (sentence,) = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
-    return sentence
 
 
 def python(code: str) -> subprocess.CompletedProcess:
@@ -47,11 +26,6 @@ def python(code: str) -> subprocess.CompletedProcess:
     root = str(Path(__file__).parents[1])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> Path:
-    return write_demo_scene(tmp_path_factory.mktemp("data"), views=10, size=48)
 
 
 @pytest.fixture(scope="module")
@@ -326,7 +300,7 @@ def test_command_line_offers_what_the_library_has():
     from hyrfpack.train import config
 
     assert PRESETS == config.PRESETS
-    assert PROFILES == tuple(codec.PROFILES)
+    assert (PROFILES, DEFAULT_PROFILE) == (tuple(codec.PROFILES), codec.DEFAULT_PROFILE)
     defaults = config.TrainConfig().to_dict()
     options = {option.name: option.default for option in train.params if option.name in defaults}
     assert {"steps", "seed", "preset", "max_gaussians", "antialiased", "background", "log2_table_size"} <= set(options)

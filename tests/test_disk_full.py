@@ -21,24 +21,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import hyrfpack
 from PIL import Image
 from scenes import ball_scene
 
 from hyrfpack import format as hyrf_format
-from hyrfpack.cli import main
 from hyrfpack.data import PictureCache
-from hyrfpack.data.demo_scene import write_demo_scene
 from hyrfpack.errors import HyrfError
 from hyrfpack.train import TrainConfig, Trainer, train
 
 resource = pytest.importorskip("resource", reason="limits and mounts are of Unix")
 STEPS = ("--steps", 20, "--max-gaussians", 500)
 PICTURE = re.compile(r"\.(png|tiff)$")
-
-
-def hyrfpack(*arguments: object):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 @contextmanager
@@ -75,11 +69,6 @@ def fill(disk: Path, leave: int) -> Path:
 
 def files_in(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> Path:
-    return write_demo_scene(tmp_path_factory.mktemp("data"), views=10, size=48)
 
 
 @pytest.fixture(scope="module")

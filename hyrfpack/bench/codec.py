@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,9 +15,9 @@ from hyrfpack.bench.rows import Error, Row, difference, in_words
 from hyrfpack.bench.subject import Subject
 from hyrfpack.bench.timing import take_turns
 from hyrfpack.errors import HyrfError
-from hyrfpack.format import compress, decode_model, encode_model
+from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import to_arrays
-from hyrfpack.format.codec import PROFILES
+from hyrfpack.format.codec import DEFAULT_PROFILE, PROFILES
 from hyrfpack.format.container import read_container
 from hyrfpack.format.info import SECTIONS
 from hyrfpack.format.metadata import read_metadata
@@ -123,7 +122,7 @@ def _cases(model: HybridModel, profile: str) -> Iterator[Case]:
     """The profile itself, then each of its knobs' values."""
     written = read_container(encode_model(model, profile), SECTIONS)
     defaults = read_metadata(written).settings
-    itself = Case("profile", profile, profile == _default_profile(), partial(encode_model, model, profile))
+    itself = Case("profile", profile, profile == DEFAULT_PROFILE, partial(encode_model, model, profile))
     yield itself
     for knob, values in KNOBS.get(profile, {}).items():
         default = _plain(defaults[knob])
@@ -138,10 +137,6 @@ def _cases(model: HybridModel, profile: str) -> Iterator[Case]:
 def _plain(value: object) -> object:
     """A setting as it came through JSON, as the profile takes it."""
     return tuple(value) if isinstance(value, list) else value
-
-
-def _default_profile() -> str:
-    return inspect.signature(compress).parameters["profile"].default
 
 
 def _pictures(subject: Subject, model: HybridModel) -> list[Tensor]:

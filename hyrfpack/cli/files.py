@@ -15,7 +15,7 @@ from hyrfpack.errors import HyrfError, printable
 if TYPE_CHECKING:
     from hyrfpack.format import CompressionReport
 
-PROFILES = ("raw", "paper")  # hyrfpack.format.codec.PROFILES, without loading torch
+PROFILES, DEFAULT_PROFILE = ("raw", "paper"), "paper"  # those of hyrfpack.format.codec, without loading torch
 
 
 @click.command(short_help="Pack a model into a small file.")
@@ -24,7 +24,7 @@ PROFILES = ("raw", "paper")  # hyrfpack.format.codec.PROFILES, without loading t
 @click.option(
     "--profile",
     type=click.Choice(PROFILES),
-    default="paper",
+    default=DEFAULT_PROFILE,
     show_default=True,
     help="How: exact float32 (raw), or the HyRF paper's recipe.",
 )

@@ -19,6 +19,7 @@ from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.quant import DamagedDataError
 
 PROFILES = {"raw": raw.encode, "paper": paper.encode}
+DEFAULT_PROFILE = "paper"  # of `compress`
 DECODERS = {**raw.DECODERS, **paper.DECODERS}
 
 
@@ -99,7 +100,7 @@ def load(path: str | os.PathLike[str], device: str | torch.device = "cpu") -> Hy
 
 
 def compress(
-    source: str | os.PathLike[str], target: str | os.PathLike[str], profile: str = "paper", **settings: object
+    source: str | os.PathLike[str], target: str | os.PathLike[str], profile: str = DEFAULT_PROFILE, **settings: object
 ) -> CompressionReport:
     """Rewrite a `.hyrf` file with another profile; its provenance goes along. "raw" decompresses.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from click.testing import CliRunner
+from commands import hyrfpack, refused
 from PIL import Image
 from scenes import ball_points, small_model
 
@@ -13,7 +13,6 @@ from hyrfpack.bench import GROUPS, BenchReport, Error, Row
 from hyrfpack.bench.figure import panels, plot
 from hyrfpack.bench.tables import fill, markdown, tables
 from hyrfpack.bench.timing import Ratio, Timing
-from hyrfpack.cli import main
 from hyrfpack.cli.bench import GROUPS as CHOICES
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import save
@@ -41,17 +40,6 @@ def rows() -> list[Row]:
 
 def report() -> BenchReport:
     return BenchReport({"cpu": "slide rule", "cores": 2}, "a model", ["a note"], rows())
-
-
-def hyrfpack(*arguments: object):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
-
-
-def refused(*arguments: object) -> str:
-    result = hyrfpack("bench", *arguments)
-    assert result.exit_code == 2 and result.stdout == "", result.output
-    (sentence,) = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
-    return sentence
 
 
 @pytest.fixture(scope="module")
@@ -151,18 +139,18 @@ def test_one_run_leaves_the_table_the_numbers_the_page_and_the_plot(model, tmp_p
 
 
 def test_what_the_user_got_wrong_is_one_sentence(model, tmp_path):
-    assert "no such file" in refused(tmp_path / "missing.hyrf")
+    assert "no such file" in refused("bench", tmp_path / "missing.hyrf")
     (tmp_path / "bad.hyrf").write_bytes(b"not a model")
-    assert "not a .hyrf file" in refused(tmp_path / "bad.hyrf")
-    assert "nowhere" in refused(model, "--data", tmp_path / "nowhere")
-    assert "'nothing' is not one of" in refused(model, "--only", "nothing")
-    assert "name the model too" in refused("--data", tmp_path)
-    assert "plot is written as" in refused(model, "-o", tmp_path / "plot.txt")
+    assert "not a .hyrf file" in refused("bench", tmp_path / "bad.hyrf")
+    assert "nowhere" in refused("bench", model, "--data", tmp_path / "nowhere")
+    assert "'nothing' is not one of" in refused("bench", model, "--only", "nothing")
+    assert "name the model too" in refused("bench", "--data", tmp_path)
+    assert "plot is written as" in refused("bench", model, "-o", tmp_path / "plot.txt")
 
 
 def test_a_page_without_places_is_refused_before_anything_is_measured(model, tmp_path):
     (tmp_path / "page.md").write_text("# Nothing here")
-    sentence = refused(model, "--only", "mlp", "--markdown", tmp_path / "page.md", "-o", tmp_path / "b.png")
+    sentence = refused("bench", model, "--only", "mlp", "--markdown", tmp_path / "page.md", "-o", tmp_path / "b.png")
     assert "no place for machine" in sentence and (tmp_path / "page.md").read_text() == "# Nothing here"
     assert not (tmp_path / "b.png").exists()
 
