@@ -22,6 +22,7 @@ import torch
 
 from hyrfpack.format import encode_model
 from hyrfpack.format.arrays import group_shapes, parse_config, to_arrays
+from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.container import read_container
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
@@ -135,11 +136,7 @@ def seeds() -> tuple[tuple[bytes, ...], tuple[float, ...]]:
     """
     rng = Random(0)
     models = [_model(0), _model(1, background=False), _model(20, direction_encoding="sh"), _model(200, hidden=2)]
-    files = [
-        (encode_model(model, profile), 1 if len(model) == 200 else 10)
-        for model in models
-        for profile in ("raw", "paper")
-    ]
+    files = [(encode_model(model, profile), 1 if len(model) == 200 else 10) for model in models for profile in PROFILES]
     files += [(file.read_bytes(), 10) for file in sorted(GOLDEN.glob("*.hyrf"))]
     files.append((encode_model(models[2], "paper", color=(3, 8), scale=(2, 4), opacity=(1, 16)), 10))
     mixed = [models[1], _model(5), _model(6), models[2], models[3], _model(2500)]

@@ -16,6 +16,7 @@ from scenes import camera_at, small_model
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
+from hyrfpack.format.codec import PROFILES
 from hyrfpack.model import HashGridConfig, HybridModel
 from hyrfpack.model.hash_grid import FEATURES
 from hyrfpack.quant import (
@@ -32,7 +33,6 @@ from hyrfpack.render import render
 
 LARGEST = float(np.finfo(np.float32).max)
 SMALLEST = 2.0**-149
-PROFILES = ("raw", "paper")
 
 
 def through_bytes(symbols: np.ndarray, code: HuffmanCode | None = None) -> tuple[np.ndarray, int]:

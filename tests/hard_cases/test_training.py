@@ -16,6 +16,7 @@ from scenes import ball_scene, camera_at, photograph, ring, view_of
 from hyrfpack import TrainConfig, evaluate, load_scene, train
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.format import decode_model, encode_model
+from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.container import read_container
 from hyrfpack.model import Frame, HybridModel
 from hyrfpack.render import render
@@ -246,7 +247,7 @@ def test_a_unit_that_is_a_power_of_two_changes_no_bit_of_model_and_file(unit):
     here, there = (trained(a_scene(scale=scale), 40).model for scale in (1.0, unit))
 
     assert all(torch.equal(a, b) for a, b in zip(here.parameters(), there.parameters(), strict=True))
-    for profile in ("raw", "paper"):
+    for profile in PROFILES:
         files = [read_container(encode_model(model, profile)) for model in (here, there)]
         differing = [s.type for s, t in zip(files[0].sections, files[1].sections, strict=True) if s.data != t.data]
         assert differing == ["META"]
