@@ -12,12 +12,12 @@ Rows, all of one seed:
     float64        everything
 
 A difference from `float32` counts only where it is larger than the spread of the nudged rows: training multiplies any
-rounding until two runs differ as two seeds do. Scores are on held-out views, rendered by the product.
+rounding until two runs differ as two seeds do. Scores are on held-out views, rendered by the product; those that
+--out holds already are kept.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Callable
@@ -27,7 +27,7 @@ from unittest import mock
 
 import torch
 from torch import Tensor
-from train_sets import DATA
+from train_sets import study_arguments
 
 import hyrfpack
 from hyrfpack.evaluate import evaluate
@@ -50,6 +50,7 @@ OPERATIONS = {
 }
 RASTERIZE = "hyrfpack.render.renderer.rasterize"
 ROWS = ("float32", *(f"nudged {n}" for n in range(1, 7)), "adam", "rasterizer", "float64")
+SETS = ("nerf_synthetic_lego", "indoor_room")
 NUDGE = 1e-7
 
 
@@ -105,27 +106,20 @@ def train(scene: Scene, config: TrainConfig, row: str) -> tuple[HybridModel, flo
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=1000, help="of each run (1,000)")
-    parser.add_argument(
-        "--sets", nargs="*", default=["nerf_synthetic_lego", "indoor_room"], help="folders below --data"
-    )
-    parser.add_argument("--only", nargs="*", default=ROWS, help="parts of the names of the rows wanted")
-    parser.add_argument("--data", type=Path, default=DATA, help="where the sets are")
-    parser.add_argument("--out", type=Path, default=Path("runs/precision.json"), help="scores; those it holds are kept")
-    args = parser.parse_args()
-    scores = json.loads(args.out.read_text()) if args.out.exists() else {}
+    args = study_arguments(__doc__, steps=1000, sets=SETS, out=Path("runs/precision"), seeds=False).parse_args()
+    kept = args.out / "scores.json"
+    scores = json.loads(kept.read_text()) if kept.exists() else {}
     print("| set | row | PSNR | against float32 | SSIM | Gaussians | seconds |\n|---|---|---|---|---|---|---|")
     for name in args.sets:
         scene = hyrfpack.load_scene(args.data / name)
-        for row in (row for row in ROWS if any(part in row for part in args.only)):
+        for row in (row for row in ROWS if any(part in row for part in args.only or ROWS)):
             key = f"{name}, {row}, {args.steps}"
             if key not in scores:
                 model, seconds = train(scene, TrainConfig(steps=args.steps), row)
                 found = evaluate(model, scene.test)
                 scores[key] = {"psnr": found.psnr, "ssim": found.ssim, "gaussians": len(model), "seconds": seconds}
-                args.out.parent.mkdir(parents=True, exist_ok=True)
-                args.out.write_text(json.dumps(scores, indent=1))
+                args.out.mkdir(parents=True, exist_ok=True)
+                kept.write_text(json.dumps(scores, indent=1))
             score, base = scores[key], scores.get(f"{name}, float32, {args.steps}", {}).get("psnr", float("nan"))
             print(
                 f"| {name} | {row} | {score['psnr']:.3f} | {score['psnr'] - base:+.3f} | {score['ssim']:.4f} | "

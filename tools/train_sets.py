@@ -64,12 +64,18 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def study_arguments(text: str, steps: int, sets: Sequence[str], out: Path) -> argparse.ArgumentParser:
-    """The options of a study that trains variants on sets; `text` is its help, the rest are defaults."""
+def study_arguments(
+    text: str, steps: int, sets: Sequence[str], out: Path, seeds: bool = True
+) -> argparse.ArgumentParser:
+    """The options of a study that trains variants on sets; `text` is its help, the rest are defaults.
+
+    With `seeds` False every run has one seed, and there is no such option.
+    """
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=steps, help=f"of each run ({steps:,})")
     parser.add_argument("--sets", nargs="*", default=list(sets), help=f"folders below --data ({' '.join(sets)})")
-    parser.add_argument("--seeds", type=int, default=2, help="runs of each row and set, with seeds from 0 (2)")
+    if seeds:
+        parser.add_argument("--seeds", type=int, default=2, help="runs of each row and set, with seeds from 0 (2)")
     parser.add_argument("--data", type=Path, default=DATA, help="where the sets are")
     parser.add_argument("--out", type=Path, default=out, help=f"folder for results ({out})")
     parser.add_argument("--only", nargs="*", help="parts of the names of the rows wanted")
