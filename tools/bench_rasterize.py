@@ -15,8 +15,8 @@ from time import perf_counter, process_time
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.pool import thread_count
 from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.parallel.pool import thread_count
 
 WORKLOADS = {"A": (50_000, 320, 240, 1.75), "B": (200_000, 800, 800, 2.6)}  # Gaussians, width, height, sigma in px
 REPEATS = 7

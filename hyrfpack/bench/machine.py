@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 import hyrfpack
-from hyrfpack.ops.pool import thread_count
+from hyrfpack.parallel.pool import thread_count
 
 
 def machine() -> dict[str, object]:

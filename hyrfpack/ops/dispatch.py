@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
-from functools import cache
-
 import torch
 from torch import Tensor
 
-
-@cache
-def has_numba() -> bool:
-    """Whether the compiled CPU kernels can be had."""
-    return importlib.util.find_spec("numba") is not None
+from hyrfpack.parallel import has_numba
 
 
 def choose(implementation: str, available: tuple[str, ...], *tensors: Tensor) -> str:

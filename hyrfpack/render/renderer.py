@@ -12,9 +12,9 @@ from torch import Tensor
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.model import Geometry, HybridModel, viewpoint_of
-from hyrfpack.ops.pool import torch_on_one_thread
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
+from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.render.cull import frustum_cull
 from hyrfpack.scene import Camera
 

@@ -16,8 +16,8 @@ from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.ops.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.ops.ssim import photometric_loss
+from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.render import render
 from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from hyrfpack.ops.dispatch import has_numba
 from hyrfpack.ops.hash_encode import cells, corner_rows, hash_encode, level_offsets, level_resolutions
+from hyrfpack.parallel import has_numba
 
 IMPLEMENTATIONS = ["reference", pytest.param("cpu", marks=pytest.mark.skipif(not has_numba(), reason="no numba"))]
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from hyrfpack.ops.dispatch import has_numba
 from hyrfpack.ops.ssim import photometric_loss, ssim
+from hyrfpack.parallel import has_numba
 
 IMPLEMENTATIONS = ["reference", pytest.param("cpu", marks=pytest.mark.skipif(not has_numba(), reason="no numba"))]
 

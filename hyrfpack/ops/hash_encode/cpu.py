@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.compiled import compiled
 from hyrfpack.ops.hash_encode.reference import PRIME_Y, PRIME_Z, level_offsets
-from hyrfpack.ops.pool import run_tasks
+from hyrfpack.parallel.compiled import compiled
+from hyrfpack.parallel.pool import run_tasks
 
 njit = compiled(fastmath={"contract", "nsz", "nnan", "reassoc", "arcp"})
 

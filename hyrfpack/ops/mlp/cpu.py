@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.pool import run_tasks, torch_on_one_thread
+from hyrfpack.parallel.pool import run_tasks, torch_on_one_thread
 
 _MOST_ROWS, _LEAST_ROWS = 2048, 256  # a chunk's activations (0.5 MiB at width 64) stay in the second cache
 _WORTH_SKIPPING = 0.1  # share of idle rows from which gathering the others is cheaper than computing all

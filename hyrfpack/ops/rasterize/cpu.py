@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from hyrfpack.ops.pool import run_ranges, run_tasks, thread_count
 from hyrfpack.ops.rasterize import cpu_bin, cpu_blend, cpu_project
 from hyrfpack.ops.rasterize.reference import TILE
+from hyrfpack.parallel.pool import run_ranges, run_tasks, thread_count
 
 
 @dataclass(frozen=True)

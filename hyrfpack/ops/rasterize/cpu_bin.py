@@ -10,9 +10,9 @@ import math
 
 import numpy as np
 
-from hyrfpack.ops.compiled import compiled
 from hyrfpack.ops.rasterize.cpu_project import COV_XX, COV_YY, HIDDEN, MEAN_X, MEAN_Y, REACH, RECORD, U_X, U_Y
 from hyrfpack.ops.rasterize.reference import TILE
+from hyrfpack.parallel.compiled import compiled
 
 # From the low end: 4 bits first row, 4 bits last row, 28 bits slot, 28 bits position.
 PAIRS_MAX = 1 << 28

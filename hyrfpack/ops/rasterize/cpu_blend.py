@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from hyrfpack.ops.compiled import compiled
 from hyrfpack.ops.rasterize.cpu_bin import POSITION_SHIFT, SLOT_MASK, SLOT_SHIFT
 from hyrfpack.ops.rasterize.cpu_prefetch import prefetch_row, prefetch_row_for_write
 from hyrfpack.ops.rasterize.cpu_project import (
@@ -37,6 +36,7 @@ from hyrfpack.ops.rasterize.cpu_project import (
     V_Y,
 )
 from hyrfpack.ops.rasterize.reference import ALPHA_MAX, TILE
+from hyrfpack.parallel.compiled import compiled
 
 _kernel = compiled(fastmath={"contract", "nsz", "nnan", "reassoc", "arcp"}, error_model="numpy")
 _CAP = np.float32(ALPHA_MAX)

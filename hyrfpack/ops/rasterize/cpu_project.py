@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
-from hyrfpack.ops.compiled import compiled
 from hyrfpack.ops.rasterize.reference import ALPHA_MIN, COMPENSATION_MIN, LOW_PASS, QUAT_NORM_MIN, TILE
+from hyrfpack.parallel.compiled import compiled
 
 # One record of a projected Gaussian: 16 float32, one cache line. With Sigma = its 2D covariance,
 #     u = U_X dx + U_Y dy,  v = V_Y dy,  u^2 + v^2 = 1/16 d^T Sigma^-1 d   (so the exponent is -8 (u^2 + v^2)).

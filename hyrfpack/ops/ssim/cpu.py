@@ -12,9 +12,9 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from hyrfpack.ops.compiled import compiled
-from hyrfpack.ops.pool import run_tasks
 from hyrfpack.ops.ssim.reference import C1, C2, RADIUS, window
+from hyrfpack.parallel.compiled import compiled
+from hyrfpack.parallel.pool import run_tasks
 
 # The error model of numpy: a division that tests for zero would keep its loop from vectorising.
 _FAST_MATH = {"contract", "nsz", "nnan", "reassoc", "arcp"}

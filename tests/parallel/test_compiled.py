@@ -6,7 +6,7 @@ import numba
 import pytest
 from numba.core.caching import CompileResultCacheImpl
 
-from hyrfpack.ops.compiled import compiled
+from hyrfpack.parallel.compiled import compiled
 
 
 def twice(x):
