@@ -13,7 +13,7 @@ from hyrfpack.model.background import RADIUS
 from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.field import DIRECTION_FEATURES
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.model.hash_grid import FEATURES
+from hyrfpack.model.hash_grid import FEATURES, HashGridConfig
 from hyrfpack.model.hybrid import HybridModel
 
 # What every model of this version computes and no setting of it says; `docs/format.md` has the equations.
@@ -67,12 +67,25 @@ def to_arrays(model: HybridModel) -> dict[str, np.ndarray]:
 def group_shapes(config: ModelConfig, gaussians: int) -> dict[str, tuple[int, int]]:
     """(rows, columns) of each matrix of a model. Allocates nothing: what a file claims can be checked first."""
     shapes = {group: (gaussians, width) for group, width in zip(GROUPS, Gaussians.WIDTHS, strict=False)}
-    directions = DIRECTION_FEATURES[config.direction_encoding]
-    for field, grid, extra, outputs in (("G", config.geometry, 0, 8), ("R", config.radiance, directions, 3)):
-        widths = (grid.levels * FEATURES + extra, config.hidden, config.hidden, outputs)
+    for field, grid in grids(config).items():
         shapes[field + "TAB"] = (grid.rows, FEATURES)
+        widths = decoder_widths(config)[field]
         shapes[field + "MLP"] = (sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(widths)), 1)
     return shapes
+
+
+def grids(config: ModelConfig) -> dict[str, HashGridConfig]:
+    """The hash grid of each field by its letter: "G" geometry, "R" radiance."""
+    return {"G": config.geometry, "R": config.radiance}
+
+
+def decoder_widths(config: ModelConfig) -> dict[str, tuple[int, int, int, int]]:
+    """Inputs, hidden, hidden and outputs of each field's decoder, by the field's letter."""
+    extra, outputs = {"G": 0, "R": DIRECTION_FEATURES[config.direction_encoding]}, {"G": 8, "R": 3}
+    return {
+        field: (grid.levels * FEATURES + extra[field], config.hidden, config.hidden, outputs[field])
+        for field, grid in grids(config).items()
+    }
 
 
 def to_model(config: ModelConfig, arrays: dict[str, np.ndarray]) -> HybridModel:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,17 +12,18 @@ import torch
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.errors import HyrfError, HyrfFormatError
-from hyrfpack.format import paper, raw
+from hyrfpack.format import compact, paper, raw
 from hyrfpack.format.arrays import RULES, check_rules, group_shapes, parse_config, to_model
 from hyrfpack.format.container import Container, read_container, write_container
 from hyrfpack.format.info import SECTIONS, SectionSize, section_sizes
 from hyrfpack.format.metadata import Metadata, read_metadata
 from hyrfpack.model.hybrid import HybridModel
+from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.quant import DamagedDataError
 
-PROFILES = {"raw": raw.encode, "paper": paper.encode}
-DEFAULT_PROFILE = "paper"  # of `compress`
-DECODERS = {**raw.DECODERS, **paper.DECODERS}
+PROFILES = {"raw": raw.encode, "paper": paper.encode, "compact": compact.encode}
+DEFAULT_PROFILE = "compact"  # of `compress`
+DECODERS = {**raw.DECODERS, **paper.DECODERS}  # of codecs that need no other section
 
 
 @dataclass(frozen=True)
@@ -57,8 +60,9 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
     if profile not in PROFILES:
         raise HyrfError(f"there is no profile '{profile}'; use one of: {', '.join(PROFILES)}")
     sections, used = PROFILES[profile](model, **settings)
-    metadata = Metadata(profile, len(model), model.config.to_dict(), RULES, used, provenance or {})
-    return write_container([metadata.to_section(), *sections])
+    stored = next(section for section in sections if section.type == "POSI").raw_length // 12
+    metadata = Metadata(profile, stored, model.config.to_dict(), RULES, used, provenance or {})
+    return write_container([metadata.to_section(deflate=profile == "compact"), *sections])
 
 
 def decode_model(data: bytes | memoryview, device: str | torch.device = "cpu", name: str = "the data") -> HybridModel:
@@ -124,20 +128,43 @@ def _decode(container: Container) -> HybridModel:
         entry = container.entries.get(group)
         if entry is None:
             raise HyrfFormatError(f"{name}: there is no section '{group}'; the file is incomplete, write it again")
-        if entry.codec not in DECODERS:
+        if entry.codec not in DECODERS and entry.codec not in compact.CODECS:
             raise HyrfFormatError(f"{name}: section '{group}' has the unknown codec {entry.codec}; update hyrfpack")
         if entry.raw_length != 4 * rows * columns:
             raise HyrfFormatError(
                 f"{name}: section '{group}' says it decodes to {entry.raw_length} bytes and the metadata asks for "
                 f"{4 * rows * columns}; the file is damaged, write it again"
             )
-    arrays = {}
-    for group, shape in shapes.items():
-        section = container[group]
-        try:
-            arrays[group] = DECODERS[section.codec](section.data, shape)
-        except (HyrfFormatError, DamagedDataError) as error:
-            raise HyrfFormatError(f"{name}: section '{group}': {error}") from error
-        if not np.isfinite(arrays[group]).all():
+    sections = {group: container[group] for group in shapes}
+    arrays: dict[str, np.ndarray] = {}
+    points = None  # positions on a lattice, on which other sections lean
+    if sections["POSI"].codec == compact.CODEC_POINTS:
+        with _naming(name, "POSI"):
+            arrays["POSI"], points = compact.decode_positions(sections["POSI"].data, metadata.gaussians, config)
+    groups = [group for group in shapes if group not in arrays]
+
+    def decode(index: int) -> None:
+        group = groups[index]
+        section = sections[group]
+        with _naming(name, group):
+            if section.codec in DECODERS:
+                arrays[group] = DECODERS[section.codec](section.data, shapes[group])
+            else:
+                arrays[group] = compact.decode_section(
+                    group, section.codec, section.data, shapes[group], config, points
+                )
+
+    run_tasks(decode, len(groups))
+    for group, values in arrays.items():
+        if not np.isfinite(values).all():
             raise HyrfFormatError(f"{name}: section '{group}' holds numbers that are not finite; write the file again")
     return to_model(config, arrays)
+
+
+@contextmanager
+def _naming(name: str, group: str) -> Iterator[None]:
+    """Say which file and section an error is of."""
+    try:
+        yield
+    except (HyrfFormatError, DamagedDataError) as error:
+        raise HyrfFormatError(f"{name}: section '{group}': {error}") from error

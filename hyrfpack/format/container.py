@@ -22,7 +22,7 @@ from typing import BinaryIO
 from hyrfpack.errors import HyrfFormatError
 
 MAGIC = b"\x89HYRF\r\n\n"
-MAJOR, MINOR = 1, 0
+MAJOR, MINOR = 1, 1
 
 # A file that breaks one of these is refused before anything is read or allocated for it.
 MAX_SECTIONS = 1024

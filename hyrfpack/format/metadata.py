@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+import zlib
 from dataclasses import dataclass, field, fields
 
 import hyrfpack
@@ -12,7 +13,7 @@ from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format.container import Container, Section
 
 TYPE = "META"
-CODEC_JSON = 0
+CODEC_JSON, CODEC_DEFLATED = 0, 5
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 64  # objects and lists within each other; what walks them calls itself once for each
 MAX_INTEGER = 1 << 63
@@ -56,7 +57,7 @@ class Metadata:
     provenance: dict = field(default_factory=dict)
     writer: str = field(default_factory=lambda: writer())
 
-    def to_section(self) -> Section:
+    def to_section(self, deflate: bool = False) -> Section:
         """The section, same values, same bytes: keys sorted, no spaces, ASCII.
 
         Raises:
@@ -72,7 +73,12 @@ class Metadata:
             raise ValueError(f"the metadata is not JSON: {error}") from error
         if len(text) > MAX_BYTES:
             raise HyrfError(f"the metadata takes {len(text)} bytes and may take {MAX_BYTES}; shorten the provenance")
-        return Section(TYPE, CODEC_JSON, text.encode("ascii"), len(text))
+        data = text.encode("ascii")
+        return (
+            Section(TYPE, CODEC_DEFLATED, zlib.compress(data, 9), len(data))
+            if deflate
+            else Section(TYPE, CODEC_JSON, data, len(data))
+        )
 
 
 def writer() -> str:
@@ -87,17 +93,19 @@ def read_metadata(container: Container) -> Metadata:
         HyrfFormatError: the section is absent, too long, not JSON, or a field is missing or of the wrong type.
     """
     name, entry = container.name, container.entries.get(TYPE)
-    if entry is not None and (entry.length > MAX_BYTES or entry.codec != CODEC_JSON):
+    if entry is not None and (entry.raw_length > MAX_BYTES or entry.codec not in (CODEC_JSON, CODEC_DEFLATED)):
         raise HyrfFormatError(
-            f"{name}: the metadata has {entry.length} bytes in codec {entry.codec}, and {MAX_BYTES} bytes at most in "
-            f"codec {CODEC_JSON} can be read; the file is damaged or newer than this hyrfpack"
+            f"{name}: the metadata has {entry.raw_length} bytes in codec {entry.codec}, and {MAX_BYTES} bytes at most "
+            f"in codecs {CODEC_JSON} and {CODEC_DEFLATED} can be read; the file is damaged or newer than this hyrfpack"
         )
-    if entry is not None and entry.raw_length != entry.length:
+    if entry is not None and entry.codec == CODEC_JSON and entry.raw_length != entry.length:
         raise HyrfFormatError(
             f"{name}: the metadata has {entry.length} bytes and says it decodes to {entry.raw_length}; the file is "
             "damaged, write it again"
         )
     data = bytes(container[TYPE].data)
+    if entry.codec == CODEC_DEFLATED:
+        data = _inflate(data, entry.raw_length, name)
     try:
         values = json.loads(data.decode("utf-8"), parse_constant=_finite, parse_float=_finite)
     # Nesting without end overflows the parser's stack, and a number of 5,000 digits is a ValueError.
@@ -118,6 +126,18 @@ def read_metadata(container: Container) -> Metadata:
     except ValueError as error:
         raise HyrfFormatError(f"{name}: the metadata is not valid: {error}; write the file again") from error
     return Metadata(**values)
+
+
+def _inflate(data: bytes, length: int, name: str) -> bytes:
+    """Exactly `length` bytes out of a zlib stream; never more are made."""
+    inflater = zlib.decompressobj()
+    try:
+        text = inflater.decompress(data, length + 1)
+    except zlib.error as error:
+        raise HyrfFormatError(f"{name}: the metadata cannot be unpacked ({error}); write the file again") from error
+    if len(text) != length or not inflater.eof or inflater.unused_data:
+        raise HyrfFormatError(f"{name}: the metadata does not unpack to {length} bytes; write the file again")
+    return text
 
 
 def _check(value: object, kind: type | tuple | dict, path: str) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hyrfpack.ops.hash_encode import hash_encode, level_offsets, level_resolutions
+from hyrfpack.ops.hash_encode.reference import PRIME_Y, PRIME_Z
 
 FEATURES = 2
 
@@ -50,6 +52,33 @@ class HashGridConfig:
     def rows(self) -> int:
         """Rows of the whole table."""
         return self.offsets[-1]
+
+    def usage(self, points: np.ndarray, bits: int) -> np.ndarray:
+        """How many corners of the cells that hold these points read each row of the table. Integers only.
+
+        Args:
+            points: (N, 3) int64 in units of 2^-bits of the unit cube, 0 to 2^bits - 1; bits + the bits of the finest
+                resolution at most 62.
+
+        Returns:
+            (rows,) int64.
+        """
+        counts = np.zeros(self.rows, np.int64)
+        for level, resolution in enumerate(self.resolutions):
+            first, last = self.offsets[level : level + 2]
+            cells = (points * (resolution - 1) >> bits).astype(np.uint32)
+            dense = resolution**3 <= 1 << self.log2_table_size
+            factors = (1, resolution, resolution**2) if dense else (1, PRIME_Y, PRIME_Z)
+            # Products wrap around at 32 bits, as the hash has it.
+            sides = [
+                [(cells[:, axis] + np.uint32(side)) * np.uint32(factor) for side in (0, 1)]
+                for axis, factor in enumerate(factors)
+            ]
+            for corner in range(8):
+                x, y, z = (sides[axis][corner >> axis & 1] for axis in range(3))
+                rows = x + y + z if dense else (x ^ y ^ z) & np.uint32((1 << self.log2_table_size) - 1)
+                counts[first:last] += np.bincount(rows, minlength=last - first)
+        return counts
 
 
 class HashGrid(nn.Module):

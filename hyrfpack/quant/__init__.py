@@ -1,7 +1,9 @@
 """Numbers -> few symbols -> few bytes. Knows arrays, never models."""
 
+from hyrfpack.quant.bits import pack_bits, unpack_bits
 from hyrfpack.quant.errors import DamagedDataError
 from hyrfpack.quant.huffman import HuffmanCode, HuffmanStream, huffman_decode, huffman_encode
+from hyrfpack.quant.integers import decode_integers, encode_integers
 from hyrfpack.quant.min_max import MinMaxParams, MinMaxQuantizer
 from hyrfpack.quant.residual_vq import ResidualVectorQuantizer
 
@@ -12,6 +14,10 @@ __all__ = [
     "MinMaxParams",
     "MinMaxQuantizer",
     "ResidualVectorQuantizer",
+    "decode_integers",
+    "encode_integers",
     "huffman_decode",
     "huffman_encode",
+    "pack_bits",
+    "unpack_bits",
 ]

@@ -1,0 +1,149 @@
+"""Quantisation-aware fine-tuning: train on, seeing through the quantiser, with the bits in the loss."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from copy import deepcopy
+
+import numpy as np
+import torch
+
+from hyrfpack.data import PictureCache
+from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.format.arrays import GROUPS
+from hyrfpack.format.compact import Plan, Quantized, quantize
+from hyrfpack.format.compact.quantize import ERROR_PER_BIT
+from hyrfpack.model import HybridModel
+from hyrfpack.ops.ssim import photometric_loss
+from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
+from hyrfpack.quant.steps import ONE, step_of
+from hyrfpack.render import render
+from hyrfpack.scene import View
+from hyrfpack.train.config import LearningRates
+from hyrfpack.train.optimizer import Optimizer
+
+RATES = LearningRates(
+    positions=(1e-9, 1e-9),  # they stay where they are
+    fields=(1e-3, 1e-4),
+    color_logits=(3e-3, 3e-4),
+    scale_logits=(4e-3, 4e-4),
+    opacity_logits=(1e-2, 1e-3),
+)
+LOSS_PER_ERROR = 20.0  # what the photometric loss rises by for a small mean squared error added to the picture
+
+
+def finetune(
+    model: HybridModel,
+    plan: Plan,
+    views: Sequence[View],
+    steps: int,
+    *,
+    seed: int = 0,
+    cache: PictureCache | None = None,
+    report: Callable[[int, float], None] = lambda step, loss: None,
+) -> HybridModel:
+    """Fit a planned model's numbers to the photos as they will be decoded.
+
+    Each step renders the model as it is after quantising (rounding passes gradients straight through) and adds
+
+        LOSS_PER_ERROR * 2 ln 2 D * bits
+
+    to the photometric loss, the exchange rate of `quantize`; a number q steps from its prediction is taken to cost
+    |q| / (b ln 2) bits, b being the mean of |q| in its group (the ideal code of a Laplace distribution). Positions,
+    order and steps stay.
+
+    Args:
+        model: `plan.apply` of a trained model; not changed.
+        plan: its plan.
+        views: photos to fit.
+        steps: optimiser steps, one view each.
+        seed: of the order of views.
+        cache: holds decoded photos.
+        report: called after each step with its number, from 1, and the photometric loss.
+
+    Returns:
+        The fitted model, to be quantised with `reach` 0 in the plan: its numbers sit where they shall be rounded to.
+
+    Raises:
+        HyrfTrainingError: the loss or a gradient is not finite.
+    """
+    rounding = dataclasses.replace(plan, reach=0)
+    tuned = deepcopy(model)
+    tuned.gaussians.positions.requires_grad_(False)
+    optimizer = Optimizer(tuned, RATES)
+    keep_freed_memory()
+    with closing((cache or PictureCache()).stream(_order(views, steps, seed))) as pictures, torch_on_one_thread():
+        for step, (view, picture) in enumerate(pictures):
+            quantized = quantize(tuned, rounding)
+            exact = {name: parameter.detach().clone() for name, parameter in tuned.named_parameters()}
+            _load(tuned, quantized.arrays(rounding))
+            solid = None if tuned.config.background else np.array(tuned.config.solid, np.float32)
+            target = torch.from_numpy(picture.composite(solid))
+            mask = None if picture.mask is None else torch.from_numpy(picture.mask)
+            loss = photometric_loss(render(tuned, view.camera).rgb, target, mask)
+            loss.backward()
+            with torch.no_grad():
+                for name, parameter in tuned.named_parameters():
+                    parameter.copy_(exact[name])
+            if not torch.isfinite(loss) or optimizer.nonfinite_groups():
+                raise HyrfTrainingError(
+                    f"fine-tuning stopped at step {step + 1} on view '{view.name}': the loss or a gradient is not finite"
+                )
+            _add_rate(tuned, quantized, rounding, LOSS_PER_ERROR * ERROR_PER_BIT * plan.distortion)
+            optimizer.step(step, steps)
+            report(step + 1, float(loss.detach()))
+    tuned.gaussians.positions.requires_grad_(True)
+    return tuned
+
+
+def _order(views: Sequence[View], steps: int, seed: int) -> Iterator[View]:
+    """Views for the steps: each epoch a permutation of its own."""
+    for step in range(steps):
+        epoch, place = divmod(step, len(views))
+        if place == 0:
+            order = np.random.default_rng((seed, epoch)).permutation(len(views))
+        yield views[order[place]]
+
+
+@torch.no_grad()
+def _load(model: HybridModel, arrays: dict[str, np.ndarray]) -> None:
+    """Set the parameters of the sections in `arrays`."""
+    parameters = dict(model.named_parameters())
+    for group, values in arrays.items():
+        rest = torch.from_numpy(values.ravel())
+        for name in GROUPS[group]:
+            parameter = parameters[name]
+            part, rest = rest[: parameter.numel()], rest[parameter.numel() :]
+            parameter.copy_(part.view(parameter.shape))
+
+
+@torch.no_grad()
+def _add_rate(model: HybridModel, quantized: Quantized, plan: Plan, price: float) -> None:
+    """Add the gradient of price * bits to the parameters' gradients."""
+    parameters = dict(model.named_parameters())
+    slopes = {}
+    classes = plan.points.classes
+    for group, channels in quantized.channels.items():
+        columns = [_slope(c.residuals, classes, len(c.codes), c.codes) for c in channels]
+        values = np.stack(columns, axis=1)
+        slopes[group] = values @ plan.basis.T.astype(np.float64) if len(columns) == 3 else values
+    for group, chosen in quantized.groups.items():
+        groups = plan.groups[group]
+        slopes[group] = _slope(chosen.symbols, groups.index, groups.count, chosen.codes)
+    for group, values in slopes.items():
+        rest = torch.from_numpy((price * values).astype(np.float32).ravel())
+        for name in GROUPS[group]:
+            parameter = parameters[name]
+            part, rest = rest[: parameter.numel()], rest[parameter.numel() :]
+            if parameter.grad is not None:
+                parameter.grad += part.view(parameter.shape)
+
+
+def _slope(symbols: np.ndarray, index: np.ndarray, count: int, codes: np.ndarray) -> np.ndarray:
+    """d bits / d number: sign(q) / (b ln 2 step), (n,) float64."""
+    members = np.maximum(np.bincount(index, minlength=count), 1)
+    spread = np.bincount(index, np.abs(symbols), count) / members + 0.1
+    slope = 1 / (spread * np.log(2) * (step_of(codes) / ONE))
+    return np.sign(symbols) * slope[index]

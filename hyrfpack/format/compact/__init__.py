@@ -1,0 +1,91 @@
+"""Profile `compact`: every number as coarse as pictures allow, in as few bits as that takes.
+
+positions                          lattice of the contracted cube, Morton order, gaps       section codec 6
+colour, scale, opacity logits      a step for each class of Gaussians, prediction, rANS     section codec 7
+hash tables                        a step by how often a row is read, rANS                  section codec 8
+decoders (MLPs)                    a step for each output, rANS                             section codec 8
+
+`Sensitivity` says how much each number matters to pictures, `make_plan` decides from it what is stored and how finely,
+`encode` does it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hyrfpack.errors import HyrfFormatError
+from hyrfpack.format.arrays import group_shapes
+from hyrfpack.format.compact import sections
+from hyrfpack.format.compact.groups import decode_groups
+from hyrfpack.format.compact.plan import Plan, from_lattice, groups_of, make_plan
+from hyrfpack.format.compact.sections import CODEC_CHANNELS, CODEC_GROUPS, CODEC_POINTS, Quantized, quantize
+from hyrfpack.format.compact.sensitivity import Sensitivity
+from hyrfpack.format.container import Section
+from hyrfpack.model.config import ModelConfig
+from hyrfpack.model.hybrid import HybridModel
+from hyrfpack.quant.points import Points, decode_points
+
+__all__ = [
+    "CODEC_POINTS",
+    "Plan",
+    "Sensitivity",
+    "decode_positions",
+    "decode_section",
+    "encode",
+    "make_plan",
+    "quantize",
+]
+
+# The sections that may have a codec.
+CODECS = {
+    CODEC_POINTS: ("POSI",),
+    CODEC_CHANNELS: ("COLO", "SCAL", "OPAC"),
+    CODEC_GROUPS: ("GTAB", "GMLP", "RTAB", "RMLP"),
+}
+
+
+def encode(model: HybridModel, plan: Plan) -> tuple[list[Section], dict]:
+    """Sections for a model, and what was decided, for people.
+
+    Args:
+        model: the model that the plan was made for.
+        plan: from `make_plan`.
+
+    Raises:
+        HyrfError: a parameter is NaN or infinite.
+    """
+    coded = sections.encode(quantize(plan.apply(model), plan), plan)
+    shapes = group_shapes(model.config, len(plan.kept))
+    settings = {"distortion": plan.distortion, "gaussians_before": len(model)}
+    return [Section(group, *coded[group], 4 * rows * columns) for group, (rows, columns) in shapes.items()], settings
+
+
+def decode_positions(data: memoryview, count: int, config: ModelConfig) -> tuple[np.ndarray, Points]:
+    """Local positions (count, 3) float32 and the lattice points that the other sections need.
+
+    Raises:
+        DamagedDataError: the bytes are damaged.
+    """
+    points = decode_points(data, count)
+    return from_lattice(points, config.frame), points
+
+
+def decode_section(
+    group: str, codec: int, data: memoryview, shape: tuple[int, int], config: ModelConfig, points: Points | None
+) -> np.ndarray:
+    """The numbers of a section of codec 7 or 8.
+
+    Args:
+        points: from `decode_positions`; None when the positions have another codec.
+
+    Raises:
+        DamagedDataError: the bytes are damaged.
+        HyrfFormatError: the section cannot have this codec, or not beside such positions.
+    """
+    if group not in CODECS[codec]:
+        raise HyrfFormatError(f"it cannot have codec {codec}; the file is damaged, write it again")
+    if points is None and not group.endswith("MLP"):
+        raise HyrfFormatError(f"codec {codec} needs positions of codec {CODEC_POINTS}; write the file again")
+    if codec == CODEC_CHANNELS:
+        return sections.decode_channels(data, points, shape[1])
+    return decode_groups(data, groups_of(group, config, points)).reshape(shape)
