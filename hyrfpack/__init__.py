@@ -4,7 +4,7 @@
 
     scene = hyrfpack.load_scene("data/bonsai")
     result = hyrfpack.train(scene, "runs/bonsai", hyrfpack.TrainConfig(steps=3000))
-    hyrfpack.compress("runs/bonsai/model.hyrf", "bonsai.hyrf", profile="paper")
+    hyrfpack.compress("runs/bonsai/model.hyrf", "bonsai.hyrf")
     model = hyrfpack.load("bonsai.hyrf")
     print(hyrfpack.evaluate(model, scene.test).psnr)
     picture = hyrfpack.render(model, scene.test[0].camera).rgb
@@ -41,13 +41,12 @@ _PUBLIC = {
     "TrainResult": "hyrfpack.train",
     "Evaluation": "hyrfpack.evaluate",
     "CompressionReport": "hyrfpack.format",
-    "compress": "hyrfpack.format",
     "describe": "hyrfpack.format",
     "load": "hyrfpack.format",
     "save": "hyrfpack.format",
 }
 # Sub-packages that are also the one function they are about: `hyrfpack.render(...)` calls `hyrfpack.render.render`.
-_CALLABLE = ("bench", "evaluate", "render", "train")
+_CALLABLE = ("bench", "compress", "evaluate", "render", "train")
 
 __all__ = ["__version__", *_CALLABLE, *_PUBLIC]
 

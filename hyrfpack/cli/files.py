@@ -2,20 +2,41 @@
 
 from __future__ import annotations
 
+import math
 import os
+import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from hyrfpack.cli.common import PATH, json_option, print_json, table
+from hyrfpack.cli.common import PATH, json_option, note, print_json, read_scene, scene_options, table
 from hyrfpack.errors import HyrfError, printable
 
 if TYPE_CHECKING:
     from hyrfpack.format import CompressionReport
+    from hyrfpack.scene import Scene
 
-PROFILES, DEFAULT_PROFILE = ("raw", "paper"), "paper"  # those of hyrfpack.format.codec, without loading torch
+# Those of hyrfpack.format.codec, without loading torch.
+PROFILES, DEFAULT_PROFILE = ("raw", "paper", "compact"), "compact"
+_SIZE = re.compile(r"([0-9.]+)\s*([kmg]?)b?", re.IGNORECASE)
+
+
+class _Bytes(click.ParamType):
+    """A size such as 2MB, 350k or 1500000; k, M and G are powers of 1000."""
+
+    name = "size"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        match = _SIZE.fullmatch(str(value).strip())
+        try:
+            size = int(float(match[1]) * 1000 ** " kmg".index(match[2].lower() or " ")) if match else 0
+        except (ValueError, OverflowError):
+            size = 0
+        if size < 1:
+            self.fail(f"'{value}' is no size; write it as 2MB, 350kB or 1500000", param, ctx)
+        return size
 
 
 @click.command(short_help="Pack a model into a small file.")
@@ -26,18 +47,75 @@ PROFILES, DEFAULT_PROFILE = ("raw", "paper"), "paper"  # those of hyrfpack.forma
     type=click.Choice(PROFILES),
     default=DEFAULT_PROFILE,
     show_default=True,
-    help="How: exact float32 (raw), or the HyRF paper's recipe.",
+    help="How: what pictures need and no more (compact), the HyRF paper's recipe (paper), or exact float32 (raw).",
 )
+@click.option("--data", type=PATH, help="Photos of the scene: to measure on, and for the options below.")
+@click.option(
+    "--finetune",
+    "finetune_steps",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Fit the quantised model to the photos for N steps: a smaller file for more time.",
+)
+@click.option("--prune/--no-prune", default=True, help="Leave out Gaussians that pictures do not miss.  [default: do]")
+@click.option("--target-size", type=_Bytes(), metavar="SIZE", help="As good as can be in so many bytes, such as 2MB.")
+@click.option(
+    "--max-psnr-drop",
+    type=click.FloatRange(min=0),
+    metavar="DB",
+    help="As small as can be for so many dB lost on the held-out photos of --data.",
+)
+@click.option("--report", type=PATH, metavar="DIR", help="Write a page there: size against loss, pictures, error maps.")
+@scene_options
 @json_option
-def compress(model: Path, output: Path, profile: str, as_json: bool) -> None:
+def compress(
+    model: Path,
+    output: Path,
+    profile: str,
+    data: Path | None,
+    finetune_steps: int | None,
+    prune: bool,
+    target_size: int | None,
+    max_psnr_drop: float | None,
+    report: Path | None,
+    test_every: int,
+    images: str | None,
+    layout: str | None,
+    as_json: bool,
+) -> None:
     """Pack MODEL, a .hyrf file, into a smaller one and show what each part takes.
+
+    The default profile renders the model to see what each number does to pictures, and spends bits where they show.
+    With the photos it also says what was lost.
 
     \b
     Examples:
       hyrfpack compress runs/bonsai/model.hyrf -o bonsai.hyrf
-      hyrfpack compress runs/bonsai/model.hyrf -o bonsai.hyrf --profile paper --json
+      hyrfpack compress runs/bonsai/model.hyrf -o bonsai.hyrf --data photos/bonsai --finetune 500
+      hyrfpack compress runs/bonsai/model.hyrf -o bonsai.hyrf --target-size 150kB
+      hyrfpack compress runs/bonsai/model.hyrf -o bonsai.hyrf --data photos/bonsai --max-psnr-drop 0.05 --report page
     """
-    _rewrite(model, output, profile, as_json)
+    _refuse_same(model, output)
+    from hyrfpack.compress import compress as pack
+
+    scene = None if data is None else read_scene(data, test_every, images, layout)
+    result = pack(
+        model,
+        output,
+        profile,
+        data=scene,
+        finetune_steps=finetune_steps or 0,
+        prune=prune,
+        target_bytes=target_size,
+        max_psnr_drop=max_psnr_drop,
+        say=note,
+    )
+    scores = _scores(model, output, scene)
+    if report is not None:
+        from hyrfpack.compress.report import write_report
+
+        write_report(report, model, output, result, scene)
+    _print_report(output, result, scores, as_json)
 
 
 @click.command(short_help="Unpack a file to exact float32.")
@@ -51,7 +129,10 @@ def decompress(file: Path, output: Path, as_json: bool) -> None:
     Example:
       hyrfpack decompress bonsai.hyrf -o back.hyrf
     """
-    _rewrite(file, output, "raw", as_json)
+    _refuse_same(file, output)
+    from hyrfpack.format import repack
+
+    _print_report(output, repack(file, output), {}, as_json)
 
 
 @click.command(short_help="Show what a file holds.")
@@ -97,39 +178,62 @@ def _say(line: str) -> None:
     click.echo(printable(line))
 
 
-def _rewrite(source: Path, target: Path, profile: str, as_json: bool) -> None:
+def _refuse_same(source: Path, target: Path) -> None:
     if os.path.realpath(source) == os.path.realpath(target):
         raise HyrfError(f"{target}: the output is the input itself; name another file with -o")
-    from hyrfpack.format import compress as rewrite
 
-    report: CompressionReport = rewrite(source, target, profile)
-    sections = [asdict(part) for part in report.sections]
+
+def _scores(before: Path, after: Path, scene: Scene | None) -> dict[str, float]:
+    """Mean PSNR and SSIM on held-out photos of both files, where there are photos."""
+    if scene is None or not scene.test:
+        return {}
+    from hyrfpack.evaluate import evaluate
+    from hyrfpack.format import load
+
+    old, new = (evaluate(load(path), scene.test) for path in (before, after))
+    return {"psnr_before": old.psnr, "psnr": new.psnr, "ssim_before": old.ssim, "ssim": new.ssim}
+
+
+def _print_report(path: Path, report: CompressionReport, scores: dict[str, float], as_json: bool) -> None:
     if as_json:
-        print_json(
-            {
-                "file": str(target),
-                "profile": report.profile,
-                "gaussians": report.gaussians,
-                "bytes": report.bytes_after,
-                "bytes_before": report.bytes_before,
-                "sections": sections,
-            }
-        )
+        print_json({"file": str(path), **asdict(report), **scores})
         return
-    click.echo(_section_table(sections, report.bytes_after, report.gaussians))
+    sections = [asdict(part) for part in report.sections]
+    click.echo(_section_table(sections, report.bytes_after, report.gaussians, report.shares))
     ratio = report.bytes_before / report.bytes_after
-    outcome = "every number as float32" if profile == "raw" else f"{ratio:.2f} times smaller than as float32"
-    click.echo(f"{target}: {report.bytes_after:,} bytes, {outcome}")
+    outcome = "every number as float32" if report.profile == "raw" else f"{ratio:.2f} times smaller than as float32"
+    click.echo(f"{path}: {report.bytes_after:,} bytes, {report.gaussians:,} Gaussians, {outcome}")
+    if report.found:
+        click.echo(report.found)
+    if report.error is not None:
+        click.echo(f"estimated loss: {report.error:.2g} mean squared error, {-10 * math.log10(report.error):.1f} dB")
+    if scores:
+        click.echo(
+            f"held-out photos: PSNR {scores['psnr_before']:.3f} to {scores['psnr']:.3f} dB, "
+            f"SSIM {scores['ssim_before']:.4f} to {scores['ssim']:.4f}"
+        )
 
 
-def _section_table(sections: list[dict], total: int, gaussians: int) -> str:
-    parts = [(f"{part['type']} {part['holds']}", f"{part['before']:,}", part["after"]) for part in sections]
-    parts.append(("header, table of contents, padding", "", total - sum(after for *_, after in parts)))
-    rows = [
-        [name, before, f"{after:,}", f"{after / total:.1%}", f"{8 * after / max(gaussians, 1):.2f}"]
-        for name, before, after in parts
-    ]
-    return table(["section", "unpacked bytes", "stored bytes", "share", "bits/Gaussian"], rows)
+def _section_table(sections: list[dict], total: int, gaussians: int, shares: dict[str, float] | None = None) -> str:
+    """Bytes of each section, and what part of the loss comes from it where that is known."""
+    parts = [(part["type"], part["holds"], f"{part['before']:,}", part["after"]) for part in sections]
+    parts.append(("", "header, table of contents, padding", "", total - sum(after for *_, after in parts)))
+    rows, header = [], ["section", "unpacked bytes", "stored bytes", "share", "bits/Gaussian", "bits/number"]
+    for type, holds, before, after in parts:
+        numbers = int(before.replace(",", "") or 0) / 4 if type not in ("META", "") else 0
+        rows.append(
+            [
+                f"{type} {holds}".strip(),
+                before,
+                f"{after:,}",
+                f"{after / total:.1%}",
+                f"{8 * after / max(gaussians, 1):.2f}",
+                f"{8 * after / numbers:.2f}" if numbers else "",
+            ]
+        )
+        if shares:
+            rows[-1].append(f"{shares[type]:.1%}" if type in shares else "")
+    return table([*header, *(["of the loss"] if shares else [])], rows)
 
 
 def _in_words(values: dict) -> str:

@@ -89,7 +89,8 @@ def finetune(
                     parameter.copy_(exact[name])
             if not torch.isfinite(loss) or optimizer.nonfinite_groups():
                 raise HyrfTrainingError(
-                    f"fine-tuning stopped at step {step + 1} on view '{view.name}': the loss or a gradient is not finite"
+                    f"fine-tuning stopped at step {step + 1} on view '{view.name}': the loss or a gradient is not "
+                    "finite; compress without --finetune"
                 )
             _add_rate(tuned, quantized, rounding, LOSS_PER_ERROR * ERROR_PER_BIT * plan.distortion)
             optimizer.step(step, steps)

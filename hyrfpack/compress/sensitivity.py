@@ -97,9 +97,7 @@ def _gathered(
     return Sensitivity(
         *explicit.values(),
         # Both numbers of a row are read together.
-        tables={
-            group: fields[group].reshape(-1, 2).mean(axis=1).repeat(2) for group in ("GTAB", "RTAB")
-        },
+        tables={group: fields[group].reshape(-1, 2).mean(axis=1).repeat(2) for group in ("GTAB", "RTAB")},
         decoders={group: np.maximum(values, LEAST * values.mean()) for group, values in decoders.items()},
     )
 

@@ -8,55 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from hyrfpack.errors import HyrfDataError
-from hyrfpack.render.camera_files import focal_length, rigid_pose, side_length
-from hyrfpack.render.paths import orbit, stored_viewpoint
-from hyrfpack.scene import Camera, evenly_spaced
+from hyrfpack.scene import Camera
 
-KEPT = 128  # cameras that a trained model keeps
-ORBIT = 48  # cameras around a model that kept none
 WIDER = 1.4  # sides of the pictures between the cameras: what lies just outside the photos is seen too
 _NEAREST = 3  # neighbours that a camera is moved towards
 _TURN = 10.0  # what a turn by a radian counts as in finding them, in median distances between neighbours
-
-
-def capture_of(cameras: Sequence[Camera]) -> list[list[float]]:
-    """Up to KEPT of the cameras, evenly spread, as JSON: [width, height, fx, fy, cx, cy, 3 x 4 camera_from_world]."""
-    return [
-        [c.width, c.height, *(float(f"{x:.9g}") for x in (*c.intrinsics, *c.camera_from_world[:3].ravel()))]
-        for c in evenly_spaced(cameras, KEPT)
-    ]
-
-
-def stored_cameras(facts: dict) -> list[Camera]:
-    """The cameras that a model keeps, or else an orbit about what it shows.
-
-    Args:
-        facts: from `hyrfpack.describe`.
-
-    Raises:
-        HyrfDataError: they make no sense.
-    """
-    capture = facts["provenance"].get("cameras")
-    if not capture:
-        return orbit(stored_viewpoint(facts), ORBIT)
-    try:
-        return [
-            Camera(
-                side_length(width),
-                side_length(height),
-                focal_length(fx),
-                focal_length(fy),
-                float(cx),
-                float(cy),
-                rigid_pose(np.reshape(pose, (3, 4))),
-            )
-            for width, height, fx, fy, cx, cy, *pose in capture
-        ]
-    except (TypeError, ValueError, ArithmeticError) as error:
-        raise HyrfDataError(
-            f"the cameras that the file keeps make no sense ({error!s:.160}); name the photos with --data"
-        ) from error
 
 
 def views_between(cameras: Sequence[Camera], seed: int = 0) -> list[Camera]:

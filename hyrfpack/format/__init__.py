@@ -10,7 +10,7 @@ from typing import Any
 
 from hyrfpack.format.info import SectionSize, describe
 
-_LAZY = ("CompressionReport", "compress", "decode_model", "encode_model", "load", "save")
+_LAZY = ("CompressionReport", "decode_model", "encode_model", "load", "repack", "save")
 
 __all__ = ["SectionSize", "describe", *_LAZY]
 

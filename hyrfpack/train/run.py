@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import signal
+import statistics
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from hyrfpack.evaluate import Evaluation, evaluate
 from hyrfpack.evaluate.figures import training_curve
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render
+from hyrfpack.render.capture import capture_of
 from hyrfpack.render.paths import viewpoint_hint
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train.config import TrainConfig
@@ -115,6 +117,8 @@ def _finish(trainer: Trainer, out: Path) -> dict:
         "seed": config.seed,
         "choices": trainer.choices,
         "viewpoint": viewpoint_hint([view.camera for view in scene.train]),
+        "cameras": capture_of([view.camera for view in scene.train]),
+        "psnr": statistics.median(record["psnr"] for record in trainer.records[-len(trainer.records) // 10 :]),
     }
     report = hyrf_format.save(model, path, profile="raw", provenance=provenance)
     metrics = {

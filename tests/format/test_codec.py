@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hyrfpack.errors import HyrfError, HyrfFormatError
-from hyrfpack.format import compress, decode_model, describe, encode_model, load, save
+from hyrfpack.format import repack, decode_model, describe, encode_model, load, save
 from hyrfpack.format.container import Section, read_container, write_container
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
@@ -250,8 +250,8 @@ def test_compress_keeps_configuration_and_provenance(tmp_path):
     model = make_model(100)
     save(model, tmp_path / "raw.hyrf", "raw", {"steps": 7})
 
-    report = compress(tmp_path / "raw.hyrf", tmp_path / "paper.hyrf", color=(3, 16))
-    compress(tmp_path / "paper.hyrf", tmp_path / "back.hyrf", "raw")
+    report = repack(tmp_path / "raw.hyrf", tmp_path / "paper.hyrf", color=(3, 16))
+    repack(tmp_path / "paper.hyrf", tmp_path / "back.hyrf", "raw")
 
     assert (tmp_path / "paper.hyrf").read_bytes() == encode_model(model, "paper", {"steps": 7}, color=(3, 16))
     assert report.profile == "paper"

@@ -21,7 +21,7 @@ from fuzz_mutate import GROUPS, KINDS, assemble, disassemble, mutant, seeds
 
 from hyrfpack.cli.files import info
 from hyrfpack.errors import HyrfError
-from hyrfpack.format import compress, encode_model
+from hyrfpack.format import repack, encode_model
 
 CORPUS = Path(__file__).parent / "corpus"
 
@@ -137,7 +137,7 @@ def test_provenance_that_grows_in_writing_is_refused_in_one_line(tmp_path):
     (tmp_path / "model.hyrf").write_bytes(assemble(parts))
 
     with pytest.raises(HyrfError, match="may take 1048576; shorten the provenance"):
-        compress(tmp_path / "model.hyrf", tmp_path / "packed.hyrf", "raw")
+        repack(tmp_path / "model.hyrf", tmp_path / "packed.hyrf", "raw")
 
     assert not (tmp_path / "packed.hyrf").exists()
 

@@ -26,6 +26,7 @@ from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.quant.points import Points, decode_points
 
 __all__ = [
+    "Quantized",
     "CODEC_POINTS",
     "Plan",
     "Sensitivity",
@@ -44,17 +45,18 @@ CODECS = {
 }
 
 
-def encode(model: HybridModel, plan: Plan) -> tuple[list[Section], dict]:
+def encode(model: HybridModel, plan: Plan, quantized: Quantized | None = None) -> tuple[list[Section], dict]:
     """Sections for a model, and what was decided, for people.
 
     Args:
         model: the model that the plan was made for.
         plan: from `make_plan`.
+        quantized: `quantize(plan.apply(model), plan)` where it is at hand.
 
     Raises:
         HyrfError: a parameter is NaN or infinite.
     """
-    coded = sections.encode(quantize(plan.apply(model), plan), plan)
+    coded = sections.encode(quantized or quantize(plan.apply(model), plan), plan)
     shapes = group_shapes(model.config, len(plan.kept))
     settings = {"distortion": plan.distortion, "gaussians_before": len(model)}
     return [Section(group, *coded[group], 4 * rows * columns) for group, (rows, columns) in shapes.items()], settings

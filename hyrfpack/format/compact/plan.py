@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -58,6 +58,10 @@ class Plan:
             arrays[group] = arrays[group][self.kept]
         arrays["POSI"] = from_lattice(self.points, model.config.frame)
         return to_model(model.config, arrays)
+
+    def of_applied(self) -> Plan:
+        """The same plan for the model that `apply` gave."""
+        return replace(self, kept=np.arange(len(self.kept)))
 
 
 def make_plan(model: HybridModel, sensitivity: Sensitivity, noise: float, prune: bool = True) -> Plan:

@@ -45,7 +45,7 @@ def quantize(model: HybridModel, plan: Plan) -> Quantized:
     """Quantise a planned model (`plan.apply`) by rate and distortion."""
     arrays = {group: values.astype(np.float64) for group, values in to_arrays(model).items()}
     sensitivity, classes, d, reach = plan.sensitivity, plan.points.classes, plan.distortion, plan.reach
-    opacity, error = _opacity_error(model, arrays["OPAC"][:, 0], sensitivity.opacities)
+    opacity, error = opacity_error(model, arrays["OPAC"][:, 0], sensitivity.opacities)
     channels = {
         "COLO": [
             quantize_channel(values, classes, sensitivity.colors, d, reach=reach)
@@ -109,7 +109,7 @@ def _joined(channels: list[np.ndarray], basis: np.ndarray) -> np.ndarray:
 
 
 @torch.no_grad()
-def _opacity_error(model: HybridModel, logits: np.ndarray, sensitivity: np.ndarray) -> tuple[np.ndarray, ErrorModel]:
+def opacity_error(model: HybridModel, logits: np.ndarray, sensitivity: np.ndarray) -> tuple[np.ndarray, ErrorModel]:
     """Opacity logits (M,) without tails that nobody sees, and the error of candidates, counted in opacity."""
     neural = model.geometry(model.cube_coords(model.gaussians.positions))[:, 0].double().cpu().numpy()
     opacities = expit(neural + logits)

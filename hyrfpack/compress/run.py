@@ -1,0 +1,216 @@
+"""Compressing a file: measure, plan, perhaps search and fine-tune, write."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrfpack.compress.finetune import finetune
+from hyrfpack.compress.search import coarsest, finest
+from hyrfpack.compress.sensitivity import measure_sensitivity
+from hyrfpack.data import PictureCache
+from hyrfpack.errors import HyrfError
+from hyrfpack.evaluate import Evaluation, evaluate
+from hyrfpack.format.arrays import to_arrays
+from hyrfpack.format.codec import (
+    DEFAULT_PROFILE,
+    CompressionReport,
+    decode_model,
+    encode_model,
+    load_with_provenance,
+    repack,
+    without_cameras,
+    write_model,
+)
+from hyrfpack.format.compact import Plan, Quantized, Sensitivity, make_plan, quantize
+from hyrfpack.format.compact.sections import opacity_error
+from hyrfpack.format.info import describe
+from hyrfpack.model import HybridModel
+from hyrfpack.render.capture import stored_cameras
+from hyrfpack.scene import Scene
+
+PSNR_DROP = 0.03  # dB that a file may cost, by estimate, unless told otherwise
+ASSUMED_PSNR = 30.0  # of a model that does not say how well it fits its photos
+FINETUNED = 5.0  # times as much noise, which fine-tuning takes back
+NOISE = (1e-8, 1e-2)  # least and largest mean squared error that files are made for
+TRIALS, FINETUNED_TRIALS = 9, 4  # of a search
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """A file that was made: its bytes and plan, the error it adds by section, and what it scores."""
+
+    data: bytes
+    plan: Plan
+    errors: dict[str, float]
+    scores: Evaluation | None
+
+
+def compress(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    profile: str = DEFAULT_PROFILE,
+    *,
+    data: Scene | None = None,
+    finetune_steps: int = 0,
+    prune: bool = True,
+    target_bytes: int | None = None,
+    max_psnr_drop: float | None = None,
+    noise: float | None = None,
+    say: Callable[[str], None] = lambda sentence: None,
+    **settings: object,
+) -> CompressionReport:
+    """Pack a `.hyrf` file into a smaller one.
+
+    Profile "compact" measures what each number does to pictures, at the cameras of `data` or those that the file
+    keeps, and spends bits where they show. By itself it aims at PSNR_DROP, the rest is for when that is not what is
+    wanted. "paper" and "raw" do what they always do, and take none of it.
+
+    Args:
+        source: a file of any profile, best "raw".
+        target: the file to write.
+        profile: "compact", "paper" or "raw".
+        data: photos of the scene.
+        finetune_steps: steps of fitting the quantised model to the photos of `data`; buys smaller files with time.
+        prune: leave out Gaussians that cost more in bytes than they give to pictures.
+        target_bytes: make the file as good as can be within so many bytes.
+        max_psnr_drop: make the file as small as can be for so many dB of mean PSNR on the held-out photos of `data`.
+        noise: mean squared error that pictures may get, by estimate; instead of a search.
+        say: told what is going on.
+        settings: of "paper", see `hyrfpack.format.paper`.
+
+    Raises:
+        HyrfError: a file cannot be read or written, the options do not go together, or what is asked for cannot be
+            had.
+    """
+    if profile != "compact":
+        if data is not None or finetune_steps or target_bytes or max_psnr_drop is not None or noise:
+            raise HyrfError(f"profile '{profile}' has no settings to fit to photos, sizes or losses; use 'compact'")
+        return repack(source, target, profile, **settings)
+    if settings:
+        raise HyrfError(f"profile 'compact' has no setting '{next(iter(settings))}'")
+    if data is None and (finetune_steps or max_psnr_drop is not None):
+        raise HyrfError("fine-tuning and limits on PSNR need photos; name their folder with --data")
+    if sum(option is not None for option in (target_bytes, max_psnr_drop, noise)) > 1:
+        raise HyrfError("a target size and a largest loss of PSNR each decide how fine the file is; give one of them")
+    if max_psnr_drop is not None and not (data.test or data.train):
+        raise HyrfError(f"{data.path}: there is no photo to measure the loss on")
+    model, provenance = load_with_provenance(source)
+    if len(model) == 0:
+        raise HyrfError(f"{source}: there is no Gaussian in it, so there is nothing to measure; use profile 'paper'")
+    cameras = [view.camera for view in data.train] if data is not None else stored_cameras(describe(source))
+    say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
+    sensitivity = measure_sensitivity(model, cameras)
+    packer = _Packer(model, without_cameras(provenance), sensitivity, data, finetune_steps, prune, say)
+    start = noise or _default_noise(provenance) * (FINETUNED if finetune_steps else 1)
+    if target_bytes is not None:
+        trial, found = packer.within_bytes(target_bytes, start)
+    elif max_psnr_drop is not None:
+        trial, found = packer.within_drop(max_psnr_drop, start)
+    else:
+        trial, found = packer.attempt(start), ""
+    report = write_model(trial.data, target)
+    total = sum(trial.errors.values()) or 1.0
+    shares = {group: error / total for group, error in trial.errors.items()}
+    return dataclasses.replace(report, shares=shares, error=sum(trial.errors.values()), found=found)
+
+
+@dataclass
+class _Packer:
+    """Makes files of one model, finer and coarser."""
+
+    model: HybridModel
+    provenance: dict
+    sensitivity: Sensitivity
+    scene: Scene | None
+    finetune_steps: int
+    prune: bool
+    say: Callable[[str], None]
+
+    def __post_init__(self) -> None:
+        self.cache = PictureCache()
+        self.before: Evaluation | None = None
+
+    def attempt(self, noise: float) -> _Trial:
+        plan = make_plan(self.model, self.sensitivity, noise, self.prune)
+        if not self.finetune_steps:
+            return self._pack(self.model, plan)
+        self.say(f"fine-tuning for {self.finetune_steps:,} steps")
+        tuned = finetune(plan.apply(self.model), plan, self.scene.train, self.finetune_steps, cache=self.cache)
+        return self._pack(tuned, dataclasses.replace(plan.of_applied(), reach=0))
+
+    def within_bytes(self, limit: int, start: float) -> tuple[_Trial, str]:
+        def attempt(noise: float) -> _Trial:
+            trial = self.attempt(noise)
+            self.say(f"noise {noise:.2g}: {len(trial.data):,} bytes")
+            return trial
+
+        answer = finest(attempt, lambda trial: len(trial.data) <= limit, start, self._trials(), NOISE)
+        if answer is None:
+            smallest = len(self.attempt(NOISE[1]).data)
+            raise HyrfError(
+                f"the model does not fit into {limit:,} bytes, the least is about {smallest:,}; "
+                "ask for more, or train with fewer Gaussians (--max-gaussians)"
+            )
+        noise, trial = answer
+        return trial, f"noise {noise:.2g} gives {len(trial.data):,} of {limit:,} bytes"
+
+    def within_drop(self, limit: float, start: float) -> tuple[_Trial, str]:
+        views = self.scene.test or self.scene.train
+        before = evaluate(self.model, views).psnr
+
+        def attempt(noise: float) -> _Trial:
+            trial = self.attempt(noise)
+            trial = dataclasses.replace(trial, scores=evaluate(decode_model(trial.data), views))
+            self.say(f"noise {noise:.2g}: {len(trial.data):,} bytes, {before - trial.scores.psnr:+.3f} dB lost")
+            return trial
+
+        answer = coarsest(attempt, lambda trial: before - trial.scores.psnr <= limit, start, self._trials(), NOISE)
+        if answer is None:
+            raise HyrfError(
+                f"even the finest file loses more than {limit:g} dB of PSNR; allow more, or use profile 'raw'"
+            )
+        noise, trial = answer
+        return trial, (
+            f"noise {noise:.2g} loses {before - trial.scores.psnr:+.3f} of {limit:g} dB on {len(views)} photos"
+        )
+
+    def _trials(self) -> int:
+        return FINETUNED_TRIALS if self.finetune_steps else TRIALS
+
+    def _pack(self, model: HybridModel, plan: Plan) -> _Trial:
+        planned = plan.apply(model)
+        quantized = quantize(planned, plan)
+        data = encode_model(model, "compact", self.provenance, plan=plan, quantized=quantized)
+        return _Trial(data, plan, added_errors(planned, quantized, plan), None)
+
+
+def added_errors(planned: HybridModel, quantized: Quantized, plan: Plan) -> dict[str, float]:
+    """What storing a planned model adds to the pictures' mean squared error, by section and by estimate."""
+    wanted, stored, s = to_arrays(planned), quantized.arrays(plan), plan.sensitivity
+    weights = {
+        "COLO": s.colors[:, None],
+        "SCAL": s.scales[:, None],
+        **{group: values[:, None] for group, values in {**s.tables, **s.decoders}.items()},
+    }
+    # A point is anywhere in its cell.
+    _, opacity = opacity_error(planned, wanted["OPAC"][:, 0].astype(np.float64), s.opacities)
+    errors = {"OPAC": float(opacity(slice(None), stored["OPAC"][:, 0]).sum())}
+    errors["POSI"] = float((s.positions * 3 / 12 * 4.0 ** -plan.points.bits[plan.points.classes]).sum())
+    for group, weight in weights.items():
+        difference = stored[group].reshape(len(weight), -1) - wanted[group].reshape(len(weight), -1)
+        errors[group] = float((weight * difference.astype(np.float64) ** 2).sum())
+    return errors
+
+
+def _default_noise(provenance: dict) -> float:
+    """The mean squared error that costs PSNR_DROP: errors of photos and of quantising add up."""
+    psnr = provenance.get("psnr")
+    if not isinstance(psnr, int | float) or not 0 < psnr < 100:
+        psnr = ASSUMED_PSNR
+    return math.exp(-psnr / 10 * math.log(10)) * (10 ** (PSNR_DROP / 10) - 1)

@@ -1,0 +1,61 @@
+"""Finding how coarse a file may be: a monotone search for one number."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+Trial = TypeVar("Trial")
+FACTOR = 4.0  # that the noise is changed by until the answer is between two trials
+
+
+def coarsest(
+    attempt: Callable[[float], Trial],
+    fits: Callable[[Trial], bool],
+    start: float,
+    trials: int,
+    ends: tuple[float, float],
+) -> tuple[float, Trial] | None:
+    """The largest noise whose trial fits, as far as a number of trials tells.
+
+    Args:
+        attempt: noise -> trial; finer noise fits whenever coarser does.
+        fits: whether a trial is fine enough.
+        start: noise to begin with.
+        trials: how many may be made, at least 2.
+        ends: least and largest noise.
+
+    Returns:
+        The noise and its trial, None when not even the least noise fits.
+    """
+    low = high = None  # the coarsest that fits and the finest that does not
+    noise, best = min(max(start, ends[0]), ends[1]), None
+    for _ in range(trials):
+        trial = attempt(noise)
+        if fits(trial):
+            low, best = noise, (noise, trial)
+        else:
+            high = noise
+        if low == ends[1] or high == ends[0]:
+            break
+        if high is None:
+            noise = min(low * FACTOR, ends[1])
+        elif low is None:
+            noise = max(high / FACTOR, ends[0])
+        else:
+            noise = (low * high) ** 0.5
+    if best is None and high != ends[0] and fits(trial := attempt(ends[0])):
+        best = ends[0], trial
+    return best
+
+
+def finest(
+    attempt: Callable[[float], Trial],
+    fits: Callable[[Trial], bool],
+    start: float,
+    trials: int,
+    ends: tuple[float, float],
+) -> tuple[float, Trial] | None:
+    """The least noise whose trial fits, where coarser noise fits whenever finer does; arguments as `coarsest`."""
+    mirrored = coarsest(lambda inverse: attempt(1 / inverse), fits, 1 / start, trials, (1 / ends[1], 1 / ends[0]))
+    return None if mirrored is None else (1 / mirrored[0], mirrored[1])

@@ -1,0 +1,54 @@
+"""The cameras of a capture, kept with a trained model: what it will be looked at from, about."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.render.camera_files import focal_length, rigid_pose, side_length
+from hyrfpack.render.paths import orbit, stored_viewpoint
+from hyrfpack.scene import Camera, evenly_spaced
+
+KEPT = 128  # cameras that a trained model keeps
+ORBIT = 48  # cameras around a model that kept none
+
+
+def capture_of(cameras: Sequence[Camera]) -> list[list[float]]:
+    """Up to KEPT of the cameras, evenly spread, as JSON: [width, height, fx, fy, cx, cy, 3 x 4 camera_from_world]."""
+    return [
+        [c.width, c.height, *(float(f"{x:.9g}") for x in (*c.intrinsics, *c.camera_from_world[:3].ravel()))]
+        for c in evenly_spaced(cameras, KEPT)
+    ]
+
+
+def stored_cameras(facts: dict) -> list[Camera]:
+    """The cameras that a model keeps, or else an orbit about what it shows.
+
+    Args:
+        facts: from `hyrfpack.describe`.
+
+    Raises:
+        HyrfDataError: they make no sense.
+    """
+    capture = facts["provenance"].get("cameras")
+    if not capture:
+        return orbit(stored_viewpoint(facts), ORBIT)
+    try:
+        return [
+            Camera(
+                side_length(width),
+                side_length(height),
+                focal_length(fx),
+                focal_length(fy),
+                float(cx),
+                float(cy),
+                rigid_pose(np.reshape(pose, (3, 4))),
+            )
+            for width, height, fx, fy, cx, cy, *pose in capture
+        ]
+    except (TypeError, ValueError, ArithmeticError) as error:
+        raise HyrfDataError(
+            f"the cameras that the file keeps make no sense ({error!s:.160}); name the photos with --data"
+        ) from error
