@@ -1,4 +1,5 @@
-"""Shared fixtures: photos. Tests may also import what lies beside this: `scenes`, tiny made-up worlds; `commands`."""
+"""Shared fixtures: photos. Tests may also import what lies beside this (`scenes`, tiny made-up worlds; `commands`), and
+`plans` of tools, which writes files of any profile."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-sys.path.append(str(Path(__file__).parent))
+sys.path += [str(Path(__file__).parent), str(Path(__file__).parents[1] / "tools")]
 
 # OpenMP's threads spin while they wait and take the cores from the kernels' own: tiny pictures train 3 times slower on
 # a quiet machine and 20 times on a busy one. Read once, when torch is loaded.

@@ -21,6 +21,7 @@ import contextlib
 import io
 import itertools
 import multiprocessing
+import os
 import re
 import resource
 import signal
@@ -218,7 +219,7 @@ def pattern(sentence: str) -> str:
     sentence = re.sub(r"^rule .* and this", "rule '...' and this", sentence)
     sentence = re.sub(r"(?<!\w)b?'.*('(?!\w)|$)|\"[^\"]*\"", "'...'", sentence)
     sentence = re.sub(r"0x[\da-f]+|-?\d[\d,.e+-]*", "#", sentence)
-    return re.sub(r"<\w{4}>", "<....>", sentence).split(";")[0][:110]
+    return re.sub(r"<[\w#]{4}>", "<....>", sentence).split(";")[0][:110]
 
 
 # --- many ---
@@ -231,6 +232,7 @@ def work(pipe: Connection, current: multiprocessing.Value, seed: int) -> None:
         raise TooLong
 
     torch.set_num_threads(1)
+    os.environ["HYRFPACK_THREADS"] = "1"  # what is refused first, and how much memory it takes, is no matter of luck
     signal.signal(signal.SIGPROF, stop)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     warnings.simplefilter("error")

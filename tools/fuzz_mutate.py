@@ -16,13 +16,16 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from random import Random
+from unittest.mock import patch
 
 import numpy as np
 import torch
+from plans import encode
 
-from hyrfpack.format import encode_model
+from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import group_shapes, parse_config, to_arrays
 from hyrfpack.format.codec import PROFILES
+from hyrfpack.format.compact import plan as planning
 from hyrfpack.format.container import read_container
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
@@ -54,6 +57,7 @@ class Part:
 
 def assemble(parts: list[Part]) -> bytes:
     """A file of these sections with all places, lengths and checksums right, whatever the sections say."""
+    minor = int(any(5 <= part.codec <= 8 for part in parts))
     offset = 48 + 40 * len(parts)
     toc, payloads = [], []
     for part in parts:
@@ -64,7 +68,7 @@ def assemble(parts: list[Part]) -> bytes:
         offset += stored + -stored % 8
     table = b"".join(toc)
     header = struct.pack(
-        "<8sHHIQQIII", b"\x89HYRF\r\n\n", 1, 0, 0, offset, 48, len(table), len(parts), zlib.crc32(table)
+        "<8sHHIQQIII", b"\x89HYRF\r\n\n", 1, minor, 0, offset, 48, len(table), len(parts), zlib.crc32(table)
     )
     return b"".join((header, struct.pack("<I", zlib.crc32(header)), table, *payloads))
 
@@ -108,7 +112,7 @@ def _model(count: int, hidden: int = 3, background: bool = True, **config: objec
 
 
 def _codec(values: np.ndarray, codec: int, rng: Random) -> bytes:
-    """A matrix in any of the four codecs."""
+    """A matrix in any of the codecs that need no other section."""
     if codec in (1, 2):
         return values.astype(f"<f{4 // codec}").tobytes()
     if codec == 3:
@@ -131,23 +135,39 @@ def _codec(values: np.ndarray, codec: int, rng: Random) -> bytes:
 def seeds() -> tuple[tuple[bytes, ...], tuple[float, ...]]:
     """Valid files, and how often each is taken: the small ones, which decode faster, more often.
 
-    Each profile with 0, 1, 20 and 200 Gaussians, with and without background; the golden files; and groups in codecs
-    that no profile gives them.
+    Each profile with 0, 1, 20 and 200 Gaussians, with and without background; the golden files; Gaussians in layers;
+    and groups in codecs that no profile gives them.
     """
     rng = Random(0)
     models = [_model(0), _model(1, background=False), _model(20, direction_encoding="sh"), _model(200, hidden=2)]
-    files = [(encode_model(model, profile), 1 if len(model) == 200 else 10) for model in models for profile in PROFILES]
+    files = [(encode(model, profile), 1 if len(model) == 200 else 10) for profile in PROFILES for model in models]
     files += [(file.read_bytes(), 10) for file in sorted(GOLDEN.glob("*.hyrf"))]
     files.append((encode_model(models[2], "paper", color=(3, 8), scale=(2, 4), opacity=(1, 16)), 10))
+    files.append((encode(models[3], "compact", noise=1e-9, prune=False), 2))
+    files.append((encode(_alike(models[3]), "compact", prune=False), 10))
+    with patch.object(planning, "LEAST_OF_LAYER", (2, 100)):
+        files += [(encode(model, "compact", prune=False), 10) for model in (models[2], _model(40))]
     mixed = [models[1], _model(5), _model(6), models[2], models[3], _model(2500)]
     for model in mixed:
-        arrays = to_arrays(model)
-        parts = disassemble(encode_model(model, "raw"))
-        for part in parts[1:]:
-            part.codec = rng.choice((2, 3, 3, 4, 4))
-            part.data = _codec(arrays[part.type.decode()], part.codec, rng)
-        files.append((assemble(parts), {200: 0.5, 2500: 0.1}.get(len(model), 10)))
+        weight = {200: 0.5, 2500: 0.1}.get(len(model), 10)
+        for profile, exchanged in (("raw", 1.0), ("compact", 0.4)):
+            data = encode(model, profile)
+            arrays, parts = to_arrays(decode_model(data)), disassemble(data)
+            for part in parts[1:]:
+                # Other sections need the lattice of codec 6.
+                if rng.random() < exchanged and (profile == "raw" or part.type != b"POSI"):
+                    part.codec = rng.choice((2, 3, 3, 4, 4))
+                    part.data = _codec(arrays[part.type.decode()], part.codec, rng)
+            files.append((assemble(parts), weight))
     return tuple(zip(*files, strict=True))
+
+
+def _alike(model: HybridModel) -> HybridModel:
+    """Gaussians that are all the same: their streams have one symbol, which takes no bytes however many there are."""
+    with torch.no_grad():
+        for parameter in model.gaussians.parameters():
+            parameter.copy_(parameter[:1].expand_as(parameter))
+    return model
 
 
 def _seed(rng: Random) -> bytes:
@@ -249,13 +269,15 @@ def _forge_sections(rng: Random) -> bytes:
             borrowed = rng.choice(_pick(rng))
             parts[one].data, parts[one].codec = borrowed.data, borrowed.codec
         elif kind == 5:
-            parts[one].codec = rng.choice((0, 1, 2, 3, 4, 5, 65535))
+            parts[one].codec = rng.choice((*range(10), 65535))
         elif kind == 6:
             parts[one].raw_length = rng.choice((*EXTREMES, parts[one].raw_length + 4))
         elif kind == 7:
             parts[one].flags = rng.choice((0, 1, 2, 65535))
         else:
-            parts[one].type = rng.choice((b"NEW_", b"posi", b"\0\0\0\0", b"\xff\n\x1b ", b"META", b"POSI"))
+            parts[one].type = rng.choice(
+                (b"NEW_", b"posi", b"\0\0\0\0", b"\xff\n\x1b ", b"META", b"POSI", b"POS1", b"COL3")
+            )
     return assemble(parts)
 
 
@@ -264,7 +286,7 @@ def _forge_payload(rng: Random) -> bytes:
     parts = [replace(part) for part in _pick(rng)]
     part = rng.choice(parts)
     part.data = edit_bytes(part.data, rng)
-    if part.type == b"META":
+    if part.type == b"META" and part.codec == 0:
         part.raw_length = len(part.data)
     return assemble(parts)
 
@@ -272,7 +294,7 @@ def _forge_payload(rng: Random) -> bytes:
 def _forge_metadata(rng: Random) -> bytes:
     """Metadata with other values, keys, nesting or text; often with the raw lengths that it then asks for."""
     parts = [replace(part) for part in _pick(rng)]
-    values = json.loads(parts[0].data)
+    values = json.loads(zlib.decompress(parts[0].data) if parts[0].codec == 5 else parts[0].data)
     for _ in range(rng.choice((1, 1, 2))):
         kind = rng.randrange(8)
         everywhere = places(values)
@@ -282,6 +304,9 @@ def _forge_metadata(rng: Random) -> bytes:
             node[key] = rng.choice((rng.randint(*RANGES[key]), rng.choice(EXTREMES)))
         elif kind == 3:
             values["gaussians"] = rng.choice((rng.randrange(3000), rng.choice(EXTREMES), 8_000_000))
+            if rng.random() < 0.3:
+                first = rng.randint(0, min(values["gaussians"], 50))
+                values["layers"] = rng.choice(([first, values["gaussians"] - first], [values["gaussians"]], [0] * 9))
         else:
             node, key = rng.choice(everywhere)
             if kind == 4 and isinstance(node, dict):
@@ -297,6 +322,10 @@ def _forge_metadata(rng: Random) -> bytes:
     elif rng.random() < 0.1:
         text = edit_bytes(text, rng)
     parts[0].data, parts[0].raw_length = text, len(text)
+    if rng.random() < 0.3:
+        _deflate(parts[0], rng)
+    else:
+        parts[0].codec = 0
     if rng.random() < 0.6:
         try:
             shapes = group_shapes(parse_config(values["config"]), int(values["gaussians"]))
@@ -306,6 +335,21 @@ def _forge_metadata(rng: Random) -> bytes:
         except Exception:  # the metadata is no longer sane, and need not be
             pass
     return assemble(parts)
+
+
+def _deflate(part: Part, rng: Random) -> None:
+    """The metadata as codec 5 has it; now and then not quite."""
+    part.codec, text = 5, part.data
+    kind = rng.randrange(12)
+    part.data = zlib.compress(text + b" " * (50_000_000 if kind == 0 and rng.random() < 0.1 else 0), rng.choice((0, 9)))
+    if kind == 1:
+        part.raw_length += rng.choice((-1, 1, 1 << 19, 1 << 20, 1 << 28))
+    elif kind == 2:
+        part.data = part.data[: -rng.randint(1, 8)]
+    elif kind == 3:
+        part.data += rng.randbytes(rng.randint(1, 8))
+    elif kind == 4:
+        part.data = edit_bytes(part.data, rng)
 
 
 def places(node: dict | list) -> list[tuple[dict | list, str | int]]:
@@ -321,7 +365,7 @@ def places(node: dict | list) -> list[tuple[dict | list, str | int]]:
 def _forge_fields(rng: Random) -> bytes:
     """One field of a codec forged, and the lengths around it repaired."""
     parts = [replace(part) for part in _pick(rng)]
-    coded = [part for part in parts[1:] if part.codec in (3, 4)] or parts[1:]
+    coded = [part for part in parts[1:] if part.codec in (3, 4, 6, 7, 8)] or parts[1:]
     part = rng.choice(coded)
     fields = _fields(part)
     for _ in range(rng.choice((1, 1, 2))):
@@ -349,7 +393,16 @@ def _forge_fields(rng: Random) -> bytes:
 
 
 def _fields(part: Part) -> dict[str, bytes | tuple[int, int]]:
-    """The payload of a valid section by field, in order: (number, bytes it takes), or bytes."""
+    """The payload of a valid section by field, in order: (number, bytes it takes), or bytes.
+
+    A field "size of NAME" holds the bytes of all fields whose names start with NAME.
+    """
+    if part.codec == 6:
+        return _points_fields(part.data)
+    if part.codec == 7:
+        return _channels_fields(part.data, 3 if part.type[:3] == b"COL" else 1)
+    if part.codec == 8:
+        return _groups_fields(part.data)
     if part.codec == 4:
         names = {"minimum": part.data[:4], "maximum": part.data[4:8], "bits": (part.data[8], 1)}
         return names | _stream_fields(part.data[9:], "")
@@ -364,6 +417,46 @@ def _fields(part: Part) -> dict[str, bytes | tuple[int, int]]:
         fields |= _stream_fields(part.data[end + 8 : end + 8 + length], f" {stage}")
         end += 8 + length
     return fields
+
+
+def _points_fields(data: bytes) -> dict[str, bytes | tuple[int, int]]:
+    base, kinds, *sizes = struct.unpack_from("<BBII", data)
+    fields = {"base": (base, 1), "size of bits": (kinds, 1), "size of gaps": (sizes[0], 4)}
+    fields |= {"size of classes": (sizes[1], 4), "bits": data[10 : 10 + kinds]}
+    start = 10 + kinds
+    for name, size in zip(("gaps", "classes"), sizes, strict=True):
+        fields |= _integers_fields(data[start : start + size], name)
+        start += size
+    return fields | {"tails": data[start:]}
+
+
+def _channels_fields(data: bytes, columns: int) -> dict[str, bytes | tuple[int, int]]:
+    fields = {"basis": data[:36]} if columns == 3 else {}
+    start = len(fields) * 36
+    for column in range(columns):
+        _, weight, size, kinds = struct.unpack_from("<fBIB", data, start)
+        fields |= {f"mean {column}": data[start : start + 4], f"weight {column}": (weight, 1)}
+        fields |= {f"size of stream {column}": (size, 4), f"size of steps {column}": (kinds, 1)}
+        start += 10 + kinds
+        fields[f"steps {column}"] = data[start - kinds : start]
+        fields |= _integers_fields(data[start : start + size], f"stream {column}")
+        start += size
+    return fields
+
+
+def _groups_fields(data: bytes) -> dict[str, bytes | tuple[int, int]]:
+    first, second = struct.unpack_from("<II", data)
+    fields = {"size of steps": (first, 4), "size of models": (second, 4)}
+    fields |= _integers_fields(data[8 : 8 + first], "steps")
+    fields |= _integers_fields(data[8 + first : 8 + first + second], "models")
+    return fields | _integers_fields(data[8 + first + second :], "symbols")
+
+
+def _integers_fields(data: bytes, name: str) -> dict[str, bytes | tuple[int, int]]:
+    """A stream of integers: its first two numbers, and what they decide about."""
+    if len(data) < 2:
+        return {f"{name} rest": data}
+    return {f"{name} lanes": (data[0], 1), f"{name} alphabet": (data[1], 1), f"{name} rest": data[2:]}
 
 
 def _stream_fields(data: bytes, suffix: str) -> dict[str, bytes | tuple[int, int]]:
@@ -386,11 +479,14 @@ def _repair(fields: dict) -> None:
             fields["packed" + name[5:]] = (len(value), 8)
         elif name.startswith("lengths"):
             fields["leaves" + name[7:]] = (len(value), 4)
-    for name in fields:
+    sizes = {name: value[1] if isinstance(value, tuple) else len(value) for name, value in fields.items()}
+    for name, value in fields.items():
         if name.startswith("length "):
-            stream = [value for other, value in fields.items() if other.split(" ")[1:] == name.split(" ")[1:]]
-            sizes = [value[1] if isinstance(value, tuple) else len(value) for value in stream]
-            fields[name] = (sum(sizes) - 8, 8)
+            stream = [other for other in fields if other.split(" ")[1:] == name.split(" ")[1:]]
+            fields[name] = (sum(sizes[other] for other in stream) - 8, 8)
+        elif name.startswith("size of "):
+            total = sum(size for other, size in sizes.items() if f"{other} ".startswith(f"{name[8:]} "))
+            fields[name] = (total % 256 ** value[1], value[1])
 
 
 def _pick(rng: Random) -> tuple[Part, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from time import perf_counter
 
 import numpy as np
 import torch
@@ -14,10 +15,12 @@ from torch import Tensor
 from hyrfpack.bench.rows import Error, Row, difference, in_words
 from hyrfpack.bench.subject import Subject
 from hyrfpack.bench.timing import take_turns
+from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import DEFAULT_PROFILE, PROFILES
+from hyrfpack.format.compact import make_plan
 from hyrfpack.format.container import read_container
 from hyrfpack.format.info import SECTIONS
 from hyrfpack.format.metadata import read_metadata
@@ -25,12 +28,14 @@ from hyrfpack.model import HybridModel
 from hyrfpack.render import render
 
 # What is tried of each setting of a profile, one at a time; the profile's default joins them. A `seed` is no setting.
+# Of `noise` these are multiples of the default, which the model's own quality decides.
 KNOBS: dict[str, dict[str, tuple]] = {
     "paper": {
         "color": ((1, 64), (1, 256), (2, 64), (2, 128), (2, 256), (3, 128), (4, 256)),
         "scale": ((1, 16), (1, 32), (1, 64), (1, 128), (1, 256), (2, 64), (2, 256)),
         "opacity": ((1, 8), (1, 16), (1, 32), (1, 64), (1, 256), (2, 64)),
     },
+    "compact": {"noise": (0.1, 0.3, 3.0, 10.0), "prune": (False, True)},
 }
 REFERENCE = "raw"
 PER_GAUSSIAN = ("POSI", "COLO", "SCAL", "OPAC")
@@ -61,7 +66,7 @@ def codec_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> I
     cases = []
     for profile in PROFILES:
         try:
-            cases += _cases(subject.model, profile)
+            cases += _cases(subject, profile, note)
         except HyrfError as error:
             note(f"profile '{profile}' is left out: {error}")
     names = {f"{case.setting} {case.value}": case for case in cases}
@@ -118,25 +123,51 @@ def _order(old: dict[str, np.ndarray], new: dict[str, np.ndarray]) -> np.ndarray
     return cKDTree(rows[1] / size).query(rows[0] / size)[1]
 
 
-def _cases(model: HybridModel, profile: str) -> Iterator[Case]:
+def _cases(subject: Subject, profile: str, note: Callable[[str], None]) -> Iterator[Case]:
     """The profile itself, then each of its knobs' values."""
-    written = read_container(encode_model(model, profile), SECTIONS)
-    defaults = read_metadata(written).settings
-    itself = Case("profile", profile, profile == DEFAULT_PROFILE, partial(encode_model, model, profile))
+    encode, defaults = _compact(subject, note) if profile == "compact" else _plain(subject.model, profile)
+    itself = Case("profile", profile, profile == DEFAULT_PROFILE, encode)
     yield itself
     for knob, values in KNOBS.get(profile, {}).items():
-        default = _plain(defaults[knob])
+        default = defaults[knob]
+        if knob == "noise":
+            values = [default * factor for factor in values]
         for value in sorted({*values, default}):
             if value == default:
-                yield replace(itself, setting=f"{profile}, {knob}", value=in_words(value), is_default=True)
+                yield replace(itself, setting=f"{profile}, {knob}", value=_in_words(value), is_default=True)
             else:
-                encode = partial(encode_model, model, profile, **{knob: value})
-                yield Case(f"{profile}, {knob}", in_words(value), False, encode)
+                yield Case(f"{profile}, {knob}", _in_words(value), False, partial(encode, **{knob: value}))
 
 
-def _plain(value: object) -> object:
-    """A setting as it came through JSON, as the profile takes it."""
-    return tuple(value) if isinstance(value, list) else value
+def _plain(model: HybridModel, profile: str) -> tuple[Callable[..., bytes], dict]:
+    """What writes the model with settings of a profile, and their defaults."""
+    encode = partial(encode_model, model, profile)
+    defaults = read_metadata(read_container(encode(), SECTIONS)).settings
+    # They came through JSON, which has no tuples.
+    return encode, {name: tuple(value) if isinstance(value, list) else value for name, value in defaults.items()}
+
+
+def _compact(subject: Subject, note: Callable[[str], None]) -> tuple[Callable[..., bytes], dict]:
+    """The same of profile "compact". What each number does to pictures is measured here, once for all settings."""
+    start = perf_counter()
+    with torch.enable_grad():
+        sensitivity = measure_sensitivity(subject.model, subject.capture)
+    note(
+        f"before profile 'compact' encodes, measuring what each number does to pictures took "
+        f"{perf_counter() - start:.1f} s; that is the same for all its settings and in none of the times"
+    )
+
+    def encode(noise: float = subject.noise, prune: bool = True) -> bytes:
+        plan = make_plan(subject.model, sensitivity, noise, prune)
+        return encode_model(subject.model, "compact", plan=plan)
+
+    return encode, {"noise": subject.noise, "prune": True}
+
+
+def _in_words(value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.2g}" if isinstance(value, float) else in_words(value)
 
 
 def _pictures(subject: Subject, model: HybridModel) -> list[Tensor]:

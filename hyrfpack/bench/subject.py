@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 
@@ -14,12 +14,14 @@ import torch
 from torch import Tensor
 
 from hyrfpack.bench.rows import difference
+from hyrfpack.compress.run import default_noise
 from hyrfpack.data import load_scene
 from hyrfpack.data.demo_scene import write_demo_scene
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.format import describe, load
 from hyrfpack.model import HybridModel
+from hyrfpack.render.capture import stored_cameras
 from hyrfpack.render.paths import orbit, stored_viewpoint
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 from hyrfpack.train import TrainConfig, train
@@ -38,6 +40,8 @@ class Subject:
         model: what is measured; every loss is against it as it is here.
         cameras: viewpoints.
         photos: for each viewpoint (H, W, 3) in [0, 1] and a mask (H, W) or None; None when there are no photos.
+        capture: cameras that compression measures the model at: those of the photos it was trained on.
+        noise: mean squared error in pictures that compression aims at by itself.
     """
 
     name: str
@@ -45,6 +49,8 @@ class Subject:
     model: HybridModel
     cameras: list[Camera]
     photos: list[tuple[Tensor, Tensor | None]] | None
+    capture: list[Camera]
+    noise: float
 
     def scores(self, pictures: Sequence[Tensor], exact: Sequence[Tensor]) -> tuple[float, float]:
         """PSNR and SSIM, means over views, against the photos, or against the `exact` pictures without photos."""
@@ -102,7 +108,10 @@ def read_subject(path: str | os.PathLike[str], scene: Scene | None) -> Subject:
     else:
         views, photos = _photos(scene, model)
         cameras = [view.camera for view in views]
-    return Subject(os.fspath(path), facts["profile"], model, cameras, photos)
+    capture = stored_cameras(facts) if scene is None else [view.camera for view in scene.train]
+    return Subject(
+        os.fspath(path), facts["profile"], model, cameras, photos, capture, default_noise(facts["provenance"])
+    )
 
 
 def built_in_subject(report: Callable[[str], None]) -> Subject:
@@ -118,7 +127,7 @@ def built_in_subject(report: Callable[[str], None]) -> Subject:
         if trained.model is None:  # Ctrl-C: training took it for a request to stop
             raise KeyboardInterrupt
         subject = read_subject(trained.model, scene)
-    return Subject("built-in", subject.profile, subject.model, subject.cameras, subject.photos)
+    return replace(subject, name="built-in")
 
 
 def _photos(scene: Scene, model: HybridModel) -> tuple[list[View], list[tuple[Tensor, Tensor | None]]]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import os
 import re
+import shlex
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -114,25 +116,36 @@ def compress(
     if report is not None:
         from hyrfpack.compress.report import write_report
 
-        write_report(report, model, output, result, scene)
+        command = shlex.join(["hyrfpack", *sys.argv[1:]])
+        write_report(report, model, output, result, scene, command=command, say=note)
     _print_report(output, result, scores, as_json)
 
 
 @click.command(short_help="Unpack a file to exact float32.")
 @click.argument("file", type=PATH)
 @click.option("-o", "--output", type=PATH, required=True, metavar="FILE", help="The .hyrf file to write.")
+@click.option(
+    "--fraction",
+    type=click.FloatRange(0, 1),
+    metavar="F",
+    help="Use only so much of the file, from its start, such as 0.6: a coarser model.",
+)
 @json_option
-def decompress(file: Path, output: Path, as_json: bool) -> None:
+def decompress(file: Path, output: Path, fraction: float | None, as_json: bool) -> None:
     """Unpack FILE into a .hyrf file of profile raw: the numbers that FILE decodes to, bit for bit.
 
+    A large file of profile compact comes in layers, the most important Gaussians first, so that its start is a model,
+    too. With --fraction the rest of the file may be missing.
+
     \b
-    Example:
+    Examples:
       hyrfpack decompress bonsai.hyrf -o back.hyrf
+      hyrfpack decompress bonsai.hyrf -o coarse.hyrf --fraction 0.6
     """
     _refuse_same(file, output)
     from hyrfpack.format import repack
 
-    _print_report(output, repack(file, output), {}, as_json)
+    _print_report(output, repack(file, output, fraction=fraction), {}, as_json)
 
 
 @click.command(short_help="Show what a file holds.")
@@ -215,8 +228,16 @@ def _print_report(path: Path, report: CompressionReport, scores: dict[str, float
 
 
 def _section_table(sections: list[dict], total: int, gaussians: int, shares: dict[str, float] | None = None) -> str:
-    """Bytes of each section, and what part of the loss comes from it where that is known."""
-    parts = [(part["type"], part["holds"], f"{part['before']:,}", part["after"]) for part in sections]
+    """Bytes of each section, all layers together, and what part of the loss comes from it where that is known."""
+    from hyrfpack.format.info import SECTIONS, SECTIONS_OF_LAYERS
+
+    together: dict[str, list] = {}
+    for part in sections:
+        type = SECTIONS_OF_LAYERS.get(part["type"], (part["type"], 0))[0]
+        sizes = together.setdefault(type, [SECTIONS.get(type, part["holds"]), 0, 0])
+        sizes[1] += part["before"]
+        sizes[2] += part["after"]
+    parts = [(type, holds, f"{before:,}", after) for type, (holds, before, after) in together.items()]
     parts.append(("", "header, table of contents, padding", "", total - sum(after for *_, after in parts)))
     rows, header = [], ["section", "unpacked bytes", "stored bytes", "share", "bits/Gaussian", "bits/number"]
     for type, holds, before, after in parts:

@@ -24,6 +24,9 @@ DEFAULT_ORBIT = 60  # frames
 @click.option("--orbit", type=click.IntRange(1, 100_000), metavar="N", help="Render N frames around the scene.")
 @click.option("--depth", is_flag=True, help="Also write depth in world units (float32 TIFF).")
 @click.option("--video", is_flag=True, help="Also put the frames together as OUT/video.mp4 (needs ffmpeg).")
+@click.option(
+    "--allow-partial", is_flag=True, help="Take a file that is cut short: a coarser model, if enough is there."
+)
 @json_option
 def render(
     model: Path,
@@ -37,6 +40,7 @@ def render(
     orbit: int | None,
     depth: bool,
     video: bool,
+    allow_partial: bool,
     as_json: bool,
 ) -> None:
     """Render MODEL, a .hyrf file, to PNG pictures: the views of photos, cameras of a file, or an orbit of 60 frames.
@@ -59,18 +63,19 @@ def render(
     from hyrfpack.render.paths import stored_viewpoint
     from hyrfpack.render.video import has_ffmpeg, write_video
 
+    part = 1.0 if allow_partial else None
     if data is not None:
         views = split_views(read_scene(data, test_every, images, layout), split)
         named = [(view.name, view.camera) for view in views]
     elif cameras is not None:
         named = cameras_from_json(cameras)
     else:
-        path = orbit_around(stored_viewpoint(describe(model)), orbit or DEFAULT_ORBIT)
+        path = orbit_around(stored_viewpoint(describe(model, part)), orbit or DEFAULT_ORBIT)
         named = [(f"{number:04d}", camera) for number, camera in enumerate(path)]
 
     written = []
     with click.progressbar(
-        render_files(load(model), named, output, depth=depth),
+        render_files(load(model, fraction=part), named, output, depth=depth),
         len(named),
         "rendering",
         file=sys.stderr,
@@ -95,6 +100,9 @@ def render(
 @scene_options
 @click.option("--lpips-weights", type=PATH, metavar="FILE", help="Weights of the lpips package, to score LPIPS too.")
 @click.option("--pictures", type=PATH, metavar="DIR", help="Write photo | render | error pictures here.")
+@click.option(
+    "--allow-partial", is_flag=True, help="Take a file that is cut short: a coarser model, if enough is there."
+)
 @json_option
 def evaluate(
     model: Path,
@@ -105,6 +113,7 @@ def evaluate(
     layout: str | None,
     lpips_weights: Path | None,
     pictures: Path | None,
+    allow_partial: bool,
     as_json: bool,
 ) -> None:
     """Score MODEL, a .hyrf file, against photos it has not seen: PSNR, SSIM, LPIPS, bytes on disk, seconds a frame.
@@ -120,7 +129,7 @@ def evaluate(
     from hyrfpack.evaluate import evaluate as score
     from hyrfpack.format import load
 
-    loaded = load(model)
+    loaded = load(model, fraction=1.0 if allow_partial else None)
     views = split_views(read_scene(data, test_every, images, layout), split)
     scores = score(loaded, views, lpips_weights=lpips_weights, pictures=pictures)
     size = os.path.getsize(model)

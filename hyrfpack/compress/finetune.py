@@ -26,12 +26,12 @@ from hyrfpack.train.optimizer import Optimizer
 
 RATES = LearningRates(
     positions=(1e-9, 1e-9),  # they stay where they are
-    fields=(1e-3, 1e-4),
-    color_logits=(3e-3, 3e-4),
-    scale_logits=(4e-3, 4e-4),
-    opacity_logits=(1e-2, 1e-3),
+    fields=(2e-3, 2e-4),
+    color_logits=(6e-3, 6e-4),
+    scale_logits=(8e-3, 8e-4),
+    opacity_logits=(2e-2, 2e-3),
 )
-LOSS_PER_ERROR = 20.0  # what the photometric loss rises by for a small mean squared error added to the picture
+LOSS_PER_ERROR = 40.0  # what the photometric loss rises by for a small mean squared error added to the picture
 
 
 def finetune(
@@ -73,10 +73,11 @@ def finetune(
     tuned = deepcopy(model)
     tuned.gaussians.positions.requires_grad_(False)
     optimizer = Optimizer(tuned, RATES)
+    quantized: Quantized | None = None
     keep_freed_memory()
     with closing((cache or PictureCache()).stream(_order(views, steps, seed))) as pictures, torch_on_one_thread():
         for step, (view, picture) in enumerate(pictures):
-            quantized = quantize(tuned, rounding)
+            quantized = quantize(tuned, rounding, quantized)
             exact = {name: parameter.detach().clone() for name, parameter in tuned.named_parameters()}
             _load(tuned, quantized.arrays(rounding))
             solid = None if tuned.config.background else np.array(tuned.config.solid, np.float32)
@@ -125,11 +126,14 @@ def _add_rate(model: HybridModel, quantized: Quantized, plan: Plan, price: float
     """Add the gradient of price * bits to the parameters' gradients."""
     parameters = dict(model.named_parameters())
     slopes = {}
-    classes = plan.points.classes
-    for group, channels in quantized.channels.items():
-        columns = [_slope(c.residuals, classes, len(c.codes), c.codes) for c in channels]
-        values = np.stack(columns, axis=1)
-        slopes[group] = values @ plan.basis.T.astype(np.float64) if len(columns) == 3 else values
+    for group in quantized.channels[0]:
+        values = np.concatenate(
+            [
+                np.stack([_slope(c.residuals, layer.points.classes, len(c.codes), c.codes) for c in channels[group]], 1)
+                for layer, channels in zip(plan.layers, quantized.channels, strict=True)
+            ]
+        )
+        slopes[group] = values @ plan.basis.T.astype(np.float64) if group == "COLO" else values
     for group, chosen in quantized.groups.items():
         groups = plan.groups[group]
         slopes[group] = _slope(chosen.symbols, groups.index, groups.count, chosen.codes)

@@ -36,7 +36,7 @@ from hyrfpack.scene import Scene
 
 PSNR_DROP = 0.03  # dB that a file may cost, by estimate, unless told otherwise
 ASSUMED_PSNR = 30.0  # of a model that does not say how well it fits its photos
-FINETUNED = 5.0  # times as much noise, which fine-tuning takes back
+FINETUNED = 4.0  # times as much noise, which fine-tuning takes back
 NOISE = (1e-8, 1e-2)  # least and largest mean squared error that files are made for
 TRIALS, FINETUNED_TRIALS = 9, 4  # of a search
 
@@ -107,7 +107,7 @@ def compress(
     say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
     sensitivity = measure_sensitivity(model, cameras)
     packer = _Packer(model, without_cameras(provenance), sensitivity, data, finetune_steps, prune, say)
-    start = noise or _default_noise(provenance) * (FINETUNED if finetune_steps else 1)
+    start = noise or default_noise(provenance) * (FINETUNED if finetune_steps else 1)
     if target_bytes is not None:
         trial, found = packer.within_bytes(target_bytes, start)
     elif max_psnr_drop is not None:
@@ -198,17 +198,17 @@ def added_errors(planned: HybridModel, quantized: Quantized, plan: Plan) -> dict
         "SCAL": s.scales[:, None],
         **{group: values[:, None] for group, values in {**s.tables, **s.decoders}.items()},
     }
-    # A point is anywhere in its cell.
+    bits = np.concatenate([layer.points.bits[layer.points.classes] for layer in plan.layers])  # anywhere in its cell
     _, opacity = opacity_error(planned, wanted["OPAC"][:, 0].astype(np.float64), s.opacities)
     errors = {"OPAC": float(opacity(slice(None), stored["OPAC"][:, 0]).sum())}
-    errors["POSI"] = float((s.positions * 3 / 12 * 4.0 ** -plan.points.bits[plan.points.classes]).sum())
+    errors["POSI"] = float((s.positions * 3 / 12 * 4.0**-bits).sum())
     for group, weight in weights.items():
         difference = stored[group].reshape(len(weight), -1) - wanted[group].reshape(len(weight), -1)
         errors[group] = float((weight * difference.astype(np.float64) ** 2).sum())
     return errors
 
 
-def _default_noise(provenance: dict) -> float:
+def default_noise(provenance: dict) -> float:
     """The mean squared error that costs PSNR_DROP: errors of photos and of quantising add up."""
     psnr = provenance.get("psnr")
     if not isinstance(psnr, int | float) or not 0 < psnr < 100:

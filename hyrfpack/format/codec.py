@@ -15,7 +15,7 @@ from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import compact, paper, raw
 from hyrfpack.format.arrays import RULES, check_rules, group_shapes, parse_config, to_model
 from hyrfpack.format.container import Container, read_container, write_container
-from hyrfpack.format.info import SECTIONS, SectionSize, section_sizes
+from hyrfpack.format.info import LAYERED, SECTIONS, SECTIONS_OF_LAYERS, SectionSize, layer_section, section_sizes
 from hyrfpack.format.metadata import Metadata, read_metadata
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.parallel.pool import run_tasks
@@ -66,22 +66,31 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
     if profile not in PROFILES:
         raise HyrfError(f"there is no profile '{profile}'; use one of: {', '.join(PROFILES)}")
     sections, used = PROFILES[profile](model, **settings)
-    stored = next(section for section in sections if section.type == "POSI").raw_length // 12
-    metadata = Metadata(profile, stored, model.config.to_dict(), RULES, used, provenance or {})
-    return write_container([metadata.to_section(deflate=profile == "compact"), *sections])
+    counts = [section.raw_length // 12 for section in sections if section.type.startswith("POS")]
+    layers = counts if len(counts) > 1 else []
+    metadata = Metadata(profile, sum(counts), model.config.to_dict(), RULES, used, provenance or {}, layers=layers)
+    is_new = profile == "compact"  # all else is read by readers of version 1.0 too
+    return write_container([metadata.to_section(deflate=is_new), *sections], minor=int(is_new))
 
 
-def decode_model(data: bytes | memoryview, device: str | torch.device = "cpu", name: str = "the data") -> HybridModel:
+def decode_model(
+    data: bytes | memoryview,
+    device: str | torch.device = "cpu",
+    name: str = "the data",
+    fraction: float | None = None,
+) -> HybridModel:
     """Read a model from the bytes of a `.hyrf` file. Safe on any input.
 
     Args:
         device: where the parameters shall live.
         name: what error messages call the file.
+        fraction: read only this part of the file, from its first byte, 0 to 1; the rest may be missing. Files of
+            profile "compact" come in layers: what is whole of them makes a coarser model. None wants the whole file.
 
     Raises:
         HyrfFormatError: the bytes are damaged, contradict themselves, or come from a newer version.
     """
-    return _decode(read_container(data, SECTIONS, name)).to(device)
+    return _decode(read_container(data, SECTIONS, name, fraction)).to(device)
 
 
 def save(
@@ -112,26 +121,32 @@ def write_model(data: bytes, path: str | os.PathLike[str]) -> CompressionReport:
     return CompressionReport(metadata.profile, metadata.gaussians, before, len(data), sizes)
 
 
-def load(path: str | os.PathLike[str], device: str | torch.device = "cpu") -> HybridModel:
+def load(
+    path: str | os.PathLike[str], device: str | torch.device = "cpu", fraction: float | None = None
+) -> HybridModel:
     """Read a model from a `.hyrf` file. Arguments and errors as `decode_model`, and where no file can be read."""
-    with Container.open(path, SECTIONS) as container:
+    with Container.open(path, SECTIONS, fraction) as container:
         return _decode(container).to(device)
 
 
 def repack(
-    source: str | os.PathLike[str], target: str | os.PathLike[str], profile: str = "raw", **settings: object
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    profile: str = "raw",
+    fraction: float | None = None,
+    **settings: object,
 ) -> CompressionReport:
     """Rewrite a `.hyrf` file with profile "raw" or "paper"; its provenance goes along.
 
     Arguments and errors as `encode_model`, `load` and `save`.
     """
-    model, provenance = load_with_provenance(source)
+    model, provenance = load_with_provenance(source, fraction)
     return save(model, target, profile, provenance if profile == "raw" else without_cameras(provenance), **settings)
 
 
-def load_with_provenance(path: str | os.PathLike[str]) -> tuple[HybridModel, dict]:
-    """A model and where it comes from. Errors as `load`."""
-    with Container.open(path, SECTIONS) as container:
+def load_with_provenance(path: str | os.PathLike[str], fraction: float | None = None) -> tuple[HybridModel, dict]:
+    """A model and where it comes from. Arguments and errors as `load`."""
+    with Container.open(path, SECTIONS, fraction) as container:
         return _decode(container), read_metadata(container).provenance
 
 
@@ -147,42 +162,66 @@ def _decode(container: Container) -> HybridModel:
         config = parse_config(metadata.config)
     except HyrfFormatError as error:
         raise HyrfFormatError(f"{name}: {error}") from error
-    shapes = group_shapes(config, metadata.gaussians)
+    layers = metadata.layers or [metadata.gaussians]
+    shapes = {}
+    for layer, count in enumerate(layers):
+        for group, shape in group_shapes(config, count).items():
+            if layer == 0 or group in LAYERED:
+                shapes[layer_section(group, layer)] = shape
     # Every size is checked before the first section is decoded.
-    for group, (rows, columns) in shapes.items():
-        entry = container.entries.get(group)
+    for type, (rows, columns) in shapes.items():
+        entry = container.entries.get(type)
         if entry is None:
-            raise HyrfFormatError(f"{name}: there is no section '{group}'; the file is incomplete, write it again")
+            raise HyrfFormatError(f"{name}: there is no section '{type}'; the file is incomplete, write it again")
         if entry.codec not in DECODERS and entry.codec not in compact.CODECS:
-            raise HyrfFormatError(f"{name}: section '{group}' has the unknown codec {entry.codec}; update hyrfpack")
+            raise HyrfFormatError(f"{name}: section '{type}' has the unknown codec {entry.codec}; update hyrfpack")
         if entry.raw_length != 4 * rows * columns:
             raise HyrfFormatError(
-                f"{name}: section '{group}' says it decodes to {entry.raw_length} bytes and the metadata asks for "
+                f"{name}: section '{type}' says it decodes to {entry.raw_length} bytes and the metadata asks for "
                 f"{4 * rows * columns}; the file is damaged, write it again"
             )
-    sections = {group: container[group] for group in shapes}
+    # Of a file that is not all there: the first layer must be, further ones up to the first that lacks something.
+    there = 1
+    while there < len(layers) and all(layer_section(group, there) in container for group in LAYERED):
+        there += 1
+    wanted = [type for type in shapes if type not in SECTIONS_OF_LAYERS or SECTIONS_OF_LAYERS[type][1] < there]
+    if any(type not in container for type in wanted) and container.available < container.length:
+        needed = max(container.entries[type].end for type in wanted)
+        raise HyrfFormatError(
+            f"{name}: the first {needed:,} of {container.length:,} bytes make a model, and only "
+            f"{container.available:,} are there or allowed; take more of the file"
+        )
+    sections = {type: container[type] for type in wanted}
     arrays: dict[str, np.ndarray] = {}
-    points = None  # positions on a lattice, on which other sections lean
-    if sections["POSI"].codec == compact.CODEC_POINTS:
-        with _naming(name, "POSI"):
-            arrays["POSI"], points = compact.decode_positions(sections["POSI"].data, metadata.gaussians, config)
-    groups = [group for group in shapes if group not in arrays]
+    points = {}  # of each layer with positions on a lattice, on which other sections lean
+
+    def decode_positions(layer: int) -> None:
+        type = layer_section("POSI", layer)
+        if sections[type].codec == compact.CODEC_POINTS:
+            with _naming(name, type):
+                arrays[type], points[layer] = compact.decode_positions(sections[type].data, layers[layer], config)
+
+    run_tasks(decode_positions, there)
+    rest = [type for type in wanted if type not in arrays]
 
     def decode(index: int) -> None:
-        group = groups[index]
-        section = sections[group]
-        with _naming(name, group):
+        type = rest[index]
+        group, layer = SECTIONS_OF_LAYERS.get(type, (type, 0))
+        section = sections[type]
+        with _naming(name, type):
             if section.codec in DECODERS:
-                arrays[group] = DECODERS[section.codec](section.data, shapes[group])
+                arrays[type] = DECODERS[section.codec](section.data, shapes[type])
             else:
-                arrays[group] = compact.decode_section(
-                    group, section.codec, section.data, shapes[group], config, points
+                arrays[type] = compact.decode_section(
+                    group, section.codec, section.data, shapes[type], config, points.get(layer)
                 )
 
-    run_tasks(decode, len(groups))
-    for group, values in arrays.items():
+    run_tasks(decode, len(rest))
+    for type, values in arrays.items():
         if not np.isfinite(values).all():
-            raise HyrfFormatError(f"{name}: section '{group}' holds numbers that are not finite; write the file again")
+            raise HyrfFormatError(f"{name}: section '{type}' holds numbers that are not finite; write the file again")
+    for group in LAYERED if there > 1 else ():
+        arrays[group] = np.concatenate([arrays.pop(layer_section(group, layer)) for layer in range(there)])
     return to_model(config, arrays)
 
 

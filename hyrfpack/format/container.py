@@ -75,6 +75,11 @@ class Entry:
     raw_length: int
     checksum: int
 
+    @property
+    def end(self) -> int:
+        """Where the section ends, padding included."""
+        return self.offset + _padded(self.length)
+
 
 class Container:
     """A `.hyrf` file whose header and table of contents have been checked; payloads are read on demand.
@@ -83,15 +88,23 @@ class Container:
 
     Attributes:
         name: what error messages call the file.
-        length: its bytes.
+        length: its bytes, as the header says.
+        available: how many of them, from the first on, are there and may be used.
         version: (major, minor) of its format.
         entries: the whole table of contents by type, in file order, unknown optional sections included.
 
-    `"POSI" in container` tells whether a section is there, `container["POSI"]` reads it and verifies its checksum.
+    `"POSI" in container` tells whether a section is there whole; `container["POSI"]` reads it and checks its bytes.
     Read from one thread at a time; decode sections on as many as you like.
     """
 
-    def __init__(self, read_at: ReadAt, length: int, known: Collection[str] | None = None, name: str = "the data"):
+    def __init__(
+        self,
+        read_at: ReadAt,
+        length: int,
+        known: Collection[str] | None = None,
+        name: str = "the data",
+        fraction: float | None = None,
+    ) -> None:
         """Check header and table of contents, nothing more.
 
         Args:
@@ -99,21 +112,26 @@ class Container:
             length: bytes there are.
             known: section types the caller can decode; None accepts any.
             name: what error messages call the file.
+            fraction: use only this part of the file, from its first byte, 0 to 1; the rest may be missing. None wants
+                the whole file.
 
         Raises:
             HyrfFormatError: not a `.hyrf` file, a newer version, an unknown required section, damage or forgery.
         """
         self._read_at = read_at
         self.name = name
-        self.length = length
+        self.length = self.available = length
+        self._fraction = fraction
         self._known = known
         self._close: Callable[[], None] = lambda: None
         self.version, toc, count = self._read_header()
         self.entries = self._check_toc(toc, count)
 
     @classmethod
-    def open(cls, path: str | os.PathLike[str], known: Collection[str] | None = None) -> Container:
-        """Open a file, reading its header and table of contents only.
+    def open(
+        cls, path: str | os.PathLike[str], known: Collection[str] | None = None, fraction: float | None = None
+    ) -> Container:
+        """Open a file, reading its header and table of contents only. Arguments as the constructor's.
 
         Raises:
             HyrfFormatError: as the constructor, and where there is no readable file at `path`.
@@ -130,7 +148,8 @@ class Container:
         except (OSError, ValueError) as error:
             raise _unreadable(name, error) from error
         try:
-            container = cls(partial(_read_file_at, file, name), os.fstat(file.fileno()).st_size, known, name)
+            size = os.fstat(file.fileno()).st_size
+            container = cls(partial(_read_file_at, file, name), size, known, name, fraction)
         except BaseException:
             file.close()
             raise
@@ -143,7 +162,8 @@ class Container:
         return [self[type] for type in self.entries if type in self]
 
     def __contains__(self, type: str) -> bool:
-        return type in self.entries and (self._known is None or type in self._known)
+        entry = self.entries.get(type)
+        return entry is not None and (self._known is None or type in self._known) and self._reaches(entry)
 
     def __getitem__(self, type: str) -> Section:
         """Read one section and verify its checksum and padding.
@@ -151,9 +171,14 @@ class Container:
         Raises:
             HyrfFormatError: the file has no such section, or its bytes are damaged.
         """
-        if type not in self:
+        if type not in self.entries or (self._known is not None and type not in self._known):
             raise HyrfFormatError(f"{self.name}: there is no section '{type}'; the file is incomplete, write it again")
         entry = self.entries[type]
+        if not self._reaches(entry):
+            raise HyrfFormatError(
+                f"{self.name}: section '{type}' ends at byte {entry.end:,} and only {self.available:,} of the "
+                f"file's {self.length:,} bytes are there or allowed; take more of the file"
+            )
         stored = memoryview(self._read_at(entry.offset, _padded(entry.length)))
         data = stored[: entry.length]
         if zlib.crc32(data) != entry.checksum:
@@ -161,6 +186,9 @@ class Container:
         if any(stored[entry.length :]):
             raise self._damaged(f"the padding after section '{type}' is not zero")
         return Section(type, entry.codec, data, entry.raw_length, entry.required)
+
+    def _reaches(self, entry: Entry) -> bool:
+        return entry.end <= self.available
 
     def close(self) -> None:
         """Release the file; sections read before stay valid."""
@@ -199,22 +227,27 @@ class Container:
             raise HyrfFormatError(
                 f"{self.name}: the header sets flags {flags:#x} that this hyrfpack does not know; update hyrfpack"
             )
-        if file_length > length:
+        if file_length > length and self._fraction is None:
             raise HyrfFormatError(
                 f"{self.name}: the header says {file_length:,} bytes and there are {length:,}; the file is truncated, "
                 f"copy or write it again"
             )
         if file_length < length:
             raise self._damaged(f"the header says {file_length:,} bytes and there are {length:,}")
-        if length > MAX_FILE_BYTES:
+        if file_length > MAX_FILE_BYTES:
             raise HyrfFormatError(
-                f"{self.name}: {length:,} bytes are more than a .hyrf file may have ({MAX_FILE_BYTES:,}); "
+                f"{self.name}: {file_length:,} bytes are more than a .hyrf file may have ({MAX_FILE_BYTES:,}); "
                 f"compress the model"
             )
         if count > MAX_SECTIONS:
             raise self._damaged(f"the header says {count:,} sections, more than the {MAX_SECTIONS:,} a file may have")
-        if toc_offset != _TOC_OFFSET or toc_length != count * _ENTRY.size or toc_offset + toc_length > length:
+        if toc_offset != _TOC_OFFSET or toc_length != count * _ENTRY.size or toc_offset + toc_length > file_length:
             raise self._damaged("the header misplaces the table of contents")
+        self.length = file_length
+        if self._fraction is not None:
+            self.available = min(length, int(self._fraction * file_length))
+        if toc_offset + toc_length > length:
+            raise self._damaged(f"the file ends after {length} bytes, within its table of contents")
         toc = self._read_at(toc_offset, toc_length)
         if zlib.crc32(toc) != toc_checksum:
             raise self._damaged("the checksum of the table of contents does not match its bytes")
@@ -250,17 +283,23 @@ class Container:
             entries[type] = Entry(type, codec, required, offset, stored, raw, checksum)
         if end != length:
             raise self._damaged(f"the sections end at {end:,} and the file at {length:,}")
-        raw = sum(entry.raw_length for entry in entries.values())
-        if raw > raw_limit(length):
-            raise self._damaged(f"the sections say they decode to {raw:,} bytes, more than {raw_limit(length):,}")
+        # What is not there can be promised without paying for it: it does not count.
+        limit = raw_limit(min(length, self.available))
+        raw = sum(entry.raw_length for entry in entries.values() if self._reaches(entry))
+        if raw > limit:
+            raise self._damaged(f"the sections say they decode to {raw:,} bytes, more than {limit:,}")
         return entries
 
     def _damaged(self, what: str) -> HyrfFormatError:
         return HyrfFormatError(f"{self.name}: {what}; the file is damaged, copy or write it again")
 
 
-def write_container(sections: Sequence[Section]) -> bytes:
+def write_container(sections: Sequence[Section], minor: int = MINOR) -> bytes:
     """Lay sections out as a `.hyrf` file: same sections, same bytes.
+
+    Args:
+        sections: in file order.
+        minor: the minor version that a reader must know to read them, 0 to MINOR.
 
     Raises:
         ValueError: what `read_container` would refuse: a malformed or repeated type, a number out of range, too
@@ -289,17 +328,22 @@ def write_container(sections: Sequence[Section]) -> bytes:
     if offset > MAX_FILE_BYTES or raw > raw_limit(offset):
         raise ValueError(f"{offset} bytes that decode to {raw} exceed the format's limits")
     table = b"".join(toc)
-    header = _HEADER.pack(MAGIC, MAJOR, MINOR, 0, offset, _TOC_OFFSET, len(table), len(sections), zlib.crc32(table))
+    header = _HEADER.pack(MAGIC, MAJOR, minor, 0, offset, _TOC_OFFSET, len(table), len(sections), zlib.crc32(table))
     return b"".join([header, _CHECKSUM.pack(zlib.crc32(header)), table, *payloads])
 
 
-def read_container(data: bytes | memoryview, known: Collection[str] | None = None, name: str = "the data") -> Container:
+def read_container(
+    data: bytes | memoryview,
+    known: Collection[str] | None = None,
+    name: str = "the data",
+    fraction: float | None = None,
+) -> Container:
     """Read a `.hyrf` file held in memory; sections are views into `data`, not copies.
 
     Arguments and errors as `Container`.
     """
     view = _as_bytes(data).toreadonly()
-    return Container(lambda offset, count: view[offset : offset + count], len(view), known, name)
+    return Container(lambda offset, count: view[offset : offset + count], len(view), known, name, fraction)
 
 
 def raw_limit(file_length: int) -> int:

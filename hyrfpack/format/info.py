@@ -6,9 +6,9 @@ import os
 from dataclasses import asdict, dataclass
 
 from hyrfpack.format.container import Container
-from hyrfpack.format.metadata import read_metadata
+from hyrfpack.format.metadata import MAX_LAYERS, read_metadata
 
-# Section types and what they hold, in file order; every one is required.
+# Section types and what they hold; every one is required.
 SECTIONS = {
     "META": "metadata",
     "POSI": "positions",
@@ -20,6 +20,18 @@ SECTIONS = {
     "RTAB": "radiance hash table",
     "RMLP": "radiance decoder",
 }
+# Gaussians may come in layers, the most important first: sections of the first, and of what further ones are called.
+LAYERED = ("POSI", "COLO", "SCAL", "OPAC")
+
+
+def layer_section(group: str, layer: int) -> str:
+    """What a section of LAYERED is called in a layer: "POSI", then "POS1", "POS2", ..."""
+    return f"{group[:3]}{layer}" if layer else group
+
+
+# Type -> group and layer.
+SECTIONS_OF_LAYERS = {layer_section(group, layer): (group, layer) for layer in range(MAX_LAYERS) for group in LAYERED}
+SECTIONS |= {type: f"{SECTIONS[group]}, layer {layer}" for type, (group, layer) in SECTIONS_OF_LAYERS.items() if layer}
 
 
 @dataclass(frozen=True)
@@ -46,8 +58,11 @@ def section_sizes(container: Container) -> list[SectionSize]:
     ]
 
 
-def describe(path: str | os.PathLike[str]) -> dict:
+def describe(path: str | os.PathLike[str], fraction: float | None = None) -> dict:
     """Say what a `.hyrf` file holds without decoding it: header, table of contents and metadata are read, no more.
+
+    Args:
+        fraction: how much of the file must be there, see `hyrfpack.load`; None for all.
 
     Returns:
         A dictionary ready for JSON: `bytes` (of the file), `version` ("1.0"), and the metadata's `writer`, `profile`,
@@ -58,7 +73,7 @@ def describe(path: str | os.PathLike[str]) -> dict:
     Raises:
         HyrfFormatError: there is no such file, or its header, table of contents or metadata is damaged.
     """
-    with Container.open(path, SECTIONS) as container:
+    with Container.open(path, SECTIONS, fraction) as container:
         metadata = read_metadata(container)
         sizes = section_sizes(container)
         length, version = container.length, ".".join(map(str, container.version))

@@ -17,6 +17,7 @@ CODEC_JSON, CODEC_DEFLATED = 0, 5
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 64  # objects and lists within each other; what walks them calls itself once for each
 MAX_INTEGER = 1 << 63
+MAX_LAYERS = 8  # that Gaussians may come in
 
 # Types of the configuration's values, as JSON has them; a tuple is a list of that length. `ModelConfig` checks ranges.
 _GRID = {"log2_table_size": int, "levels": int, "base": int, "finest": int}
@@ -47,6 +48,7 @@ class Metadata:
         settings: what the profile was asked for, for people.
         provenance: where the model comes from, for people: preset, steps, why the sizes were chosen.
         writer: program and version that wrote the file.
+        layers: how many Gaussians each layer has, where they come in layers; empty for one layer.
     """
 
     profile: str
@@ -56,6 +58,7 @@ class Metadata:
     settings: dict = field(default_factory=dict)
     provenance: dict = field(default_factory=dict)
     writer: str = field(default_factory=lambda: writer())
+    layers: list[int] = field(default_factory=list)
 
     def to_section(self, deflate: bool = False) -> Section:
         """The section, same values, same bytes: keys sorted, no spaces, ASCII.
@@ -65,6 +68,8 @@ class Metadata:
             HyrfError: all are more than MAX_BYTES, or nested deeper than MAX_DEPTH.
         """
         values = {item.name: getattr(self, item.name) for item in fields(self)}
+        if not self.layers:
+            del values["layers"]
         if _is_deep(values):
             raise HyrfError(f"the metadata is nested deeper than {MAX_DEPTH} levels; flatten the provenance")
         try:
@@ -115,6 +120,7 @@ def read_metadata(container: Container) -> Metadata:
         raise HyrfFormatError(f"{name}: the metadata is not a JSON object; write the file again")
     if _is_deep(values):
         raise HyrfFormatError(f"{name}: the metadata is nested deeper than {MAX_DEPTH} levels; write the file again")
+    values = {"layers": [], **values}
     values = {item.name: values.get(item.name) for item in fields(Metadata)}
     try:
         for key, kind in (("gaussians", int), ("rules", dict), ("settings", dict), ("provenance", dict)):
@@ -123,6 +129,11 @@ def read_metadata(container: Container) -> Metadata:
         _check([values["profile"], values["writer"]], (str, str), "profile or writer")
         if not 0 <= values["gaussians"] < 1 << 40:
             raise ValueError(f"there cannot be {values['gaussians']} Gaussians")
+        layers = values["layers"]
+        _check(layers, list, "layers")
+        _check(layers, (int,) * min(len(layers), MAX_LAYERS), "layers")
+        if layers and (min(layers) < 0 or sum(layers) != values["gaussians"]):
+            raise ValueError(f"its layers do not add up to {values['gaussians']} Gaussians")
     except ValueError as error:
         raise HyrfFormatError(f"{name}: the metadata is not valid: {error}; write the file again") from error
     return Metadata(**values)

@@ -14,23 +14,37 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+_PART = 1 << 14
+
 
 def levels(count: int) -> Iterator[tuple[np.ndarray, int]]:
-    """The places (n,) of each level after the first, and the distance d to their neighbours; coarse levels first."""
+    """The places (n,) of each level after the first, and the distance d to their neighbours; coarse levels first.
+
+    Long levels come in parts, which temporaries in the caches are enough for.
+    """
     distance = 1 << max(count - 1, 0).bit_length()
     while distance > 1:
         distance //= 2
-        yield np.arange(distance, count, 2 * distance), distance
+        for first in range(distance, count, 2 * distance * _PART):
+            yield np.arange(first, min(first + 2 * distance * _PART, count), 2 * distance), distance
 
 
 def predict(values: np.ndarray, places: np.ndarray, distance: int, weight: int) -> np.ndarray:
-    """Predictions (n,) int64 for the numbers at `places`, from decoded `values` (N,) int64; weight 0 to 16."""
+    """Predictions (n,) int64 for the numbers at `places`, from decoded `values` (N,) int64; weight 0 to 16.
+
+    Args:
+        places: as from `levels`: 2 d apart.
+    """
     if weight == 0:
         return np.zeros(len(places), np.int64)
-    after = places + distance
-    if len(after) and after[-1] >= len(values):
-        after[-1] = places[-1] - distance
-    return (values[places - distance] + values[after]) * weight >> 5
+    neighbours = values[places[0] - distance : places[-1] + distance + 1 : 2 * distance]
+    prediction = neighbours[: len(places)].copy()
+    after = neighbours[1:]
+    prediction[: len(after)] += after
+    prediction[len(after) :] *= 2  # the last has none after it
+    prediction *= weight
+    prediction >>= 5
+    return prediction
 
 
 def lift(
@@ -58,8 +72,8 @@ def lift(
 
 def unlift(residuals: np.ndarray, weight: int, steps: np.ndarray) -> np.ndarray:
     """The numbers (N,) int64 from differences (N,) in steps (N,) int64."""
-    values = residuals.astype(np.int64) * steps
+    values = np.multiply(residuals, steps, dtype=np.int64)
     if weight:
         for places, distance in levels(len(values)):
-            values[places] += predict(values, places, distance, weight)
+            values[places[0] : places[-1] + 1 : 2 * distance] += predict(values, places, distance, weight)
     return values

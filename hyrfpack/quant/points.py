@@ -26,7 +26,7 @@ class Points:
     """Lattice points.
 
     Attributes:
-        cells: (N, 3) int64; a coordinate of a point of class k lies in [0, 2^bits[k]).
+        cells: (N, 3) int32 or int64; a coordinate of a point of class k lies in [0, 2^bits[k]).
         classes: (N,) uint8.
         bits: (K,) int64, each 1 to MAX_BITS.
     """
@@ -34,6 +34,9 @@ class Points:
     cells: np.ndarray
     classes: np.ndarray
     bits: np.ndarray
+
+    def __getitem__(self, index: slice) -> Points:
+        return Points(self.cells[index], self.classes[index], self.bits)
 
     def centers(self) -> np.ndarray:
         """(N, 3) int64: centres of the cells, in units of 2^-(MAX_BITS + 1) of the lattice's side."""
@@ -58,14 +61,13 @@ def encode_points(points: Points) -> tuple[bytes, np.ndarray, Points]:
     cells = points.cells[order] << (refined - bits)[classes][:, None]
     ordered = Points(cells, classes, refined)
 
-    finer = (refined - base)[classes]
-    heads = morton_codes(cells >> finer[:, None])
-    gaps = np.diff(heads, prepend=0)
+    finer = (3 * (refined - base)).astype(np.uint8)[classes]
+    codes = morton_codes(cells)
+    gaps = np.diff(codes >> finer, prepend=0)
     gap_bytes = encode_integers(gaps)
-    class_bytes = encode_integers(classes, (gaps == 0).astype(np.uint8))
-    tails = morton_codes(cells & (1 << finer)[:, None] - 1)
+    class_bytes = encode_integers(classes, (gaps == 0).view(np.uint8))
     header = _HEADER.pack(base, len(bits), len(gap_bytes), len(class_bytes)) + refined.astype(np.uint8).tobytes()
-    tail_bytes = pack_bits(tails.view(np.uint64), (3 * finer).astype(np.uint8))
+    tail_bytes = pack_bits(codes.view(np.uint64), finer)
     return b"".join((header, gap_bytes, class_bytes, tail_bytes)), order, ordered
 
 
@@ -85,7 +87,7 @@ def decode_points(data: bytes | memoryview, count: int) -> Points:
     if bits.min() < base or bits.max() > MAX_BITS:
         raise DamagedDataError("points: a class has fewer bits than all share, or too many; the data is damaged")
     gaps = decode_integers(data[start : start + gap_size], count)
-    repeated = (gaps == 0).astype(np.uint8)
+    repeated = (gaps == 0).view(np.uint8)
     heads = np.cumsum(gaps, dtype=np.int64)
     if count and (int(heads.max()) >> 3 * base or int(heads.min()) < 0):
         raise DamagedDataError("points: the gaps lead out of the lattice; the data is damaged")
@@ -94,11 +96,11 @@ def decode_points(data: bytes | memoryview, count: int) -> Points:
     if count and int(classes.max()) >= kinds:
         raise DamagedDataError(f"points: class {classes.max()} of {kinds}; the data is damaged")
     classes = classes.astype(np.uint8)
-    finer = (bits - base)[classes]
-    tails = unpack_bits(data[start + gap_size + class_size :], (3 * finer).astype(np.uint8))
-    cells = morton_cells(heads) << finer[:, None]
-    cells |= morton_cells(tails.view(np.int64))
-    return Points(cells, classes, bits)
+    finer = (3 * (bits - base)).astype(np.uint8)[classes]
+    tails = unpack_bits(data[start + gap_size + class_size :], finer)
+    heads <<= finer
+    heads |= tails.view(np.int64)
+    return Points(morton_cells(heads), classes, bits)
 
 
 def _best_base(codes: np.ndarray, classes: np.ndarray, bits: np.ndarray, finest: int) -> int:
@@ -111,7 +113,7 @@ def _best_base(codes: np.ndarray, classes: np.ndarray, bits: np.ndarray, finest:
         return 1
     population = np.bincount(classes, minlength=len(bits))
     best, least = 1, np.inf
-    for base in range(max(1, int(np.log2(len(codes)) / 3) - 1), finest + 1):
+    for base in range(max(1, min(int(np.log2(len(codes)) / 3) - 1, finest)), finest + 1):
         lengths = np.frexp(np.diff(codes >> 3 * (finest - base), prepend=0).astype(np.float64))[1]
         histogram = np.bincount(lengths)
         share = histogram[histogram > 0] / len(codes)

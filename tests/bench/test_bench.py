@@ -27,6 +27,7 @@ from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.render import RenderSettings, render
 
 CAMERAS = ring(3, width=24, height=24)
+NOISE = 1e-5
 
 
 def model_of(count: int = 60, **settings):
@@ -35,7 +36,7 @@ def model_of(count: int = 60, **settings):
 
 
 def subject_of(model, photos=None) -> Subject:
-    return Subject("tiny", "raw", model, CAMERAS, photos)
+    return Subject("tiny", "raw", model, CAMERAS, photos, ring(8, width=24, height=24), NOISE)
 
 
 def ignore(sentence: str) -> None:
@@ -154,7 +155,7 @@ def test_quality_drops_are_differences_of_what_evaluate_scores():
     model, scene = model_of(), ball_scene(views=3, side=24)
     views = scene.train
     photos = [(torch.from_numpy(view.load().composite()), None) for view in views]
-    tested = Subject("tiny", "raw", model, [view.camera for view in views], photos)
+    tested = dataclasses.replace(subject_of(model, photos), cameras=[view.camera for view in views])
     row = by_setting(render_rows(tested, 1, ignore))["background_threshold"]["0.3"]
     exact, cut = (
         hyrfpack.evaluate(model, views, settings=RenderSettings(background_threshold=tau)) for tau in (0, 0.3)
@@ -170,7 +171,8 @@ def test_raw_is_the_exact_codec_and_bytes_are_those_of_the_file():
     raw, paper = rows["profile"]["raw"], rows["profile"]["paper"]
     assert raw.is_reference and raw.error.max == 0 and all(part.max == 0 for part in raw.parts.values())
     assert raw.bytes == len(encode_model(model)) and paper.bytes == len(encode_model(model, "paper"))
-    assert paper.is_default and paper.error.rms > 0 and paper.decode.ms > 0
+    assert rows["profile"]["compact"].is_default and not paper.is_default
+    assert paper.error.rms > 0 and paper.decode.ms > 0
     assert paper.decode_ratio.wall == pytest.approx(paper.decode.ms / raw.decode.ms)
 
 
@@ -195,6 +197,25 @@ def test_every_knob_of_the_paper_profile_is_tried_with_its_default_marked():
     few = rows["paper, color"]["1 x 64"]
     assert few.bytes == len(encode_model(model, "paper", color=(1, 64)))
     assert few.parts["scale logits"] == rows["profile"]["paper"].parts["scale logits"]
+
+
+def test_every_knob_of_the_compact_profile_is_tried_with_its_default_marked():
+    notes = []
+    rows = by_setting(codec_rows(subject_of(model_of(300, scale_logits=-4.0)), 1, notes.append))
+    itself = rows["profile"]["compact"]
+    for knob, count in (("noise", 5), ("prune", 2)):
+        values = rows[f"compact, {knob}"]
+        (default,) = [row for row in values.values() if row.is_default]
+        assert len(values) == count and default.bytes == itself.bytes
+    assert list(rows["compact, noise"]) == ["1e-06", "3e-06", "1e-05", "3e-05", "0.0001"]
+    noises = list(rows["compact, noise"].values())
+    assert [row.bytes for row in noises] == sorted((row.bytes for row in noises), reverse=True)
+    assert [row.error.rms for row in noises] == sorted(row.error.rms for row in noises)
+    assert rows["compact, prune"]["no"].bytes >= rows["compact, prune"]["yes"].bytes
+    assert 0 < itself.decode.ms and itself.decode_ratio.wall > 0
+    assert itself.bytes < rows["profile"]["paper"].bytes
+    (measuring,) = [sentence for sentence in notes if "measuring" in sentence]
+    assert "in none of the times" in measuring
 
 
 def test_a_new_profile_appears_by_itself_and_may_reorder_gaussians(monkeypatch):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import tracemalloc
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -12,14 +14,15 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plans import drawn_plan, encode
 
 from hyrfpack.errors import HyrfError, HyrfFormatError
-from hyrfpack.format import repack, decode_model, describe, encode_model, load, save
+from hyrfpack.format import decode_model, describe, encode_model, load, repack, save
 from hyrfpack.format.container import Section, read_container, write_container
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 
-PROFILES = ("raw", "paper")
+PROFILES = ("raw", "paper", "compact")
 
 
 def make_model(count: int = 40, grid: HashGridConfig | None = None, **config) -> HybridModel:
@@ -41,19 +44,26 @@ def bits(tensor: torch.Tensor) -> np.ndarray:
 
 
 def rewrite(data: bytes, **changes: bytes | None) -> bytes:
-    """The file with payloads of sections replaced (None: dropped) and every checksum right."""
-    sections = [
-        replace(section, data=changes.get(section.type, section.data))
-        for section in read_container(data).sections
-        if changes.get(section.type, b"") is not None
-    ]
-    return write_container(
-        [replace(section, raw_length=len(section.data)) if section.type == "META" else section for section in sections]
-    )
+    """The file with payloads of sections replaced (None: dropped) and every checksum right; metadata is plain JSON."""
+    sections = []
+    for section in read_container(data).sections:
+        if section.type == "META" and "META" not in changes:
+            changes = {**changes, "META": metadata_text(data)}
+        payload = changes.get(section.type, section.data)
+        if payload is not None and section.type == "META":
+            sections.append(replace(section, codec=0, data=payload, raw_length=len(payload)))
+        elif payload is not None:
+            sections.append(replace(section, data=payload))
+    return write_container(sections)
+
+
+def metadata_text(data: bytes) -> bytes:
+    section = read_container(data)["META"]
+    return zlib.decompress(section.data) if section.codec == 5 else bytes(section.data)
 
 
 def metadata_of(data: bytes) -> dict:
-    return json.loads(bytes(read_container(data)["META"].data))
+    return json.loads(metadata_text(data))
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 40])
@@ -81,7 +91,7 @@ def test_raw_is_bit_exact(count):
 def test_configuration_survives(profile, config):
     model = make_model(**config)
 
-    decoded = decode_model(encode_model(model, profile))
+    decoded = decode_model(encode(model, profile))
 
     assert decoded.config == model.config
     assert all(parameter.requires_grad for parameter in decoded.parameters())
@@ -158,18 +168,19 @@ def test_constant_channels_and_tables_are_exact():
 def test_same_model_gives_same_bytes(profile):
     provenance = {"steps": 1000, "preset": "standard", "why": {"table": "8 Gaussians an entry"}}
 
-    first = encode_model(make_model(300), profile, provenance)
-    second = encode_model(make_model(300), profile, dict(reversed(provenance.items())))
+    first = encode(make_model(300), profile, provenance)
+    second = encode(make_model(300), profile, dict(reversed(provenance.items())))
 
     assert first == second
 
 
-def test_encoding_leaves_model_and_random_state_alone():
+@pytest.mark.parametrize("profile", PROFILES)
+def test_encoding_leaves_model_and_random_state_alone(profile):
     model = make_model(300)
     before = {name: value.clone() for name, value in model.state_dict().items()}
     state = torch.get_rng_state()
 
-    decode_model(encode_model(model, "paper"))
+    decode_model(encode(model, profile))
 
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
     assert torch.equal(torch.get_rng_state(), state)
@@ -188,11 +199,12 @@ def test_encoding_leaves_model_and_random_state_alone():
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_save_refuses_numbers_that_are_not_finite_and_names_the_group(tmp_path, profile, parameter, holds, value):
     model = make_model()
+    settings = {"plan": drawn_plan(model)} if profile == "compact" else {}
     with torch.no_grad():
         model.state_dict()[parameter].view(-1)[-1] = value
 
     with pytest.raises(HyrfError, match=f"1 of [0-9]+ numbers in the model's {holds} "):
-        save(model, tmp_path / "model.hyrf", profile)
+        save(model, tmp_path / "model.hyrf", profile, **settings)
 
     assert not list(tmp_path.iterdir())
 
@@ -216,7 +228,7 @@ def test_paper_keeps_the_largest_half():
 
 
 def test_unknown_profile_and_settings_out_of_range_are_refused():
-    with pytest.raises(HyrfError, match="no profile 'best'.*raw, paper"):
+    with pytest.raises(HyrfError, match="no profile 'best'.*raw, paper, compact"):
         encode_model(make_model(), "best")
     with pytest.raises(HyrfError, match="0 stages"):
         encode_model(make_model(), "paper", color=(0, 64))
@@ -246,11 +258,11 @@ def test_report_adds_up_to_the_file(tmp_path):
     assert 0 <= overhead < 8 * len(stored)
 
 
-def test_compress_keeps_configuration_and_provenance(tmp_path):
+def test_repacking_keeps_configuration_and_provenance(tmp_path):
     model = make_model(100)
     save(model, tmp_path / "raw.hyrf", "raw", {"steps": 7})
 
-    report = repack(tmp_path / "raw.hyrf", tmp_path / "paper.hyrf", color=(3, 16))
+    report = repack(tmp_path / "raw.hyrf", tmp_path / "paper.hyrf", "paper", color=(3, 16))
     repack(tmp_path / "paper.hyrf", tmp_path / "back.hyrf", "raw")
 
     assert (tmp_path / "paper.hyrf").read_bytes() == encode_model(model, "paper", {"steps": 7}, color=(3, 16))
@@ -285,6 +297,17 @@ def test_describe_tells_what_is_inside_without_torch_and_numpy(tmp_path):
     assert positions["before"] == 6000
 
 
+def test_describe_reads_deflated_metadata(tmp_path):
+    model = make_model(500)
+    (tmp_path / "model.hyrf").write_bytes(encode(model, "compact", {"steps": 30}))
+
+    facts = describe(tmp_path / "model.hyrf")
+
+    assert facts["profile"] == "compact" and facts["provenance"] == {"steps": 30} and facts["version"] == "1.1"
+    assert facts["gaussians"] == len(load(tmp_path / "model.hyrf")) < facts["settings"]["gaussians_before"] == 500
+    assert facts["config"] == json.loads(json.dumps(model.config.to_dict()))
+
+
 def test_describe_of_no_gaussians_has_no_bits_per_gaussian(tmp_path):
     save(make_model(0), tmp_path / "empty.hyrf")
 
@@ -293,7 +316,7 @@ def test_describe_of_no_gaussians_has_no_bits_per_gaussian(tmp_path):
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_truncation_is_refused_everywhere(profile):
-    data = encode_model(make_model(), profile)
+    data = encode(make_model(), profile)
     entries = read_container(data).entries.values()
     edges = {
         0,
@@ -314,7 +337,7 @@ def test_truncation_is_refused_everywhere(profile):
 @pytest.mark.parametrize("profile", PROFILES)
 def test_a_flipped_bit_is_found_everywhere(profile):
     small_codebooks = {"color": (2, 8), "scale": (1, 4), "opacity": (1, 4)} if profile == "paper" else {}
-    data = bytearray(encode_model(make_model(5), profile, **small_codebooks))
+    data = bytearray(encode(make_model(5), profile, **small_codebooks))
 
     for position in range(0, len(data), 3):
         data[position] ^= 1 << position % 8
@@ -336,7 +359,7 @@ def test_error_names_the_file_and_the_section(tmp_path):
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("count", [0, 39, 41, 2**39])
 def test_a_forged_count_is_refused(profile, count):
-    data = encode_model(make_model(40), profile)
+    data = encode(make_model(40), profile, **({"prune": False} if profile == "compact" else {}))
     forged = json.dumps(metadata_of(data) | {"gaussians": count}).encode()
 
     with pytest.raises(HyrfFormatError):
@@ -356,7 +379,7 @@ def test_a_forged_table_size_is_refused_before_anything_is_allocated():
 @pytest.mark.parametrize("type", ["META", "POSI", "RTAB", "GMLP"])
 def test_a_missing_section_is_refused(profile, type):
     with pytest.raises(HyrfFormatError):
-        decode_model(rewrite(encode_model(make_model(), profile), **{type: None}))
+        decode_model(rewrite(encode(make_model(), profile), **{type: None}))
 
 
 def test_an_unknown_codec_is_refused():
@@ -451,6 +474,38 @@ def test_metadata_that_is_not_json_is_refused(tmp_path, text):
         describe(path)
 
 
+DEFLATED_FORGERIES = {
+    "empty": lambda text: (b"", len(text)),
+    "not deflated": lambda text: (text, len(text)),
+    "truncated": lambda text: (zlib.compress(text)[:-1], len(text)),
+    "followed by a byte": lambda text: (zlib.compress(text) + b"!", len(text)),
+    "longer than it says": lambda text: (zlib.compress(text), len(text) - 1),
+    "shorter than it says": lambda text: (zlib.compress(text), len(text) + 1),
+    "a bomb": lambda text: (zlib.compress(b" " * (1 << 28) + text), len(text)),
+    "more than a reader takes": lambda text: (zlib.compress(text + b" " * (1 << 20)), len(text) + (1 << 20)),
+    "not JSON": lambda text: (zlib.compress(text[:-1]), len(text) - 1),
+}
+
+
+@pytest.mark.parametrize("forgery", DEFLATED_FORGERIES)
+def test_forged_deflated_metadata_is_refused_in_little_memory(forgery):
+    data = encode(make_model(), "compact")
+    payload, raw_length = DEFLATED_FORGERIES[forgery](metadata_text(data))
+    sections = [
+        replace(section, data=payload, raw_length=raw_length) if section.type == "META" else section
+        for section in read_container(data).sections
+    ]
+    forged = write_container(sections)
+
+    tracemalloc.start()
+    with pytest.raises(HyrfFormatError, match="the metadata "):
+        decode_model(forged)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+
+    assert peak < 4 << 20
+
+
 @settings(max_examples=150, deadline=None)
 @given(
     profile=st.sampled_from(PROFILES),
@@ -472,4 +527,4 @@ def test_forged_payloads_with_right_checksums_never_escape_the_error_family(prof
     assert all(torch.isfinite(parameter).all() for parameter in model.parameters())
 
 
-FORGERY_TARGETS = {profile: encode_model(make_model(20), profile) for profile in PROFILES}
+FORGERY_TARGETS = {profile: encode(make_model(20), profile) for profile in PROFILES}

@@ -32,7 +32,7 @@ def random_groups(count: int, groups: int, seed: int = 0) -> Groups:
 
 def laplace(groups: Groups, seed: int = 1) -> np.ndarray:
     """Numbers that are wider from group to group."""
-    return np.random.default_rng(seed).laplace(size=len(groups.index)) * 1.3**groups.index
+    return np.random.default_rng(seed).laplace(size=len(groups.index)) * 1.3 ** (groups.index % 10)
 
 
 def check_round_trip(chosen: GroupSymbols, groups: Groups) -> bytes:
@@ -154,9 +154,7 @@ def test_the_same_numbers_give_the_same_bytes() -> None:
     groups = random_groups(3000, 30)
     values = laplace(groups)
 
-    written = {
-        encode_groups(quantize_groups(values.copy(), groups, np.ones(3000), 1e-3), groups) for _ in range(2)
-    }
+    written = {encode_groups(quantize_groups(values.copy(), groups, np.ones(3000), 1e-3), groups) for _ in range(2)}
 
     assert len(written) == 1
 
@@ -187,9 +185,9 @@ def test_bits_are_code_lengths_that_a_prefix_code_could_have(symbols: list[int],
 
     np.testing.assert_allclose((2.0**-bits).sum(axis=1), 1, rtol=1e-9)  # Kraft's sum
     assert bits.size <= kinds * 4096
-    if max(symbols, default=0) - min(symbols, default=0) < 4000:
-        assert least <= min(symbols, default=0) - reach
-        assert least + bits.shape[1] > max(symbols, default=0) + reach
+    if max([0, *symbols]) - min([0, *symbols]) < 4000:
+        assert least <= min([0, *symbols]) - reach
+        assert least + bits.shape[1] > max([0, *symbols]) + reach
 
 
 def test_bits_are_what_the_shares_of_symbols_say() -> None:
@@ -242,7 +240,7 @@ def test_reach_never_costs_more_by_the_coders_own_measure(data: st.DataObject) -
     assert cost(far) <= cost(near) * (1 + 1e-12)
 
 
-@pytest.mark.parametrize("error", [0.03, 0.3, 1.0, 3.0])
+@pytest.mark.parametrize("error", [0.1, 0.3, 1.0, 3.0])
 def test_reach_costs_less_in_error_and_bytes_together(error: float) -> None:
     groups = random_groups(30_000, 8)
     values, ones = laplace(groups), np.ones(30_000)

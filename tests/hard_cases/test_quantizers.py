@@ -12,11 +12,14 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plans import even_plan
 from scenes import camera_at, small_model
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.codec import PROFILES
+from hyrfpack.format.compact import Plan
+from hyrfpack.format.compact.groups import LARGEST as LARGEST_SYMBOL
 from hyrfpack.model import HashGridConfig, HybridModel
 from hyrfpack.model.hash_grid import FEATURES
 from hyrfpack.quant import (
@@ -308,6 +311,27 @@ FILLS = {
 }
 
 
+STEP = 2.0**-10
+# What `compact` may be off by, in its steps: half a step to the nearest, and one, of opacities four, to a cheaper one.
+STEPS_OFF = {"color_logits": 1.5 * 3**0.5, "opacity_logits": 4.5}  # colours are rotated
+
+
+def check_compact(model: HybridModel, decoded: HybridModel, plan: Plan) -> None:
+    """All numbers within their steps; those of tables beyond 2^24 steps are cut there."""
+    step, cut = STEP * 16 / 15, LARGEST_SYMBOL * STEP
+    for name, expected in model.state_dict().items():
+        got, kind = decoded.state_dict()[name], name.removeprefix("gaussians.")
+        if kind == "positions":
+            expected, got = model.cube_coords(expected.double()), model.cube_coords(got.double())
+            allowed = step / 2 + 1e-6
+        else:
+            allowed = step * STEPS_OFF.get(kind, 1.5) + 2e-6
+        expected = expected[plan.kept] if kind != name else expected
+        inside = expected.abs() < cut
+        assert ((got - expected)[inside].abs() <= allowed).all(), name
+        assert ((got[~inside] / (cut * expected[~inside].sign()) - 1).abs() < 0.07).all(), name
+
+
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("fill", FILLS)
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -315,12 +339,15 @@ def test_models_of_hardly_any_gaussians_survive_and_render(profile, fill, count)
     model = small_model(np.random.default_rng(count).normal(size=(count, 3)), fields=1.0, background=True)
     with torch.no_grad():
         FILLS[fill](model)
+    settings = {"plan": even_plan(model, STEP)} if profile == "compact" else {}
 
-    data = encode_model(model, profile)
+    data = encode_model(model, profile, **settings)
     decoded = decode_model(data)
 
-    assert len(decoded) == count and encode_model(model, profile) == data
-    for name, expected in model.state_dict().items():
+    assert len(decoded) == count and encode_model(model, profile, **settings) == data
+    if profile == "compact":
+        check_compact(model, decoded, settings["plan"])
+    for name, expected in model.state_dict().items() if profile != "compact" else ():
         got = decoded.state_dict()[name]
         if profile == "raw":
             assert np.array_equal(got.numpy().view(np.uint32), expected.numpy().view(np.uint32)), name
@@ -339,8 +366,9 @@ def test_models_of_hardly_any_gaussians_survive_and_render(profile, fill, count)
 def test_one_number_that_is_not_finite_is_refused_in_every_group(profile, value):
     for name in small_model(np.zeros((2, 3))).state_dict():
         model = small_model(np.zeros((2, 3)))
+        settings = {"plan": even_plan(model, STEP)} if profile == "compact" else {}
         with torch.no_grad():
             model.state_dict()[name].view(-1)[-1] = value
 
         with pytest.raises(HyrfError, match="^1 of [0-9]+ numbers in the model's [a-z ]+ are NaN or infinite; "):
-            encode_model(model, profile)
+            encode_model(model, profile, **settings)

@@ -21,6 +21,7 @@ from hyrfpack.format.compact.plan import Plan, from_lattice, groups_of, make_pla
 from hyrfpack.format.compact.sections import CODEC_CHANNELS, CODEC_GROUPS, CODEC_POINTS, Quantized, quantize
 from hyrfpack.format.compact.sensitivity import Sensitivity
 from hyrfpack.format.container import Section
+from hyrfpack.format.info import LAYERED, layer_section
 from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.quant.points import Points, decode_points
@@ -57,9 +58,14 @@ def encode(model: HybridModel, plan: Plan, quantized: Quantized | None = None) -
         HyrfError: a parameter is NaN or infinite.
     """
     coded = sections.encode(quantized or quantize(plan.apply(model), plan), plan)
-    shapes = group_shapes(model.config, len(plan.kept))
+    shapes = {}
+    for layer, points in enumerate(plan.layers):
+        for group, shape in group_shapes(model.config, len(points.points.classes)).items():
+            shapes.setdefault(layer_section(group, layer) if group in LAYERED else group, shape)
     settings = {"distortion": plan.distortion, "gaussians_before": len(model)}
-    return [Section(group, *coded[group], 4 * rows * columns) for group, (rows, columns) in shapes.items()], settings
+    return [
+        Section(type, codec, data, 4 * shapes[type][0] * shapes[type][1]) for type, (codec, data) in coded.items()
+    ], settings
 
 
 def decode_positions(data: memoryview, count: int, config: ModelConfig) -> tuple[np.ndarray, Points]:

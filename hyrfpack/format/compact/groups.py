@@ -7,6 +7,7 @@ The bytes: u32 and u32 lengths of the two streams that follow, step codes and mo
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ from hyrfpack.quant.steps import NOT_CODED, ONE, step_of
 
 MODELS = 8  # of the entropy coder
 LARGEST = 1 << 24  # steps from zero
+_PART = 1 << 15
 _FLOOR = 0.01  # least sensitivity of a number against the mean of its group
 _HEADER = struct.Struct("<II")
 
@@ -27,12 +29,19 @@ class Groups:
     """Which number is in which group.
 
     Attributes:
-        index: (n,) int64, 0 to count - 1.
+        index: (n,) integers of any width, 0 to count - 1.
         count: how many groups there may be.
     """
 
     index: np.ndarray
     count: int
+
+    def spread(self, values: np.ndarray) -> np.ndarray:
+        """(n,) the value of each number's group, of `values` (count,)."""
+        result = np.empty(len(self.index), values.dtype)
+        for part in _parts(len(result)):
+            result[part] = values.take(self.index[part])
+        return result
 
 
 @dataclass(frozen=True)
@@ -67,31 +76,33 @@ def quantize_groups(
     members = np.maximum(np.bincount(index, minlength=count), 1)
     mean = np.bincount(index, sensitivity, count) / members
     codes = np.where(mean > 0, best_steps(np.where(mean > 0, mean, 1), distortion), NOT_CODED).astype(np.uint8)
-    steps = step_of(codes)[index] / ONE
-    symbols = np.clip(np.rint(values / steps), -LARGEST, LARGEST).astype(np.int64)
-    symbols[codes[index] == NOT_CODED] = 0
+    steps, unread = step_of(codes) / ONE, codes == NOT_CODED
+    symbols = np.empty(len(values), np.int64)
+    for part in _parts(len(values)):
+        nearest = np.rint(values[part] / steps[index[part]])
+        symbols[part] = np.where(unread[index[part]], 0, np.clip(nearest, -LARGEST, LARGEST))
     models = _models(np.bincount(index, np.abs(symbols), count) / members)
     if reach:
-        weights, contexts = np.maximum(sensitivity, _FLOOR * mean[index]), models[index]
-        symbols = cheapest(
-            symbols,
-            lambda candidates: weights * (candidates * steps - values) ** 2,
-            contexts,
-            code_bits(symbols, contexts, MODELS, reach),
-            distortion,
-            reach,
-        )
-        symbols[codes[index] == NOT_CODED] = 0
+        contexts = groups.spread(models)
+        bits = code_bits(symbols, contexts, MODELS, reach)
+        for part in _parts(len(values)):
+            weights, step = np.maximum(sensitivity[part], (_FLOOR * mean)[index[part]]), steps[index[part]]
+
+            def error(candidates: np.ndarray, weights=weights, step=step, wanted=values[part]) -> np.ndarray:
+                return weights * (candidates * step - wanted) ** 2
+
+            chosen = cheapest(symbols[part], error, contexts[part], bits, distortion, reach)
+            symbols[part] = np.where(unread[index[part]], 0, np.clip(chosen, -LARGEST, LARGEST))
     codes[np.bincount(index, np.abs(symbols), count) == 0] = NOT_CODED
-    return GroupSymbols(codes, models, symbols, (symbols * steps).astype(np.float32))
+    return GroupSymbols(codes, models, symbols, (symbols * groups.spread(steps)).astype(np.float32))
 
 
 def encode_groups(chosen: GroupSymbols, groups: Groups) -> bytes:
     """The bytes of numbers in groups."""
-    coded = (chosen.codes != NOT_CODED)[groups.index]
+    coded = groups.spread(chosen.codes != NOT_CODED)
     codes = encode_integers(chosen.codes)
     models = encode_integers(chosen.models[chosen.codes != NOT_CODED])
-    symbols = encode_integers(chosen.symbols[coded], chosen.models[groups.index[coded]], signed=True)
+    symbols = encode_integers(chosen.symbols[coded], groups.spread(chosen.models)[coded], signed=True)
     return _HEADER.pack(len(codes), len(models)) + codes + models + symbols
 
 
@@ -109,21 +120,31 @@ def decode_groups(data: memoryview, groups: Groups) -> np.ndarray:
     if codes.max(initial=0) > 255:
         raise DamagedDataError(f"the step code {codes.max()} is above 255; it is damaged")
     used = codes != NOT_CODED
-    models = np.zeros(groups.count, np.uint8)
     chosen = decode_integers(data[first : first + second], np.count_nonzero(used))
     if chosen.max(initial=0) >= MODELS:
         raise DamagedDataError(f"the model {chosen.max()} of {MODELS}; it is damaged")
+    models = np.full(groups.count, MODELS, np.uint8)
     models[used] = chosen
-    coded = np.flatnonzero(used[groups.index])
-    index = groups.index[coded]
-    symbols = decode_integers(data[first + second :], len(coded), models[index], signed=True)
+    contexts = groups.spread(models)
+    coded = contexts < MODELS
+    contexts = contexts[coded]
+    symbols = decode_integers(data[first + second :], len(contexts), contexts, signed=True)
     if symbols.max(initial=0) > LARGEST or symbols.min(initial=0) < -LARGEST:
         raise DamagedDataError(f"a number is more than {LARGEST} steps; it is damaged")
     values = np.zeros(len(groups.index), np.float32)
-    values[coded] = symbols * (step_of(codes) / ONE)[index]
+    steps, place = step_of(codes) / ONE, 0
+    for part in _parts(len(values)):
+        index = groups.index[part][coded[part]]
+        values[part][coded[part]] = symbols[place : place + len(index)] * steps[index]
+        place += len(index)
     return values
 
 
 def _models(magnitude: np.ndarray) -> np.ndarray:
     """The model for groups of these mean magnitudes in steps, (count,) uint8: they double from 1/16 to 4."""
     return np.clip(np.floor(np.log2(np.maximum(magnitude, 1e-9))) + 5, 0, MODELS - 1).astype(np.uint8)
+
+
+def _parts(count: int) -> Iterator[slice]:
+    """Consecutive parts of a list of numbers, few enough in each that temporaries stay in the caches."""
+    return (slice(first, first + _PART) for first in range(0, count, _PART))

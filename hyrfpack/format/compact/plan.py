@@ -22,9 +22,24 @@ from hyrfpack.quant.points import Points, encode_points
 CLASSES = 6
 CLASS_WIDTH = 3.0  # log2 of sensitivity that a class spans: classes much narrower or wider cost more
 ABOVE_MEAN = 2  # classes for what matters more than the mean
-BITS_OF_A_GAUSSIAN = 10  # that pruning counts as saved: those it takes are cheap ones
+BITS_OF_A_GAUSSIAN = 16  # that pruning counts as saved: those it takes are cheap ones
 USAGE_CLASSES = 16
 COUNTED = 1 << 16  # Gaussians whose reading of the tables is counted; of more, every n-th
+LEAST_OF_LAYER = 5000, 8  # Gaussians of a layer: at least so many, and so much of all; smaller ones cost over 1 %
+PLACED = 1 << 14  # Gaussians whose positions are worked out at once: few enough that temporaries stay in the caches
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Gaussians that are stored together: the first layers of a file make a coarser model.
+
+    Attributes:
+        points: where they are on the lattice, and what class each is in.
+        positions: the bytes of `points`.
+    """
+
+    points: Points
+    positions: bytes
 
 
 @dataclass(frozen=True)
@@ -33,8 +48,7 @@ class Plan:
 
     Attributes:
         kept: (M,) int64, the Gaussians that are stored, in the file's order.
-        points: where they are on the lattice, and what class each is in.
-        positions: the bytes of `points`.
+        layers: they in parts, the most important first.
         basis: (3, 3) float32, the columns of an orthonormal transform of colour logits, most varied first.
         groups: which numbers of the tables and decoders share a step, by section.
         sensitivity: of what is stored.
@@ -43,8 +57,7 @@ class Plan:
     """
 
     kept: np.ndarray
-    points: Points
-    positions: bytes
+    layers: tuple[Layer, ...]
     basis: np.ndarray
     groups: dict[str, Groups]
     sensitivity: Sensitivity
@@ -56,8 +69,15 @@ class Plan:
         arrays = to_arrays(model)
         for group in ("COLO", "SCAL", "OPAC"):
             arrays[group] = arrays[group][self.kept]
-        arrays["POSI"] = from_lattice(self.points, model.config.frame)
+        places = [from_lattice(layer.points, model.config.frame) for layer in self.layers]
+        arrays["POSI"] = np.concatenate(places)
         return to_model(model.config, arrays)
+
+    @property
+    def parts(self) -> list[slice]:
+        """Which of the Gaussians each layer has."""
+        stops = np.cumsum([len(layer.points.classes) for layer in self.layers]).tolist()
+        return [slice(start, stop) for start, stop in zip([0, *stops], stops, strict=False)]
 
     def of_applied(self) -> Plan:
         """The same plan for the model that `apply` gave."""
@@ -73,21 +93,50 @@ def make_plan(model: HybridModel, sensitivity: Sensitivity, noise: float, prune:
     """
     with torch.no_grad():
         cube = model.cube_coords(model.gaussians.positions.double()).cpu().numpy()
-        opacities = model.decode_geometry().opacities.double().cpu().numpy()
     distortion = noise / sum(parameter.numel() for parameter in model.parameters())
     kept = np.arange(len(cube))
     if prune:
+        with torch.no_grad():
+            opacities = model.decode_geometry().opacities.double().cpu().numpy()
         kept = np.flatnonzero(~negligible(sensitivity.opacities, opacities, distortion))
         sensitivity = sensitivity.of(kept)
     classes = importance_classes(sensitivity)
     bits = position_bits(sensitivity.positions, classes, distortion)
-    side = (1 << bits)[classes][:, None]
-    cells = np.clip(np.floor(cube[kept] * side), 0, side - 1).astype(np.int64)
-    data, order, points = encode_points(Points(cells, classes, bits))
+    layers, order = [], []
+    for kinds in _layer_classes(np.bincount(classes, minlength=CLASSES)):
+        members = np.flatnonzero(np.isin(classes, kinds))
+        layer, index = _layer(cube[kept[members]], classes[members], bits)
+        layers.append(layer)
+        order.append(members[index])
+    order = np.concatenate(order)
     kept = kept[order]
     basis = color_basis(to_arrays(model)["COLO"][kept])
-    groups = {group: groups_of(group, model.config, points) for group in ("GTAB", "GMLP", "RTAB", "RMLP")}
-    return Plan(kept, points, data, basis, groups, sensitivity.of(order), distortion)
+    groups = {group: groups_of(group, model.config, layers[0].points) for group in ("GTAB", "GMLP", "RTAB", "RMLP")}
+    return Plan(kept, tuple(layers), basis, groups, sensitivity.of(order), distortion)
+
+
+def _layer(cube: np.ndarray, classes: np.ndarray, bits: np.ndarray) -> tuple[Layer, np.ndarray]:
+    """A layer of the points (n, 3) of the cube, and which of them comes at each place."""
+    while True:
+        side = (1 << bits)[classes][:, None]
+        cells = np.clip(np.floor(cube * side), 0, side - 1).astype(np.int64)
+        data, order, points = encode_points(Points(cells, classes, bits))
+        # A class coarser than all share was made finer: its points are placed anew, in the middle of their cells.
+        if (points.bits == bits).all():
+            return Layer(points, data), order
+        bits = points.bits
+
+
+def _layer_classes(members: np.ndarray) -> list[list[int]]:
+    """The classes of each layer, from the numbers of their members: in order, and no layer with few Gaussians."""
+    fewest, share = LEAST_OF_LAYER
+    least = max(fewest, members.sum() / share)
+    layers: list[list[int]] = [[]]
+    for kind in range(len(members)):
+        if members[layers[-1]].sum() >= least and members[kind:].sum() >= least:
+            layers.append([])
+        layers[-1].append(kind)
+    return layers
 
 
 def importance_classes(sensitivity: Sensitivity) -> np.ndarray:
@@ -99,7 +148,8 @@ def importance_classes(sensitivity: Sensitivity) -> np.ndarray:
         (sensitivity.scales, 1),
         (sensitivity.opacities, 1),
     ):
-        logs += numbers / 8 * np.log2(values / max(float(values.mean()), 1e-300)) if len(values) else 0
+        if len(values):
+            logs += numbers / 8 * np.log2(np.maximum(values, 1e-300) / max(float(values.mean()), 1e-300))
     return np.clip(np.round(-logs / CLASS_WIDTH) + ABOVE_MEAN, 0, CLASSES - 1).astype(np.uint8)
 
 
@@ -107,8 +157,8 @@ def position_bits(sensitivity: np.ndarray, classes: np.ndarray, distortion: floa
     """(CLASSES,) bits of an axis for each class: the lattice step nearest to sqrt(12 D / s)."""
     bits = np.ones(CLASSES, np.int64)
     for kind in np.unique(classes):
-        step = np.sqrt(12 * distortion / sensitivity[classes == kind].mean())
-        bits[kind] = np.clip(np.round(-np.log2(step)), 1, MAX_BITS)
+        step = np.sqrt(12 * distortion / max(float(sensitivity[classes == kind].mean()), 1e-300))
+        bits[kind] = np.clip(np.round(-np.log2(max(step, 2.0**-MAX_BITS))), 1, MAX_BITS)
     return bits
 
 
@@ -125,8 +175,12 @@ def negligible(sensitivity: np.ndarray, opacities: np.ndarray, distortion: float
 
 def from_lattice(points: Points, frame: Frame) -> np.ndarray:
     """Local positions (N, 3) float32 of the centres of the points' cells."""
-    cube = torch.from_numpy(points.centers() / float(2 << MAX_BITS))
-    return (expand(cube) * cube.new_tensor(frame.half_extent)).float().numpy()
+    local = np.empty(points.cells.shape, np.float32)
+    for first in range(0, len(local), PLACED):
+        part = slice(first, first + PLACED)
+        cube = torch.from_numpy(points[part].centers() / float(2 << MAX_BITS))
+        local[part] = (expand(cube) * cube.new_tensor(frame.half_extent)).float().numpy()
+    return local
 
 
 def color_basis(colors: np.ndarray) -> np.ndarray:
@@ -154,9 +208,10 @@ def groups_of(group: str, config: ModelConfig, points: Points | None) -> Groups:
         return Groups(np.repeat(np.arange(len(sizes)), sizes), len(sizes))
     grid = grids(config)[field]
     every = max(1, -(-len(points.cells) // COUNTED))
-    counted = Points(points.cells[::every], points.classes[::every], points.bits)
-    usage = grid.usage(counted.centers(), MAX_BITS + 1)
-    length = np.frexp(usage.astype(np.float64))[1]  # of the binary number; 0 for 0
-    level = np.repeat(np.arange(grid.levels), np.diff(grid.offsets))
-    index = level * USAGE_CLASSES + np.minimum((length + 1) // 2, USAGE_CLASSES - 1)
-    return Groups(np.repeat(index, FEATURES), grid.levels * USAGE_CLASSES)
+    usage = grid.usage(points[::every].centers(), MAX_BITS + 1)
+    index, count = np.empty((grid.rows, FEATURES), np.uint16), grid.levels * USAGE_CLASSES
+    for level, (first, last) in enumerate(pairwise(grid.offsets)):
+        length = np.frexp(usage[first:last].astype(np.float64))[1]  # of the binary number; 0 for 0
+        usage_class = np.minimum((length + 1) // 2, USAGE_CLASSES - 1)
+        index[first:last] = (level * USAGE_CLASSES + usage_class)[:, None]
+    return Groups(index.ravel(), count)

@@ -31,9 +31,16 @@ def code_bits(symbols: np.ndarray, classes: np.ndarray, count: int, reach: int) 
     width = int(symbols.max(initial=0)) + reach + 1 - least
     if width > _WIDEST:
         least, width = -_WIDEST // 2, _WIDEST
-    index = classes.astype(np.int64) * width + np.clip(symbols - least, 0, width - 1)
+    index = np.clip(symbols - least, 0, width - 1)
+    index += classes.astype(np.int64) * width
     histogram = np.bincount(index, minlength=count * width).reshape(count, width) + 0.25
     return -np.log2(histogram / histogram.sum(axis=1, keepdims=True)), least
+
+
+def bits_of(symbols: np.ndarray, classes: np.ndarray, bits: tuple[np.ndarray, int]) -> np.ndarray:
+    """What each of (n,) symbols costs by `code_bits`."""
+    table, least = bits
+    return table[classes, np.clip(symbols - least, 0, table.shape[1] - 1)]
 
 
 def cheapest(
@@ -53,11 +60,17 @@ def cheapest(
         distortion: D.
     """
     table, least = bits
-    best, least_cost = nearest, np.full(len(nearest), np.inf)
+    width = table.shape[1]
+    rates = (ERROR_PER_BIT * distortion * table).ravel()
+    rows = classes.astype(np.int64) * width
+    best, least_cost = nearest.copy(), np.full(len(nearest), np.inf)
     for shift in sorted(range(-reach, reach + 1), key=abs):
         candidate = nearest + shift
-        rate = table[classes, np.clip(candidate - least, 0, table.shape[1] - 1)]
-        cost = error(candidate) + ERROR_PER_BIT * distortion * rate
+        places = candidate - least
+        np.clip(places, 0, width - 1, out=places)
+        places += rows
+        cost = error(candidate) + rates.take(places)
         better = cost < least_cost
-        best, least_cost = np.where(better, candidate, best), np.where(better, cost, least_cost)
+        np.copyto(best, candidate, where=better)
+        np.copyto(least_cost, cost, where=better)
     return best

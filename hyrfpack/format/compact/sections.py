@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -12,13 +15,19 @@ from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.compact.channels import Channel, ErrorModel, decode_channel, encode_channel, quantize_channel
 from hyrfpack.format.compact.groups import GroupSymbols, encode_groups, quantize_groups
 from hyrfpack.format.compact.plan import Plan
+from hyrfpack.format.info import LAYERED, layer_section
 from hyrfpack.model.hybrid import HybridModel
+from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.points import Points
 
 CODEC_POINTS, CODEC_CHANNELS, CODEC_GROUPS = 6, 7, 8
 SATURATED = 8.0  # an opacity's total logit beyond it looks like it: sigmoid is within 3.4e-4 of its end
+COLUMNS = {"COLO": 3, "SCAL": 1, "OPAC": 1}
 OPACITY_REACH = 4  # where opacity is near 0 or 1 logits may move far
+_BLOCK = 1 << 15  # numbers at once: few enough that temporaries stay in the caches
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -26,52 +35,84 @@ class Quantized:
     """A model's numbers as they will be stored.
 
     Attributes:
-        channels: of "COLO" (3, in the plan's basis), "SCAL" (1) and "OPAC" (1).
+        channels: of each layer "COLO" (3, in the plan's basis), "SCAL" (1) and "OPAC" (1).
         groups: of "GTAB", "GMLP", "RTAB" and "RMLP".
     """
 
-    channels: dict[str, list[Channel]]
+    channels: list[dict[str, list[Channel]]]
     groups: dict[str, GroupSymbols]
 
     def arrays(self, plan: Plan) -> dict[str, np.ndarray]:
         """The numbers as they will be decoded: flat tables and decoders, (M, columns) explicit logits; float32."""
         arrays = {group: chosen.values for group, chosen in self.groups.items()}
-        for group, channels in self.channels.items():
-            arrays[group] = _joined([channel.values for channel in channels], plan.basis)
+        for group in ("COLO", "SCAL", "OPAC"):
+            layers = [[channel.values for channel in layer[group]] for layer in self.channels]
+            arrays[group] = np.concatenate([_joined(values, plan.basis) for values in layers])
         return arrays
 
 
-def quantize(model: HybridModel, plan: Plan) -> Quantized:
-    """Quantise a planned model (`plan.apply`) by rate and distortion."""
+def quantize(model: HybridModel, plan: Plan, like: Quantized | None = None) -> Quantized:
+    """Quantise a planned model (`plan.apply`) by rate and distortion.
+
+    Args:
+        like: an earlier result of the same plan, whose weights of predictions are taken over.
+    """
     arrays = {group: values.astype(np.float64) for group, values in to_arrays(model).items()}
-    sensitivity, classes, d, reach = plan.sensitivity, plan.points.classes, plan.distortion, plan.reach
+    sensitivity, d, reach = plan.sensitivity, plan.distortion, plan.reach
     opacity, error = opacity_error(model, arrays["OPAC"][:, 0], sensitivity.opacities)
-    channels = {
-        "COLO": [
-            quantize_channel(values, classes, sensitivity.colors, d, reach=reach)
-            for values in (arrays["COLO"] @ plan.basis.astype(np.float64)).T
-        ],
-        "SCAL": [quantize_channel(arrays["SCAL"][:, 0], classes, sensitivity.scales, d, reach=reach)],
-        "OPAC": [quantize_channel(opacity, classes, sensitivity.opacities, d, error, reach and OPACITY_REACH)],
-    }
     by_group = {**sensitivity.tables, **sensitivity.decoders}
-    groups = {
-        group: quantize_groups(arrays[group].ravel(), plan.groups[group], by_group[group], d, reach)
+    jobs = {
+        group: partial(quantize_groups, arrays[group].ravel(), plan.groups[group], by_group[group], d, reach)
         for group in plan.groups
     }
-    return Quantized(channels, groups)
+    colors = arrays["COLO"] @ plan.basis.astype(np.float64)
+    for layer, part in enumerate(plan.parts):
+        classes, s = plan.layers[layer].points.classes, sensitivity.of(part)
+
+        def opacity_cost(places: np.ndarray, candidates: np.ndarray, part: slice = part) -> np.ndarray:
+            return error(places + part.start, candidates)
+
+        parts = {
+            "COLO": (colors[part], s.colors, None, reach),
+            "SCAL": (arrays["SCAL"][part], s.scales, None, reach),
+            "OPAC": (opacity[part, None], s.opacities, opacity_cost, reach and OPACITY_REACH),
+        }
+        for group, (values, weights, cost, far) in parts.items():
+            for column, numbers in enumerate(values.T):
+                weight = None if like is None else like.channels[layer][group][column].weight
+                jobs[f"{group} {layer} {column}"] = partial(
+                    quantize_channel, numbers, classes, weights, d, cost, far, weight
+                )
+    done = _together(jobs)
+    channels = [
+        {group: [done[f"{group} {layer} {column}"] for column in range(count)] for group, count in COLUMNS.items()}
+        for layer in range(len(plan.layers))
+    ]
+    return Quantized(channels, {group: done[group] for group in plan.groups})
 
 
 def encode(quantized: Quantized, plan: Plan) -> dict[str, tuple[int, bytes]]:
-    """Codec and stored bytes of each section but the metadata."""
-    sections = {"POSI": (CODEC_POINTS, plan.positions)}
-    for group, channels in quantized.channels.items():
-        data = b"".join(encode_channel(channel, plan.points.classes) for channel in channels)
+    """Codec and stored bytes of each section but the metadata, in file order: a part of the file from its start on is
+    a model if it holds the first layer and the fields."""
+
+    def encode_channels(layer: int, group: str) -> tuple[int, bytes]:
         basis = plan.basis.astype("<f4").tobytes() if group == "COLO" else b""
-        sections[group] = CODEC_CHANNELS, basis + data
-    for group, chosen in quantized.groups.items():
-        sections[group] = CODEC_GROUPS, encode_groups(chosen, plan.groups[group])
-    return sections
+        classes = plan.layers[layer].points.classes
+        channels = [encode_channel(channel, classes) for channel in quantized.channels[layer][group]]
+        return CODEC_CHANNELS, basis + b"".join(channels)
+
+    def encode_numbers(group: str) -> tuple[int, bytes]:
+        return CODEC_GROUPS, encode_groups(quantized.groups[group], plan.groups[group])
+
+    jobs = {group: partial(encode_numbers, group) for group in plan.groups}
+    for layer in range(len(plan.layers)):
+        jobs |= {layer_section(group, layer): partial(encode_channels, layer, group) for group in COLUMNS}
+    done = _together(jobs)
+    for layer, points in enumerate(plan.layers):
+        done[layer_section("POSI", layer)] = CODEC_POINTS, points.positions
+    first = ["GMLP", "RMLP", *LAYERED, "GTAB", "RTAB"]
+    further = [layer_section(group, layer) for layer in range(1, len(plan.layers)) for group in LAYERED]
+    return {type: done[type] for type in (*first, *further)}
 
 
 def decode_channels(data: memoryview, points: Points, columns: int) -> np.ndarray:
@@ -86,7 +127,7 @@ def decode_channels(data: memoryview, points: Points, columns: int) -> np.ndarra
             raise DamagedDataError(f"its {len(data)} bytes are fewer than those of a basis; it is truncated")
         basis = np.frombuffer(data[:36], "<f4").reshape(3, 3)
         data = data[36:]
-        if not (np.abs(basis) <= 1.001).all():
+        if not (np.abs(basis) <= 1 + 2**-10).all():
             raise DamagedDataError("its basis is not orthonormal; it is damaged")
     channels = []
     for _ in range(columns):
@@ -102,10 +143,23 @@ def _joined(channels: list[np.ndarray], basis: np.ndarray) -> np.ndarray:
     if len(channels) == 1:
         return channels[0][:, None].astype(np.float32)
     joined = np.empty((len(channels[0]), 3), np.float32)
-    for column in range(3):
-        first, second, third = (values * float(basis[column, j]) for j, values in enumerate(channels))
-        joined[:, column] = first + second + third
+    for start in range(0, len(joined), _BLOCK):
+        part = slice(start, start + _BLOCK)
+        for column in range(3):
+            first, second, third = (values[part] * float(basis[column, j]) for j, values in enumerate(channels))
+            joined[part, column] = first + second + third
     return joined
+
+
+def _together(jobs: dict[str, Callable[[], T]]) -> dict[str, T]:
+    """What independent jobs return; they run side by side."""
+    names, done = list(jobs), {}
+
+    def run(index: int) -> None:
+        done[names[index]] = jobs[names[index]]()
+
+    run_tasks(run, len(names))
+    return {name: done[name] for name in names}
 
 
 @torch.no_grad()

@@ -1,0 +1,229 @@
+"""The page about a compressed file: what it takes, what it lost, what else it could have been."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from fractions import Fraction
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyrfpack.atomic import check_writable, make_folder, write_atomic
+from hyrfpack.bench.machine import machine, machine_line
+from hyrfpack.bench.timing import take_turns
+from hyrfpack.compress.report_page import PLOT, Findings, Point, ShownView, page
+from hyrfpack.compress.report_plot import draw
+from hyrfpack.compress.run import NOISE, default_noise
+from hyrfpack.compress.sensitivity import measure_sensitivity
+from hyrfpack.errors import HyrfError
+from hyrfpack.evaluate import Evaluation, evaluate
+from hyrfpack.evaluate.metrics import psnr, to_8bit
+from hyrfpack.format.codec import (
+    CompressionReport,
+    decode_model,
+    encode_model,
+    load_with_provenance,
+    without_cameras,
+)
+from hyrfpack.format.compact import make_plan
+from hyrfpack.format.info import describe
+from hyrfpack.model import HybridModel
+from hyrfpack.render import render
+from hyrfpack.render.capture import stored_cameras
+from hyrfpack.render.files import save_picture, to_image
+from hyrfpack.scene import Camera, Picture, Scene, View, evenly_spaced
+
+FACTORS = (1 / 16, 1 / 4, 1, 4, 16)  # of the file's noise, for the curve
+LARGE = 200_000  # Gaussians from which on the curve takes the middle three alone
+SCORED = 24  # views at most
+SHOWN = 4  # views whose pictures stand on the page
+VISIBLE = 0.4  # rms difference that the worst shown view is amplified to, at most
+MOST_AMPLIFIED = 64
+TURNS = 3  # of timing each file
+CHOSEN = "this file"
+
+
+def write_report(
+    folder: str | os.PathLike[str],
+    source: str | os.PathLike[str],
+    packed: str | os.PathLike[str],
+    report: CompressionReport,
+    scene: Scene | None = None,
+    *,
+    command: str = "",
+    say: Callable[[str], None] = lambda sentence: None,
+) -> Path:
+    """Write `folder/index.html` about a compressed file, and its pictures beside it.
+
+    Scores are those of decoded files on the held-out photos of the scene, on those it was trained on where none are
+    held out, and without photos against the uncompressed model's own renders.
+
+    Args:
+        folder: made if missing; files of an earlier page are replaced.
+        source: the file that was compressed.
+        packed: the file it became.
+        report: what `hyrfpack.compress` returned.
+        scene: photos.
+        command: what was run, for people to run it again.
+        say: told what is going on.
+
+    Returns:
+        The page, written last: where it is, all that it shows is there.
+
+    Raises:
+        HyrfError: a file cannot be read, or the folder cannot be written.
+    """
+    folder, source, packed = Path(folder), Path(source), Path(packed)
+    make_folder(folder)
+    check_writable(folder)
+    model, provenance = load_with_provenance(source)
+    views, words = _views(model, source, scene)
+    say(f"comparing pictures with {words}, for the page")
+    before = evaluate(model, views)
+    facts, data = describe(packed), _read(packed)
+    scored = [view for view in views if view.name not in before.skipped]
+
+    profiles = _profiles(model, provenance, report.profile)
+    curve = {}
+    if len(model):
+        cameras = stored_cameras(describe(source)) if scene is None else [view.camera for view in scene.train]
+        curve = _finer_and_coarser(model, provenance, cameras, _noise(facts, model, provenance))
+    same = [name for name, other in curve.items() if other == data]  # the file itself, where it is on the curve
+    files = {CHOSEN: data, **profiles, **{name: other for name, other in curve.items() if name not in same}}
+    points, decoded = _measured(files, scored)
+
+    shown, amplified = _write_pictures(folder, model, decoded[CHOSEN], scored, before, points[CHOSEN].scores)
+    findings = Findings(
+        views=words,
+        has_photos=scene is not None,
+        before=before,
+        chosen=points[CHOSEN],
+        profiles=[points[name] for name in profiles],
+        curve=[points[CHOSEN if name in same else name] for name in curve],
+        shown=shown,
+        amplified=amplified,
+        gaussians=len(model),
+        machine=machine_line(machine()),
+        writer=facts["writer"],
+    )
+    draw(findings, folder / PLOT)
+    path = folder / "index.html"
+    write_atomic(path, page(source, packed, report, findings, command).encode())
+    return path
+
+
+def _views(model: HybridModel, source: Path, scene: Scene | None) -> tuple[list[View], str]:
+    """What pictures are compared with, and that in words."""
+    if scene is None:
+        with torch.no_grad():
+            geometry = model.decode_geometry()
+            cameras = evenly_spaced(stored_cameras(describe(source)), SCORED)
+            renders = [to_image(render(model, camera, geometry=geometry).rgb) for camera in cameras]
+        views = [
+            View(f"viewpoint {number}", camera, partial(Picture, np.asarray(picture)))
+            for number, (camera, picture) in enumerate(zip(cameras, renders, strict=True), 1)
+        ]
+        return views, f"what the uncompressed model shows from {len(views)} viewpoints"
+    views, kind = (scene.test, "held-out") if scene.test else (scene.train, "training")
+    chosen = evenly_spaced(views, SCORED)
+    count = f"{len(chosen)}" if len(chosen) == len(views) else f"{len(chosen)} of {len(views)}"
+    return chosen, f"{count} {kind} {'photo' if len(views) == 1 else 'photos'}"
+
+
+def _noise(facts: dict, model: HybridModel, provenance: dict) -> float:
+    """What the packed file allows pictures, as `make_plan` takes it; of other profiles the default."""
+    distortion = facts["settings"].get("distortion")
+    if not isinstance(distortion, float) or not distortion > 0:
+        return default_noise(provenance)
+    return distortion * sum(parameter.numel() for parameter in model.parameters())
+
+
+def _profiles(model: HybridModel, provenance: dict, done: str) -> dict[str, bytes]:
+    """The model in the profiles without settings to choose, but for the one that is done."""
+    files = {}
+    for profile, kept in (("raw", provenance), ("paper", without_cameras(provenance))):
+        with suppress(HyrfError):  # half precision does not hold every model
+            if profile != done:
+                files[profile] = encode_model(model, profile, kept)
+    return files
+
+
+def _finer_and_coarser(
+    model: HybridModel, provenance: dict, cameras: Sequence[Camera], noise: float
+) -> dict[str, bytes]:
+    """The model in profile "compact", finest first."""
+    sensitivity = measure_sensitivity(model, cameras)
+    files = {}
+    for factor in FACTORS if len(model) < LARGE else FACTORS[1:-1]:
+        share = f"{Fraction(factor)} of the noise" if factor < 1 else f"{factor} times the noise"
+        plan = make_plan(model, sensitivity, min(max(factor * noise, NOISE[0]), NOISE[1]))
+        name = "compact, the same noise" if factor == 1 else f"compact, {share}"
+        files[name] = encode_model(model, "compact", without_cameras(provenance), plan=plan)
+    return files
+
+
+def _measured(files: dict[str, bytes], views: Sequence[View]) -> tuple[dict[str, Point], dict[str, HybridModel]]:
+    """Decode files in turns, and score what comes out."""
+    times, decoded = take_turns({name: partial(decode_model, data) for name, data in files.items()}, TURNS)
+    points = {
+        name: Point(name, len(data), evaluate(decoded[name], views), times[name].ms) for name, data in files.items()
+    }
+    return points, decoded
+
+
+@torch.no_grad()
+def _write_pictures(
+    folder: Path,
+    model: HybridModel,
+    packed: HybridModel,
+    views: Sequence[View],
+    before: Evaluation,
+    after: Evaluation,
+) -> tuple[list[ShownView], int]:
+    """Renders of both models and their difference, from the view that loses most to the one that loses least.
+
+    Returns:
+        The views, and how many times the differences are amplified.
+    """
+    scored = sorted(zip(views, before.views, after.views, strict=True), key=lambda item: item[2].psnr - item[1].psnr)
+    chosen = evenly_spaced(scored, SHOWN)
+    geometries = model.decode_geometry(), packed.decode_geometry()
+    pairs: list[tuple[Tensor, Tensor]] = [
+        tuple(
+            to_8bit(render(each, view.camera, geometry=geometry).rgb)
+            for each, geometry in zip((model, packed), geometries, strict=True)
+        )
+        for view, *_ in chosen
+    ]
+    between = [psnr(new, old) for old, new in pairs]
+    amplified = amplification(min(between))
+    shown = []
+    for number, ((view, old, new), pair, distance) in enumerate(zip(chosen, pairs, between, strict=True), 1):
+        pictures = {
+            f"view{number}_before.png": pair[0],
+            f"view{number}_after.png": pair[1],
+            f"view{number}_difference.png": amplified * (pair[1] - pair[0]).abs(),
+        }
+        for name, picture in pictures.items():
+            save_picture(folder / name, to_image(picture))
+        shown.append(ShownView(view.name, old.psnr, new.psnr, distance, tuple(pictures)))
+    return shown, amplified
+
+
+def amplification(between: float) -> int:
+    """The power of two that makes a difference of so many dB visible, 1 to MOST_AMPLIFIED."""
+    rms = 10 ** (-between / 20)
+    return 2 ** max(0, min(math.floor(math.log2(VISIBLE / rms)), int(math.log2(MOST_AMPLIFIED))))
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise HyrfError(f"{path}: the file cannot be read ({error.strerror or error}); write it again") from error

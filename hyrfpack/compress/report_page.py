@@ -1,0 +1,313 @@
+"""What `hyrfpack compress --report` found out, as one HTML page that needs no network and no scripts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+from hyrfpack.errors import printable
+from hyrfpack.evaluate import Evaluation
+from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
+from hyrfpack.format import CompressionReport
+from hyrfpack.format.info import SECTIONS_OF_LAYERS
+
+PLOT = "size_against_loss.png"
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; color: #202124; max-width: 68rem; margin: 2rem auto; padding: 0 1rem; }
+h1 { font-size: 2rem; margin-bottom: 0; }
+h2 { font-size: 1.3rem; margin-top: 2.5rem; }
+p, figcaption { max-width: 48rem; }
+figcaption { color: #5f6368; margin-top: .3rem; }
+figure { margin: 1rem 0 2rem; }
+img { max-width: 100%; height: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { text-align: right; padding: .25rem .8rem; border-bottom: 1px solid #dadce0; }
+th:first-child, td:first-child { text-align: left; padding-left: 0; }
+tr.chosen td { font-weight: bold; }
+pre { background: #f1f3f4; padding: .8rem; white-space: pre-wrap; overflow-wrap: anywhere; }
+.views { display: grid; grid-template-columns: repeat(3, 1fr); gap: .5rem; text-align: center; }
+.views img { width: 100%; }
+"""
+
+
+@dataclass(frozen=True)
+class Point:
+    """A file that the model can be written as.
+
+    Attributes:
+        name: in words.
+        bytes: of the whole file.
+        scores: of the decoded file.
+        decode_ms: median time to decode it, in milliseconds.
+    """
+
+    name: str
+    bytes: int
+    scores: Evaluation
+    decode_ms: float
+
+
+@dataclass(frozen=True)
+class ShownView:
+    """A view whose pictures stand on the page.
+
+    Attributes:
+        name: of the photo, or which viewpoint it is.
+        before, after: PSNR of the model before and after compression against the photo, dB.
+        between: PSNR between the two renders, dB.
+        files: before, after and difference, relative to the page.
+    """
+
+    name: str
+    before: float
+    after: float
+    between: float
+    files: tuple[str, str, str]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What was measured for the page.
+
+    Attributes:
+        views: what was rendered, in words.
+        has_photos: views are scored against photos; else against the renders of the uncompressed model.
+        before: the uncompressed model.
+        chosen: the file that was written.
+        profiles: the model in the other profiles that have no settings to choose.
+        curve: the model in profile "compact" at other levels of noise, finest first.
+        shown: views to look at, the one that loses most first.
+        amplified: how many times the difference pictures show the difference.
+        gaussians: how many the uncompressed model has.
+        machine: that the times belong to.
+        writer: the program and its version.
+    """
+
+    views: str
+    has_photos: bool
+    before: Evaluation
+    chosen: Point
+    profiles: list[Point]
+    curve: list[Point]
+    shown: list[ShownView]
+    amplified: int
+    gaussians: int
+    machine: str
+    writer: str
+
+    @property
+    def points(self) -> list[Point]:
+        """All files, largest first; the chosen one may be on the curve."""
+        others = [point for point in (*self.profiles, *self.curve) if point is not self.chosen]
+        return sorted([self.chosen, *others], key=lambda point: -point.bytes)
+
+    def is_exact(self, scores: Evaluation) -> bool:
+        """Without photos: pictures are the same in every pixel."""
+        return not self.has_photos and scores.psnr == IDENTICAL_PSNR
+
+    def fidelity(self, scores: Evaluation) -> float:
+        """With photos how much PSNR is lost, else the PSNR against the uncompressed model's renders; dB."""
+        return self.before.psnr - scores.psnr if self.has_photos else scores.psnr
+
+
+def page(source: Path, packed: Path, report: CompressionReport, findings: Findings, command: str) -> str:
+    """The page as HTML. Words out of files are text in a tree of elements, so none of them can become markup."""
+    title = headline(report, findings)
+    head = _element(
+        "head",
+        _element("meta", charset="utf-8"),
+        _element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        _element("title", f"{packed.name}: {title}"),
+        _element("style", STYLE),
+    )
+    body = _element(
+        "body",
+        _element("h1", title),
+        *_summary(source, packed, report, findings),
+        _element("h2", "What each part takes"),
+        *_parts(report),
+        _element("h2", "Size, loss and speed"),
+        *_choices(findings),
+        _element("h2", "Before and after"),
+        *_pictures(findings),
+        _element("h2", "How to make this file again"),
+        *([_element("pre", command)] if command else []),
+        _element("p", f"Written by {findings.writer}. Times were measured on this machine: {findings.machine}."),
+    )
+    document = _element("html", head, body, lang="en")
+    ElementTree.indent(document)
+    return "<!DOCTYPE html>\n" + ElementTree.tostring(document, encoding="unicode", method="html") + "\n"
+
+
+def headline(report: CompressionReport, findings: Findings) -> str:
+    """What came of it, in a few words: "183 kB, 5.8 times smaller, 0.04 dB lost"."""
+    size = size_in_words(report.bytes_after)
+    if report.profile == "raw":
+        return f"{size}, every number exact, nothing lost"
+    ratio = report.bytes_before / report.bytes_after
+    return f"{size}, {ratio:.1f} times smaller, {_loss_in_words(findings)}"
+
+
+def size_in_words(count: float) -> str:
+    """Bytes with three digits that matter; k, M and G are powers of 1000."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= 0.9995 * factor:
+            return f"{count / factor:.3g} {unit}"
+    return f"{count:.0f} bytes"
+
+
+def _loss_in_words(findings: Findings) -> str:
+    scores = findings.chosen.scores
+    value = findings.fidelity(scores)
+    if not findings.has_photos:
+        return "no pixel changed" if findings.is_exact(scores) else f"{value:.1f} dB between pictures before and after"
+    if abs(value) < 0.005:
+        return "less than 0.01 dB lost"
+    return f"{abs(value):.2f} dB {'lost' if value > 0 else 'gained'}"
+
+
+def _summary(source: Path, packed: Path, report: CompressionReport, findings: Findings) -> list[Element]:
+    kept = f"{report.gaussians:,} Gaussians"
+    if report.gaussians < findings.gaussians:
+        kept += f" out of {findings.gaussians:,} (pictures do not miss the others)"
+    before, after = findings.before, findings.chosen.scores
+    sentences = [
+        f"{packed} is a packed copy of {source}: a scene learnt from photos, which can be looked at from any side. "
+        f"It is {report.bytes_after:,} bytes long and holds {kept}; as plain 32-bit numbers they take "
+        f"{report.bytes_before:,} bytes. Profile: {report.profile}.",
+    ]
+    if findings.has_photos:
+        sentences.append(
+            f"Its pictures were compared with {findings.views}: PSNR {before.psnr:.3f} dB before and {after.psnr:.3f} "
+            f"dB after compression, SSIM {before.ssim:.4f} before and {after.ssim:.4f} after. PSNR says how near "
+            "pictures are to the photos, and so does SSIM, up to 1; more is nearer. A tenth of a dB is rarely seen."
+        )
+    elif findings.is_exact(after):
+        sentences.append(f"Its pictures were compared with {findings.views}: they are the same in every pixel.")
+    else:
+        sentences.append(
+            f"Its pictures were compared with {findings.views}: PSNR {after.psnr:.2f} dB, SSIM {after.ssim:.4f}. PSNR "
+            "says how near pictures are, and so does SSIM, up to 1; more is nearer. From 40 dB on differences are hard "
+            "to see. Name photos of the scene with --data to learn what was lost against them."
+        )
+    if report.found:
+        sentences.append(f"The search came to this: {report.found}.")
+    return [_element("p", sentence) for sentence in sentences]
+
+
+def _parts(report: CompressionReport) -> list[Element]:
+    """The bytes of each section, all layers together."""
+    sizes: dict[str, list[int]] = {}
+    names = {part.type: part.holds for part in report.sections}
+    for part in report.sections:
+        size = sizes.setdefault(SECTIONS_OF_LAYERS.get(part.type, (part.type, 0))[0], [0, 0])
+        size[0] += part.before
+        size[1] += part.after
+    header = ["part", "bytes before", "bytes after", "share of the file", "bits a number"]
+    rows, total = [], report.bytes_after
+    for type, (before, after) in sizes.items():
+        numbers = 0 if type == "META" else before // 4
+        bits = f"{8 * after / numbers:.2f}" if numbers else ""
+        loss = f"{report.shares[type]:.1%}" if type in report.shares else ""
+        rows.append([names.get(type, type), f"{before:,}", f"{after:,}", f"{after / total:.1%}", bits, loss])
+    rest = total - sum(after for _, after in sizes.values())
+    rows.append(["header, table of contents, padding", "", f"{rest:,}", f"{rest / total:.1%}", "", ""])
+    rows.append(["the whole file", f"{report.bytes_before:,}", f"{total:,}", "100.0%", "", ""])
+    note = (
+        "Positions and logits belong to the Gaussians, soft blobs of colour. Hash tables and decoders are two small "
+        "neural networks that add to each Gaussian's colour, size and opacity and turn it. Bytes before are those of "
+        "plain 32-bit numbers, the metadata not counted in the sum."
+    )
+    if report.shares:
+        header.append("share of the loss")
+        note += " The share of the loss is an estimate: how much of what changed in pictures is due to this part."
+    return [_table(header, [row[: len(header)] for row in rows]), _element("p", note)]
+
+
+def _choices(findings: Findings) -> list[Element]:
+    """The plot, and the same numbers as a table."""
+    measure = "PSNR lost (dB)" if findings.has_photos else "PSNR (dB)"
+    rows = [
+        [
+            point.name,
+            f"{point.bytes:,}",
+            "exact" if findings.is_exact(point.scores) else f"{findings.fidelity(point.scores):.3f}",
+            f"{point.scores.ssim:.4f}",
+            f"{point.decode_ms:.1f}",
+        ]
+        for point in findings.points
+    ]
+    caption = (
+        "Other files that the same model could be. The line joins those of profile compact at its defaults, without "
+        "fine-tuning, that allow pictures more or less noise; paper is the recipe of the HyRF paper, raw stores every "
+        "number exactly. Below: how long each takes to decode. For another file on the line ask for its size with "
+        "--target-size."
+    )
+    return [
+        _element(
+            "figure",
+            _element("img", src=PLOT, alt="Bytes of each file against its loss, and against the time to decode it"),
+            _element("figcaption", caption),
+        ),
+        _table(
+            ["file", "bytes", measure, "SSIM", "decoding (ms)"],
+            rows,
+            chosen=findings.points.index(findings.chosen),
+        ),
+    ]
+
+
+def _pictures(findings: Findings) -> list[Element]:
+    labels = ("before", "after", f"difference, {findings.amplified} times as strong")
+    figures = []
+    for view in findings.shown:
+        told = f"{view.name}: {view.between:.1f} dB between before and after"
+        if view.between == IDENTICAL_PSNR:
+            told = f"{view.name}: before and after are identical"
+        if findings.has_photos:
+            told += f"; {view.before:.2f} dB before and {view.after:.2f} dB after against the photo"
+        pictures = [
+            _element("a", _element("img", src=file, alt=f"{view.name}, {label}"), _element("div", label), href=file)
+            for file, label in zip(view.files, labels, strict=True)
+        ]
+        figures.append(
+            _element("figure", _element("div", *pictures, **{"class": "views"}), _element("figcaption", told))
+        )
+    intro = (
+        "Rendered by the model before compression, and from the file after it. The third picture shows how far the two "
+        f"are apart in each colour, {findings.amplified} times as strong as it is: black is no difference. The view "
+        "that loses most comes first, the one that loses least last. Each picture is linked in its full size."
+    )
+    return [_element("p", intro), *figures]
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]], chosen: int | None = None) -> Element:
+    return _element(
+        "table",
+        _element("thead", _element("tr", *(_element("th", cell) for cell in header))),
+        _element(
+            "tbody",
+            *(
+                _element(
+                    "tr",
+                    *(_element("td", cell) for cell in row),
+                    **({"class": "chosen"} if number == chosen else {}),
+                )
+                for number, row in enumerate(rows)
+            ),
+        ),
+    )
+
+
+def _element(tag: str, *content: str | Element, **attributes: str) -> Element:
+    """An element with text, or with other elements, inside."""
+    made = Element(tag, {name: printable(value) for name, value in attributes.items()})
+    for part in content:
+        if isinstance(part, Element):
+            made.append(part)
+        else:
+            made.text = part if tag == "style" else printable(part)
+    return made

@@ -1,0 +1,283 @@
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from commands import succeeded
+from PIL import Image
+from scenes import ball_points, ball_scene, ring, small_model
+
+from hyrfpack.compress import compress
+from hyrfpack.compress.report import amplification, write_report
+from hyrfpack.compress.report_page import size_in_words
+from hyrfpack.errors import HyrfError
+from hyrfpack.evaluate import evaluate
+from hyrfpack.format import CompressionReport, load, save
+from hyrfpack.render.capture import capture_of
+from hyrfpack.scene import Scene
+
+MARKUP = "<script>alert(1)</script>&amp;.png"
+
+
+class Page(HTMLParser):
+    """Tags, attributes, texts by tag, and rows of tables of a page, as a browser would see them."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.links: list[str] = []
+        self.texts: dict[str, list[str]] = {}
+        self.tables: list[list[list[str]]] = []
+        self.feed(path.read_text(encoding="utf-8"))
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.links += [value for name, value in attrs if name in ("src", "href")]
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+        if tag == "table":
+            self.tables.append([])
+        elif tag == "tr":
+            self.tables[-1].append([])
+        elif tag in ("td", "th"):
+            self.tables[-1][-1].append("")
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open:
+            self.texts.setdefault(self.open[-1], []).append(data)
+            if self.open[-1] in ("td", "th"):
+                self.tables[-1][-1][-1] += data
+
+    @property
+    def words(self) -> str:
+        return " ".join(text for tag, texts in self.texts.items() if tag != "style" for text in texts)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick() -> Iterator[None]:
+    """Here neither times need be fair nor sensitivities precise."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hyrfpack.compress.report.TURNS", 1)
+        patch.setattr("hyrfpack.bench.timing.WARM_SECONDS", 0.0)
+        patch.setattr("hyrfpack.compress.sensitivity.MOST", 24)
+        yield
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """Photos of balls, the last two held out; one has a name like markup."""
+    made = ball_scene(8)
+    views = [dataclasses.replace(made.train[0], name=MARKUP), *made.train[1:]]
+    return dataclasses.replace(made, train=views[2:], test=views[:2])
+
+
+@pytest.fixture(scope="module")
+def source(scene, tmp_path_factory) -> Path:
+    """A model of the balls that keeps its cameras, in a folder with a name like markup."""
+    positions, colors = ball_points(150)
+    model = small_model(positions, color_logits=torch.from_numpy(colors) * 4 - 2, scale_logits=-2.5, fields=0.2)
+    folder = tmp_path_factory.mktemp("<img src=x onerror=alert(1)>")
+    path = folder / "model.hyrf"
+    save(model, path, provenance={"cameras": capture_of([view.camera for view in scene.train])})
+    return path
+
+
+def reported(
+    source: Path, folder: Path, profile: str = "compact", scene: Scene | None = None, **options
+) -> tuple[Path, CompressionReport, Page]:
+    """Compress and write a page about it: the packed file, the report and the page."""
+    packed = folder / "packed.hyrf"
+    report = compress(source, packed, profile, data=scene, **options)
+    return (
+        packed,
+        report,
+        Page(write_report(folder / "page", source, packed, report, scene, command="make <it> \udcff")),
+    )
+
+
+@pytest.fixture(scope="module")
+def with_photos(source, scene, tmp_path_factory) -> tuple[Path, CompressionReport, Page]:
+    return reported(source, tmp_path_factory.mktemp("photos"), scene=scene, noise=1e-4)
+
+
+# -- the page as a file ----------------------------------------------------------------------------------------------
+
+
+def test_page_is_whole_and_needs_nothing_but_the_pictures_beside_it(with_photos):
+    packed, _, page = with_photos
+    folder = packed.parent / "page"
+    assert page.open == []  # every element is closed, in order
+    assert not {"script", "link", "iframe", "object"} & set(page.tags)
+    assert "url(" not in "".join(page.texts["style"]) and "@import" not in "".join(page.texts["style"])
+    assert {"index.html", *page.links} == {path.name for path in folder.iterdir()}
+
+
+def test_words_of_files_are_never_markup(with_photos):
+    _, _, page = with_photos
+    assert any(MARKUP in text for text in page.texts["figcaption"])
+    assert any("<img src=x onerror=alert(1)>" in text for text in page.texts["p"])
+    assert page.texts["pre"] == ["make <it> \\udcff"]  # a path that is no Unicode
+    assert page.tags.count("img") == 1 + 3 * 2
+
+
+def test_folder_that_cannot_be_made_is_refused_before_the_work(source, tmp_path):
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(HyrfError, match="cannot be made"):
+        write_report(tmp_path / "file" / "page", source, source, CompressionReport("raw", 1, 1, 1, []))
+
+
+def test_page_appears_only_after_its_pictures(source, tmp_path, monkeypatch):
+    def full(path, image):
+        raise HyrfError("the disk is full")
+
+    monkeypatch.setattr("hyrfpack.compress.report.save_picture", full)
+    with pytest.raises(HyrfError, match="full"):
+        reported(source, tmp_path, "raw")
+    assert list((tmp_path / "page").iterdir()) == []
+
+
+# -- its numbers -----------------------------------------------------------------------------------------------------
+
+
+def test_headline_tells_the_bytes_on_disk_and_the_psnr_lost_on_held_out_photos(with_photos, source, scene):
+    packed, report, page = with_photos
+    lost = evaluate(load(source), scene.test).psnr - evaluate(load(packed), scene.test).psnr
+    ratio = report.bytes_before / packed.stat().st_size
+    size = f"{packed.stat().st_size / 1000:.3g} kB"
+    words = f"{abs(lost):.2f} dB {'lost' if lost > 0 else 'gained'}" if abs(lost) >= 0.005 else "less than 0.01 dB lost"
+    assert page.texts["h1"] == [f"{size}, {ratio:.1f} times smaller, {words}"]
+    assert "2 held-out photos" in page.words
+
+
+def test_parts_add_up_to_the_file_and_to_the_loss(with_photos):
+    packed, _, page = with_photos
+    header, *rows = page.tables[0]
+    assert header[2] == "bytes after" and header[5] == "share of the loss"
+    *parts, total = [int(row[2].replace(",", "")) for row in rows]
+    assert sum(parts) == total == packed.stat().st_size
+    assert sum(float(row[5].rstrip("%")) for row in rows if row[5]) == pytest.approx(100, abs=0.5)
+
+
+def test_layers_of_a_section_are_one_part(source, tmp_path):
+    packed, report, _ = reported(source, tmp_path, "raw")
+    positions = next(part for part in report.sections if part.type == "POSI")
+    halves = [
+        dataclasses.replace(positions, type=type, before=positions.before // 2, after=positions.after // 2)
+        for type in ("POSI", "POS1")
+    ]
+    sections = [*halves, *(part for part in report.sections if part.type != "POSI")]
+    path = write_report(tmp_path / "page", source, packed, dataclasses.replace(report, sections=sections))
+    (row,) = [row for row in Page(path).tables[0] if row[0].startswith("positions")]
+    assert row[:3] == ["positions", f"{positions.before:,}", f"{positions.after:,}"]
+
+
+def test_curve_gets_smaller_as_it_is_allowed_more_noise(with_photos):
+    _, _, page = with_photos
+    header, *rows = page.tables[1]
+    assert header[:3] == ["file", "bytes", "PSNR lost (dB)"]
+    by_name = {row[0]: (int(row[1].replace(",", "")), float(row[2])) for row in rows}
+    names = ("1/16 of the noise", "1/4 of the noise", None, "4 times the noise", "16 times the noise")
+    curve = [by_name["this file" if name is None else f"compact, {name}"] for name in names]
+    assert [size for size, _ in curve] == sorted((size for size, _ in curve), reverse=True)
+    assert curve[-1][1] > curve[0][1]
+    assert by_name["raw"][1] == 0 and by_name["raw"][0] > by_name["paper"][0]
+    assert len(by_name) == 7
+
+
+def test_a_file_off_the_curve_stands_beside_it(source, scene, tmp_path):
+    _, _, page = reported(source, tmp_path, scene=scene, noise=3e-3, finetune_steps=2)
+    names = [row[0] for row in page.tables[1]]
+    assert "this file" in names and "compact, the same noise" in names
+
+
+def test_difference_pictures_are_amplified_as_the_page_says(with_photos):
+    packed, _, page = with_photos
+    folder = packed.parent / "page"
+    (times,) = {int(text.split()[1]) for text in page.texts["div"] if text.startswith("difference")}
+    before, after, difference = (
+        np.asarray(Image.open(folder / f"view1_{name}.png")).astype(int) for name in ("before", "after", "difference")
+    )
+    np.testing.assert_array_equal(difference, np.minimum(times * np.abs(after - before), 255))
+    assert difference.max() > 0
+
+
+def test_views_go_from_the_one_that_loses_most_to_the_one_that_loses_least(with_photos, source, scene):
+    packed, _, page = with_photos
+    old, new = (evaluate(load(path), scene.test).views for path in (source, packed))
+    lost = {before.name: before.psnr - after.psnr for before, after in zip(old, new, strict=True)}
+    expected = sorted(lost, key=lost.get, reverse=True)
+    captions = [text for text in page.texts["figcaption"] if "against the photo" in text]
+    assert [next(name for name in expected if text.startswith(name)) for text in captions] == expected
+
+
+# -- other inputs ----------------------------------------------------------------------------------------------------
+
+
+def test_without_photos_renders_are_compared_with_the_uncompressed_model(source, tmp_path):
+    _, _, page = reported(source, tmp_path, noise=1e-4)
+    assert "dB between pictures before and after" in page.texts["h1"][0]
+    assert "against the photo" not in page.words
+    assert "what the uncompressed model shows from 6 viewpoints" in page.words
+    (raw,) = [row for row in page.tables[1] if row[0] == "raw"]
+    assert raw[2] == "exact"
+
+
+def test_a_raw_file_has_lost_nothing(source, tmp_path):
+    _, _, page = reported(source, tmp_path, "raw")
+    assert page.texts["h1"][0].endswith("every number exact, nothing lost")
+    assert "the same in every pixel" in page.words and "share of the loss" not in page.words
+    assert "raw" not in [row[0] for row in page.tables[1]]
+
+
+def test_a_model_without_gaussians_has_a_page_without_a_curve(tmp_path):
+    save(small_model(np.zeros((0, 3))), tmp_path / "empty.hyrf", provenance={"cameras": capture_of(ring(2))})
+    _, _, page = reported(tmp_path / "empty.hyrf", tmp_path, "paper")
+    assert sorted(row[0] for row in page.tables[1][1:]) == ["raw", "this file"]
+
+
+def test_a_model_that_half_precision_cannot_hold_has_a_page_without_paper(tmp_path):
+    positions, _ = ball_points(20)
+    model = small_model(positions)
+    with torch.no_grad():
+        model.gaussians.positions[0, 0] = 1e5
+    save(model, tmp_path / "far.hyrf", provenance={"cameras": capture_of(ring(2))})
+    _, _, page = reported(tmp_path / "far.hyrf", tmp_path, noise=1e-4)
+    assert "paper" not in [row[0] for row in page.tables[1]]
+
+
+def test_command_line_writes_the_page_and_says_so(source, tmp_path):
+    result = succeeded("compress", source, "-o", tmp_path / "p.hyrf", "--profile", "raw", "--report", tmp_path / "page")
+    assert "for the page" in result.stderr
+    assert Page(tmp_path / "page" / "index.html").texts["pre"][0].startswith("hyrfpack ")
+
+
+@pytest.mark.parametrize(
+    ("count", "words"),
+    [
+        (0, "0 bytes"),
+        (999, "999 bytes"),
+        (1000, "1 kB"),
+        (183_456, "183 kB"),
+        (999_499, "999 kB"),
+        (999_500, "1 MB"),
+        (1_234_567, "1.23 MB"),
+        (2_500_000_000, "2.5 GB"),
+    ],
+)
+def test_sizes_in_words_keep_three_digits(count, words):
+    assert size_in_words(count) == words
+
+
+@pytest.mark.parametrize(("between", "times"), [(100.0, 64), (40.0, 32), (30.0, 8), (6.0, 1), (0.0, 1)])
+def test_amplification_makes_the_worst_difference_visible(between, times):
+    assert amplification(between) == times

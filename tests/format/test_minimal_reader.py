@@ -1,0 +1,139 @@
+"""docs/format.md is enough: a reader written from it alone gives the same bits as hyrfpack, and refuses the same."""
+
+from __future__ import annotations
+
+import ast
+import json
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import minimal_reader
+import numpy as np
+import pytest
+from plans import encode
+from scenes import small_model
+
+from hyrfpack.errors import HyrfFormatError
+from hyrfpack.format import decode_model
+from hyrfpack.format.arrays import to_arrays
+from hyrfpack.format.container import read_container, write_container
+from hyrfpack.quant.integers import encode_integers
+
+GOLDEN = sorted((Path(__file__).parents[1] / "golden").glob("*.hyrf"))
+PROFILES = ("raw", "paper", "compact")
+
+
+def model_of(count: int, **settings):
+    """A model with Gaussians inside and outside the box, and numbers of every parameter drawn."""
+    rng = np.random.default_rng(count)
+    return small_model(
+        rng.standard_t(2, (count, 3)),
+        fields=1.0,
+        color_logits=rng.normal(size=(count, 3)),
+        scale_logits=rng.normal(-4, 1, (count, 1)),
+        opacity_logits=rng.normal(0, 3, (count, 1)),
+        **settings,
+    )
+
+
+def assert_same_bits(data: bytes) -> None:
+    metadata, groups = minimal_reader.read(data)
+    model = decode_model(data)
+
+    assert metadata["config"] == json.loads(json.dumps(model.config.to_dict()))
+    expected = to_arrays(model)
+    assert groups.keys() == expected.keys()
+    for name, values in groups.items():
+        assert values.shape == expected[name].shape, name
+        assert values.dtype == np.float32
+        assert np.array_equal(values.view(np.uint32), expected[name].view(np.uint32)), name
+
+
+def test_minimal_reader_is_independent():
+    nodes = list(ast.walk(ast.parse(Path(minimal_reader.__file__).read_text())))
+
+    imported = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    imported |= {node.module for node in nodes if isinstance(node, ast.ImportFrom)}
+
+    assert imported == {
+        *("bisect", "collections.abc", "dataclasses", "json", "math", "struct", "typing", "zlib"),
+        "numpy",
+    }
+
+
+@pytest.mark.parametrize("file", GOLDEN, ids=lambda file: file.stem)
+def test_golden_files_read_the_same(file):
+    assert_same_bits(file.read_bytes())
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize(
+    ("count", "background"), [(0, True), (1, False), (2, True), (3, False), (1000, True), (1000, False)]
+)
+def test_fresh_files_read_the_same(profile, count, background):
+    encoding = "sh" if background else "frequency"
+
+    assert_same_bits(encode(model_of(count, background=background, direction_encoding=encoding), profile))
+
+
+def test_the_stream_of_the_page_is_read():
+    data = bytes.fromhex("00 12 29 B0 03 00 69 B1 00")
+
+    assert minimal_reader.read_integers(data, np.zeros(5, np.int64)).tolist() == [0, 0, 1, 0, 20]
+
+
+STREAMS = {  # scale of the integers, and what their stream must have for the test to be worth something
+    "one lane": (np.ones(500), lambda first, alphabet: first == 0 and alphabet),
+    "lanes": (1e9 * np.ones(20_000), lambda first, alphabet: first & 15),
+    "classes": (np.exp(4 * np.sin(np.arange(20_000) / 50)), lambda first, alphabet: first >> 4 & 7),
+    "static models": (1e9 * np.ones(70_000), lambda first, alphabet: first >> 7),
+    "one token": (np.zeros(70_000), lambda first, alphabet: alphabet == 0),
+}
+
+
+@pytest.mark.parametrize("contexts", [1, 3])
+@pytest.mark.parametrize("kind", STREAMS)
+def test_streams_of_every_kind_read_the_same(kind, contexts):
+    rng = np.random.default_rng(0)
+    scale, has_kind = STREAMS[kind]
+    context = rng.integers(0, contexts, len(scale)).astype(np.uint8)
+    values = np.rint(rng.laplace(size=len(scale)) * scale * (1 + context)).astype(np.int64)
+    data = encode_integers(values, context, signed=True)
+
+    read = minimal_reader.read_integers(data, context.astype(np.int64), signed=True)
+
+    assert has_kind(data[0], data[1])
+    assert np.array_equal(read, values)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_both_readers_refuse_the_same_damage(profile):
+    rng = np.random.default_rng(0)
+    sections = list(read_container(encode(model_of(30), profile)).sections)
+    refused, count = 0, 30
+
+    for _ in range(count):
+        data = write_container(damaged(sections, rng))
+        try:
+            assert_same_bits(data)
+        except (ValueError, zlib.error):
+            refused += 1
+            with pytest.raises(HyrfFormatError):
+                decode_model(data)
+
+    assert 0 < refused < count
+
+
+def damaged(sections: list, rng: np.random.Generator) -> list:
+    """The sections, one of them with a bit flipped, cut short or longer; checksums will be right."""
+    which = rng.integers(len(sections))
+    data = bytearray(sections[which].data)
+    kind, place = rng.integers(4), rng.integers(len(data))
+    if kind == 0:
+        data = data[:place]
+    elif kind == 1:
+        data += bytes(1)
+    else:
+        data[place % (16 if kind == 2 else len(data))] ^= 1 << rng.integers(8)
+    return [*sections[:which], replace(sections[which], data=bytes(data)), *sections[which + 1 :]]

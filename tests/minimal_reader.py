@@ -1,0 +1,503 @@
+"""A reader of `.hyrf` files, version 1.0 and 1.1, written from docs/format.md alone: numpy and the standard library.
+
+It shares no code with hyrfpack, and so tells whether the page says enough and whether hyrfpack does what the page says.
+Plain rather than fast: a file of 30,000 Gaussians takes some seconds. Section numbers are those of the page.
+
+    metadata, groups = read(Path("scene.hyrf").read_bytes())
+    groups["POSI"]      # float32 (N, 3)
+"""
+
+import json
+import math
+import struct
+import zlib
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+MATRIX_CODECS = {
+    "POSI": {1, 2, 3, 4, 6},
+    "COLO": {1, 2, 3, 4, 7},
+    "SCAL": {1, 2, 3, 4, 7},
+    "OPAC": {1, 2, 3, 4, 7},
+    "GTAB": {1, 2, 3, 4, 8},
+    "RTAB": {1, 2, 3, 4, 8},
+    "GMLP": {1, 2, 3, 4, 8},
+    "RMLP": {1, 2, 3, 4, 8},
+}
+RULES = {
+    "activations": "sigmoid",
+    "background_radius": 100.0,
+    "contraction": "l2",
+    "decoders": "relu",
+    "hash": "instant-ngp",
+    "rotation": "identity-offset",
+}
+KEYS = {"gaussians", "config", "rules", "profile", "settings", "provenance", "writer"}
+CONFIG_KEYS = {
+    *("frame", "geometry", "radiance", "hidden", "background", "solid"),
+    *("scale_rule", "scale_grows", "direction_encoding", "antialiased", "position_gradients"),
+}
+FRAME_KEYS = {"center", "scale", "half_extent"}
+GRID_KEYS = {"log2_table_size", "levels", "base", "finest"}
+
+
+def read(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Metadata and the eight groups of part 2, by section type, as float32 matrices (rows, columns).
+
+    Raises ValueError for files that the page tells a reader to refuse (zlib.error where a deflate stream is damaged).
+    """
+    sections = read_container(data)
+    need({"META", *MATRIX_CODECS} <= sections.keys(), "a section is missing")
+    metadata = read_metadata(sections["META"])
+    config = metadata["config"]
+    shapes = matrix_shapes(metadata)
+    for name, (rows, columns) in shapes.items():
+        need(sections[name].raw_length == 4 * rows * columns, f"{name}: wrong raw length")
+        need(sections[name].codec in MATRIX_CODECS[name], f"{name}: codec not allowed here")
+
+    groups, points = {}, None
+    for name, (rows, columns) in shapes.items():  # POSI is the first: others lean on it
+        codec, source = sections[name].codec, Cursor(sections[name].stored)
+        if codec in (1, 2):
+            numbers = np.frombuffer(source.rest(), "<f4" if codec == 1 else "<f2")
+        elif codec == 3:
+            numbers = read_codebooks(source, rows, columns)
+        elif codec == 4:
+            numbers = read_min_max(source, rows * columns)
+        elif codec == 6:
+            points = read_points(source, rows)
+            numbers = positions(points, config["frame"]["half_extent"])
+        elif codec == 7:
+            need(points is not None, f"{name}: codec 7 without lattice points")
+            numbers = read_channels(source, columns, points.classes)
+        elif name in ("GMLP", "RMLP"):
+            numbers = read_numbers(source, decoder_groups(decoder_layers(config, name)))
+        else:
+            need(points is not None, f"{name}: codec 8 without lattice points")
+            grid = config["geometry" if name == "GTAB" else "radiance"]
+            numbers = read_numbers(source, (np.repeat(table_groups(grid, points.m), 2), 16 * grid["levels"]))
+        source.end()
+        need(numbers.size == rows * columns, f"{name}: {numbers.size} numbers")
+        groups[name] = numbers.astype(np.float32).reshape(rows, columns)
+        need(bool(np.isfinite(groups[name]).all()), f"{name}: NaN or infinite")
+    return metadata, groups
+
+
+# Bytes
+
+
+def need(condition: bool, message: str) -> None:
+    if not condition:
+        raise ValueError(message)
+
+
+class Cursor:
+    """A place in bytes, which moves as they are taken; bytes that end too early or are left over are damage."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.at = data, 0
+
+    def take(self, count: int) -> bytes:
+        need(self.at + count <= len(self.data), "bytes end too early")
+        self.at += count
+        return self.data[self.at - count : self.at]
+
+    def unpack(self, layout: str) -> tuple:
+        return struct.unpack("<" + layout, self.take(struct.calcsize("<" + layout)))
+
+    def numbers(self, dtype: str, count: int) -> list:
+        return np.frombuffer(self.take(np.dtype(dtype).itemsize * count), dtype).tolist()
+
+    def rest(self) -> bytes:
+        return self.take(len(self.data) - self.at)
+
+    def end(self) -> None:
+        need(self.at == len(self.data), "bytes left over")
+
+
+def read_bits(data: bytes, widths: np.ndarray) -> np.ndarray:
+    """Numbers of so many bits each, lowest bit first from the lowest bit of the first byte on (3.1, extra bits)."""
+    total = int(widths.sum())
+    need(len(data) == -(-total // 8), "wrong number of bits")
+    bits = np.unpackbits(np.frombuffer(data, np.uint8), bitorder="little").astype(np.int64)
+    need(not bits[total:].any(), "bits left in the last byte are not zero")
+    starts = np.cumsum(widths) - widths
+    numbers = np.zeros(len(widths), np.int64)
+    for k in range(int(widths.max(initial=0))):
+        wide = widths > k
+        numbers[wide] |= bits[starts[wide] + k] << k
+    return numbers
+
+
+# 1. Container
+
+
+@dataclass(frozen=True)
+class Section:
+    codec: int
+    raw_length: int
+    stored: bytes
+
+
+def read_container(data: bytes) -> dict[str, Section]:
+    """The sections by type, checked as 1.3 says."""
+    need(data[:8] == b"\x89HYRF\r\n\n", "not a .hyrf file")
+    header = Cursor(data)
+    _, major, _, flags, length, toc_at, toc_length, count, toc_crc, header_crc = header.unpack("8sHHIQQIIII")
+    need(major == 1, f"major version {major}")
+    need(zlib.crc32(data[:44]) == header_crc and flags == 0, "damaged header")
+    need(length == len(data) <= 2**34, "wrong file length")
+    need(count <= 1024 and toc_at == 48 and toc_length == 40 * count, "table of contents in the wrong place")
+    toc = Cursor(header.take(toc_length))
+    need(zlib.crc32(toc.data) == toc_crc, "damaged table of contents")
+
+    sections, expected, raw_total = {}, 48 + toc_length, 0
+    for _ in range(count):
+        kind, codec, flags, offset, stored_length, raw_length, crc, reserved = toc.unpack("4sHHQQQII")
+        name = kind.decode("latin-1")
+        need(name.isascii() and name.replace("_", "0").isalnum() and name not in sections, f"bad type {name!r}")
+        need(flags <= 1 and reserved == 0, f"{name}: reserved bit")
+        need(flags == 0 or name == "META" or name in MATRIX_CODECS, f"{name}: required but unknown")
+        end = offset + stored_length
+        padded = -(-end // 8) * 8
+        need(offset == expected and padded <= length, f"{name}: in the wrong place")
+        stored = data[offset:end]
+        need(zlib.crc32(stored) == crc and not any(data[end:padded]), f"{name}: damaged")
+        sections[name] = Section(codec, raw_length, stored)
+        expected, raw_total = padded, raw_total + raw_length
+    need(expected == length, "bytes after the last section")
+    need(raw_total <= min(1024 * length + 2**28, 2**34), "sections too large")
+    return sections
+
+
+# 2.1 Metadata and the shapes that follow from it
+
+
+def read_metadata(section: Section) -> dict[str, Any]:
+    need(section.codec in (0, 5) and section.raw_length <= 2**20, "META: unknown codec or too long")
+    text = section.stored
+    if section.codec == 5:
+        inflate = zlib.decompressobj()
+        text = inflate.decompress(section.stored, section.raw_length + 1)
+        need(inflate.eof and not inflate.unused_data, "META: bad deflate stream")
+    need(len(text) == section.raw_length, "META: wrong raw length")
+    metadata = json.loads(text.decode("utf-8"))
+    need(isinstance(metadata, dict) and depth(metadata) <= 64, "META: not an object or too deep")
+    need(all(map(math.isfinite, floats(metadata))), "META: NaN or infinity")
+    need(KEYS <= metadata.keys(), "META: a key is missing")
+    need(metadata["rules"] == RULES, "META: other rules")
+    config = metadata["config"]
+    need(set(config) == CONFIG_KEYS and set(config["frame"]) == FRAME_KEYS, "META: unknown or missing keys in config")
+    whole(metadata["gaussians"], 0, 2**40 - 1)
+    whole(config["hidden"], 1, 1024)
+    for grid in (config["geometry"], config["radiance"]):
+        need(set(grid) == GRID_KEYS, "META: unknown or missing keys in a grid")
+        whole(grid["log2_table_size"], 4, 24)
+        whole(grid["levels"], 1, 32)
+        whole(grid["finest"], whole(grid["base"], 2, 65536), 65536)
+    need(config["direction_encoding"] in ("sh", "frequency"), "META: direction_encoding")
+    need(config["scale_rule"] in ("sum", "product"), "META: scale_rule")
+    need(config["frame"]["scale"] > 0 and min(config["frame"]["half_extent"]) > 0, "META: frame")
+    return metadata
+
+
+def depth(value: Any) -> int:
+    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
+    return 0 if inner is None else 1 + max(map(depth, inner), default=0)
+
+
+def floats(value: Any) -> list[float]:
+    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return [value] if isinstance(value, float) else [number for item in inner for number in floats(item)]
+
+
+def whole(value: Any, low: int, high: int) -> int:
+    need(type(value) is int and low <= value <= high, f"META: {value!r} is not an integer from {low} to {high}")
+    return value
+
+
+def matrix_shapes(metadata: dict[str, Any]) -> dict[str, tuple[int, int]]:
+    """Rows and columns of each group (2)."""
+    n, config = metadata["gaussians"], metadata["config"]
+    shapes = {"POSI": (n, 3), "COLO": (n, 3), "SCAL": (n, 1), "OPAC": (n, 1)}
+    for name, grid in (("GTAB", config["geometry"]), ("RTAB", config["radiance"])):
+        shapes[name] = (sum(rows for _, rows in grid_levels(grid)), 2)
+    for name in ("GMLP", "RMLP"):
+        shapes[name] = (sum(outputs * (inputs + 1) for inputs, outputs in decoder_layers(config, name)), 1)
+    return shapes
+
+
+def grid_levels(grid: dict[str, int]) -> list[tuple[int, int]]:
+    """(vertices an axis, rows) of each level of a hash grid (2.3)."""
+    growth = (grid["finest"] / grid["base"]) ** (1 / max(grid["levels"] - 1, 1))
+    vertices = [math.ceil(grid["base"] * growth**level - 1e-6) for level in range(grid["levels"])]
+    return [(r, min(r**3, 2 ** grid["log2_table_size"])) for r in vertices]
+
+
+def decoder_layers(config: dict[str, Any], name: str) -> list[tuple[int, int]]:
+    """(inputs, outputs) of the three layers of a decoder (2.4)."""
+    if name == "GMLP":
+        inputs, outputs = 2 * config["geometry"]["levels"], 8
+    else:
+        inputs, outputs = 2 * config["radiance"]["levels"] + {"sh": 9, "frequency": 24}[config["direction_encoding"]], 3
+    return [(inputs, config["hidden"]), (config["hidden"], config["hidden"]), (config["hidden"], outputs)]
+
+
+# 2.2 Codecs 3 and 4, 2.5 Huffman streams
+
+
+def read_codebooks(source: Cursor, rows: int, columns: int) -> np.ndarray:
+    stages, width, words = source.unpack("BBH")
+    need(1 <= stages <= 16 and width == columns and words >= 1, "codec 3: bad sizes")
+    books = np.array(source.numbers("<f2", stages * words * width), np.float32).reshape(stages, words, width)
+    need(bool(np.isfinite(books).all()), "codec 3: NaN or infinite")
+    total = np.zeros((rows, width), np.float32)
+    for book in books:
+        stream = Cursor(source.take(source.unpack("Q")[0]))
+        indices = read_huffman(stream, rows)
+        stream.end()
+        need(bool((indices < words).all()), "codec 3: index out of range")
+        total += book[indices]
+    return total
+
+
+def read_min_max(source: Cursor, count: int) -> np.ndarray:
+    low, high, bits = source.unpack("ffB")
+    need(math.isfinite(low) and math.isfinite(high) and low <= high and 1 <= bits <= 16, "codec 4: bad range")
+    top, q = 2**bits - 1, read_huffman(source, count)
+    need(bool((q <= top).all()), "codec 4: code out of range")
+    return ((top - q) * low + q * high) / top
+
+
+def read_huffman(source: Cursor, count: int) -> np.ndarray:
+    symbol_count, packed_bytes, leaves, end_mark, symbol_bytes, size_bytes = source.unpack("QQIIBB")
+    need(symbol_count == count <= 8 * packed_bytes, "Huffman: wrong number of symbols")
+    need(symbol_bytes in (1, 2) and size_bytes in (2, 4), "Huffman: bad header")
+    need(end_mark < leaves or leaves == end_mark == count == 0, "Huffman: no end mark")
+    lengths = list(source.take(leaves))
+    symbols: list[Any] = source.numbers(f"<u{symbol_bytes}", max(leaves - 1, 0))
+    chunk = max(1024, 2 * -(-count // 2048))
+    sizes = source.numbers(f"<u{size_bytes}", -(-count // chunk))
+    packed = source.take(packed_bytes)
+    need(packed_bytes == -(-sum(sizes) // 8), "Huffman: sizes do not add up")
+    need(all(1 <= length <= 57 for length in lengths), "Huffman: length out of range")
+    need(len(set(symbols)) == len(symbols), "Huffman: a symbol occurs twice")
+    symbols.insert(end_mark, None)
+
+    codes, code = [], 0
+    for length in lengths:
+        need(code % 2 ** (64 - length) == 0, "Huffman: bad code")
+        codes.append(code)
+        code += 2 ** (64 - length)
+    need(code == (2**64 if leaves else 0), "Huffman: code is not complete")
+
+    packed += bytes(9)
+    decoded, at = [], 0
+    for first in range(0, count, chunk):
+        stop = at + sizes[first // chunk]
+        for _ in range(first, min(first + chunk, count)):
+            next_bits = int.from_bytes(packed[at // 8 : at // 8 + 9], "big") >> (8 - at % 8) & (2**64 - 1)
+            leaf = bisect_right(codes, next_bits) - 1
+            need(leaf != end_mark, "Huffman: the end mark comes too early")
+            decoded.append(symbols[leaf])
+            at += lengths[leaf]
+        need(at == stop, "Huffman: a chunk ends elsewhere than its size says")
+    return np.array(decoded, np.int64)
+
+
+# 3.1 Integer streams
+
+
+def read_integers(data: bytes, contexts: np.ndarray, signed: bool = False) -> np.ndarray:
+    """The integers that fill `data`, one for each context."""
+    source = Cursor(data)
+    tokens = np.array(read_tokens(source, contexts.tolist()), np.int64)
+    n = np.where(tokens < 28, tokens // 4, (tokens - 14) // 2)  # floor(log2 v); only for tokens of 16 and more
+    leading = np.where(tokens < 28, 4 + tokens % 4, 2 + tokens % 2)  # the highest bits of v, 3 or 2 of them
+    widths = np.where(tokens < 16, 0, np.where(tokens < 28, n - 2, n - 1))
+    v = np.where(tokens < 16, tokens, leading << widths) + read_bits(source.rest(), widths)
+    return (v >> 1) ^ -(v & 1) if signed else v
+
+
+def read_tokens(source: Cursor, contexts: Sequence[int]) -> list[int]:
+    """One token for each context: interleaved rANS."""
+    count = len(contexts)
+    if count == 0:
+        return []
+    head, alphabet = source.unpack("BB")
+    lanes, classes, static = 1 << (head & 15), (head >> 4 & 7) + 1, head >> 7
+    need(alphabet <= 126, "tokens: alphabet too large")
+    if alphabet == 0:
+        only = source.take(max(contexts) + 1)
+        need(head == 0 and max(only) < 126, "tokens: bad constant stream")
+        return [only[context] for context in contexts]
+    need(lanes <= 8192 and (lanes == 8192 or count <= 65536 * lanes), "tokens: too many for the lanes")
+    thresholds = list(source.take(classes - 1))
+    need(all(a < b for a, b in zip([0, *thresholds], [*thresholds, alphabet], strict=True)), "tokens: bad thresholds")
+    class_after = [bisect_right(thresholds, token) for token in range(alphabet)]
+    models = (max(contexts) + 1) * classes
+    need(models <= 1024, "tokens: too many models")
+    if static:
+        sums = cumulative(read_weights(source, models, alphabet))
+
+    per_lane = -(-count // lanes)
+    per_lane += per_lane % 2 == 0
+    used = -(-count // per_lane)
+    states = list(source.unpack(f"{used}I"))
+    words, taken = np.frombuffer(source.data[source.at :][: (len(source.data) - source.at) // 2 * 2], "<u2").tolist(), 0
+    tokens, lane_class = [0] * count, [0] * used
+    seen, change = [[0] * alphabet for _ in range(models)], 0
+    for step in range(per_lane):
+        if step == change and not static:
+            sums, change = cumulative(adaptive_weights(np.array(seen))), change + 1 + change // 8
+        for lane in range(-(-(count - step) // per_lane)):
+            place, x = lane * per_lane + step, states[lane]
+            model = classes * contexts[place] + lane_class[lane]
+            low = x % 4096
+            token = bisect_right(sums[model], low) - 1
+            x = (sums[model][token + 1] - sums[model][token]) * (x // 4096) + low - sums[model][token]
+            if x < 65536:
+                need(taken < len(words), "tokens: words run out")
+                x, taken = 65536 * x + words[taken], taken + 1
+            states[lane], tokens[place], lane_class[lane] = x, token, class_after[token]
+            seen[model][token] += 1
+    need(all(x == 65536 for x in states), "tokens: wrong last state")
+    source.take(2 * taken)
+    return tokens
+
+
+def cumulative(weights: np.ndarray) -> list[list[int]]:
+    """0, f_0, f_0 + f_1, ..., 4096 for each row of weights."""
+    need(bool(weights.any(axis=1).all()), "tokens: a model without weights")
+    f = np.where(weights > 0, np.maximum(1, 4096 * weights // weights.sum(axis=1, keepdims=True)), 0)
+    f[np.arange(len(f)), weights.argmax(axis=1)] += 4096 - f.sum(axis=1)
+    return np.pad(f.cumsum(axis=1), ((0, 0), (1, 0))).tolist()
+
+
+def adaptive_weights(seen: np.ndarray) -> np.ndarray:
+    a = 1 + 2 * seen.sum(axis=0)
+    return 65536 * seen + 1048576 * a // a.sum() + 1
+
+
+def read_weights(source: Cursor, models: int, alphabet: int) -> np.ndarray:
+    """Weights of static models."""
+    need(source.data[source.at : source.at + 1] < b"\x80", "tokens: levels with static models")
+    folded = np.array(read_tokens(source, [0] * (models * alphabet)), np.int64).reshape(models, alphabet)
+    levels = (folded >> 1) ^ -(folded & 1)
+    levels[0] = levels[0].cumsum()
+    levels = levels.cumsum(axis=0)
+    need(0 <= levels.min() and levels.max() <= 49, "tokens: level out of range")
+    return np.where(levels > 0, (4 + (levels - 1) % 4) << np.maximum(levels - 1, 0) // 4, 0)
+
+
+def steps_of(codes: Sequence[int]) -> np.ndarray:
+    """Step sizes in units of 2^-24 (3.2)."""
+    return np.array([(8 + e % 8) << e // 8 for e in codes], np.int64)
+
+
+# 3.3 Codec 6
+
+
+@dataclass(frozen=True)
+class Points:
+    m: np.ndarray  # int64 (N, 3), centres of cells in units of 2^-19 of the contracted cube
+    classes: np.ndarray  # int64 (N,)
+
+
+def read_points(source: Cursor, count: int) -> Points:
+    g, class_count, gap_bytes, class_bytes = source.unpack("BBII")
+    need(1 <= g <= 18 and 1 <= class_count <= 16, "codec 6: bad header")
+    bits_of_class = np.array(list(source.take(class_count)))
+    need(bool((g <= bits_of_class).all() and (bits_of_class <= 18).all()), "codec 6: bits out of range")
+    gaps = read_integers(source.take(gap_bytes), np.zeros(count, np.int64))
+    need(sum(gaps.tolist()) < 2 ** (3 * g), "codec 6: a point outside the cube")
+    classes = read_integers(source.take(class_bytes), (gaps == 0).astype(np.int64))
+    need(bool((classes < class_count).all()), "codec 6: class out of range")
+    bits = bits_of_class[classes][:, None]
+    lower = read_bits(source.rest(), 3 * (bits[:, 0] - g))
+    q = (from_morton(np.cumsum(gaps), g) << (bits - g)) + from_morton(lower, 18 - g)
+    return Points((2 * q + 1) << (18 - bits), classes)
+
+
+def from_morton(codes: np.ndarray, bits: int) -> np.ndarray:
+    axes = [sum((codes >> (3 * i + axis) & 1) << i for i in range(bits)) + 0 * codes for axis in range(3)]
+    return np.stack(axes, axis=1)
+
+
+def positions(points: Points, half_extent: Sequence[float]) -> np.ndarray:
+    y = (points.m - 2**18) / 2**17
+    radius = np.maximum(np.sqrt((y * y).sum(axis=1, keepdims=True)), 1)
+    return y / (radius * (2 - np.minimum(radius, 2 - 2**-20))) * np.array(half_extent, np.float64)
+
+
+# 3.4 Codec 7
+
+
+def read_channels(source: Cursor, columns: int, classes: np.ndarray) -> np.ndarray:
+    if columns == 1:
+        return read_channel(source, classes)
+    basis = np.array(source.unpack("9f")).reshape(3, 3)
+    need(bool((np.abs(basis) <= np.float32(1.001)).all()), "codec 7: basis out of range")
+    n = [read_channel(source, classes) for _ in range(3)]
+    return np.stack([(n[0] * row[0] + n[1] * row[1]) + n[2] * row[2] for row in basis], axis=1)
+
+
+def read_channel(source: Cursor, classes: np.ndarray) -> np.ndarray:
+    mean, weight, difference_bytes, class_count = source.unpack("fBIB")
+    need(abs(mean) <= 4096 and weight <= 16, "codec 7: bad channel")
+    need(class_count > classes.max(initial=0), "codec 7: classes without a step size")
+    d = steps_of(source.take(class_count))[classes]
+    s = read_integers(source.take(difference_bytes), classes, signed=True)
+    need(bool((np.abs(s) <= np.minimum(2**39 // d, 2**30)).all()), "codec 7: difference out of range")
+    v, count = d * s, len(s)
+    for distance in (1 << k for k in reversed(range(count.bit_length()))):
+        i = np.arange(distance, count, 2 * distance)
+        right = np.where(i + distance < count, i + distance, i - distance)
+        v[i] += weight * (v[i - distance] + v[right]) // 32
+        need(bool((np.abs(v) < 2**45).all()), "codec 7: value out of range")
+    return v / 2**24 + mean
+
+
+# 3.5 Codec 8
+
+
+def read_numbers(source: Cursor, groups: tuple[np.ndarray, int]) -> np.ndarray:
+    """Numbers from the group of each number and the count of all groups."""
+    group, group_count = groups
+    step_bytes, model_bytes = source.unpack("II")
+    codes = read_integers(source.take(step_bytes), np.zeros(group_count, np.int64))
+    need(bool((codes <= 255).all()), "codec 8: step size out of range")
+    models = np.zeros(group_count, np.int64)
+    models[codes > 0] = read_integers(source.take(model_bytes), np.zeros(int((codes > 0).sum()), np.int64))
+    need(bool((models < 8).all()), "codec 8: model out of range")
+    stored = codes[group] > 0
+    s = read_integers(source.rest(), models[group[stored]], signed=True)
+    need(bool((np.abs(s) <= 2**24).all()), "codec 8: symbol out of range")
+    numbers = np.zeros(len(group))
+    numbers[stored] = s * steps_of(codes.tolist())[group[stored]] / 2**24
+    return numbers
+
+
+def decoder_groups(layers: list[tuple[int, int]]) -> tuple[np.ndarray, int]:
+    sizes = [size for inputs, outputs in layers for size in [inputs] * outputs + [outputs]]
+    return np.repeat(np.arange(len(sizes)), sizes), len(sizes)
+
+
+def table_groups(grid: dict[str, int], m: np.ndarray) -> np.ndarray:
+    """The group of each row of a hash table: 16 level + u."""
+    groups, m = [], m[:: max(1, -(-len(m) // 65536))]
+    for level, (r, rows) in enumerate(grid_levels(grid)):
+        cells, use = m * (r - 1) // 2**19, np.zeros(rows, np.int64)
+        for corner in np.ndindex(2, 2, 2):
+            x, y, z = (cells + corner).T
+            if r**3 <= rows:
+                row = x + r * (y + r * z)
+            else:
+                row = (x ^ (2654435761 * y & 0xFFFFFFFF) ^ (805459861 * z & 0xFFFFFFFF)) % rows
+            use += np.bincount(row, minlength=rows)
+        groups += [16 * level + (count.bit_length() + 1) // 2 for count in use.tolist()]
+    return np.array(groups)

@@ -1,0 +1,57 @@
+"""Plans of profile `compact` without renders: how much each number matters is drawn, or the same for all.
+
+For golden files, recorded sizes, hostile files and tests: no picture decides about their bytes. `hyrfpack.compress`
+measures instead.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hyrfpack.format import encode_model
+from hyrfpack.format.arrays import decoder_widths, grids, to_arrays
+from hyrfpack.format.compact import Plan, Sensitivity, make_plan
+from hyrfpack.model import HybridModel
+from hyrfpack.quant.morton import MAX_BITS
+
+NOISE = 1e-5
+# Sums over all numbers of a kind, as they are in trained models, about.
+POSITIONS, LOGITS, TABLE, DECODER = 300.0, 0.01, 0.01, 1.0
+SPREAD = 1.5  # standard deviation of the logarithms
+
+
+def drawn_sensitivity(model: HybridModel, seed: int = 0) -> Sensitivity:
+    """A fixed draw: log-normal, all numbers of a Gaussian alike, and rows of tables by how often Gaussians read them."""
+    rng = np.random.default_rng(seed)
+    shares = np.exp(SPREAD * rng.normal(size=len(model))) / max(len(model), 1)
+    places = model.cube_coords(model.gaussians.positions.detach().double()).numpy()
+    points = 2 * np.minimum(places * (1 << MAX_BITS), (1 << MAX_BITS) - 1).astype(np.int64) + 1
+    tables, decoders = {}, {}
+    for field, grid in grids(model.config).items():
+        usage = grid.usage(points, MAX_BITS + 1)
+        tables[f"{field}TAB"] = (TABLE * usage / max(usage.sum(), 1)).repeat(2)
+        widths = decoder_widths(model.config)[field]
+        count = sum((fan_in + 1) * fan_out for fan_in, fan_out in zip(widths, widths[1:], strict=False))
+        decoders[f"{field}MLP"] = DECODER / count * np.exp(SPREAD * rng.normal(size=count))
+    return Sensitivity(POSITIONS * shares, *[LOGITS * shares] * 3, tables, decoders)
+
+
+def drawn_plan(model: HybridModel, noise: float = NOISE, prune: bool = True) -> Plan:
+    """The plan that `drawn_sensitivity` leads to."""
+    return make_plan(model, drawn_sensitivity(model), noise, prune)
+
+
+def even_plan(model: HybridModel, step: float) -> Plan:
+    """All Gaussians, and all numbers, those that nobody reads included, in steps within 1/15 of `step`."""
+    arrays = to_arrays(model)
+    ones = {group: np.ones(values.size) for group, values in arrays.items()}
+    tables, decoders = ({group: ones[group] for group in groups} for groups in (("GTAB", "RTAB"), ("GMLP", "RMLP")))
+    noise = step**2 / 12 * sum(values.size for values in arrays.values())
+    return make_plan(model, Sensitivity(*np.ones((4, len(model))), tables, decoders), noise, prune=False)
+
+
+def encode(model: HybridModel, profile: str, provenance: dict | None = None, **settings: object) -> bytes:
+    """`encode_model` with any profile: "compact" gets a drawn plan, with `noise` and `prune` if they are given."""
+    if profile == "compact":
+        settings = {"plan": drawn_plan(model, **settings)}
+    return encode_model(model, profile, provenance, **settings)
