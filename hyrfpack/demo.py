@@ -12,12 +12,13 @@ import numpy as np
 import torch
 from PIL import Image
 
+from hyrfpack.compress import compress
 from hyrfpack.data import load_scene
 from hyrfpack.data.demo_scene import write_demo_scene
 from hyrfpack.evaluate import evaluate
 from hyrfpack.evaluate.figures import comparison, contact_sheet
 from hyrfpack.evaluate.metrics import psnr, to_8bit
-from hyrfpack.format import compress, load
+from hyrfpack.format import load, repack
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render
 from hyrfpack.render.files import render_files, save_picture
@@ -32,10 +33,11 @@ class ProfileResult:
     """One profile of the demo's model, measured on the decoded file.
 
     Attributes:
-        profile: "raw" or "paper".
+        profile: "raw", "paper" or "compact".
         psnr, ssim: means over the held-out views.
         bytes: on disk.
-        compress_seconds: reading the trained file and writing this one; None for the file that training wrote.
+        compress_seconds: reading the trained file and writing this one, for "compact" with the measuring; None for the
+            file that training wrote.
         decompress_seconds: reading this file and writing it as raw.
     """
 
@@ -54,8 +56,8 @@ class DemoResult:
     Attributes:
         steps, gaussians: of the training.
         train_seconds: its time, kernels compiled on the way included.
-        frames_per_second: one over the median time to render a held-out view from the paper file.
-        profiles: raw, then paper.
+        frames_per_second: one over the median time to render a held-out view from the compact file.
+        profiles: raw, paper, compact.
         picture: path of the picture that shows it.
     """
 
@@ -91,8 +93,9 @@ def run_demo(
 ) -> DemoResult:
     """Make a scene, train on it, compress, decompress, render, score, and draw one picture of it.
 
-    Leaves in `folder`: `scene/` (photos and poses), `run/` (the training), `paper.hyrf`, `back.hyrf` (paper.hyrf
-    decompressed), `renders/` (held-out views from paper.hyrf) and `demo.png`. Earlier results are replaced.
+    Leaves in `folder`: `scene/` (photos and poses), `run/` (the training), `paper.hyrf`, `compact.hyrf`, `back.hyrf`
+    (compact.hyrf decompressed), `renders/` (held-out views from compact.hyrf) and `demo.png`. Earlier results are
+    replaced.
 
     Args:
         folder: made if missing.
@@ -113,17 +116,19 @@ def run_demo(
         raise KeyboardInterrupt
 
     report("compressing, decompressing and scoring")
-    packed, back = folder / "paper.hyrf", folder / "back.hyrf"
-    compress_seconds = _seconds(lambda: compress(trained.model, packed, "paper"))
-    profiles = []
-    for profile, path, seconds in (("raw", trained.model, None), ("paper", packed, compress_seconds)):
-        decompress_seconds = _seconds(lambda path=path: compress(path, back, "raw"))
+    back, profiles = folder / "back.hyrf", []
+    for profile in ("raw", "paper", "compact"):
+        path, compress_seconds = trained.model, None
+        if profile != "raw":
+            path = folder / f"{profile}.hyrf"
+            compress_seconds = _seconds(lambda path=path, profile=profile: compress(trained.model, path, profile))
+        decompress_seconds = _seconds(lambda path=path: repack(path, back))
         scores = evaluate(load(back), scene.test)
         stored = path.stat().st_size
-        profiles.append(ProfileResult(profile, scores.psnr, scores.ssim, stored, seconds, decompress_seconds))
+        profiles.append(ProfileResult(profile, scores.psnr, scores.ssim, stored, compress_seconds, decompress_seconds))
 
     report("rendering held-out views")
-    model = load(packed)
+    model = load(path)
     for _ in render_files(model, [(view.name, view.camera) for view in scene.test], folder / "renders"):
         pass
     result = DemoResult(
@@ -140,7 +145,7 @@ def run_demo(
 
 @torch.no_grad()
 def _draw(model: HybridModel, scene: Scene, result: DemoResult) -> Image.Image:
-    """The demo's picture: held-out views of the paper file under the table."""
+    """The demo's picture: held-out views of the compact file under the table."""
     geometry = model.decode_geometry()
     solid = np.array(model.config.solid, np.float32)
     rows = []

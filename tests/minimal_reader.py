@@ -4,7 +4,7 @@ It shares no code with hyrfpack, and so tells whether the page says enough and w
 Plain rather than fast: a file of 30,000 Gaussians takes some seconds. Section numbers are those of the page.
 
     metadata, groups = read(Path("scene.hyrf").read_bytes())
-    groups["POSI"]      # float32 (N, 3)
+    groups["POSI"]      # float32 (N, 3), the Gaussians of all layers
 """
 
 import json
@@ -28,6 +28,8 @@ MATRIX_CODECS = {
     "GMLP": {1, 2, 3, 4, 8},
     "RMLP": {1, 2, 3, 4, 8},
 }
+LAYERED = ("POSI", "COLO", "SCAL", "OPAC")
+FIELDS = ("GTAB", "RTAB", "GMLP", "RMLP")
 RULES = {
     "activations": "sigmoid",
     "background_radius": 100.0,
@@ -45,23 +47,33 @@ FRAME_KEYS = {"center", "scale", "half_extent"}
 GRID_KEYS = {"log2_table_size", "levels", "base", "finest"}
 
 
-def read(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Metadata and the eight groups of part 2, by section type, as float32 matrices (rows, columns).
+def read(data: bytes, part: bool = False) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Metadata and the eight groups of part 2, by type of the first layer, as float32 matrices (rows, columns).
 
+    With `part`, `data` may be the start of a file: layers that are not whole, and what follows them, are left out.
     Raises ValueError for files that the page tells a reader to refuse (zlib.error where a deflate stream is damaged).
     """
-    sections = read_container(data)
-    need({"META", *MATRIX_CODECS} <= sections.keys(), "a section is missing")
+    sections = read_container(data, part)
+    need("META" in sections, "a section is missing")
     metadata = read_metadata(sections["META"])
-    config = metadata["config"]
-    shapes = matrix_shapes(metadata)
-    for name, (rows, columns) in shapes.items():
+    config, layers = metadata["config"], metadata.get("layers") or [metadata["gaussians"]]
+    shapes = matrix_shapes(config, layers)
+    for (group, layer), (rows, columns) in shapes.items():
+        name = section_type(group, layer)
+        need(name in sections, f"{name}: the section is missing")
         need(sections[name].raw_length == 4 * rows * columns, f"{name}: wrong raw length")
-        need(sections[name].codec in MATRIX_CODECS[name], f"{name}: codec not allowed here")
+        need(sections[name].codec in MATRIX_CODECS[group], f"{name}: codec not allowed here")
+    used = 1
+    while used < len(layers) and all(sections[section_type(group, used)].whole for group in LAYERED):
+        used += 1
 
-    groups, points = {}, None
-    for name, (rows, columns) in shapes.items():  # POSI is the first: others lean on it
-        codec, source = sections[name].codec, Cursor(sections[name].stored)
+    matrices: dict[str, list[np.ndarray]] = {group: [] for group in MATRIX_CODECS}
+    points: dict[int, Points] = {}
+    for (group, layer), (rows, columns) in shapes.items():  # POSI is the first of a layer: others lean on it
+        if layer >= used:
+            continue
+        section = sections[section_type(group, layer)]
+        codec, source = section.codec, Cursor(section.read())
         if codec in (1, 2):
             numbers = np.frombuffer(source.rest(), "<f4" if codec == 1 else "<f2")
         elif codec == 3:
@@ -69,22 +81,22 @@ def read(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         elif codec == 4:
             numbers = read_min_max(source, rows * columns)
         elif codec == 6:
-            points = read_points(source, rows)
-            numbers = positions(points, config["frame"]["half_extent"])
+            points[layer] = read_points(source, rows)
+            numbers = positions(points[layer], config["frame"]["half_extent"])
         elif codec == 7:
-            need(points is not None, f"{name}: codec 7 without lattice points")
-            numbers = read_channels(source, columns, points.classes)
-        elif name in ("GMLP", "RMLP"):
-            numbers = read_numbers(source, decoder_groups(decoder_layers(config, name)))
+            need(layer in points, f"{group}: codec 7 without lattice points in layer {layer}")
+            numbers = read_channels(source, columns, points[layer].classes)
+        elif group in ("GMLP", "RMLP"):
+            numbers = read_numbers(source, decoder_groups(decoder_layers(config, group)))
         else:
-            need(points is not None, f"{name}: codec 8 without lattice points")
-            grid = config["geometry" if name == "GTAB" else "radiance"]
-            numbers = read_numbers(source, (np.repeat(table_groups(grid, points.m), 2), 16 * grid["levels"]))
+            need(0 in points, f"{group}: codec 8 without lattice points")
+            grid = config["geometry" if group == "GTAB" else "radiance"]
+            numbers = read_numbers(source, (np.repeat(table_groups(grid, points[0].m), 2), 16 * grid["levels"]))
         source.end()
-        need(numbers.size == rows * columns, f"{name}: {numbers.size} numbers")
-        groups[name] = numbers.astype(np.float32).reshape(rows, columns)
-        need(bool(np.isfinite(groups[name]).all()), f"{name}: NaN or infinite")
-    return metadata, groups
+        need(numbers.size == rows * columns, f"{group}: {numbers.size} numbers")
+        matrices[group].append(numbers.astype(np.float32).reshape(rows, columns))
+        need(bool(np.isfinite(matrices[group][-1]).all()), f"{group}: NaN or infinite")
+    return metadata, {group: np.concatenate(parts) for group, parts in matrices.items()}
 
 
 # Bytes
@@ -138,19 +150,42 @@ def read_bits(data: bytes, widths: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Section:
+    name: str
     codec: int
     raw_length: int
-    stored: bytes
+    stored_length: int
+    crc: int
+    padded: bytes  # stored bytes and padding; fewer of them where the data ends before
+
+    @property
+    def whole(self) -> bool:
+        return len(self.padded) == -(-self.stored_length // 8) * 8
+
+    def read(self) -> bytes:
+        """The stored bytes, checked as step 7 of 1.3 says."""
+        need(self.whole, f"{self.name}: not all of it is there")
+        stored, padding = self.padded[: self.stored_length], self.padded[self.stored_length :]
+        need(zlib.crc32(stored) == self.crc and not any(padding), f"{self.name}: damaged")
+        return stored
 
 
-def read_container(data: bytes) -> dict[str, Section]:
-    """The sections by type, checked as 1.3 says."""
+def section_type(group: str, layer: int) -> str:
+    """POSI, then POS1, POS2, ... (2)."""
+    return f"{group[:3]}{layer}" if layer else group
+
+
+KNOWN = {"META", *FIELDS, *(section_type(group, layer) for group in LAYERED for layer in range(8))}
+
+
+def read_container(data: bytes, part: bool = False) -> dict[str, Section]:
+    """The sections by type, checked as steps 1 to 6 of 1.3 say."""
     need(data[:8] == b"\x89HYRF\r\n\n", "not a .hyrf file")
     header = Cursor(data)
     _, major, _, flags, length, toc_at, toc_length, count, toc_crc, header_crc = header.unpack("8sHHIQQIIII")
     need(major == 1, f"major version {major}")
     need(zlib.crc32(data[:44]) == header_crc and flags == 0, "damaged header")
-    need(length == len(data) <= 2**34, "wrong file length")
+    need(length == len(data) or (part and length > len(data)), "wrong file length")
+    need(length <= 2**34, "file too long")
     need(count <= 1024 and toc_at == 48 and toc_length == 40 * count, "table of contents in the wrong place")
     toc = Cursor(header.take(toc_length))
     need(zlib.crc32(toc.data) == toc_crc, "damaged table of contents")
@@ -161,16 +196,14 @@ def read_container(data: bytes) -> dict[str, Section]:
         name = kind.decode("latin-1")
         need(name.isascii() and name.replace("_", "0").isalnum() and name not in sections, f"bad type {name!r}")
         need(flags <= 1 and reserved == 0, f"{name}: reserved bit")
-        need(flags == 0 or name == "META" or name in MATRIX_CODECS, f"{name}: required but unknown")
+        need(flags == 0 or name in KNOWN, f"{name}: required but unknown")
         end = offset + stored_length
         padded = -(-end // 8) * 8
         need(offset == expected and padded <= length, f"{name}: in the wrong place")
-        stored = data[offset:end]
-        need(zlib.crc32(stored) == crc and not any(data[end:padded]), f"{name}: damaged")
-        sections[name] = Section(codec, raw_length, stored)
-        expected, raw_total = padded, raw_total + raw_length
+        sections[name] = Section(name, codec, raw_length, stored_length, crc, data[offset:padded])
+        expected, raw_total = padded, raw_total + raw_length * sections[name].whole
     need(expected == length, "bytes after the last section")
-    need(raw_total <= min(1024 * length + 2**28, 2**34), "sections too large")
+    need(raw_total <= min(1024 * len(data) + 2**28, 2**34), "sections too large")
     return sections
 
 
@@ -179,10 +212,10 @@ def read_container(data: bytes) -> dict[str, Section]:
 
 def read_metadata(section: Section) -> dict[str, Any]:
     need(section.codec in (0, 5) and section.raw_length <= 2**20, "META: unknown codec or too long")
-    text = section.stored
+    text = section.read()
     if section.codec == 5:
         inflate = zlib.decompressobj()
-        text = inflate.decompress(section.stored, section.raw_length + 1)
+        text = inflate.decompress(text, section.raw_length + 1)
         need(inflate.eof and not inflate.unused_data, "META: bad deflate stream")
     need(len(text) == section.raw_length, "META: wrong raw length")
     metadata = json.loads(text.decode("utf-8"))
@@ -193,6 +226,9 @@ def read_metadata(section: Section) -> dict[str, Any]:
     config = metadata["config"]
     need(set(config) == CONFIG_KEYS and set(config["frame"]) == FRAME_KEYS, "META: unknown or missing keys in config")
     whole(metadata["gaussians"], 0, 2**40 - 1)
+    layers = metadata.get("layers", [])
+    need(isinstance(layers, list) and len(layers) <= 8, "META: layers")
+    need(not layers or sum(whole(n, 0, 2**40) for n in layers) == metadata["gaussians"], "META: layers do not add up")
     whole(config["hidden"], 1, 1024)
     for grid in (config["geometry"], config["radiance"]):
         need(set(grid) == GRID_KEYS, "META: unknown or missing keys in a grid")
@@ -220,14 +256,15 @@ def whole(value: Any, low: int, high: int) -> int:
     return value
 
 
-def matrix_shapes(metadata: dict[str, Any]) -> dict[str, tuple[int, int]]:
-    """Rows and columns of each group (2)."""
-    n, config = metadata["gaussians"], metadata["config"]
-    shapes = {"POSI": (n, 3), "COLO": (n, 3), "SCAL": (n, 1), "OPAC": (n, 1)}
+def matrix_shapes(config: dict[str, Any], layers: list[int]) -> dict[tuple[str, int], tuple[int, int]]:
+    """Rows and columns of each group, those of Gaussians for each layer (2)."""
+    shapes = {}
+    for layer, n in enumerate(layers):
+        shapes |= {(group, layer): (n, columns) for group, columns in zip(LAYERED, (3, 3, 1, 1), strict=True)}
     for name, grid in (("GTAB", config["geometry"]), ("RTAB", config["radiance"])):
-        shapes[name] = (sum(rows for _, rows in grid_levels(grid)), 2)
+        shapes[name, 0] = (sum(rows for _, rows in grid_levels(grid)), 2)
     for name in ("GMLP", "RMLP"):
-        shapes[name] = (sum(outputs * (inputs + 1) for inputs, outputs in decoder_layers(config, name)), 1)
+        shapes[name, 0] = (sum(outputs * (inputs + 1) for inputs, outputs in decoder_layers(config, name)), 1)
     return shapes
 
 
@@ -441,7 +478,7 @@ def read_channels(source: Cursor, columns: int, classes: np.ndarray) -> np.ndarr
     if columns == 1:
         return read_channel(source, classes)
     basis = np.array(source.unpack("9f")).reshape(3, 3)
-    need(bool((np.abs(basis) <= np.float32(1.001)).all()), "codec 7: basis out of range")
+    need(bool((np.abs(basis) <= 1 + 2**-10).all()), "codec 7: basis out of range")
     n = [read_channel(source, classes) for _ in range(3)]
     return np.stack([(n[0] * row[0] + n[1] * row[1]) + n[2] * row[2] for row in basis], axis=1)
 

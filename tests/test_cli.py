@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -11,12 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from commands import hyrfpack, refused, succeeded
 from PIL import Image
 
 from hyrfpack.cli.files import DEFAULT_PROFILE, PROFILES
 from hyrfpack.cli.train import PRESETS, train
 from hyrfpack.data.demo_scene import write_demo_scene
+from hyrfpack.format import load
 
 COMMANDS = ("train", "compress", "decompress", "render", "evaluate", "info", "bench", "demo")
 
@@ -54,17 +57,55 @@ def test_train_leaves_a_model_metrics_and_pictures(run):
     assert {path.name for path in (run / "views").iterdir()} == {"0000.png", "0008.png"}
 
 
-def test_compress_reports_the_bytes_on_disk(run, tmp_path):
+@pytest.mark.parametrize("profile", PROFILES)
+def test_compress_reports_the_bytes_on_disk(profile, run, tmp_path):
+    arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--profile", profile, "--json")
+    report = json.loads(succeeded(*arguments).stdout)
+    assert report["profile"] == profile and report["file"] == str(tmp_path / "p.hyrf")
+    assert report["bytes_after"] == (tmp_path / "p.hyrf").stat().st_size <= (run / "model.hyrf").stat().st_size
+    assert sum(section["after"] for section in report["sections"]) < report["bytes_after"]
+
+
+def test_compact_is_the_default_and_smaller_than_the_paper_profile(run, packed, tmp_path):
     report = json.loads(succeeded("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--json").stdout)
-    assert report["profile"] == "paper"
-    assert report["bytes"] == (tmp_path / "p.hyrf").stat().st_size < (run / "model.hyrf").stat().st_size
-    assert sum(section["after"] for section in report["sections"]) < report["bytes"]
+    assert report["profile"] == "compact" and report["bytes_after"] < 0.7 * packed.stat().st_size
+    assert report["error"] > 0 and sum(report["shares"].values()) == pytest.approx(1)
 
 
-def test_compress_prints_every_section(run, tmp_path):
-    table = succeeded("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf").stdout
-    for words in ("positions", "geometry hash table", "radiance decoder", "padding", "bits/Gaussian"):
-        assert words in table
+def test_compress_prints_every_section_and_what_it_costs(run, tmp_path):
+    printed = succeeded("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf").stdout
+    words = ("positions", "geometry hash table", "radiance decoder", "padding", "bits/Gaussian", "bits/number")
+    for word in (*words, "of the loss", "estimated loss"):
+        assert word in printed
+
+
+def test_compress_with_photos_says_what_was_lost_on_those_held_out(run, data, tmp_path):
+    arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--data", data)
+    scores = [
+        json.loads(succeeded("evaluate", path, "--data", data, "--json").stdout)
+        for path in (run / "model.hyrf", tmp_path / "p.hyrf")
+        if succeeded(*arguments)
+    ]
+    report = json.loads(succeeded(*arguments, "--json").stdout)
+    assert (report["psnr_before"], report["psnr"]) == pytest.approx([score["psnr"] for score in scores])
+    assert (report["ssim_before"], report["ssim"]) == pytest.approx([score["ssim"] for score in scores])
+    assert "held-out photos: PSNR" in succeeded(*arguments).stdout
+
+
+def test_compress_keeps_to_a_target_size(run, tmp_path):
+    whole = json.loads(succeeded("compress", run / "model.hyrf", "-o", tmp_path / "w.hyrf", "--json").stdout)
+    target = int(0.8 * whole["bytes_after"])
+    arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--target-size")
+    report = json.loads(succeeded(*arguments, f"{target / 1000}kB", "--json").stdout)
+    assert 0.9 * target < report["bytes_after"] <= target
+    assert f"of {target:,} bytes" in report["found"]
+
+
+def test_compress_fits_the_quantised_model_to_the_photos_and_keeps_every_gaussian_if_told(run, data, tmp_path):
+    arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--data", data, "--json")
+    report = json.loads(succeeded(*arguments, "--finetune", 3, "--no-prune").stdout)
+    assert report["gaussians"] == len(load(run / "model.hyrf"))
+    assert report["psnr"] > 12
 
 
 def test_the_last_line_says_what_became_of_the_numbers(run, tmp_path):
@@ -72,7 +113,7 @@ def test_the_last_line_says_what_became_of_the_numbers(run, tmp_path):
         succeeded("compress", run / "model.hyrf", "-o", tmp_path / "x.hyrf", "--profile", profile).stdout.splitlines()
         for profile in ("raw", "paper")
     )
-    assert raw[-1].endswith("bytes, every number as float32")
+    assert re.search("bytes, [0-9,]+ Gaussians, every number as float32$", raw[-1])
     assert "times smaller than as float32" in paper[-1]
 
 
@@ -173,13 +214,21 @@ def test_demo_ends_with_a_table_and_a_picture(tmp_path):
     result = run_demo(tmp_path, steps=10, views=10, size=32)
     assert Image.open(tmp_path / "demo.png").width > 900
     assert {path.name for path in tmp_path.iterdir()} == {
-        "scene", "run", "paper.hyrf", "back.hyrf", "renders", "demo.png",
+        "scene", "run", "paper.hyrf", "compact.hyrf", "back.hyrf", "renders", "demo.png",
     }  # fmt: skip
+    assert [profile.profile for profile in result.profiles] == ["raw", "paper", "compact"]
     assert [profile.bytes for profile in result.profiles] == [
-        (tmp_path / name).stat().st_size for name in ("run/model.hyrf", "paper.hyrf")
+        (tmp_path / name).stat().st_size for name in ("run/model.hyrf", "paper.hyrf", "compact.hyrf")
     ]
+    assert result.gaussians == len(load(tmp_path / "compact.hyrf"))
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(
+            load(tmp_path / "back.hyrf").parameters(), load(tmp_path / "compact.hyrf").parameters(), strict=True
+        )
+    )
     json.dumps(result.to_dict(), allow_nan=False)
-    assert len(result.table()) == 4
+    assert len(result.table()) == 5
 
 
 # -- what users get wrong --------------------------------------------------------------------------------------------
@@ -229,6 +278,34 @@ def test_a_wrong_input_is_one_sentence_that_names_it(arguments, tmp_path, monkey
 )
 def test_wrong_usage_exits_with_2(arguments):
     refused(*arguments)
+
+
+# What `compress` is asked on the command line, and what it answers.
+REFUSED_OPTIONS = {
+    "fine-tuning without photos": (("--finetune", 5), "need photos; name their folder with --data"),
+    "a loss without photos": (("--max-psnr-drop", 0.1), "need photos; name their folder with --data"),
+    "two aims": (("--data", "DATA", "--target-size", "20kB", "--max-psnr-drop", 0.1), "give one of them"),
+    "photos for the paper profile": (("--data", "DATA", "--profile", "paper"), "profile 'paper' has no settings"),
+    "a size for the raw profile": (("--target-size", "1MB", "--profile", "raw"), "profile 'raw' has no settings"),
+    "too small a size": (("--target-size", "900"), "does not fit into 900 bytes"),
+    "photos that are not there": (("--data", "nowhere"), "nowhere"),
+    "a gain": (("--data", "DATA", "--max-psnr-drop", "-1"), "--max-psnr-drop"),
+    "no step": (("--data", "DATA", "--finetune", 0), "--finetune"),
+    "words for a size": (("--target-size", "small"), "'small' is no size"),
+    "no size": (("--target-size", "0"), "'0' is no size"),
+    "a size of nothing": (("--target-size", "0.0001kB"), "is no size"),
+    "a negative size": (("--target-size", "-5kB"), "is no size"),
+    "two points": (("--target-size", "1.2.3MB"), "is no size"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED_OPTIONS)
+def test_options_of_compress_that_cannot_be_met_are_one_sentence(case, run, data, tmp_path):
+    options, words = REFUSED_OPTIONS[case]
+    (tmp_path / "old.hyrf").write_bytes(b"old")
+    options = [data if option == "DATA" else option for option in options]
+    assert words in refused("compress", run / "model.hyrf", "-o", tmp_path / "old.hyrf", *options)
+    assert (tmp_path / "old.hyrf").read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 1
 
 
 def test_a_second_training_does_not_overwrite_the_first(run, data):

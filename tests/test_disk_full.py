@@ -81,7 +81,7 @@ def run(data, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def packed(run, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("packed") / "paper.hyrf"
+    path = tmp_path_factory.mktemp("packed") / "packed.hyrf"
     assert hyrfpack("compress", run / "model.hyrf", "-o", path).exit_code == 0
     return path
 

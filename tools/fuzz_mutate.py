@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from random import Random
-from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -25,7 +24,6 @@ from plans import encode
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import group_shapes, parse_config, to_arrays
 from hyrfpack.format.codec import PROFILES
-from hyrfpack.format.compact import plan as planning
 from hyrfpack.format.container import read_container
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
@@ -145,8 +143,7 @@ def seeds() -> tuple[tuple[bytes, ...], tuple[float, ...]]:
     files.append((encode_model(models[2], "paper", color=(3, 8), scale=(2, 4), opacity=(1, 16)), 10))
     files.append((encode(models[3], "compact", noise=1e-9, prune=False), 2))
     files.append((encode(_alike(models[3]), "compact", prune=False), 10))
-    with patch.object(planning, "LEAST_OF_LAYER", (2, 100)):
-        files += [(encode(model, "compact", prune=False), 10) for model in (models[2], _model(40))]
+    files += [(encode(model, "compact", prune=False, layered=True), 10) for model in (models[2], _model(40))]
     mixed = [models[1], _model(5), _model(6), models[2], models[3], _model(2500)]
     for model in mixed:
         weight = {200: 0.5, 2500: 0.1}.get(len(model), 10)

@@ -6,11 +6,14 @@ measures instead.
 
 from __future__ import annotations
 
+from unittest.mock import patch
+
 import numpy as np
 
 from hyrfpack.format import encode_model
 from hyrfpack.format.arrays import decoder_widths, grids, to_arrays
 from hyrfpack.format.compact import Plan, Sensitivity, make_plan
+from hyrfpack.format.compact import plan as planning
 from hyrfpack.model import HybridModel
 from hyrfpack.quant.morton import MAX_BITS
 
@@ -21,7 +24,7 @@ SPREAD = 1.5  # standard deviation of the logarithms
 
 
 def drawn_sensitivity(model: HybridModel, seed: int = 0) -> Sensitivity:
-    """A fixed draw: log-normal, all numbers of a Gaussian alike, and rows of tables by how often Gaussians read them."""
+    """A fixed draw: log-normal, a Gaussian's numbers alike, rows of tables by how often Gaussians read them."""
     rng = np.random.default_rng(seed)
     shares = np.exp(SPREAD * rng.normal(size=len(model))) / max(len(model), 1)
     places = model.cube_coords(model.gaussians.positions.detach().double()).numpy()
@@ -36,9 +39,10 @@ def drawn_sensitivity(model: HybridModel, seed: int = 0) -> Sensitivity:
     return Sensitivity(POSITIONS * shares, *[LOGITS * shares] * 3, tables, decoders)
 
 
-def drawn_plan(model: HybridModel, noise: float = NOISE, prune: bool = True) -> Plan:
-    """The plan that `drawn_sensitivity` leads to."""
-    return make_plan(model, drawn_sensitivity(model), noise, prune)
+def drawn_plan(model: HybridModel, noise: float = NOISE, prune: bool = True, layered: bool = False) -> Plan:
+    """The plan that `drawn_sensitivity` leads to; with `layered` in layers however few the Gaussians are."""
+    with patch.object(planning, "LEAST_OF_LAYER", (2, 100) if layered else planning.LEAST_OF_LAYER):
+        return make_plan(model, drawn_sensitivity(model), noise, prune)
 
 
 def even_plan(model: HybridModel, step: float) -> Plan:
@@ -51,7 +55,7 @@ def even_plan(model: HybridModel, step: float) -> Plan:
 
 
 def encode(model: HybridModel, profile: str, provenance: dict | None = None, **settings: object) -> bytes:
-    """`encode_model` with any profile: "compact" gets a drawn plan, with `noise` and `prune` if they are given."""
+    """`encode_model` with any profile; settings of "compact" are those of its drawn plan."""
     if profile == "compact":
         settings = {"plan": drawn_plan(model, **settings)}
     return encode_model(model, profile, provenance, **settings)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import time
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,29 +20,35 @@ from pathlib import Path
 import hyrfpack
 from hyrfpack.train import TrainConfig
 
+PROFILES = ("paper", "compact")
 DATA = Path(os.environ.get("HYRFPACK_DATA") or Path(__file__).parents[2] / "shared" / "data")
 
 
 def measure(folder: Path, out: Path, config: TrainConfig, reuse: bool) -> dict:
-    """Train one set, compress it with the paper profile, score both files."""
+    """Train one set, compress it with each profile that loses something, score all files."""
     scene = hyrfpack.load_scene(folder)
     if not (reuse and (out / "metrics.json").exists()):
         hyrfpack.train(scene, out, config, overwrite=True)
     trained = json.loads((out / "metrics.json").read_text())
-    model, packed = out / "model.hyrf", out / "paper.hyrf"
-    hyrfpack.compress(model, packed, profile="paper")
-    scores = hyrfpack.evaluate(hyrfpack.load(packed), scene.test)
+    model = out / "model.hyrf"
+    packed = {}
+    for profile in PROFILES:
+        path = out / f"{profile}.hyrf"
+        began = time.perf_counter()
+        hyrfpack.compress(model, path, profile=profile)
+        seconds = time.perf_counter() - began
+        scores = hyrfpack.evaluate(hyrfpack.load(path), scene.test)
+        packed |= {f"psnr_{profile}": scores.psnr, f"ssim_{profile}": scores.ssim}
+        packed |= {f"bytes_{profile}": path.stat().st_size, f"seconds_{profile}": seconds}
     raw = trained["evaluation"]
     return {
         "set": folder.name,
         "steps": config.steps,
         "psnr": raw["psnr"],
         "ssim": raw["ssim"],
-        "psnr_paper": scores.psnr,
-        "ssim_paper": scores.ssim,
         "gaussians": trained["gaussians"],
         "bytes_raw": model.stat().st_size,
-        "bytes_paper": packed.stat().st_size,
+        **packed,
         "steps_per_second": trained["steps_per_second"],
         "seconds": trained["seconds"],
         "frame_ms": 1000 * scores.seconds_per_frame,
@@ -51,16 +58,30 @@ def measure(folder: Path, out: Path, config: TrainConfig, reuse: bool) -> dict:
 
 def table(rows: list[dict]) -> str:
     """The rows as Markdown."""
-    lines = [
-        "| set | preset | PSNR | SSIM | Gaussians | raw bytes | paper bytes | loss | steps/s | train s | frame ms |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+    columns = [f"{profile} bytes | loss | s" for profile in PROFILES]
+    header = [
+        "set",
+        "preset",
+        "PSNR",
+        "SSIM",
+        "Gaussians",
+        "raw bytes",
+        *columns,
+        "compact / paper",
+        "steps/s",
+        "train s",
     ]
-    lines += [
-        f"| {r['set']} | {r['preset']} | {r['psnr']:.2f} | {r['ssim']:.3f} | {r['gaussians']:,} | {r['bytes_raw']:,} | "
-        f"{r['bytes_paper']:,} | {r['psnr'] - r['psnr_paper']:.3f} dB | {r['steps_per_second']:.1f} | "
-        f"{r['seconds']:.0f} | {r['frame_ms']:.1f} |"
-        for r in rows
-    ]
+    lines = ["| " + " | ".join([*header, "frame ms"]) + " |"]
+    lines.append("|---" * (lines[0].count("|") - 1) + "|")
+    for r in rows:
+        cells = [r["set"], r["preset"], f"{r['psnr']:.2f}", f"{r['ssim']:.3f}", f"{r['gaussians']:,}"]
+        cells.append(f"{r['bytes_raw']:,}")
+        for profile in PROFILES:
+            loss = r["psnr"] - r[f"psnr_{profile}"]
+            cells += [f"{r[f'bytes_{profile}']:,}", f"{loss:.3f} dB", f"{r[f'seconds_{profile}']:.1f}"]
+        cells += [f"{r['bytes_compact'] / r['bytes_paper']:.2f}", f"{r['steps_per_second']:.1f}"]
+        cells += [f"{r['seconds']:.0f}", f"{r['frame_ms']:.1f}"]
+        lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 

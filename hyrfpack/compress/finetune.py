@@ -31,6 +31,7 @@ RATES = LearningRates(
     scale_logits=(8e-3, 8e-4),
     opacity_logits=(2e-2, 2e-3),
 )
+FULL_RATES = 500  # steps from which on rates are these; in fewer there is no time to settle after large ones
 LOSS_PER_ERROR = 40.0  # what the photometric loss rises by for a small mean squared error added to the picture
 
 
@@ -72,7 +73,9 @@ def finetune(
     rounding = dataclasses.replace(plan, reach=0)
     tuned = deepcopy(model)
     tuned.gaussians.positions.requires_grad_(False)
-    optimizer = Optimizer(tuned, RATES)
+    share = min(1.0, steps / FULL_RATES)
+    rates = {name: (share * first, share * last) for name, (first, last) in dataclasses.asdict(RATES).items()}
+    optimizer = Optimizer(tuned, LearningRates(**rates))
     quantized: Quantized | None = None
     keep_freed_memory()
     with closing((cache or PictureCache()).stream(_order(views, steps, seed))) as pictures, torch_on_one_thread():

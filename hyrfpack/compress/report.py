@@ -41,7 +41,7 @@ from hyrfpack.scene import Camera, Picture, Scene, View, evenly_spaced
 
 FACTORS = (1 / 16, 1 / 4, 1, 4, 16)  # of the file's noise, for the curve
 LARGE = 200_000  # Gaussians from which on the curve takes the middle three alone
-SCORED = 24  # views at most
+PHOTOS, VIEWPOINTS = 24, 12  # scored at most
 SHOWN = 4  # views whose pictures stand on the page
 VISIBLE = 0.4  # rms difference that the worst shown view is amplified to, at most
 MOST_AMPLIFIED = 64
@@ -123,7 +123,7 @@ def _views(model: HybridModel, source: Path, scene: Scene | None) -> tuple[list[
     if scene is None:
         with torch.no_grad():
             geometry = model.decode_geometry()
-            cameras = evenly_spaced(stored_cameras(describe(source)), SCORED)
+            cameras = evenly_spaced(stored_cameras(describe(source)), VIEWPOINTS)
             renders = [to_image(render(model, camera, geometry=geometry).rgb) for camera in cameras]
         views = [
             View(f"viewpoint {number}", camera, partial(Picture, np.asarray(picture)))
@@ -131,7 +131,7 @@ def _views(model: HybridModel, source: Path, scene: Scene | None) -> tuple[list[
         ]
         return views, f"what the uncompressed model shows from {len(views)} viewpoints"
     views, kind = (scene.test, "held-out") if scene.test else (scene.train, "training")
-    chosen = evenly_spaced(views, SCORED)
+    chosen = evenly_spaced(views, PHOTOS)
     count = f"{len(chosen)}" if len(chosen) == len(views) else f"{len(chosen)} of {len(views)}"
     return chosen, f"{count} {kind} {'photo' if len(views) == 1 else 'photos'}"
 

@@ -133,8 +133,7 @@ def page(source: Path, packed: Path, report: CompressionReport, findings: Findin
         *_choices(findings),
         _element("h2", "Before and after"),
         *_pictures(findings),
-        _element("h2", "How to make this file again"),
-        *([_element("pre", command)] if command else []),
+        *([_element("h2", "How to make this file again"), _element("pre", command)] if command else []),
         _element("p", f"Written by {findings.writer}. Times were measured on this machine: {findings.machine}."),
     )
     document = _element("html", head, body, lang="en")

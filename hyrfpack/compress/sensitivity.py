@@ -15,11 +15,11 @@ from hyrfpack.model.frame import expand
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, evenly_spaced
 
-DRAWN = 8_000_000  # Gaussians drawn in all views together, about: more views of smaller models
-FEWEST, MOST = 8, 192  # views
+DRAWN = 6_000_000  # Gaussians drawn in all views together, about: more views of smaller models
+FEWEST, MOST = 6, 192  # views
 FIELD_VIEWS = 1 / 6  # share of the views that the fields are measured on; each counts for many Gaussians there
-UNSEEN = 1e-3  # share of what a Gaussian would add to pictures if nothing hid it, that it counts at least
-DULL = 0.04 / 3  # (d colour / d logit)^2 of a typical colour, over the three channels of a picture
+TRUSTED = 8.0  # views that the guess from size, opacity and place counts for
+CELLS = 32  # of the cube, along each axis, in which guess and measurement are brought together
 NEAREST = 0.05  # local units
 LEAST = 1e-2  # of a decoder's number, against the mean of its decoder
 
@@ -31,8 +31,8 @@ def measure_sensitivity(model: HybridModel, cameras: Sequence[Camera], seed: int
     pixels' derivatives by x; its square is on average the sum of their squares (Hutchinson 1990). One such v a view,
     half of the views at cameras and half between them.
 
-    A Gaussian that few views show may still be seen in others: it counts at least a share of what it would if nothing
-    stood before it.
+    A Gaussian is measured in few views, or in none, and still may be seen in others. So what is measured is blended
+    with a guess from its size, opacity and place, which is right on average where it stands.
 
     Args:
         cameras: where pictures will be looked at from, about; world units.
@@ -77,31 +77,40 @@ def measure_sensitivity(model: HybridModel, cameras: Sequence[Camera], seed: int
 def _gathered(
     model: HybridModel, squares: dict[str, torch.Tensor], pixels: int, field_pixels: int, cameras: Sequence[Camera]
 ) -> Sensitivity:
-    def of(name: str) -> np.ndarray:
-        return squares[name].double().mean(dim=1).cpu().numpy() / pixels
-
-    explicit = {
-        name: of(f"gaussians.{name}") for name in ("positions", "color_logits", "scale_logits", "opacity_logits")
-    }
-    least = UNSEEN * _unhidden(model, cameras)
-    colors = explicit["color_logits"]
-    seen = colors > 1e-2 * colors.mean() if len(colors) else np.zeros(0, bool)
-    for name, values in explicit.items():
-        ratio = np.exp(np.median(np.log(np.maximum(values[seen], 1e-30) / colors[seen]))) if seen.any() else 1.0
-        explicit[name] = np.maximum(np.maximum(values, ratio * least), 1e-30)
+    expected = _expected(model, cameras)
+    views = len(cameras) * 2
+    explicit = []
+    for name, guess in expected.items():
+        measured = squares[f"gaussians.{name}"].double().mean(dim=1).cpu().numpy() / pixels
+        # What is measured in few views is shaky, and a Gaussian that none shows may be seen in others.
+        explicit.append(
+            np.maximum((views * measured + TRUSTED * _local(model, measured, guess)) / (views + TRUSTED), 1e-30)
+        )
     fields = {
         group: np.concatenate([squares[name].double().cpu().numpy().ravel() for name in GROUPS[group]]) / field_pixels
         for group in ("GTAB", "GMLP", "RTAB", "RMLP")
     }
     decoders = {group: fields[group] for group in ("GMLP", "RMLP")}
     return Sensitivity(
-        *explicit.values(),
+        *explicit,
         # Both numbers of a row are read together.
         tables={group: fields[group].reshape(-1, 2).mean(axis=1).repeat(2) for group in ("GTAB", "RTAB")},
         decoders={group: np.maximum(values, LEAST * values.mean()) for group, values in decoders.items()},
     )
 
 
+def _local(model: HybridModel, measured: np.ndarray, guess: np.ndarray) -> np.ndarray:
+    """The guess (N,), scaled so that it agrees with what was measured (N,) in each part of space and in all."""
+    cube = model.cube_coords(model.gaussians.positions.detach()).cpu().numpy()
+    cells = np.minimum((cube * CELLS).astype(np.int64), CELLS - 1) @ np.array((1, CELLS, CELLS**2))
+    sums = [np.bincount(cells, values, CELLS**3) for values in (measured, guess)]
+    overall = measured.sum() / max(guess.sum(), 1e-300)
+    # A part where little was seen leans on all of space.
+    weight = guess.sum() / max(np.count_nonzero(sums[1]), 1)
+    return guess * ((sums[0] + overall * weight) / (sums[1] + weight))[cells]
+
+
+@torch.enable_grad()
 def _stretch(model: HybridModel) -> torch.Tensor:
     """(N, 3, 3): d local position / d cube coordinate, rows local axes, columns cube axes."""
     cube = model.cube_coords(model.gaussians.positions.detach().double()).requires_grad_()
@@ -111,21 +120,28 @@ def _stretch(model: HybridModel) -> torch.Tensor:
 
 
 @torch.no_grad()
-def _unhidden(model: HybridModel, cameras: Sequence[Camera]) -> np.ndarray:
-    """(N,) what a colour logit would do to pictures if its Gaussian were in view of every camera and nothing before it.
+def _expected(model: HybridModel, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
+    """(N,) each: what a Gaussian's numbers would do to pictures, up to a factor, if nothing stood before it.
 
-    Each pixel under a Gaussian of opacity o and standard deviations a, b (the larger two) adds at most (o dc/dlogit)^2,
-    and there are pi f^2 a b / z^2 of them.
+    Each pixel under a Gaussian of opacity o and standard deviations a, b (the larger two) depends on its colour by o at
+    most, and there are pi f^2 a b / z^2 of them; on its opacity logit by o (1 - o); on its place by o / (a b)^(1/2).
     """
     geometry = model.decode_geometry()
     sides = geometry.scales.double().sort(dim=1).values
-    energy = torch.pi * sides[:, 1] * sides[:, 2] * geometry.opacities.double() ** 2
-    total = torch.zeros_like(energy)
+    area, opacities = sides[:, 1] * sides[:, 2], geometry.opacities.double()
+    total = torch.zeros_like(area)
     frame = model.config.frame
     positions = model.gaussians.positions.double()
     for camera in cameras:
         place = torch.as_tensor((camera.position - np.array(frame.center)) / frame.scale).to(positions)
         distance = torch.linalg.vector_norm(positions - place, dim=1).clamp_min(NEAREST)
-        share = energy * (camera.fx * camera.fy / (camera.width * camera.height)) / distance**2
-        total += share.clamp_max(1)
-    return (total * (DULL / max(len(cameras), 1))).cpu().numpy()
+        total += (area * (camera.fx * camera.fy / (camera.width * camera.height)) / distance**2).clamp_max(1)
+    seen = total * opacities**2
+    stretched = _stretch(model).double().square().sum(dim=(1, 2))
+    guesses = {
+        "positions": seen * stretched / area.clamp_min(1e-12),
+        "color_logits": seen,
+        "scale_logits": seen,
+        "opacity_logits": seen * (1 - opacities).clamp_min(1e-3) ** 2,
+    }
+    return {name: values.cpu().numpy() for name, values in guesses.items()}

@@ -91,7 +91,8 @@ def decoder_widths(config: ModelConfig) -> dict[str, tuple[int, int, int, int]]:
 def to_model(config: ModelConfig, arrays: dict[str, np.ndarray]) -> HybridModel:
     """The inverse of `to_arrays`; shapes must be those of `group_shapes`."""
     gaussians = Gaussians(*(torch.from_numpy(arrays[group]) for group in list(GROUPS)[: len(Gaussians.WIDTHS)]))
-    model = HybridModel(config, gaussians, torch.Generator())  # its own generator: the global one stays untouched
+    with torch.device("meta"):  # shapes alone: nothing is drawn or allocated that would be thrown away
+        model = HybridModel(config, gaussians)
     shapes = {name: value.shape for name, value in model.state_dict().items()}
     state = {}
     for group, names in GROUPS.items():

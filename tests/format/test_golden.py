@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from make_golden import FILES as GOLDEN_FILES
 from plans import encode
 
 from hyrfpack.format import describe, load, metadata
@@ -15,15 +16,8 @@ GOLDEN = Path(__file__).parents[1] / "golden"
 FILES = sorted(GOLDEN.glob("*.hyrf"))
 
 
-SETTINGS = {
-    "v1.0_raw": {},
-    "v1.0_paper": {"color": (3, 8), "scale": (2, 4), "opacity": (1, 16)},
-    "v1.1_compact": {"noise": 5e-4},
-}
-
-
 def test_golden_files_are_there():
-    assert set(SETTINGS) <= {file.stem for file in FILES}
+    assert set(GOLDEN_FILES) <= {file.stem for file in FILES}
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
@@ -57,13 +51,13 @@ def test_golden_file_has_the_recorded_configuration(file):
     )
 
 
-@pytest.mark.parametrize("name", SETTINGS)
+@pytest.mark.parametrize("name", GOLDEN_FILES)
 def test_golden_model_encodes_to_the_same_bytes(name, monkeypatch):
     golden = (GOLDEN / f"{name}.hyrf").read_bytes()
-    info = describe(GOLDEN / f"{name}.hyrf")
+    info, (profile, settings) = describe(GOLDEN / f"{name}.hyrf"), GOLDEN_FILES[name]
     monkeypatch.setattr(metadata, "writer", lambda: info["writer"])
 
-    data = encode(load(GOLDEN / "v1.0_raw.hyrf"), info["profile"], info["provenance"], **SETTINGS[name])
+    data = encode(load(GOLDEN / "v1.0_raw.hyrf"), profile, info["provenance"], **settings)
 
     assert data == golden
-    assert info["version"] == name[1:4]
+    assert (info["version"], info["profile"]) == (name[1:4], profile)

@@ -17,6 +17,7 @@ from scenes import small_model
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import decode_model
 from hyrfpack.format.arrays import to_arrays
+from hyrfpack.format.compact import plan
 from hyrfpack.format.container import read_container, write_container
 from hyrfpack.quant.integers import encode_integers
 
@@ -37,9 +38,9 @@ def model_of(count: int, **settings):
     )
 
 
-def assert_same_bits(data: bytes) -> None:
-    metadata, groups = minimal_reader.read(data)
-    model = decode_model(data)
+def assert_same_bits(data: bytes, part: bool = False) -> None:
+    metadata, groups = minimal_reader.read(data, part)
+    model = decode_model(data, fraction=1.0 if part else None)
 
     assert metadata["config"] == json.loads(json.dumps(model.config.to_dict()))
     expected = to_arrays(model)
@@ -77,6 +78,35 @@ def test_fresh_files_read_the_same(profile, count, background):
     assert_same_bits(encode(model_of(count, background=background, direction_encoding=encoding), profile))
 
 
+@pytest.fixture(scope="module")
+def in_layers() -> bytes:
+    """A file large enough for layers."""
+    data = encode(model_of(12_000), "compact")
+    assert "POS1" in read_container(data)
+    return data
+
+
+def test_files_in_layers_read_the_same(in_layers):
+    assert_same_bits(in_layers)
+
+
+@pytest.mark.parametrize("least", [None, 100], ids=["two layers", "many layers"])
+def test_the_start_of_a_file_in_layers_reads_the_same(in_layers, least, monkeypatch):
+    if least:
+        monkeypatch.setattr(plan, "LEAST_OF_LAYER", (least, 100))
+        in_layers = encode(model_of(2000), "compact")
+    entries = read_container(in_layers).entries
+    base, top = entries["RTAB"].end, entries["OPA1"].end
+
+    for cut in (base, top - 1, top, len(in_layers) - 1, len(in_layers)):
+        assert_same_bits(in_layers[:cut], part=True)
+    for cut in (base - 1, entries["META"].end, 60):
+        with pytest.raises(ValueError):
+            minimal_reader.read(in_layers[:cut], part=True)
+        with pytest.raises(HyrfFormatError):
+            decode_model(in_layers[:cut], fraction=1.0)
+
+
 def test_the_stream_of_the_page_is_read():
     data = bytes.fromhex("00 12 29 B0 03 00 69 B1 00")
 
@@ -107,10 +137,13 @@ def test_streams_of_every_kind_read_the_same(kind, contexts):
     assert np.array_equal(read, values)
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-def test_both_readers_refuse_the_same_damage(profile):
+@pytest.mark.parametrize("profile", [*PROFILES, "compact in layers"])
+def test_both_readers_refuse_the_same_damage(profile, monkeypatch):
     rng = np.random.default_rng(0)
-    sections = list(read_container(encode(model_of(30), profile)).sections)
+    if profile == "compact in layers":
+        monkeypatch.setattr(plan, "LEAST_OF_LAYER", (1, 100))
+    sections = list(read_container(encode(model_of(30), profile.split()[0])).sections)
+    assert (profile == "compact in layers") == any(section.type == "OPA1" for section in sections)
     refused, count = 0, 30
 
     for _ in range(count):

@@ -26,7 +26,7 @@ BITS_OF_A_GAUSSIAN = 16  # that pruning counts as saved: those it takes are chea
 USAGE_CLASSES = 16
 COUNTED = 1 << 16  # Gaussians whose reading of the tables is counted; of more, every n-th
 LEAST_OF_LAYER = 5000, 8  # Gaussians of a layer: at least so many, and so much of all; smaller ones cost over 1 %
-PLACED = 1 << 14  # Gaussians whose positions are worked out at once: few enough that temporaries stay in the caches
+PLACED = 1 << 13  # Gaussians whose positions are worked out at once: too few for torch to wake its own threads for
 
 
 @dataclass(frozen=True)

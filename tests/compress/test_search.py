@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from hyrfpack.compress.search import FACTOR, coarsest, finest
+
+ENDS = (1e-8, 1e-2)
+noises = st.floats(math.log(ENDS[0]), math.log(ENDS[1])).map(math.exp).filter(lambda x: ENDS[0] <= x <= ENDS[1])
+
+
+class Attempts:
+    """Trials are their noises; remembers them."""
+
+    def __init__(self) -> None:
+        self.made: list[float] = []
+
+    def __call__(self, noise: float) -> float:
+        self.made.append(noise)
+        return noise
+
+
+def worst_ratio(limit: float, start: float, trials: int) -> float:
+    """Steps by FACTOR until the limit is between two trials; those left halve the logarithm of their ratio."""
+    steps = 2 + math.floor(abs(math.log(limit / start, FACTOR)) + 1e-9)
+    return FACTOR ** 2.0 ** -(trials - steps) if trials >= steps else math.inf
+
+
+@given(limit=noises, start=noises, trials=st.integers(2, 14))
+def test_the_coarsest_that_fits_is_found_as_nearly_as_the_trials_allow(limit, start, trials):
+    attempts = Attempts()
+
+    answer = coarsest(attempts, lambda trial: trial <= limit, start, trials, ENDS)
+
+    assert len(attempts.made) <= trials + 1 and all(ENDS[0] <= noise <= ENDS[1] for noise in attempts.made)
+    noise, trial = answer
+    assert noise == trial <= limit
+    assert noise == max(noise for noise in attempts.made if noise <= limit)
+    assert limit / noise <= worst_ratio(limit, start, trials) * (1 + 1e-9)
+
+
+@given(limit=noises, start=noises, trials=st.integers(2, 14))
+def test_the_finest_that_fits_is_found_as_nearly_as_the_trials_allow(limit, start, trials):
+    attempts = Attempts()
+
+    noise, trial = finest(attempts, lambda trial: trial >= limit, start, trials, ENDS)
+
+    assert len(attempts.made) <= trials + 1
+    assert trial >= limit and noise == pytest.approx(trial, rel=1e-12)
+    assert noise / limit <= worst_ratio(limit, start, trials) * (1 + 1e-9)
+
+
+@given(start=noises, trials=st.integers(2, 14))
+def test_where_nothing_fits_there_is_no_answer(start, trials):
+    attempts = Attempts()
+
+    assert coarsest(attempts, lambda trial: False, start, trials, ENDS) is None
+
+    assert min(attempts.made) == ENDS[0] and attempts.made.count(ENDS[0]) == 1
+    assert finest(Attempts(), lambda trial: False, start, trials, ENDS) is None
+
+
+@given(start=noises)
+def test_where_everything_fits_the_end_is_the_answer_and_tried_once(start):
+    attempts = Attempts()
+
+    assert coarsest(attempts, lambda trial: True, start, 14, ENDS) == (ENDS[1], ENDS[1])
+
+    assert attempts.made.count(ENDS[1]) == 1
+    assert finest(Attempts(), lambda trial: True, start, 14, ENDS)[0] == pytest.approx(ENDS[0])
+
+
+@pytest.mark.parametrize("start", [0.0, 1e-30, 1e-8, 1e-2, 7.0, math.inf])
+def test_a_start_beyond_the_ends_begins_at_the_nearer_one(start):
+    attempts = Attempts()
+
+    coarsest(attempts, lambda trial: trial <= 1e-5, start, 12, ENDS)
+
+    assert attempts.made[0] == min(max(start, ENDS[0]), ENDS[1])
+
+
+@given(limit=noises, start=noises)
+def test_the_trial_that_is_returned_is_the_one_that_was_made(limit, start):
+    """Trials are files: the answer is one of them, not made anew."""
+    assume(limit > ENDS[0])
+    made = []
+
+    def attempt(noise: float) -> list[float]:
+        made.append([noise])
+        return made[-1]
+
+    _, trial = coarsest(attempt, lambda trial: trial[0] <= limit, start, 10, ENDS)
+
+    assert any(trial is other for other in made)

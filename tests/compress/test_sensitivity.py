@@ -1,0 +1,230 @@
+"""How much numbers matter to pictures, against finite differences of renders and a closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scenes import ball_points, ring, small_model
+
+from hyrfpack.compress.sensitivity import measure_sensitivity
+from hyrfpack.compress.views import WIDER, views_between
+from hyrfpack.errors import HyrfError
+from hyrfpack.format.arrays import GROUPS
+from hyrfpack.model import HybridModel
+from hyrfpack.model.frame import contract, expand
+from hyrfpack.render import render
+from hyrfpack.scene import Camera
+
+CAMERAS = ring(48, elevation=1.2, width=16, height=16)
+
+
+def a_model() -> HybridModel:
+    """Twenty Gaussians of a few pixels each, half transparent, with fields that say something."""
+    generator = torch.Generator().manual_seed(2)
+    colors = torch.randn(20, 3, generator=generator)
+    return small_model(ball_points(20)[0], fields=0.3, color_logits=colors, scale_logits=-1.5, opacity_logits=0.0)
+
+
+def looked_at_from(cameras: list[Camera]) -> list[Camera]:
+    return [*cameras, *views_between(cameras)]
+
+
+@torch.no_grad()
+def pictures(model: HybridModel, views: list[Camera]) -> np.ndarray:
+    return np.concatenate([render(model, view).rgb.double().numpy().ravel() for view in views])
+
+
+def slope(model: HybridModel, views: list[Camera], parameter: torch.Tensor, place: int, step: float) -> float:
+    """Mean squared derivative of all pixels by one number, from central differences."""
+    flat = parameter.data.view(-1)
+    before, sides = flat[place].item(), []
+    for sign in (1, -1):
+        flat[place] = before + sign * step
+        sides.append(pictures(model, views))
+    flat[place] = before
+    return float(np.mean(((sides[0] - sides[1]) / (2 * step)) ** 2))
+
+
+# Random signs stand for the pixels' squares: with 96 views and so many numbers, means are off by about 5 to 15 %.
+
+
+def test_explicit_numbers_are_the_slopes_of_pictures():
+    model, views = a_model(), looked_at_from(CAMERAS)
+    found = measure_sensitivity(model, CAMERAS)
+    gaussians = model.gaussians
+
+    for name, values, columns, step in (
+        ("color_logits", found.colors, 3, 0.05),
+        ("scale_logits", found.scales, 1, 0.02),
+        ("opacity_logits", found.opacities, 1, 0.05),
+    ):
+        chosen = [0, 7, 13]
+        expected = [
+            np.mean([slope(model, views, getattr(gaussians, name), columns * i + c, step) for c in range(columns)])
+            for i in chosen
+        ]
+        np.testing.assert_allclose(values[chosen].sum(), np.sum(expected), rtol=0.25, err_msg=name)
+        np.testing.assert_allclose(values[chosen], expected, rtol=0.5, err_msg=name)
+
+
+def test_positions_count_per_unit_of_the_contracted_cube():
+    model, views = a_model(), looked_at_from(CAMERAS)
+    found = measure_sensitivity(model, CAMERAS).positions
+    with torch.no_grad():
+        # One lies outside the box, where the cube's units are long.
+        model.gaussians.positions[3] = torch.tensor([0.9, 0.9, 0.6])
+    outside = measure_sensitivity(model, CAMERAS).positions[3]
+    place, step = model.gaussians.positions.data[3].double(), 2e-3
+
+    axes = []
+    for axis in range(3):
+        sides = []
+        for sign in (1, -1):
+            moved = contract(place) + sign * step * torch.eye(3, dtype=torch.float64)[axis]
+            model.gaussians.positions.data[3] = expand(moved).float()
+            sides.append(pictures(model, views))
+        axes.append(np.mean(((sides[0] - sides[1]) / (2 * step)) ** 2))
+
+    assert outside == pytest.approx(np.mean(axes), rel=0.4)
+    assert (found > 0).all()
+
+
+def test_fields_are_the_slopes_of_pictures():
+    model = a_model()
+    found = measure_sensitivity(model, CAMERAS)
+    every = looked_at_from(CAMERAS)
+
+    outputs = {"GMLP": model.geometry.biases[-1], "RMLP": model.radiance.biases[-1]}
+    for group, biases in outputs.items():
+        values = found.decoders[group][-len(biases) :]
+        expected = [slope(model, every, biases, place, 0.02) for place in range(len(biases))]
+        assert values.sum() == pytest.approx(sum(expected), rel=0.5), group
+    for group, field in (("GTAB", model.geometry), ("RTAB", model.radiance)):
+        values = found.tables[group]
+        rows = values.reshape(-1, 2)
+        assert (rows[:, 0] == rows[:, 1]).all()
+        largest = 2 * int(rows[:, 0].argmax())
+        expected = [slope(model, every, field.grid.table, largest + c, 0.02) for c in range(2)]
+        assert values[largest] == pytest.approx(np.mean(expected), rel=0.8), group
+
+
+def test_rows_that_no_gaussian_reads_count_nothing_and_decoders_never_nothing():
+    model = a_model()
+    found = measure_sensitivity(model, CAMERAS)
+    coords = model.cube_coords(model.gaussians.positions).detach()
+
+    for group, field in (("GTAB", model.geometry), ("RTAB", model.radiance)):
+        field.grid.table.grad = None
+        field.grid(coords).sum().backward()
+        read = (field.grid.table.grad != 0).any(dim=1).numpy()
+        assert 0 < read.sum() < len(read)
+        assert (found.tables[group].reshape(-1, 2)[~read] == 0).all()
+    assert all((values > 0).all() for values in found.decoders.values())
+
+
+def test_gaussians_that_no_camera_sees_count_by_their_size_opacity_and_distance():
+    """The closed form: pi f^2 a b / z^2 pixels under standard deviations a, b depend on colour by o at most."""
+    behind = np.array([[0.01, 0.01, 9.0], [0.02, 0.0, 9.0], [0.0, 0.02, 9.01]])  # all cameras look down
+    sizes, opacities = torch.tensor([[-1.5], [-2.5], [-1.5]]), torch.tensor([[0.5], [0.5], [-1.0]])
+    drawn = torch.full((20, 1), -1.5)
+    model = small_model(
+        np.vstack([ball_points(20)[0], behind]),
+        scale_logits=torch.cat([drawn, sizes]),
+        opacity_logits=torch.cat([drawn + 1.5, opacities]),
+    )
+    cameras = ring(8, width=16, height=16)
+    views = looked_at_from(cameras)
+    color = model.gaussians.color_logits
+
+    found = measure_sensitivity(model, cameras)
+
+    assert slope(model, views, color, 3 * 20, 0.1) == slope(model, views, color, 3 * 21, 0.1) == 0
+    with torch.no_grad():
+        geometry = model.decode_geometry()
+    sides, opacities = geometry.scales[20:].double().numpy(), geometry.opacities[20:].double().numpy()
+    expected = np.sort(sides, axis=1)[:, 1:].prod(axis=1) * opacities**2
+    np.testing.assert_allclose(found.colors[20:] / found.colors[20], expected / expected[0], rtol=0.02)
+    np.testing.assert_allclose(found.scales[20:] / found.scales[20], expected / expected[0], rtol=0.02)
+    by_opacity = expected * (1 - opacities) ** 2
+    np.testing.assert_allclose(found.opacities[20:] / found.opacities[20], by_opacity / by_opacity[0], rtol=0.02)
+    for values in (found.positions, found.colors, found.scales, found.opacities):
+        assert (values > 0).all() and values[20:].max() < values[:20].max()
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_the_same_model_gives_the_same_numbers_on_any_number_of_threads(background, monkeypatch):
+    found = []
+    for threads in ("1", "2", "2"):
+        monkeypatch.setenv("HYRFPACK_THREADS", threads)
+        found.append(measure_sensitivity(small_model(ball_points(200)[0], fields=0.3, background=background), CAMERAS))
+
+    for other in found[1:]:
+        for name in ("positions", "colors", "scales", "opacities"):
+            np.testing.assert_array_equal(getattr(other, name), getattr(found[0], name), err_msg=name)
+        for name in ("tables", "decoders"):
+            for group, values in getattr(found[0], name).items():
+                np.testing.assert_array_equal(getattr(other, name)[group], values, err_msg=group)
+
+
+def test_measuring_leaves_the_model_and_the_random_state_alone():
+    model = a_model()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    state = torch.get_rng_state()
+
+    measure_sensitivity(model, CAMERAS[:4])
+
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    assert all(parameter.requires_grad and parameter.grad is None for parameter in model.parameters())
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_sizes_are_those_of_the_file():
+    model = a_model()
+
+    found = measure_sensitivity(model, CAMERAS[:2])
+
+    parameters = dict(model.named_parameters())
+    for group, values in {**found.tables, **found.decoders}.items():
+        assert len(values) == sum(parameters[name].numel() for name in GROUPS[group]), group
+        assert values.dtype == np.float64 and np.isfinite(values).all()
+    for name in ("positions", "colors", "scales", "opacities"):
+        assert getattr(found, name).shape == (20,) and getattr(found, name).dtype == np.float64
+
+
+def test_a_number_that_is_not_finite_is_refused():
+    model = a_model()
+    with torch.no_grad():
+        model.geometry.biases[-1][0] = torch.nan
+
+    with pytest.raises(HyrfError):
+        measure_sensitivity(model, CAMERAS[:2])
+
+
+# -- where it is looked at from --------------------------------------------------------------------------------------
+
+
+def test_views_between_lie_between_neighbours_that_look_the_same_way():
+    """On a ring of 48 no neighbour is farther than two places: a view is within the chord, and looks inwards too."""
+    chord = 3 * 2 * np.sin(np.pi * 2 / 48)  # to the second next, of a ring of radius 3
+
+    for camera, view in zip(CAMERAS, views_between(CAMERAS), strict=True):
+        moved = np.linalg.norm(view.position - camera.position)
+        assert 0.2 * chord / 2 < moved < chord
+        assert view.rotation[2] @ camera.rotation[2] > np.cos(2 * np.pi * 2 / 48)
+        np.testing.assert_allclose(view.rotation @ view.rotation.T, np.eye(3), atol=1e-12)
+        assert (view.width, view.height) == (round(WIDER * camera.width), round(WIDER * camera.height))
+        assert (view.fx, view.fy) == (camera.fx, camera.fy)
+        assert view.cx - view.width / 2 == pytest.approx(camera.cx - camera.width / 2)
+
+
+def test_one_camera_has_no_neighbour_and_stays():
+    assert views_between(CAMERAS[:1]) == CAMERAS[:1]
+    assert views_between([]) == []
+
+
+def test_cameras_at_one_place_have_views_between_them():
+    views = views_between([CAMERAS[0]] * 3)
+
+    assert all(np.allclose(view.position, CAMERAS[0].position) for view in views)
+    assert all(np.isfinite(view.camera_from_world).all() for view in views)
