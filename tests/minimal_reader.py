@@ -156,10 +156,7 @@ class Section:
     stored_length: int
     crc: int
     padded: bytes  # stored bytes and padding; fewer of them where the data ends before
-
-    @property
-    def whole(self) -> bool:
-        return len(self.padded) == -(-self.stored_length // 8) * 8
+    whole: bool
 
     def read(self) -> bytes:
         """The stored bytes, checked as step 7 of 1.3 says."""
@@ -200,7 +197,7 @@ def read_container(data: bytes, part: bool = False) -> dict[str, Section]:
         end = offset + stored_length
         padded = -(-end // 8) * 8
         need(offset == expected and padded <= length, f"{name}: in the wrong place")
-        sections[name] = Section(name, codec, raw_length, stored_length, crc, data[offset:padded])
+        sections[name] = Section(name, codec, raw_length, stored_length, crc, data[offset:padded], padded <= len(data))
         expected, raw_total = padded, raw_total + raw_length * sections[name].whole
     need(expected == length, "bytes after the last section")
     need(raw_total <= min(1024 * len(data) + 2**28, 2**34), "sections too large")

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from hyrfpack.atomic import check_writable, make_folder
 from hyrfpack.cli.common import PATH, json_option, note, print_json, read_scene, scene_options, table
 from hyrfpack.errors import HyrfError, printable
 
@@ -41,6 +42,13 @@ class _Bytes(click.ParamType):
         return size
 
 
+def _number(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
+    """Refuse NaN, which no range does."""
+    if value is not None and math.isnan(value):
+        raise click.BadParameter("NaN is no number", ctx, param)
+    return value
+
+
 @click.command(short_help="Pack a model into a small file.")
 @click.argument("model", type=PATH)
 @click.option("-o", "--output", type=PATH, required=True, metavar="FILE", help="The .hyrf file to write.")
@@ -64,6 +72,7 @@ class _Bytes(click.ParamType):
 @click.option(
     "--max-psnr-drop",
     type=click.FloatRange(min=0),
+    callback=_number,
     metavar="DB",
     help="As small as can be for so many dB lost on the held-out photos of --data.",
 )
@@ -100,6 +109,9 @@ def compress(
     _refuse_same(model, output)
     from hyrfpack.compress import compress as pack
 
+    if report is not None:
+        make_folder(report)
+        check_writable(report)
     scene = None if data is None else read_scene(data, test_every, images, layout)
     result = pack(
         model,
@@ -127,6 +139,7 @@ def compress(
 @click.option(
     "--fraction",
     type=click.FloatRange(0, 1),
+    callback=_number,
     metavar="F",
     help="Use only so much of the file, from its start, such as 0.6: a coarser model.",
 )

@@ -118,6 +118,8 @@ class Container:
         Raises:
             HyrfFormatError: not a `.hyrf` file, a newer version, an unknown required section, damage or forgery.
         """
+        if fraction is not None and not 0 <= fraction <= 1:
+            raise HyrfFormatError(f"{name}: there is no part of {fraction} of a file; ask for 0 to 1")
         self._read_at = read_at
         self.name = name
         self.length = self.available = length

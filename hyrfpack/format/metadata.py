@@ -41,7 +41,7 @@ class Metadata:
     """What a reader must know before it decodes a section, and what a person may want to know.
 
     Attributes:
-        profile: "raw" or "paper"; for people, each section names its own codec.
+        profile: "raw", "paper" or "compact"; for people, each section names its own codec.
         gaussians: how many there are.
         config: `ModelConfig.to_dict()`.
         rules: names of the equations that are not settings of a model; a reader refuses names it does not know.

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -35,7 +37,7 @@ def digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-# The parent writes the plan: it must be the same, whatever decides about a Gaussian that is on the edge.
+# The plan comes from the test: what is measured may differ in its last bits without compiled kernels.
 SCRIPT = """
 import pickle, sys
 sys.path += {paths!r}
@@ -52,8 +54,6 @@ print(digest(encode_model(a_model(), "compact", plan=plan)))
 
 @pytest.mark.parametrize("blocked", [False, True], ids=["compiled", "numpy"])
 def test_compiled_kernels_and_numpy_write_the_same_bytes(blocked, tmp_path):
-    import pickle
-
     model = a_model()
     plan = drawn_plan(model, layered=True)
     (tmp_path / "plan").write_bytes(pickle.dumps(plan))
@@ -76,12 +76,12 @@ def test_one_thread_and_two_write_the_same_bytes_again_and_again(layered, monkey
     assert len(written) == 1
 
 
-def test_the_order_of_gaussians_in_the_model_decides_nothing_but_among_equals():
+def test_gaussians_in_another_order_give_the_same_file():
     model, other = a_model(), a_model()
     order = np.random.default_rng(1).permutation(COUNT)
     for name in other.gaussians.NAMES:
         getattr(other.gaussians, name).data = getattr(model.gaussians, name).data[order]
     plan = drawn_plan(model, prune=False)
-    moved = type(plan)(**{**vars(plan), "kept": np.argsort(order)[plan.kept]})
+    moved = dataclasses.replace(plan, kept=np.argsort(order)[plan.kept])
 
     assert encode_model(other, "compact", plan=moved) == encode_model(model, "compact", plan=plan)

@@ -26,7 +26,7 @@ class Attempts:
 def worst_ratio(limit: float, start: float, trials: int) -> float:
     """Steps by FACTOR until the limit is between two trials; those left halve the logarithm of their ratio."""
     steps = 2 + math.floor(abs(math.log(limit / start, FACTOR)) + 1e-9)
-    return FACTOR ** 2.0 ** -(trials - steps) if trials >= steps else math.inf
+    return FACTOR**2.0 ** -(trials - steps) if trials >= steps else math.inf
 
 
 @given(limit=noises, start=noises, trials=st.integers(2, 14))

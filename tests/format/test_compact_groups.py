@@ -142,7 +142,6 @@ def test_numbers_beyond_the_largest_symbol_are_cut() -> None:
     check_round_trip(chosen, groups)
 
 
-@pytest.mark.xfail(strict=True, reason="reach takes a symbol past LARGEST, which the decoder refuses")
 @pytest.mark.parametrize(("value", "distortion"), [(1e6, 1e-6), (10.0, 1e-16)])
 def test_numbers_beyond_the_largest_symbol_are_cut_with_reach_too(value: float, distortion: float) -> None:
     groups = Groups(np.zeros(2, np.int64), 1)

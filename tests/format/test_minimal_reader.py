@@ -137,6 +137,24 @@ def test_streams_of_every_kind_read_the_same(kind, contexts):
     assert np.array_equal(read, values)
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_both_readers_bound_the_basis_alike(sign):
+    sections = list(read_container(encode(model_of(30), "compact")).sections)
+    place = [section.type for section in sections].index("COLO")
+    largest = np.float32(1 + 2**-10)
+
+    def with_basis(first: np.float32) -> bytes:
+        data = np.float32(sign * first).tobytes() + bytes(sections[place].data[4:])
+        return write_container([*sections[:place], replace(sections[place], data=data), *sections[place + 1 :]])
+
+    assert_same_bits(with_basis(largest))
+    for first in (np.nextafter(largest, np.float32(2)), np.float32("nan")):
+        with pytest.raises(ValueError, match="basis"):
+            minimal_reader.read(with_basis(first))
+        with pytest.raises(HyrfFormatError, match="basis"):
+            decode_model(with_basis(first))
+
+
 @pytest.mark.parametrize("profile", [*PROFILES, "compact in layers"])
 def test_both_readers_refuse_the_same_damage(profile, monkeypatch):
     rng = np.random.default_rng(0)

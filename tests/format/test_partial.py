@@ -264,12 +264,12 @@ def test_each_layer_may_have_a_codec_of_its_own():
     assert_same_bits(decode_model(write_container([*sections.values()])), expected)
 
 
-@pytest.mark.parametrize(("replaced", "refused"), [(["POS1"], "COL1"), (GROUPS, "GTAB")])
+@pytest.mark.parametrize(("replaced", "refused"), [(["POS1"], "COL1|SCA1|OPA1"), (GROUPS, "GTAB|RTAB")])
 def test_lattice_points_of_another_layer_are_none_to_lean_on(replaced, refused):
     sections = {section.type: section for section in read_container(COMPACT).sections}
     sections |= {name: exact(name, np.zeros(sections[name].raw_length // 4, np.float32)) for name in replaced}
 
-    with pytest.raises(HyrfFormatError, match=f"section '{refused}': codec . needs positions of codec 6"):
+    with pytest.raises(HyrfFormatError, match=f"section '({refused})': codec . needs positions of codec 6"):
         decode_model(write_container([*sections.values()]))
 
 
@@ -299,7 +299,7 @@ def stretched(data: bytes, length: int) -> bytes:
 
 
 def in_little_memory(data: bytes, fraction: float | None) -> HybridModel | HyrfFormatError:
-    """What becomes of a file; a MB must be enough for it."""
+    """What becomes of a file, for which 8 MiB must be enough."""
     tracemalloc.start()
     try:
         return decode_model(data, fraction=fraction)
@@ -326,13 +326,22 @@ def test_what_is_not_there_may_promise_anything_and_costs_nothing():
     layers = [*LAYERS[:-1], 10**11]
     metadata = metadata_of(MODEL, layers, sum(layers))
     data = write_container([metadata, *sections[1:]])
-    for name, width in zip(names(len(LAYERS) - 1), (3, 3, 1, 1), strict=True):
-        data = forge(data, line(data, name) + 24, "<Q", 4 * width * 10**11)
-    cut = read_container(data, fraction=0.0).entries[names(len(LAYERS) - 1)[0]].offset
+    last = names(len(LAYERS) - 1)
+    lines, cut = [line(data, name) for name in last], read_container(data).entries[last[0]].offset
+    for place, width in zip(lines, (3, 3, 1, 1), strict=True):
+        data = forge(data, place + 24, "<Q", 4 * width * 10**11)
 
     assert_same_bits(in_little_memory(data[:cut], 1.0), prefix(WHOLE, COUNT - LAYERS[-1]))
     assert "the sections say they decode to" in str(in_little_memory(data, 1.0))
     assert "the sections say they decode to" in str(in_little_memory(data, None))
+
+
+def test_the_bytes_that_are_there_bound_what_they_decode_to_and_not_the_length_in_the_header():
+    data = forge(stretched(COMPACT, 1 << 33), line(COMPACT, "GMLP") + 24, "<Q", 1 << 30)
+
+    for fraction in (1.0, len(COMPACT) / (1 << 33)):
+        with pytest.raises(HyrfFormatError, match="the sections say they decode to"):
+            read_container(data, fraction=fraction)
 
 
 @pytest.mark.parametrize("kept", [0, 1, 39])
@@ -383,9 +392,7 @@ def test_layers_whose_sections_are_not_listed_are_refused(fraction):
         with pytest.raises(HyrfFormatError, match=f"there is no section '{missing}'"):
             decode_model(write_container(sections), fraction=fraction)
     with pytest.raises(HyrfFormatError, match="there is no section 'POS2'"):
-        decode_model(
-            with_metadata(in_layers(MODEL, [400, 200]), metadata_of(MODEL, [400, 100, 100])), fraction=fraction
-        )
+        decode_model(with_metadata(in_layers(MODEL, [400, 200]), metadata_of(MODEL, [400, 200, 0])), fraction=fraction)
 
 
 def test_a_layer_of_another_size_than_the_metadata_says_is_refused_even_where_it_is_not_there():

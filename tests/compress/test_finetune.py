@@ -1,0 +1,129 @@
+"""Fine-tuning a quantised model: what moves, what stays, and that it is worth it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from scenes import ball_scene
+
+from hyrfpack.compress.finetune import finetune
+from hyrfpack.compress.sensitivity import measure_sensitivity
+from hyrfpack.data import PictureCache
+from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.evaluate import evaluate
+from hyrfpack.format import decode_model, encode_model
+from hyrfpack.format.compact import Plan, Sensitivity, make_plan
+from hyrfpack.model import HybridModel
+from hyrfpack.scene import Picture, Scene
+from hyrfpack.train import TrainConfig, Trainer
+
+NOISE = 2e-3  # 27 dB between pictures before and after: there is something to mend
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return ball_scene(views=8, points=80, side=32)
+
+
+@pytest.fixture(scope="module")
+def trained(scene) -> HybridModel:
+    trainer = Trainer(scene, TrainConfig(steps=150, max_gaussians=300))
+    assert trainer.run()
+    return trainer.model
+
+
+@pytest.fixture(scope="module")
+def sensitivity(trained, scene) -> Sensitivity:
+    return measure_sensitivity(trained, [view.camera for view in scene.train])
+
+
+@pytest.fixture(scope="module")
+def plan(trained, sensitivity) -> Plan:
+    return make_plan(trained, sensitivity, NOISE)
+
+
+def decoded(tuned: HybridModel, plan: Plan) -> tuple[HybridModel, int]:
+    """A fine-tuned model as its file gives it back, and the bytes of that."""
+    data = encode_model(tuned, "compact", plan=dataclasses.replace(plan.of_applied(), reach=0))
+    return decode_model(data), len(data)
+
+
+def test_fine_tuning_is_worth_more_than_the_same_bytes_of_finer_steps(trained, plan, sensitivity, scene):
+    finer = encode_model(trained, "compact", plan=make_plan(trained, sensitivity, NOISE / 3))
+    without = evaluate(decode_model(finer), scene.train).psnr
+    steps = []
+
+    tuned = finetune(plan.apply(trained), plan, scene.train, 60, report=lambda step, loss: steps.append((step, loss)))
+
+    model, size = decoded(tuned, plan)
+    after = evaluate(model, scene.train).psnr
+    assert size < len(finer)
+    assert after > without + 0.5
+    assert [step for step, _ in steps] == list(range(1, 61))
+    assert np.mean([loss for _, loss in steps[-8:]]) < np.mean([loss for _, loss in steps[:8]])
+
+
+def test_positions_and_their_order_stay_and_the_model_given_is_not_touched(trained, plan, scene):
+    planned = plan.apply(trained)
+    before = {name: value.clone() for name, value in planned.state_dict().items()}
+
+    tuned = finetune(planned, plan, scene.train, 5)
+
+    for name, value in planned.state_dict().items():
+        assert torch.equal(value, before[name]), name
+    assert all(parameter.grad is None for parameter in planned.parameters())
+    assert torch.equal(tuned.gaussians.positions, planned.gaussians.positions)
+    model, _ = decoded(tuned, plan)
+    assert torch.equal(model.gaussians.positions, planned.gaussians.positions)
+    moved = {name for name, value in tuned.state_dict().items() if not torch.equal(value, before[name])}
+    for name in ("gaussians.color_logits", "gaussians.opacity_logits", "geometry.grid.table", "radiance.weights.0"):
+        assert name in moved
+    assert all(parameter.requires_grad for parameter in tuned.parameters())
+
+
+def test_what_is_decoded_is_the_nearest_to_the_fitted_numbers(trained, plan, scene):
+    """Fitted numbers sit where they shall be rounded to: with `reach` 0 nothing is traded for bits any more."""
+    tuned = finetune(plan.apply(trained), plan, scene.train, 5)
+
+    model, _ = decoded(tuned, plan)
+
+    for name in ("color_logits", "scale_logits"):
+        off = getattr(model.gaussians, name) - getattr(tuned.gaussians, name)
+        traded = decode_model(encode_model(tuned, "compact", plan=plan.of_applied())).gaussians
+        assert off.abs().mean() < (getattr(traded, name) - getattr(tuned.gaussians, name)).abs().mean()
+
+
+def test_the_same_seed_gives_the_same_model_and_another_another(trained, plan, scene):
+    planned = plan.apply(trained)
+
+    first, again, other = (finetune(planned, plan, scene.train, 6, seed=seed) for seed in (0, 0, 1))
+
+    pairs = list(zip(first.parameters(), again.parameters(), other.parameters(), strict=True))
+    assert all(torch.equal(a, b) for a, b, _ in pairs)
+    assert not all(torch.equal(a, c) for a, _, c in pairs)
+
+
+def test_each_epoch_takes_every_view_once(trained, plan, scene):
+    seen = []
+
+    def watched(view):
+        return dataclasses.replace(view, load=lambda: seen.append(view.name) or view.load())
+
+    finetune(plan.apply(trained), plan, [watched(view) for view in scene.train], 16, cache=PictureCache(0))
+
+    names = {view.name for view in scene.train}
+    assert set(seen[:8]) == set(seen[8:16]) == names
+
+
+def test_a_photo_of_nan_stops_it_with_the_step_and_the_view(trained, plan, scene):
+    class Broken(Picture):
+        def composite(self, solid=None):
+            return np.full((32, 32, 3), np.nan, np.float32)
+
+    view = dataclasses.replace(scene.train[2], load=lambda: Broken(np.zeros((32, 32, 3), np.uint8)))
+
+    with pytest.raises(HyrfTrainingError, match="stopped at step 1 on view '002.png'.*without --finetune"):
+        finetune(plan.apply(trained), plan, [view], 3)

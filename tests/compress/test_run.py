@@ -1,0 +1,263 @@
+"""Compressing a trained file end to end, on photos of the demo's scene."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scenes import ball_points, small_model
+
+import hyrfpack
+from hyrfpack.compress import compress
+from hyrfpack.compress import run as running
+from hyrfpack.compress.run import default_noise
+from hyrfpack.errors import HyrfError
+from hyrfpack.evaluate import evaluate
+from hyrfpack.format import describe, load, save
+from hyrfpack.render import render
+from hyrfpack.scene import Scene
+from hyrfpack.train import TrainConfig, train
+
+
+@pytest.fixture(scope="module")
+def scene(data) -> Scene:
+    return hyrfpack.load_scene(data)
+
+
+@pytest.fixture(scope="module")
+def trained(scene, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "small"
+    return train(scene, folder, TrainConfig(steps=250, max_gaussians=1500), quiet=True).model
+
+
+@pytest.fixture(scope="module")
+def paper(trained, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("packed") / "paper.hyrf"
+    compress(trained, path, "paper")
+    return path
+
+
+@pytest.fixture(scope="module")
+def compact(trained, scene, tmp_path_factory) -> tuple[Path, object]:
+    path = tmp_path_factory.mktemp("packed") / "compact.hyrf"
+    return path, compress(trained, path, data=scene)
+
+
+def psnr(path: Path, scene: Scene) -> float:
+    return evaluate(load(path), scene.test).psnr
+
+
+def squared_error(first: Path, second: Path, cameras) -> float:
+    """Between pictures of two files, mean over all."""
+    with torch.no_grad():
+        pictures = [
+            torch.cat([render(model, camera).rgb.flatten() for camera in cameras])
+            for model in (load(first), load(second))
+        ]
+    return float((pictures[0] - pictures[1]).double().square().mean())
+
+
+# -- what it is for --------------------------------------------------------------------------------------------------
+
+
+def test_it_is_smaller_than_the_paper_profile_by_far_at_hardly_any_loss(trained, paper, compact, scene):
+    path, _ = compact
+
+    assert path.stat().st_size < 0.55 * paper.stat().st_size
+    assert psnr(path, scene) > psnr(trained, scene) - 0.1
+
+
+def test_with_a_limit_on_the_loss_it_loses_no_more_than_the_paper_profile_and_is_smaller(
+    trained, paper, scene, tmp_path
+):
+    allowed = max(psnr(trained, scene) - psnr(paper, scene), 0.0) + 0.02
+
+    report = compress(trained, tmp_path / "small.hyrf", data=scene, max_psnr_drop=allowed)
+
+    assert psnr(trained, scene) - psnr(tmp_path / "small.hyrf", scene) <= allowed + 1e-6
+    assert report.bytes_after < 0.7 * paper.stat().st_size
+    assert f"of {allowed:g} dB on {len(scene.test)} photos" in report.found
+
+
+def test_the_report_is_of_the_file_and_its_estimate_of_the_pictures(trained, compact, scene):
+    path, report = compact
+
+    assert report.profile == "compact" == describe(path)["profile"]
+    assert report.bytes_after == path.stat().st_size
+    assert report.gaussians == len(load(path))
+    assert sum(report.shares.values()) == pytest.approx(1) and min(report.shares.values()) >= 0
+    assert set(report.shares) == {"POSI", "COLO", "SCAL", "OPAC", "GTAB", "GMLP", "RTAB", "RMLP"}
+    measured = squared_error(trained, path, [view.camera for view in scene.train])
+    assert report.error / 4 < measured < 4 * report.error
+
+
+def test_the_noise_that_is_asked_for_is_about_what_pictures_get(trained, scene, tmp_path):
+    cameras = [view.camera for view in scene.train]
+    sizes, errors = [], []
+    for noise in (1e-4, 1e-5, 1e-6):
+        report = compress(trained, tmp_path / "small.hyrf", data=scene, noise=noise)
+        errors.append(squared_error(trained, tmp_path / "small.hyrf", cameras))
+        sizes.append(report.bytes_after)
+        assert noise / 4 < errors[-1] < 4 * noise
+
+    assert sizes == sorted(sizes) and errors == sorted(errors, reverse=True)
+
+
+@pytest.mark.parametrize("share", [0.4, 0.8, 1.5])
+def test_a_target_size_is_met_and_nearly_used_up(share, trained, compact, scene, tmp_path):
+    target = int(share * compact[1].bytes_after)
+
+    report = compress(trained, tmp_path / "small.hyrf", data=scene, target_bytes=target)
+
+    assert 0.9 * target < (tmp_path / "small.hyrf").stat().st_size <= target
+    assert f"of {target:,} bytes" in report.found
+
+
+def test_fine_tuning_fits_the_photos_better_in_the_same_bytes(trained, scene, tmp_path):
+    tuned = compress(trained, tmp_path / "tuned.hyrf", data=scene, finetune_steps=60)
+    compress(trained, tmp_path / "plain.hyrf", data=scene, target_bytes=tuned.bytes_after)
+
+    fits = [evaluate(load(tmp_path / name), scene.train).psnr for name in ("tuned.hyrf", "plain.hyrf")]
+    print(
+        tuned.bytes_after,
+        fits,
+        [psnr(tmp_path / name, scene) for name in ("tuned.hyrf", "plain.hyrf")],
+        psnr(trained, scene),
+    )
+    assert fits[0] > fits[1] + 0.1
+
+
+@pytest.mark.parametrize("limit", [{"target_bytes": 9000}, {"max_psnr_drop": 0.3}], ids=["size", "loss"])
+def test_fine_tuning_keeps_to_limits(limit, trained, scene, tmp_path):
+    report = compress(trained, tmp_path / "small.hyrf", data=scene, finetune_steps=20, **limit)
+
+    if "target_bytes" in limit:
+        assert 0.6 * 9000 < report.bytes_after <= 9000
+    else:
+        assert psnr(trained, scene) - psnr(tmp_path / "small.hyrf", scene) <= 0.3 + 1e-6
+
+
+def test_pruning_leaves_out_gaussians_and_bytes_and_not_pruning_keeps_all(trained, scene, tmp_path):
+    every = len(load(trained))
+
+    kept = compress(trained, tmp_path / "all.hyrf", data=scene, noise=1e-4, prune=False)
+    pruned = compress(trained, tmp_path / "fewer.hyrf", data=scene, noise=1e-4)
+
+    assert kept.gaussians == every > pruned.gaussians > every / 4
+    assert pruned.bytes_after < kept.bytes_after
+
+
+# -- how it goes about it --------------------------------------------------------------------------------------------
+
+
+def test_without_photos_it_looks_from_the_cameras_that_the_file_keeps(trained, compact, scene, tmp_path):
+    """They are those of the photos, to nine digits."""
+    said = []
+
+    report = compress(trained, tmp_path / "small.hyrf", say=said.append)
+
+    assert f"at {len(scene.train)} cameras" in said[0]
+    assert report.bytes_after == pytest.approx(compact[1].bytes_after, rel=0.02)
+
+
+def test_without_photos_and_cameras_it_goes_around_the_scene(trained, compact, scene, tmp_path):
+    provenance = describe(trained)["provenance"]
+    del provenance["cameras"]
+    save(load(trained), tmp_path / "bare.hyrf", "raw", provenance)
+
+    report = compress(tmp_path / "bare.hyrf", tmp_path / "small.hyrf")
+
+    assert report.bytes_after < 2 * compact[1].bytes_after
+    assert psnr(tmp_path / "small.hyrf", scene) > psnr(trained, scene) - 1
+
+
+def test_the_same_file_gives_the_same_bytes(trained, compact, scene, tmp_path):
+    compress(trained, tmp_path / "again.hyrf", data=scene)
+
+    assert (tmp_path / "again.hyrf").read_bytes() == compact[0].read_bytes()
+
+
+def test_provenance_goes_along_but_for_the_cameras(trained, compact):
+    before, after = describe(trained)["provenance"], describe(compact[0])["provenance"]
+
+    assert "cameras" in before and after == {name: value for name, value in before.items() if name != "cameras"}
+
+
+def test_a_compressed_file_can_be_compressed_again_and_unpacked_exactly(paper, compact, scene, tmp_path):
+    from_paper = compress(paper, tmp_path / "small.hyrf", data=scene)
+    compress(compact[0], tmp_path / "back.hyrf", "raw")
+
+    assert from_paper.bytes_after < paper.stat().st_size
+    pairs = zip(load(compact[0]).parameters(), load(tmp_path / "back.hyrf").parameters(), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
+
+
+@pytest.mark.parametrize(
+    ("told", "expected"),
+    [(30.0, 6.93e-6), (20.0, 6.93e-5), (None, 6.93e-6), ("good", 6.93e-6), (0.0, 6.93e-6), (1e400, 6.93e-6)],
+)
+def test_by_itself_it_aims_at_three_hundredths_of_a_dB(told, expected):
+    """Errors add up: 10 lg((e + noise) / e) = 0.03 at e = 10^(-psnr / 10)."""
+    assert default_noise({} if told is None else {"psnr": told}) == pytest.approx(expected, rel=0.01)
+
+
+# -- refused ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"finetune_steps": 5}, "need photos"),
+        ({"max_psnr_drop": 0.1}, "need photos"),
+        ({"target_bytes": 10_000, "noise": 1e-5}, "give one of them"),
+        ({"color": (2, 64)}, "no setting 'color'"),
+        ({"profile": "paper", "noise": 1e-5}, "profile 'paper' has no settings"),
+        ({"profile": "raw", "finetune_steps": 5}, "profile 'raw' has no settings"),
+        ({"profile": "zip"}, "no profile 'zip'"),
+        ({"target_bytes": 500}, "does not fit into 500 bytes"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused_and_nothing_is_written(options, words, trained, tmp_path):
+    with pytest.raises(HyrfError, match=words):
+        compress(trained, tmp_path / "small.hyrf", **options)
+
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_loss_that_even_the_finest_file_exceeds_is_refused(trained, scene, tmp_path, monkeypatch):
+    scored = running.evaluate
+
+    def worse_each_time(model, views):
+        worse_each_time.calls += 1
+        return dataclasses.replace(scored(model, views), psnr=30.0 - worse_each_time.calls)
+
+    worse_each_time.calls = 0
+    monkeypatch.setattr(running, "evaluate", worse_each_time)
+
+    with pytest.raises(HyrfError, match="even the finest file loses more than 0.5 dB of PSNR"):
+        compress(trained, tmp_path / "small.hyrf", data=scene, max_psnr_drop=0.5)
+
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("options", [{}, {"finetune_steps": 5}, {"max_psnr_drop": 0.1}], ids=["plain", "tune", "limit"])
+def test_photos_that_are_all_held_out_are_refused_or_measured_on(options, trained, scene, tmp_path):
+    """There is nothing to measure at, or to fit to."""
+    held_out = dataclasses.replace(scene, train=[], test=scene.train)
+
+    with pytest.raises(HyrfError):
+        compress(trained, tmp_path / "small.hyrf", data=held_out, **options)
+
+
+def test_a_model_that_nobody_sees_is_compressed_all_the_same(tmp_path, scene):
+    """All Gaussians lie behind the cameras, and there is no background: every slope is zero."""
+    positions = ball_points(30)[0] * 0.1 + np.array([0.0, 0.0, 500.0])
+    save(small_model(positions), tmp_path / "behind.hyrf", "raw")
+
+    report = compress(tmp_path / "behind.hyrf", tmp_path / "small.hyrf", data=scene)
+
+    assert report.bytes_after < (tmp_path / "behind.hyrf").stat().st_size
+    assert all(torch.isfinite(parameter).all() for parameter in load(tmp_path / "small.hyrf").parameters())
