@@ -102,8 +102,10 @@ def compress(
         raise HyrfError("fine-tuning and limits on PSNR need photos; name their folder with --data")
     if sum(option is not None for option in (target_bytes, max_psnr_drop, noise)) > 1:
         raise HyrfError("a target size and a largest loss of PSNR each decide how fine the file is; give one of them")
-    if max_psnr_drop is not None and not (data.test or data.train):
-        raise HyrfError(f"{data.path}: there is no photo to measure the loss on")
+    if data is not None and not data.train:
+        raise HyrfError(
+            f"{data.path}: all photos are held out, so there is none to measure at; use a larger --test-every"
+        )
     model, provenance = load_with_provenance(source)
     if len(model) == 0:
         raise HyrfError(f"{source}: there is no Gaussian in it, so there is nothing to measure; use profile 'paper'")
@@ -233,17 +235,18 @@ def added_errors(planned: HybridModel, quantized: Quantized, plan: Plan) -> dict
     """What storing a planned model adds to the pictures' mean squared error, by section and by estimate."""
     wanted, stored, s = to_arrays(planned), quantized.arrays(plan), plan.sensitivity
     weights = {
-        "COLO": s.colors[:, None],
-        "SCAL": s.scales[:, None],
-        **{group: values[:, None] for group, values in {**s.tables, **s.decoders}.items()},
+        "COLO": np.repeat(s.colors, 3),
+        "SCAL": s.scales,
+        **s.tables,
+        **s.decoders,
     }
     bits = np.concatenate([layer.points.bits[layer.points.classes] for layer in plan.layers])  # anywhere in its cell
     _, opacity = opacity_error(planned, wanted["OPAC"][:, 0].astype(np.float64), s.opacities)
     errors = {"OPAC": float(opacity(slice(None), stored["OPAC"][:, 0]).sum())}
     errors["POSI"] = float((s.positions * 3 / 12 * 4.0**-bits).sum())
     for group, weight in weights.items():
-        difference = stored[group].reshape(len(weight), -1) - wanted[group].reshape(len(weight), -1)
-        errors[group] = float((weight * difference.astype(np.float64) ** 2).sum())
+        difference = stored[group].ravel().astype(np.float64) - wanted[group].ravel()
+        errors[group] = float((weight * difference**2).sum())
     return errors
 
 
