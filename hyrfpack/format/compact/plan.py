@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from hyrfpack.format.arrays import decoder_widths, grids, to_arrays, to_model
+from hyrfpack.format.compact.channels import LIMIT
 from hyrfpack.format.compact.groups import Groups
 from hyrfpack.format.compact.quantize import ERROR_PER_BIT
 from hyrfpack.format.compact.sensitivity import Sensitivity
@@ -190,7 +191,8 @@ def color_basis(colors: np.ndarray) -> np.ndarray:
     """
     if len(colors) < 2:
         return np.eye(3, dtype=np.float32)
-    basis = np.linalg.eigh(np.cov(colors.T.astype(np.float64)))[1][:, ::-1]
+    within = np.clip(colors.T.astype(np.float64), -LIMIT / 2, LIMIT / 2)
+    basis = np.linalg.eigh(np.cov(within))[1][:, ::-1]
     return (basis * np.where(basis.sum(axis=0) < 0, -1, 1)).astype(np.float32)
 
 

@@ -12,7 +12,7 @@ import torch
 from scipy.special import expit
 
 from hyrfpack.format.arrays import to_arrays
-from hyrfpack.format.compact.channels import Channel, ErrorModel, decode_channel, encode_channel, quantize_channel
+from hyrfpack.format.compact.channels import LIMIT, Channel, ErrorModel, decode_channel, encode_channel, quantize_channel
 from hyrfpack.format.compact.groups import GroupSymbols, encode_groups, quantize_groups
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.info import LAYERED, layer_section
@@ -65,7 +65,8 @@ def quantize(model: HybridModel, plan: Plan, like: Quantized | None = None) -> Q
         group: partial(quantize_groups, arrays[group].ravel(), plan.groups[group], by_group[group], d, reach)
         for group in plan.groups
     }
-    colors = arrays["COLO"] @ plan.basis.astype(np.float64)
+    # Cut before it is turned: a colour far outside would come back as another.
+    colors = np.clip(arrays["COLO"], -LIMIT / 2, LIMIT / 2) @ plan.basis.astype(np.float64)
     for layer, part in enumerate(plan.parts):
         classes, s = plan.layers[layer].points.classes, sensitivity.of(part)
 
