@@ -314,7 +314,7 @@ def test_coding_a_quantised_model_again_is_remarked(tmp_path):
     save(model_of(), tmp_path / "tiny.hyrf", "paper")
     read = subject.read_subject(tmp_path / "tiny.hyrf", None)
     notes = []
-    next(iter(codec_rows(dataclasses.replace(read, cameras=CAMERAS), 1, notes.append)))
+    next(iter(codec_rows(dataclasses.replace(read, cameras=CAMERAS, capture=CAMERAS), 1, notes.append)))
     assert any("quantised already" in sentence for sentence in notes)
 
 

@@ -1,4 +1,4 @@
-"""One model and one plan give one file: with and without compiled kernels, on any number of threads, again and again."""
+"""One model and one plan give one file: with and without compiled kernels, on any number of threads, every time."""
 
 from __future__ import annotations
 

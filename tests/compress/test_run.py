@@ -121,12 +121,6 @@ def test_fine_tuning_fits_the_photos_better_in_the_same_bytes(trained, scene, tm
     compress(trained, tmp_path / "plain.hyrf", data=scene, target_bytes=tuned.bytes_after)
 
     fits = [evaluate(load(tmp_path / name), scene.train).psnr for name in ("tuned.hyrf", "plain.hyrf")]
-    print(
-        tuned.bytes_after,
-        fits,
-        [psnr(tmp_path / name, scene) for name in ("tuned.hyrf", "plain.hyrf")],
-        psnr(trained, scene),
-    )
     assert fits[0] > fits[1] + 0.1
 
 

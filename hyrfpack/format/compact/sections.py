@@ -12,7 +12,14 @@ import torch
 from scipy.special import expit
 
 from hyrfpack.format.arrays import to_arrays
-from hyrfpack.format.compact.channels import LIMIT, Channel, ErrorModel, decode_channel, encode_channel, quantize_channel
+from hyrfpack.format.compact.channels import (
+    LIMIT,
+    Channel,
+    ErrorModel,
+    decode_channel,
+    encode_channel,
+    quantize_channel,
+)
 from hyrfpack.format.compact.groups import GroupSymbols, encode_groups, quantize_groups
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.info import LAYERED, layer_section
