@@ -66,7 +66,7 @@ def torch_on_one_thread() -> Iterator[None]:
 
 
 def run_tasks(task: Callable[[int], None], count: int) -> None:
-    """Call task(0) ... task(count - 1) on the pool's threads and wait for all; the first error is raised here.
+    """Call task(0) ... task(count - 1) on the pool's threads and wait for all; then the first error is raised here.
 
     Tasks are pulled one by one, so uneven ones balance. Results must not depend on which thread ran what: each
     task writes to its own place.
@@ -76,15 +76,22 @@ def run_tasks(task: Callable[[int], None], count: int) -> None:
             task(index)
         return
     pending = iter(range(count))
+    errors: dict[int, BaseException] = {}
 
     def worker() -> None:
         # next() on a range iterator is atomic under the GIL.
         for index in pending:
-            task(index)
+            try:
+                task(index)
+            except BaseException as error:
+                errors[index] = error
+                for _ in pending:  # nothing new is begun
+                    pass
 
-    futures = [_executor().submit(worker) for _ in range(min(thread_count(), count))]
-    for future in futures:
+    for future in [_executor().submit(worker) for _ in range(min(thread_count(), count))]:
         future.result()
+    if errors:
+        raise errors[min(errors)]
 
 
 def run_ranges(task: Callable[[int, int], None], length: int, minimum: int = 2048) -> None:
