@@ -6,7 +6,6 @@ import math
 import os
 import re
 import shlex
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -128,7 +127,7 @@ def compress(
     if report is not None:
         from hyrfpack.compress.report import write_report
 
-        command = shlex.join(["hyrfpack", *sys.argv[1:]])
+        command = _typed(click.get_current_context())
         write_report(report, model, output, result, scene, command=command, say=note)
     _print_report(output, result, scores, as_json)
 
@@ -202,6 +201,22 @@ def info(file: Path, as_json: bool) -> None:
 def _say(line: str) -> None:
     """Print a line with words of the file in it."""
     click.echo(printable(line))
+
+
+def _typed(context: click.Context) -> str:
+    """The command as it was given, from its parameters."""
+    words = ["hyrfpack", context.info_name]
+    for parameter in context.command.params:
+        if context.get_parameter_source(parameter.name) is not click.core.ParameterSource.COMMANDLINE:
+            continue
+        value = context.params[parameter.name]
+        if isinstance(parameter, click.Argument):
+            words.append(str(value))
+        elif parameter.is_flag:
+            words.append((parameter.opts if value else parameter.secondary_opts)[-1])
+        else:
+            words += [parameter.opts[-1], str(value)]
+    return shlex.join(words)
 
 
 def _refuse_same(source: Path, target: Path) -> None:
