@@ -47,10 +47,9 @@ TRIALS, FINETUNED_TRIALS = 9, 4  # of a search
 
 @dataclass(frozen=True)
 class _Trial:
-    """A file that was made: its bytes and plan, the error it adds by section, and what it scores."""
+    """A file that was made: its bytes, the error it adds by section, and what it scores."""
 
     data: bytes
-    plan: Plan
     errors: dict[str, float]
     scores: Evaluation | None
 
@@ -121,7 +120,7 @@ def compress(
     else:
         trial, found = packer.attempt(start), ""
         if not finetune_steps:
-            trial, found = packer.verified(trial, start, cameras)
+            trial = packer.verified(trial, start, cameras)
     report = write_model(trial.data, target)
     total = sum(trial.errors.values()) or 1.0
     shares = {group: error / total for group, error in trial.errors.items()}
@@ -142,7 +141,6 @@ class _Packer:
 
     def __post_init__(self) -> None:
         self.cache = PictureCache()
-        self.before: Evaluation | None = None
 
     def attempt(self, noise: float) -> _Trial:
         plan = make_plan(self.model, self.sensitivity, noise, self.prune)
@@ -152,7 +150,7 @@ class _Packer:
         tuned = finetune(plan.apply(self.model), plan, self.scene.train, self.finetune_steps, cache=self.cache)
         return self._pack(tuned, dataclasses.replace(plan.of_applied(), reach=0))
 
-    def verified(self, trial: _Trial, wanted: float, cameras: Sequence[Camera]) -> tuple[_Trial, str]:
+    def verified(self, trial: _Trial, wanted: float, cameras: Sequence[Camera]) -> _Trial:
         """The trial, or a finer one where its pictures turn out to be further off than `wanted` says.
 
         The estimate adds up errors that have nothing to do with each other. Where hundreds of faint Gaussians make up
@@ -172,7 +170,7 @@ class _Packer:
                 noise *= max(wanted / error, 1 / 16)
                 self.say(f"pictures are off by {error:.2g} instead of {wanted:.2g}: finer, for {noise:.2g}")
             trial = self.attempt(noise)
-        return trial, ""
+        return trial
 
     def within_bytes(self, limit: int, start: float) -> tuple[_Trial, str]:
         def attempt(noise: float) -> _Trial:
@@ -217,7 +215,7 @@ class _Packer:
         planned = plan.apply(model)
         quantized = quantize(planned, plan)
         data = encode_model(model, "compact", self.provenance, plan=plan, quantized=quantized)
-        return _Trial(data, plan, added_errors(planned, quantized, plan), None)
+        return _Trial(data, added_errors(planned, quantized, plan), None)
 
 
 @torch.no_grad()
