@@ -8,12 +8,16 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 sys.path += [str(Path(__file__).parent), str(Path(__file__).parents[1] / "tools")]
 
 # OpenMP's threads spin while they wait and take the cores from the kernels' own: tiny pictures train 3 times slower on
 # a quiet machine and 20 times on a busy one. Read once, when torch is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+# Without a GPU its kernels run in Triton's interpreter. Read once, when they are defined.
+os.environ.setdefault("TRITON_INTERPRET", "0" if torch.cuda.is_available() else "1")
 
 
 @pytest.fixture(scope="session")

@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
+from functools import cache
+
 import torch
 from torch import Tensor
 
 from hyrfpack.parallel import has_numba
+
+
+@cache
+def has_triton() -> bool:
+    """Whether GPU kernels can be built: Triton comes with torch wherever torch runs on CUDA or ROCm."""
+    return importlib.util.find_spec("triton") is not None
+
+
+def interpreting() -> bool:
+    """Whether Triton runs kernels in its interpreter, on tensors of the CPU: slowly, to test them without a GPU."""
+    return os.environ.get("TRITON_INTERPRET", "0") == "1"
 
 
 def choose(implementation: str, available: tuple[str, ...], *tensors: Tensor) -> str:
@@ -17,8 +32,9 @@ def choose(implementation: str, available: tuple[str, ...], *tensors: Tensor) ->
         tensors: the operation's inputs; they must agree in device and dtype.
 
     Returns:
-        A name out of `available`. "auto" takes "cpu" for float32 tensors on the CPU when Numba is installed and
-        "reference" (plain torch, any device, any dtype) otherwise.
+        A name out of `available`. "auto" takes "gpu" for float32 tensors on a CUDA or ROCm device when Triton is
+        installed, "cpu" for float32 tensors on the CPU when Numba is, and "reference" (plain torch, any device, any
+        dtype) otherwise.
 
     Raises:
         ValueError: the name is not offered, it cannot take these tensors, or the tensors disagree.
@@ -27,12 +43,23 @@ def choose(implementation: str, available: tuple[str, ...], *tensors: Tensor) ->
     for tensor in tensors[1:]:
         if tensor.device != first.device or tensor.dtype != first.dtype:
             raise ValueError(f"tensors disagree: {first.dtype} on {first.device} and {tensor.dtype} on {tensor.device}")
+    single, place = first.dtype == torch.float32, first.device.type
+    fits = {
+        "reference": True,
+        "cpu": single and place == "cpu",
+        "gpu": single and (place == "cuda" or (place == "cpu" and interpreting())),
+    }
     if implementation != "auto":
         if implementation not in available:
             raise ValueError(f"no implementation '{implementation}'; there are {', '.join(available)}")
-        if implementation == "cpu" and (first.device.type != "cpu" or first.dtype != torch.float32):
-            raise ValueError(f"the cpu kernels take float32 on the CPU, not {first.dtype} on {first.device}")
+        if not fits[implementation]:
+            where = {"cpu": "on the CPU", "gpu": "on a CUDA or ROCm device"}[implementation]
+            raise ValueError(
+                f"the {implementation} kernels take float32 {where}, not {first.dtype} on {first.device}"
+            )
         return implementation
-    if "cpu" in available and first.device.type == "cpu" and first.dtype == torch.float32 and has_numba():
+    if "gpu" in available and fits["gpu"] and place == "cuda" and has_triton():
+        return "gpu"
+    if "cpu" in available and fits["cpu"] and has_numba():
         return "cpu"
     return "reference"

@@ -5,11 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from ops.device import INTERPRETED, gpu, needs_triton
 
 from hyrfpack.ops.hash_encode import cells, corner_rows, hash_encode, level_offsets, level_resolutions
 from hyrfpack.parallel import has_numba
 
-IMPLEMENTATIONS = ["reference", pytest.param("cpu", marks=pytest.mark.skipif(not has_numba(), reason="no numba"))]
+IMPLEMENTATIONS = [
+    "reference",
+    pytest.param("cpu", marks=pytest.mark.skipif(not has_numba(), reason="no numba")),
+    pytest.param("gpu", marks=needs_triton),
+]
+KERNELS = IMPLEMENTATIONS[1:]
+
+
+def placed(tensor: torch.Tensor, implementation: str) -> torch.Tensor:
+    return gpu(tensor) if implementation == "gpu" else tensor
 
 
 def uniform(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -38,6 +48,7 @@ CASES = {
     "corners of the cube": (torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3), (5, 9, 17), 10, False),
     "on cell boundaries": (coords_on_cell_boundaries(23, 300), (23, 45), 10, False),
     "many blocks and ranges": (uniform(40_000, 3), (6, 30), 10, True),
+    "outside the cube": (3 * uniform(300, 3) - 1, (5, 9, 40), 10, False),
 }
 
 
@@ -56,19 +67,24 @@ def well_inside(coords: torch.Tensor, resolutions: tuple[int, ...]) -> torch.Ten
 @pytest.mark.parametrize("case", CASES)
 def test_values_and_gradients_match_the_float64_reference(implementation: str, case: str) -> None:
     coords, resolutions, log2_table_size, inside = CASES[case]
+    if implementation == "gpu" and INTERPRETED:
+        coords = coords[:600]
     coords = well_inside(coords, resolutions) if inside else coords.clone()
     table = table_for(resolutions, log2_table_size)
     upstream = torch.randn(coords.shape[0], 2 * len(resolutions), generator=torch.Generator().manual_seed(3))
+    upstream[::3] = 0
 
     def run(dtype: torch.dtype, implementation: str) -> list[torch.Tensor]:
-        inputs = [tensor.detach().to(dtype).requires_grad_() for tensor in (coords, table)]
+        inputs = [placed(tensor.to(dtype), implementation).requires_grad_() for tensor in (coords, table)]
         features = hash_encode(*inputs, resolutions, log2_table_size, implementation=implementation)
-        return [features, *torch.autograd.grad(features, inputs, upstream.to(dtype))]
+        grads = torch.autograd.grad(features, inputs, upstream.to(features))
+        return [tensor.cpu() for tensor in (features, *grads)]
 
     features, grad_coords, grad_table = run(torch.float32, implementation)
     expected, expected_coords, expected_table = run(torch.float64, "reference")
     # float32 places a point to 2^-24 of the level's span, and features in [-1, 1] change by up to 2 along an axis.
-    bound = 1e-6 + 6 * 2**-24 * max(resolutions)
+    # Extrapolating r spans, weights reach r^3.
+    bound = (1e-6 + 6 * 2**-24 * max(resolutions)) * (1 if case != "outside the cube" else max(resolutions) ** 3)
     torch.testing.assert_close(features.double(), expected, rtol=0, atol=bound)
     scale = expected_table.abs().max().item() if expected_table.numel() and coords.shape[0] else 1.0
     torch.testing.assert_close(grad_table.double(), expected_table, rtol=0, atol=1e-3 * scale)
@@ -156,18 +172,54 @@ def test_corner_rows_are_exactly_the_rows_with_a_gradient() -> None:
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_a_constant_table_gives_its_constant_everywhere(implementation: str) -> None:
     resolutions = level_resolutions(6, 4, 200)
-    table = torch.full((level_offsets(resolutions, 10)[-1], 2), 0.75)
-    features = hash_encode(uniform(200, 3), table, resolutions, 10, implementation=implementation)
+    table = placed(torch.full((level_offsets(resolutions, 10)[-1], 2), 0.75), implementation)
+    features = hash_encode(
+        placed(uniform(200, 3), implementation), table, resolutions, 10, implementation=implementation
+    )
     torch.testing.assert_close(features, torch.full_like(features, 0.75))
 
 
-@pytest.mark.skipif(not has_numba(), reason="no numba")
-def test_coordinates_that_are_not_finite_stay_inside_the_table() -> None:
+@pytest.mark.parametrize("implementation", KERNELS)
+def test_coordinates_that_are_not_finite_stay_inside_the_table(implementation: str) -> None:
     coords = torch.tensor([[float("nan")] * 3, [float("inf")] * 3, [-float("inf")] * 3, [1e30, -1e30, 0.5]])
-    table = table_for((5, 300), 9).requires_grad_()
-    features = hash_encode(coords.requires_grad_(), table, (5, 300), 9, implementation="cpu")
+    inputs = [placed(tensor, implementation).requires_grad_() for tensor in (coords, table_for((5, 300), 9))]
+    features = hash_encode(*inputs, (5, 300), 9, implementation=implementation)
     features.sum().backward()
     assert features.shape == (4, 4)
+
+
+@pytest.mark.parametrize("implementation", ["reference", IMPLEMENTATIONS[2]])
+def test_points_at_a_rounding_error_from_a_boundary_are_in_the_cells_that_files_are_coded_by(implementation) -> None:
+    resolutions, log2_table_size = (8, 24, 600), 10
+    on = torch.cat([coords_on_cell_boundaries(resolution, 100) for resolution in resolutions])
+    coords = torch.cat([on, on.nextafter(torch.tensor(0.0)), on.nextafter(torch.tensor(1.0))])
+    inputs = placed(coords, implementation), placed(table_for(resolutions, log2_table_size), implementation)
+    features = hash_encode(
+        inputs[0], inputs[1].requires_grad_(), resolutions, log2_table_size, implementation=implementation
+    )
+    for first in range(0, 900, 225):
+        rows = corner_rows(cells(coords[first : first + 225], resolutions), resolutions, log2_table_size)
+        upstream = torch.zeros_like(features)
+        upstream[first : first + 225] = torch.nan  # shows on every row that is read, also where its weight is 0
+        (grad,) = torch.autograd.grad(features, inputs[1], upstream, retain_graph=True)
+        assert torch.equal(grad.cpu().isnan().all(dim=1).nonzero()[:, 0], rows.unique())
+
+
+@pytest.mark.parametrize("implementation", KERNELS)
+def test_memory_layout_of_coords_and_gradients_does_not_matter(implementation: str) -> None:
+    resolutions, log2_table_size = (5, 9, 33), 9
+    coords, table = (placed(t, implementation) for t in (uniform(300, 3), table_for(resolutions, log2_table_size)))
+    upstream = placed(torch.randn(300, 6, generator=torch.Generator().manual_seed(5)), implementation)
+    planar = torch.cat((upstream.T, upstream.T)).T[:, 6:]
+
+    def run(coords: torch.Tensor, upstream: torch.Tensor) -> list[torch.Tensor]:
+        inputs = coords.requires_grad_(), table.requires_grad_()
+        features = hash_encode(*inputs, resolutions, log2_table_size, implementation=implementation)
+        return [features, *torch.autograd.grad(features, inputs, upstream)]
+
+    expected = run(coords, upstream)
+    for other in (run(coords.detach().T.contiguous().T, planar), run(coords.detach().repeat(1, 2)[:, 3:], planar)):
+        torch.testing.assert_close(other, expected, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.skipif(not has_numba(), reason="no numba")

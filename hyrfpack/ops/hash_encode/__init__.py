@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -27,12 +29,13 @@ def hash_encode(
         table: (rows, F) features of all levels, one after the other as `level_offsets` says.
         resolutions: (L,) vertices per axis, each at least 2; see `level_resolutions`.
         log2_table_size: most rows of a level, as a power of two; 1 to 28.
-        implementation: "auto", "reference" or "cpu" (float32, two features a level).
+        implementation: "auto", "reference", "cpu" or "gpu" (these two: float32, two features a level).
 
     Returns:
-        (N, L * F) features, level after level. The "cpu" implementation stores them feature by feature, as the
-        transpose of a contiguous (L * F, N); what keeps that layout (`mlp` does) spares the backward pass a copy.
-        Differentiable once in `table` and in `coords` (there by the cell the point is in).
+        (N, L * F) features, level after level. "cpu" and "gpu" store them feature by feature, as the transpose of a
+        contiguous (L * F, N); what keeps that layout (`mlp` does) spares the backward pass a copy or slow reads.
+        Differentiable once in `table` and in `coords` (there by the cell the point is in). On "gpu" the order in
+        which points add to the gradient of `table` varies from run to run, and with it the last bits.
 
     Raises:
         ValueError: shapes, sizes, types or devices do not fit together.
@@ -46,31 +49,43 @@ def hash_encode(
     rows = level_offsets(resolutions, log2_table_size)[-1]
     if table.shape[0] != rows:
         raise ValueError(f"table has {table.shape[0]} rows; these levels need {rows}")
-    available = ("reference", "cpu") if table.shape[1] == 2 else ("reference",)
-    if choose(implementation, available, coords, table) == "reference":
+    available = ("reference", "cpu", "gpu") if table.shape[1] == 2 else ("reference",)
+    chosen = choose(implementation, available, coords, table)
+    if chosen == "reference":
         return reference.hash_encode(coords, table, resolutions, log2_table_size)
-    return _HashEncode.apply(coords, table, tuple(resolutions), log2_table_size)
+    return _HashEncode.apply(coords, table, tuple(resolutions), log2_table_size, _kernels(chosen))
+
+
+def _kernels(implementation: str) -> ModuleType:
+    """The module of an implementation; imported when first used, as not every machine has what it needs."""
+    if implementation == "gpu":
+        from hyrfpack.ops.hash_encode import gpu
+
+        return gpu
+    from hyrfpack.ops.hash_encode import cpu
+
+    return cpu
 
 
 class _HashEncode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int) -> Tensor:
-        from hyrfpack.ops.hash_encode import cpu
-
+    def forward(
+        ctx, coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int, kernels: ModuleType
+    ) -> Tensor:
         ctx.save_for_backward(coords, table)
         ctx.settings = resolutions, log2_table_size
-        return cpu.encode(coords, table, resolutions, log2_table_size)
+        ctx.kernels = kernels
+        return kernels.encode(coords, table, resolutions, log2_table_size)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
-        from hyrfpack.ops.hash_encode import cpu
-
         arguments = (*ctx.saved_tensors, *ctx.settings, grad)
         needs_coords, needs_table = ctx.needs_input_grad[:2]
         return (
-            cpu.grad_coords(*arguments) if needs_coords else None,
-            cpu.grad_table(*arguments) if needs_table else None,
+            ctx.kernels.grad_coords(*arguments) if needs_coords else None,
+            ctx.kernels.grad_table(*arguments) if needs_table else None,
+            None,
             None,
             None,
         )

@@ -1,0 +1,82 @@
+"""Where tensors live: which device to use, and bringing photos there."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyrfpack.errors import HyrfError
+from hyrfpack.ops.dispatch import has_triton
+from hyrfpack.scene import Picture
+
+NO_TRITON = (
+    "Triton is not installed, so the GPU runs plain torch, far slower than kernels would be; install the package "
+    "'triton' that fits this torch"
+)
+NO_METAL = (
+    "there are no kernels for Apple's GPU: it runs the plain torch reference, which is slow; --device cpu is faster"
+)
+
+
+def choose_device(name: str = "auto", say: Callable[[str], None] = lambda sentence: None) -> torch.device:
+    """The device of a name.
+
+    Args:
+        name: "auto" (a CUDA or ROCm device where one is usable and Triton is installed, the CPU otherwise), "cpu",
+            "cuda" or "cuda:N" (ROCm too is called so in torch), or "mps".
+        say: told in a sentence where the choice runs without kernels.
+
+    Raises:
+        HyrfError: there is no such device.
+    """
+    if not re.fullmatch(r"auto|cpu|mps|cuda(:[0-9]{1,3})?", name):
+        raise HyrfError(f"'{name}' is no device; use auto, cpu, cuda, cuda:N or mps")
+    kind, _, number = name.partition(":")
+    if kind == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() and has_triton() else "cpu")
+    if kind == "cuda":
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        if int(number or 0) >= count:
+            there = f"torch sees {count} of them" if count else "torch sees no NVIDIA or AMD GPU"
+            raise HyrfError(f"device '{name}' is not there, {there}; install a GPU build of torch or use --device cpu")
+        if not has_triton():
+            say(NO_TRITON)
+    if kind == "mps":
+        if not torch.backends.mps.is_available():
+            raise HyrfError("device 'mps' is not there, torch sees no Apple GPU; use --device cpu")
+        say(NO_METAL)
+    return torch.device(name)
+
+
+def describe_device(device: torch.device) -> str:
+    """What it is called, as "cuda:0 (NVIDIA H200)"."""
+    if device.type != "cuda":
+        return device.type
+    return f"cuda:{device.index or 0} ({torch.cuda.get_device_properties(device).name})"
+
+
+def upload(picture: Picture, solid: np.ndarray | None, device: torch.device) -> tuple[Tensor, Tensor | None]:
+    """A photo over a solid colour, on a device.
+
+    Args:
+        picture: decoded.
+        solid: (3,) float32 RGB in [0, 1] behind transparent pixels; None for black.
+
+    Returns:
+        (H, W, 3) float32 in [0, 1], and the (H, W) bool mask or None. As `Picture.composite`.
+    """
+    mask = None if picture.mask is None else torch.from_numpy(picture.mask).to(device)
+    if device.type == "cpu":
+        return torch.from_numpy(picture.composite(solid)), mask
+    # Bytes travel, a quarter of the floats; the arithmetic is done there.
+    rgb = torch.from_numpy(picture.rgb).to(device).float() * (1 / 255)
+    if picture.alpha is not None:
+        alpha = torch.from_numpy(picture.alpha).to(device).float()[..., None] * (1 / 255)
+        rgb *= alpha
+        if solid is not None:
+            rgb += (1 - alpha) * torch.from_numpy(solid).to(device)
+    return rgb, mask

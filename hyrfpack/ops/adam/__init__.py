@@ -1,0 +1,69 @@
+"""Adam (Kingma and Ba 2015): one step of a group of parameters that share a learning rate, in place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from hyrfpack.ops.adam import reference
+from hyrfpack.ops.dispatch import choose
+
+__all__ = ["adam_step"]
+
+
+@torch.no_grad()
+def adam_step(
+    values: Sequence[Tensor],
+    gradients: Sequence[Tensor],
+    exp_avg: Sequence[Tensor],
+    exp_avg_sq: Sequence[Tensor],
+    *,
+    step: int,
+    rate: float,
+    betas: tuple[float, float] = (0.9, 0.999),
+    eps: float = 1e-15,
+    implementation: str = "auto",
+) -> Tensor:
+    """Take one step of Adam, without weight decay, on every tensor of a group.
+
+        m <- b1 m + (1 - b1) g        v <- b2 v + (1 - b2) g^2
+        x <- x - rate (m / (1 - b1^step)) / (sqrt(v / (1 - b2^step)) + eps)
+
+    An element whose g^2 is not finite (a NaN, an infinity or, in float32, beyond 1.8e19) keeps its x, m and v: one
+    such number would otherwise stay in them for ever. All other elements take their step.
+
+    Args:
+        values: x of each tensor, of any shape, contiguous. Changed.
+        gradients: g of each tensor, of the same shapes, in any layout.
+        exp_avg, exp_avg_sq: m and v of each tensor, as the values; zero before the first step. Changed.
+        step: number of this step, from 1; the same for all tensors.
+        rate: learning rate.
+        betas: b1 and b2, in [0, 1).
+        eps: positive.
+        implementation: "auto", "reference", "cpu" (float32; torch's fused kernel, bit by bit as
+            torch.optim.Adam(fused=True)) or "gpu" (float32; one launch for all tensors).
+
+    Returns:
+        Bool scalar on the tensors' device: whether any element was left out. Nothing waits for the device.
+
+    Raises:
+        ValueError: lists, shapes, types, devices or layouts do not fit together, or `step` is below 1.
+    """
+    tensors = list(zip(values, gradients, exp_avg, exp_avg_sq, strict=True))
+    for value, *others in tensors:
+        if any(other.shape != value.shape for other in others):
+            raise ValueError(f"shapes differ: {tuple(value.shape)} and {[tuple(other.shape) for other in others]}")
+        if not all(tensor.is_contiguous() for tensor in (value, *others[1:])):
+            raise ValueError(f"values and moments of shape {tuple(value.shape)} must be contiguous to change in place")
+    if not tensors or step < 1:
+        raise ValueError(f"{len(tensors)} tensors and step {step}; there must be a tensor, and steps count from 1")
+    chosen = choose(implementation, ("reference", "cpu", "gpu"), *(tensor for group in tensors for tensor in group))
+    if chosen == "gpu":
+        from hyrfpack.ops.adam import gpu as kernels
+    elif chosen == "cpu":
+        from hyrfpack.ops.adam import cpu as kernels
+    else:
+        kernels = reference
+    return kernels.adam_step(*map(list, zip(*tensors, strict=True)), step, rate, betas, eps)

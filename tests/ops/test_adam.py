@@ -1,0 +1,177 @@
+"""adam_step: every implementation against the reference in float64, and against torch.optim.Adam."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from ops.device import gpu, needs_triton
+from torch import Tensor
+
+from hyrfpack.ops.adam import adam_step
+from hyrfpack.parallel import has_numba
+
+IMPLEMENTATIONS = ["reference", "cpu", pytest.param("gpu", marks=needs_triton)]
+RATE = 1e-2
+
+
+def normal(*shape: int, seed: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def a_group(shapes: list[tuple[int, ...]], gradient: float = 1.0, step: int = 1) -> list[list[Tensor]]:
+    """Values, gradients of this size, and the moments such gradients may have left before this step."""
+    values = [normal(*shape, seed=i) for i, shape in enumerate(shapes)]
+    gradients = [gradient * normal(*shape, seed=10 + i) for i, shape in enumerate(shapes)]
+    if step == 1:
+        return [values, gradients, [torch.zeros(shape) for shape in shapes], [torch.zeros(shape) for shape in shapes]]
+    exp_avg = [0.3 * gradient * normal(*shape, seed=20 + i) for i, shape in enumerate(shapes)]
+    exp_avg_sq = [(gradient * (0.5 + normal(*shape, seed=30 + i).abs())) ** 2 for i, shape in enumerate(shapes)]
+    return [values, gradients, exp_avg, exp_avg_sq]
+
+
+def stepped(group: list[list[Tensor]], implementation: str, dtype=torch.float32, **settings) -> tuple[list, bool]:
+    """Values and moments of a copy of the group after a step, on the CPU, and what the step returned."""
+    place = gpu if implementation == "gpu" else torch.clone
+    copy = [[place(tensor.to(dtype).clone()) for tensor in tensors] for tensors in group]
+    broken = adam_step(*copy, rate=RATE, implementation=implementation, **settings)
+    assert broken.shape == () and broken.dtype == torch.bool and broken.device == copy[0][0].device
+    return [[tensor.cpu() for tensor in copy[i]] for i in (0, 2, 3)], bool(broken)
+
+
+# name -> the group, and its step
+CASES = {
+    "no number": (a_group([(0,)]), 1),
+    "one number": (a_group([(1,)]), 1),
+    "an odd count": (a_group([(77, 13)], step=5), 5),
+    "many blocks": (a_group([(100_000,)], step=40), 40),
+    "a whole number of blocks": (a_group([(2048,)], step=40), 40),
+    "a field: large, small and empty tensors": (a_group([(5000, 2), (64, 32), (64,), (0, 3), (8, 64), (8,)]), 1),
+    "more tensors than slots": (a_group([(3,)] * 40, step=7), 7),
+    "step 1000": (a_group([(3000,), (10,)], step=1000), 1000),
+    "gradients of zero at the first step": (a_group([(500,)], 0.0), 1),
+    "gradients of zero later": ([*a_group([(500,)], 0.0)[:2], *a_group([(500,)], step=9)[2:]], 9),
+    "tiny gradients": (a_group([(500,)], 1e-30), 1),
+    "gradients of the size of eps": (a_group([(500,)], 1e-15), 1),
+    "huge gradients": (a_group([(500,)], 1e18), 1),
+}
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("case", CASES)
+def test_a_step_matches_the_float64_reference(implementation: str, case: str) -> None:
+    group, step = CASES[case]
+    (values, exp_avg, exp_avg_sq), broken = stepped(group, implementation, step=step)
+    expected, _ = stepped(group, "reference", torch.float64, step=step)
+    assert not broken
+    for i, before in enumerate(group[0]):
+        # A healthy element moves by about the rate, and float32 holds a value to 2^-24 of its size.
+        error = (values[i].double() - expected[0][i]).abs()
+        moved = (expected[0][i] - before).abs()
+        assert (error <= 1e-4 * moved + 1e-6 * RATE + 2**-23 * before.abs()).all()
+        # The two summands of the first moment may cancel.
+        size = group[1][i].abs().double() + group[2][i].abs()
+        assert ((exp_avg[i] - expected[1][i]).abs() <= 1e-6 * size + 1e-37).all()
+        torch.testing.assert_close(exp_avg_sq[i].double(), expected[2][i], rtol=1e-5, atol=1e-37)
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_twenty_steps_match_torch(implementation: str) -> None:
+    shapes = [(40, 3), (7,), (300, 2)]
+    values = a_group(shapes)[0]
+    theirs = [value.clone().requires_grad_() for value in values]
+    adam = torch.optim.Adam(theirs, eps=1e-15, foreach=False, fused=False)
+    place = gpu if implementation == "gpu" else torch.clone
+    ours = [place(value) for value in values]
+    moments = [[torch.zeros_like(value) for value in ours] for _ in range(2)]
+    for step in range(1, 21):
+        rate = RATE / step
+        gradients = [0.1 * value + normal(*value.shape, seed=step) for value in values]
+        for tensor, gradient in zip(theirs, gradients, strict=True):
+            tensor.grad = gradient.clone()
+        adam.param_groups[0]["lr"] = rate
+        adam.step()
+        gradients = [place(gradient) for gradient in gradients]
+        adam_step(ours, gradients, *moments, step=step, rate=rate, implementation=implementation)
+    for tensor, expected in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(tensor.cpu(), expected.detach(), rtol=1e-6, atol=1e-6)
+
+
+def test_cpu_has_the_bits_of_torch_fused() -> None:
+    values = a_group([(123, 3), (5000,)])[0]
+    theirs = [value.clone().requires_grad_() for value in values]
+    adam = torch.optim.Adam(theirs, lr=RATE, betas=(0.8, 0.99), eps=1e-15, fused=True)
+    moments = [[torch.zeros_like(value) for value in values] for _ in range(2)]
+    for step in range(1, 21):
+        gradients = [normal(*value.shape, seed=step) for value in values]
+        for tensor, gradient in zip(theirs, gradients, strict=True):
+            tensor.grad = gradient.clone()
+        adam.step()
+        adam_step(values, gradients, *moments, step=step, rate=RATE, betas=(0.8, 0.99), implementation="cpu")
+    assert all(torch.equal(ours, tensor) for ours, tensor in zip(values, theirs, strict=True))
+    for name, ours in zip(("exp_avg", "exp_avg_sq"), moments, strict=True):
+        assert all(torch.equal(moment, adam.state[p][name]) for moment, p in zip(ours, theirs, strict=True))
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e30, -1e30])
+@pytest.mark.parametrize("place", [(0, 0), (0, 2999), (1, 4)])
+def test_an_element_with_a_broken_gradient_is_told_and_left_alone(implementation: str, bad: float, place) -> None:
+    group = a_group([(3000,), (5,)], step=6)
+    tensor, index = place
+    healthy, broken = stepped(group, implementation, step=6)
+    assert not broken
+    group[1][tensor][index] = bad
+
+    after, broken = stepped(group, implementation, step=6)
+
+    assert broken
+    for old, new, alone in zip((group[0], group[2], group[3]), after, healthy, strict=True):
+        assert new[tensor][index] == old[tensor][index]
+        alone[tensor][index] = old[tensor][index]
+        torch.testing.assert_close(new, alone, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_gradients_may_have_any_layout_and_tensors_may_start_anywhere(implementation: str) -> None:
+    group = a_group([(50, 3), (11, 2)], step=3)
+    expected, _ = stepped(group, implementation, step=3)
+    put = gpu if implementation == "gpu" else torch.clone
+    # One number off what 16-byte reads need.
+    copy = [[put(torch.cat((t.new_zeros(1), t.flatten())))[1:].view(t.shape) for t in tensors] for tensors in group]
+    copy[1] = [gradient.T.contiguous().T for gradient in copy[1]]
+
+    adam_step(*copy, step=3, rate=RATE, implementation=implementation)
+
+    for tensors, others in zip((copy[0], copy[2], copy[3]), expected, strict=True):
+        torch.testing.assert_close([tensor.cpu() for tensor in tensors], others, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_parameters_that_need_gradients_are_stepped(implementation: str) -> None:
+    group = a_group([(10,)])
+    parameter = (gpu if implementation == "gpu" else torch.clone)(group[0][0].clone()).requires_grad_()
+    parameter.square().sum().backward()
+    moments = [torch.zeros_like(parameter.detach()) for _ in range(2)]
+    adam_step([parameter], [parameter.grad], *([m] for m in moments), step=1, rate=RATE, implementation=implementation)
+    expected = group[0][0] - RATE * group[0][0].sign()
+    torch.testing.assert_close(parameter.detach().cpu(), expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.skipif(not has_numba(), reason="no numba")
+def test_auto_takes_the_fused_kernel_on_the_cpu() -> None:
+    group = a_group([(3000,)], step=4)
+    assert all(map(torch.equal, *(sum(stepped(group, name, step=4)[0], []) for name in ("auto", "cpu"))))
+
+
+def test_refuses_what_does_not_fit() -> None:
+    group = a_group([(4, 3)])
+    with pytest.raises(ValueError, match="steps count from 1"):
+        adam_step(*group, step=0, rate=RATE)
+    with pytest.raises(ValueError, match="there must be a tensor"):
+        adam_step([], [], [], [], step=1, rate=RATE)
+    with pytest.raises(ValueError, match="shapes differ"):
+        adam_step(group[0], [torch.zeros(3, 4)], *group[2:], step=1, rate=RATE)
+    with pytest.raises(ValueError, match="contiguous"):
+        adam_step([torch.zeros(3, 4).T], *group[1:], step=1, rate=RATE)
+    with pytest.raises(ValueError):
+        adam_step(group[0] * 2, *group[1:], step=1, rate=RATE)

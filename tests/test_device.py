@@ -1,0 +1,98 @@
+"""Choosing a device, bringing photos there, and a GPU that is not there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from pretend_gpu import CUDA, OnGpu, pretended_gpu
+
+from hyrfpack import device as devices
+from hyrfpack.device import choose_device, upload
+from hyrfpack.errors import HyrfError
+from hyrfpack.scene import Picture
+
+needs_no_gpu = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+
+
+@needs_no_gpu
+def test_auto_is_the_cpu_where_there_is_no_gpu():
+    assert choose_device() == choose_device("cpu") == torch.device("cpu")
+
+
+def test_auto_is_cuda_where_there_is_a_gpu_with_triton(monkeypatch):
+    with pretended_gpu():
+        assert choose_device() == torch.device("cuda")
+        monkeypatch.setattr(devices, "has_triton", lambda: False)
+        assert choose_device() == torch.device("cpu")
+
+
+@needs_no_gpu
+@pytest.mark.parametrize("name", ["cuda", "cuda:0", "mps"])
+def test_a_device_that_is_not_there_is_refused_in_one_sentence(name):
+    with pytest.raises(HyrfError, match=f"'{name}' is not there.*--device cpu"):
+        choose_device(name)
+
+
+@pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "cuda:-1", "cpu:0", "", "auto:1"])
+def test_what_is_no_device_is_refused_in_one_sentence(name):
+    with pytest.raises(HyrfError, match="is no device"):
+        choose_device(name)
+
+
+def test_a_gpu_beyond_the_last_is_refused():
+    with pretended_gpu(), pytest.raises(HyrfError, match="cuda:1.*sees 1 of them"):
+        choose_device("cuda:1")
+
+
+def test_a_slow_choice_is_told(monkeypatch):
+    said = []
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
+    monkeypatch.setattr(devices, "has_triton", lambda: False)
+    assert choose_device("mps", said.append).type == "mps"
+    with pretended_gpu():
+        assert choose_device("cuda", said.append).type == "cuda"
+    assert said == [devices.NO_METAL, devices.NO_TRITON]
+
+
+@pytest.mark.parametrize("solid", [None, np.array([0.25, 0.5, 1.0], np.float32)])
+@pytest.mark.parametrize("has_alpha", [False, True])
+def test_a_photo_is_the_same_on_any_device(has_alpha, solid):
+    generator = np.random.default_rng(0)
+    rgb, alpha = generator.integers(0, 256, (2, 5, 7, 4), dtype=np.uint8)[0][..., :3], None
+    if has_alpha:
+        alpha = generator.integers(0, 256, (5, 7), dtype=np.uint8)
+    picture = Picture(np.ascontiguousarray(rgb), alpha, generator.random((5, 7)) > 0.5)
+
+    here, mask_here = upload(picture, solid, torch.device("cpu"))
+    with pretended_gpu():
+        there, mask_there = upload(picture, solid, CUDA)
+
+    assert isinstance(there, OnGpu) and isinstance(mask_there, OnGpu)
+    torch.testing.assert_close(there.here, here, rtol=0, atol=1e-7)
+    assert torch.equal(mask_there.here, mask_here) and torch.equal(mask_here, torch.from_numpy(picture.mask))
+
+
+# -- the pretended GPU finds what a real one would ----------------------------------------------------------------------
+
+
+def test_mixing_devices_fails():
+    with pretended_gpu() as gpu:
+        there = torch.ones(3, device=gpu)
+        with pytest.raises(RuntimeError, match="same device"):
+            there + torch.ones(3)
+        with pytest.raises(RuntimeError, match="same device"):
+            torch.stack([there, torch.ones(3)])
+        with pytest.raises(TypeError, match="numpy"):
+            there.numpy()
+        with pytest.raises(TypeError, match="numpy"):
+            np.asarray(there)
+
+
+def test_results_stay_where_their_inputs_are():
+    with pretended_gpu() as gpu:
+        there = torch.arange(6.0, device=gpu).requires_grad_()
+        made = [there * 2, there.new_zeros(2), there.new_tensor([1.0]), torch.zeros_like(there), there.sum()]
+        (there.square().sum() * torch.tensor(2.0)).backward()
+        assert all(tensor.device == gpu for tensor in [*made, there.grad])
+        assert torch.equal(there.grad.cpu(), 4 * torch.arange(6.0)) and not isinstance(there.cpu(), OnGpu)
