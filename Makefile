@@ -8,7 +8,7 @@ SHELL := bash
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help demo test bench speed sets choices ablations precision kill fuzz lint format clean
+.PHONY: help demo test bench gpu speed sets choices ablations precision kill fuzz lint format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z.]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -32,6 +32,9 @@ test: lint ## check style, then run all tests
 
 bench: $(READY) ## time each hot operation at several sizes against its references
 	$(BIN)/python tools/bench.py
+
+gpu: $(READY) ## check and measure the GPU kernels on this machine's GPU; results in docs/gpu/ (nine minutes)
+	$(BIN)/python tools/gpu_check.py
 
 speed: $(READY) ## time beside error of every setting, on a small model; plot in runs/speed.png (two to four minutes)
 	$(BIN)/hyrfpack bench -o runs/speed.png

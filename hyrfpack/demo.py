@@ -146,12 +146,12 @@ def run_demo(
 @torch.no_grad()
 def _draw(model: HybridModel, scene: Scene, result: DemoResult) -> Image.Image:
     """The demo's picture: held-out views of the compact file under the table."""
-    geometry = model.decode_geometry()
+    decoded = model.decode()
     solid = np.array(model.config.solid, np.float32)
     rows = []
     for view in evenly_spaced(scene.test, DRAWN_VIEWS):
         photo = torch.from_numpy(view.load().composite(solid))
-        image = to_8bit(render(model, view.camera, geometry=geometry).rgb)
+        image = to_8bit(render(model, view.camera, decoded=decoded).rgb)
         rows.append(comparison(photo, image, caption=f"{view.name}   {psnr(image, photo):.2f} dB"))
     title = f"hyrfpack demo: {result.gaussians:,} Gaussians, {result.steps:,} steps in {result.train_seconds:.0f} s"
     return contact_sheet(rows, title, result.table())

@@ -60,7 +60,7 @@ class OnGpu(torch.Tensor):
         copies = func in (aten.copy_.default, aten._to_copy.default, aten.index.Tensor)
         for leaf in tree_leaves((args, kwargs)):
             if isinstance(leaf, torch.Tensor) and not isinstance(leaf, OnGpu) and leaf.ndim and not copies:
-                raise RuntimeError(f"{func}: expected all tensors to be on the same device, found cuda:0 and cpu {[(type(l).__name__, getattr(l,'shape',l)) for l in tree_leaves((args,kwargs))]}")
+                raise RuntimeError(f"{func}: expected all tensors to be on the same device, found cuda:0 and cpu")
         if func is aten.copy_.default and not isinstance(args[0], OnGpu):
             args[0].copy_(args[1].here)
             return args[0]

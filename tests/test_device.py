@@ -73,7 +73,7 @@ def test_a_photo_is_the_same_on_any_device(has_alpha, solid):
     assert torch.equal(mask_there.here, mask_here) and torch.equal(mask_here, torch.from_numpy(picture.mask))
 
 
-# -- the pretended GPU finds what a real one would ----------------------------------------------------------------------
+# -- the pretended GPU finds what a real one would -----------------------------------------------------------------
 
 
 def test_mixing_devices_fails():

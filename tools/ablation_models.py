@@ -13,8 +13,9 @@ from torch import Tensor, nn
 
 from hyrfpack.data import PictureCache
 from hyrfpack.model import Geometry, HybridModel, ModelConfig
-from hyrfpack.model.field import DIRECTION_FEATURES, Field, spherical_harmonics
+from hyrfpack.model.field import Field
 from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.ops.shade import DIRECTION_FEATURES, spherical_harmonics
 from hyrfpack.scene import Scene
 from hyrfpack.train.config import LearningRates, TrainConfig
 from hyrfpack.train.optimizer import Optimizer
@@ -52,8 +53,8 @@ class _GeometryOf(nn.Module):
         self._field = (field,)  # in a tuple it is not registered again as a part of this module
         self._directions = directions
 
-    def forward(self, coords: Tensor) -> Tensor:
-        return self._field[0](coords, coords.new_zeros(len(coords), self._directions))[:, 3:]
+    def forward(self, coords: Tensor, *, mixed: bool = False) -> Tensor:
+        return self._field[0](coords, coords.new_zeros(len(coords), self._directions), mixed=mixed)[:, 3:]
 
 
 class IsotropicDiffuse(HybridModel):

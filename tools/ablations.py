@@ -99,14 +99,14 @@ def time_frames(
     Args:
         keep_geometry: geometry is decoded once for all views, not again for each.
     """
-    geometry, geometry_full = (m.decode_geometry() if keep_geometry else None for m in (model, full))
+    decoded, decoded_full = (m.decode() if keep_geometry else None for m in (model, full))
 
     def draw(view: View) -> None:
         with culling(variant):
-            hyrfpack.render(model, view.camera, geometry=geometry)
+            hyrfpack.render(model, view.camera, decoded=decoded)
 
     def draw_full(view: View) -> None:
-        hyrfpack.render(full, view.camera, geometry=geometry_full)
+        hyrfpack.render(full, view.camera, decoded=decoded_full)
 
     times = [take_turns({"this": partial(draw, v), "full": partial(draw_full, v)}, REPEATS)[0] for v in views]
     return 1000 / median(t["this"].ms for t in times), median(t["full"].ms / t["this"].ms for t in times)

@@ -35,11 +35,11 @@ from hyrfpack.evaluate.figures import blank_figure, save_figure
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.model import Geometry, HybridModel, viewpoint_of
-from hyrfpack.model.field import spherical_harmonics
 from hyrfpack.model.gaussians import logit
 from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.rasterize.cull import frustum_cull
+from hyrfpack.ops.shade import spherical_harmonics
 from hyrfpack.render import RenderSettings, render
-from hyrfpack.render.cull import frustum_cull
 from hyrfpack.scene import Camera, View
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -196,14 +196,14 @@ class HeldOut:
 @torch.no_grad()
 def held_out(model: HybridModel, views: Sequence[View]) -> list[HeldOut]:
     """Load the photos and render what all contenders share. Views without a pixel to score are left out."""
-    geometry, solid = model.decode_geometry(), np.array(model.config.solid, np.float32)
+    decoded, solid = model.decode(), np.array(model.config.solid, np.float32)
     made = []
     for view in views:
         picture = view.load()
         mask = None if picture.mask is None else torch.from_numpy(picture.mask)
         if mask is not None and not mask.any():
             continue
-        trained = to_8bit(render(model, view.camera, geometry=geometry).rgb)
+        trained = to_8bit(render(model, view.camera, decoded=decoded).rgb)
         photo = torch.from_numpy(picture.composite(solid))
         made.append(HeldOut(view.camera, photo, mask, _background(model, view.camera), trained))
     return made
@@ -359,8 +359,8 @@ class Measure:
         """Load, render and score a `.hyrf` file."""
         model, profile = hyrfpack.load(path), hyrfpack.describe(path)["profile"]
         with torch.no_grad():
-            geometry = model.decode_geometry()
-            scores = score((render(model, view.camera, geometry=geometry).rgb for view in self.views), self.views)
+            decoded = model.decode()
+            scores = score((render(model, view.camera, decoded=decoded).rgb for view in self.views), self.views)
         return self._row(f"hyrfpack {profile}", setting, path.stat().st_size, len(model), scores)
 
 

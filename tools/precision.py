@@ -7,6 +7,7 @@ Rows, all of one seed:
 
     float32        the product
     nudged N       the product, its first positions moved by one part in ten million: what rounding alone can do
+    mixed          decoders multiply factors rounded to bfloat16, as GPU kernels do by default (here the reference does)
     adam           parameters and Adam's moments in float64, operations in float32
     rasterizer     rasterising (accumulation front to back, gradient sums of each Gaussian) in float64
     float64        everything
@@ -41,15 +42,16 @@ from hyrfpack.train import TrainConfig
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.trainer import Trainer
 
+MLP = "hyrfpack.model.field.mlp"
 # Where the product looks each operation up.
 OPERATIONS = {
     "hyrfpack.render.renderer.rasterize": rasterize,
     "hyrfpack.model.hash_grid.hash_encode": hash_encode,
-    "hyrfpack.model.field.mlp": mlp,
+    MLP: mlp,
     "hyrfpack.train.trainer.photometric_loss": photometric_loss,
 }
 RASTERIZE = "hyrfpack.render.renderer.rasterize"
-ROWS = ("float32", *(f"nudged {n}" for n in range(1, 7)), "adam", "rasterizer", "float64")
+ROWS = ("float32", *(f"nudged {n}" for n in range(1, 7)), "mixed", "adam", "rasterizer", "float64")
 SETS = ("nerf_synthetic_lego", "indoor_room")
 NUDGE = 1e-7
 
@@ -95,6 +97,8 @@ def train(scene: Scene, config: TrainConfig, row: str) -> tuple[HybridModel, flo
         trainer.optimizer = Optimizer(trainer.model, config.learning_rates)
         dtype = torch.float32 if row == "adam" else torch.float64
         patches = {place: computed_in(dtype, operation) for place, operation in OPERATIONS.items()}
+    elif row == "mixed":
+        patches = {MLP: lambda *layers, mixed: mlp(*layers, mixed=True, implementation="reference")}
     elif row == "rasterizer":
         patches = {RASTERIZE: computed_in(torch.float64, rasterize)}
     started = time.perf_counter()

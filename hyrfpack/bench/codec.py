@@ -171,5 +171,5 @@ def _in_words(value: object) -> str:
 
 
 def _pictures(subject: Subject, model: HybridModel) -> list[Tensor]:
-    geometry = model.decode_geometry()
-    return [render(model, camera, geometry=geometry).rgb for camera in subject.cameras]
+    decoded = model.decode()
+    return [render(model, camera, decoded=decoded).rgb for camera in subject.cameras]

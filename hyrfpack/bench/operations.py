@@ -13,10 +13,11 @@ from hyrfpack.bench.rows import Row, difference, relative_difference, worst
 from hyrfpack.bench.subject import Subject
 from hyrfpack.bench.timing import take_turns
 from hyrfpack.model import HybridModel, viewpoint_of
-from hyrfpack.model.field import Field, encode_directions
+from hyrfpack.model.field import Field
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.shade import encode_directions
 from hyrfpack.scene import Camera
 
 

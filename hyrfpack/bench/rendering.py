@@ -39,11 +39,11 @@ def render_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> 
     that a user would save, and the error is this setting's own. "all" compares the defaults with everything exact.
     """
     model, defaults = subject.model, RenderSettings()
-    geometry = model.decode_geometry()
+    decoded = model.decode()
 
     def pictures(settings: RenderSettings, model: HybridModel = model, keep: bool = True) -> Pictures:
-        kept = geometry if keep else None
-        return lambda: [render(model, camera, settings, geometry=kept).rgb for camera in subject.cameras]
+        kept = decoded if keep else None
+        return lambda: [render(model, camera, settings, decoded=kept).rgb for camera in subject.cameras]
 
     pictures(defaults)()  # compiles kernels that are not cached: not to be taken for a slow first run
     for name, values in SWEEPS.items():

@@ -12,11 +12,14 @@ import click
 from hyrfpack.errors import HyrfError
 
 if TYPE_CHECKING:
+    import torch
+
     from hyrfpack.scene import Scene, View
 
 Command = TypeVar("Command", bound=Callable)
 
 PATH = click.Path(path_type=Path)
+PRECISIONS = ("mixed", "float32")  # hyrfpack.train.PRECISIONS, without loading torch
 LAYOUTS = ("colmap", "blender", "nerfstudio")
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
@@ -39,6 +42,35 @@ def scene_options(command: Command) -> Command:
     ):
         command = option(command)
     return command
+
+
+def device_options(command: Command) -> Command:
+    """Options that say where the work is done, and how exactly there: --device, --precision."""
+    for option in (
+        click.option(
+            "--precision",
+            type=click.Choice(PRECISIONS),
+            default="mixed",
+            show_default=True,
+            help="What a GPU multiplies in: bfloat16 with float32 sums, or float32. The CPU knows float32 only.",
+        ),
+        click.option(
+            "--device",
+            metavar="NAME",
+            default="auto",
+            show_default=True,
+            help="cpu, cuda (NVIDIA and AMD), cuda:N or mps; auto takes cuda where it is.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+def chosen_device(name: str) -> torch.device:
+    """The device of --device, with a word about it where it is slow."""
+    from hyrfpack.device import choose_device
+
+    return choose_device(name, note)
 
 
 def read_scene(path: Path, test_every: int, images: str | None, layout: str | None) -> Scene:

@@ -7,7 +7,16 @@ from typing import Any
 
 import click
 
-from hyrfpack.cli.common import PATH, json_option, note, print_json, read_scene, scene_options
+from hyrfpack.cli.common import (
+    PATH,
+    chosen_device,
+    device_options,
+    json_option,
+    note,
+    print_json,
+    read_scene,
+    scene_options,
+)
 
 PRESETS = ("auto", "synthetic", "standard", "large", "street")  # hyrfpack.train.PRESETS, without loading torch
 BACKGROUND_COLORS = ("black", "white", "random")
@@ -36,6 +45,7 @@ BACKGROUND_COLORS = ("black", "white", "random")
 )
 @click.option("--resume", is_flag=True, help="Go on from the run's checkpoint.")
 @click.option("--overwrite", is_flag=True, help="Replace what an earlier run left in the folder.")
+@device_options
 @json_option
 def train(
     data: Path,
@@ -46,6 +56,7 @@ def train(
     cache_mb: int | None,
     resume: bool,
     overwrite: bool,
+    device: str,
     as_json: bool,
     **settings: Any,
 ) -> None:
@@ -64,13 +75,16 @@ def train(
     if resume and overwrite:
         raise click.UsageError("--resume goes on with a run and --overwrite replaces it; give one of them")
     from hyrfpack.data import PictureCache
+    from hyrfpack.device import describe_device
     from hyrfpack.train import TrainConfig
     from hyrfpack.train import train as run
 
+    place = chosen_device(device)
     scene = read_scene(data, test_every, images, layout)
-    note(f"{scene.layout} scene: {len(scene.train)} photos to train on, {len(scene.test)} held out")
+    where = describe_device(place)
+    note(f"{scene.layout} scene: {len(scene.train)} photos to train on, {len(scene.test)} held out; on {where}")
     cache = None if cache_mb is None else PictureCache(cache_mb * 2**20)
-    result = run(scene, out, TrainConfig(**settings), resume=resume, overwrite=overwrite, cache=cache)
+    result = run(scene, out, TrainConfig(**settings), resume=resume, overwrite=overwrite, cache=cache, device=place)
     if not result.complete:
         note(f"stopped after step {result.step:,}; the same command with --resume goes on from there")
     if as_json:

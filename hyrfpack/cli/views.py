@@ -8,7 +8,18 @@ from pathlib import Path
 
 import click
 
-from hyrfpack.cli.common import PATH, json_option, note, print_json, read_scene, scene_options, split_views, table
+from hyrfpack.cli.common import (
+    PATH,
+    chosen_device,
+    device_options,
+    json_option,
+    note,
+    print_json,
+    read_scene,
+    scene_options,
+    split_views,
+    table,
+)
 
 SPLITS = ("test", "train", "all")
 DEFAULT_ORBIT = 60  # frames
@@ -27,6 +38,7 @@ DEFAULT_ORBIT = 60  # frames
 @click.option(
     "--allow-partial", is_flag=True, help="Take a file that is cut short: a coarser model, if enough is there."
 )
+@device_options
 @json_option
 def render(
     model: Path,
@@ -41,6 +53,8 @@ def render(
     depth: bool,
     video: bool,
     allow_partial: bool,
+    device: str,
+    precision: str,
     as_json: bool,
 ) -> None:
     """Render MODEL, a .hyrf file, to PNG pictures: the views of photos, cameras of a file, or an orbit of 60 frames.
@@ -63,6 +77,7 @@ def render(
     from hyrfpack.render.paths import stored_viewpoint
     from hyrfpack.render.video import has_ffmpeg, write_video
 
+    place = chosen_device(device)
     part = 1.0 if allow_partial else None
     if data is not None:
         views = split_views(read_scene(data, test_every, images, layout), split)
@@ -73,9 +88,11 @@ def render(
         path = orbit_around(stored_viewpoint(describe(model, part)), orbit or DEFAULT_ORBIT)
         named = [(f"{number:04d}", camera) for number, camera in enumerate(path)]
 
+    loaded = load(model, place, part)
+    loaded.precision = precision
     written = []
     with click.progressbar(
-        render_files(load(model, fraction=part), named, output, depth=depth),
+        render_files(loaded, named, output, depth=depth),
         len(named),
         "rendering",
         file=sys.stderr,
@@ -103,6 +120,7 @@ def render(
 @click.option(
     "--allow-partial", is_flag=True, help="Take a file that is cut short: a coarser model, if enough is there."
 )
+@device_options
 @json_option
 def evaluate(
     model: Path,
@@ -114,6 +132,8 @@ def evaluate(
     lpips_weights: Path | None,
     pictures: Path | None,
     allow_partial: bool,
+    device: str,
+    precision: str,
     as_json: bool,
 ) -> None:
     """Score MODEL, a .hyrf file, against photos it has not seen: PSNR, SSIM, LPIPS, bytes on disk, seconds a frame.
@@ -129,7 +149,8 @@ def evaluate(
     from hyrfpack.evaluate import evaluate as score
     from hyrfpack.format import load
 
-    loaded = load(model, fraction=1.0 if allow_partial else None)
+    loaded = load(model, chosen_device(device), 1.0 if allow_partial else None)
+    loaded.precision = precision
     views = split_views(read_scene(data, test_every, images, layout), split)
     scores = score(loaded, views, lpips_weights=lpips_weights, pictures=pictures)
     size = os.path.getsize(model)

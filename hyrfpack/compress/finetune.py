@@ -91,13 +91,13 @@ def finetune(
             with torch.no_grad():
                 for name, parameter in tuned.named_parameters():
                     parameter.copy_(exact[name])
-            if not torch.isfinite(loss) or optimizer.nonfinite_groups():
+            _add_rate(tuned, quantized, rounding, LOSS_PER_ERROR * ERROR_PER_BIT * plan.distortion)
+            broken = optimizer.step(step, steps)
+            if not torch.isfinite(loss) or broken.any():
                 raise HyrfTrainingError(
                     f"fine-tuning stopped at step {step + 1} on view '{view.name}': the loss or a gradient is not "
                     "finite; compress without --finetune"
                 )
-            _add_rate(tuned, quantized, rounding, LOSS_PER_ERROR * ERROR_PER_BIT * plan.distortion)
-            optimizer.step(step, steps)
             report(step + 1, float(loss.detach()))
     tuned.gaussians.positions.requires_grad_(True)
     return tuned

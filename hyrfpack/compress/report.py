@@ -122,9 +122,9 @@ def _views(model: HybridModel, source: Path, scene: Scene | None) -> tuple[list[
     """What pictures are compared with, and that in words."""
     if scene is None:
         with torch.no_grad():
-            geometry = model.decode_geometry()
+            decoded = model.decode()
             cameras = evenly_spaced(stored_cameras(describe(source)), VIEWPOINTS)
-            renders = [to_image(render(model, camera, geometry=geometry).rgb) for camera in cameras]
+            renders = [to_image(render(model, camera, decoded=decoded).rgb) for camera in cameras]
         views = [
             View(f"viewpoint {number}", camera, partial(Picture, np.asarray(picture)))
             for number, (camera, picture) in enumerate(zip(cameras, renders, strict=True), 1)
@@ -193,11 +193,11 @@ def _write_pictures(
     """
     scored = sorted(zip(views, before.views, after.views, strict=True), key=lambda item: item[2].psnr - item[1].psnr)
     chosen = evenly_spaced(scored, SHOWN)
-    geometries = model.decode_geometry(), packed.decode_geometry()
+    both = model.decode(), packed.decode()
     pairs: list[tuple[Tensor, Tensor]] = [
         tuple(
-            to_8bit(render(each, view.camera, geometry=geometry).rgb)
-            for each, geometry in zip((model, packed), geometries, strict=True)
+            to_8bit(render(each, view.camera, decoded=decoded).rgb)
+            for each, decoded in zip((model, packed), both, strict=True)
         )
         for view, *_ in chosen
     ]

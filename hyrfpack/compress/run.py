@@ -220,8 +220,8 @@ class _Packer:
 
 @torch.no_grad()
 def _pictures(model: HybridModel, cameras: Sequence[Camera]) -> list[torch.Tensor]:
-    geometry = model.decode_geometry()
-    return [render(model, camera, geometry=geometry).rgb for camera in cameras]
+    decoded = model.decode()
+    return [render(model, camera, decoded=decoded).rgb for camera in cameras]
 
 
 def _difference(pictures: list[torch.Tensor], others: list[torch.Tensor]) -> float:

@@ -10,8 +10,7 @@ import torch
 from hyrfpack.compress.views import views_between
 from hyrfpack.format.arrays import GROUPS
 from hyrfpack.format.compact import Sensitivity
-from hyrfpack.model import HybridModel
-from hyrfpack.model.frame import expand
+from hyrfpack.model import HybridModel, expand
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, evenly_spaced
 

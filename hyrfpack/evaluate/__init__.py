@@ -47,7 +47,8 @@ class Evaluation:
         lpips: perceptual distance, or None.
         lpips_reason: why lpips is None, or which network made it.
         gaussians: how many the model has.
-        seconds_per_frame: median time to render a view, everything warm and the geometry decoded beforehand.
+        seconds_per_frame: median time to render a view, everything warm and what does not depend on the view decoded
+            beforehand.
         views: scores of each view.
         skipped: names of views whose mask leaves no pixel to score.
     """
@@ -94,13 +95,13 @@ def evaluate(
     if not views:
         raise HyrfError("there is no view to score; name a split that has photos or a smaller --test-every")
     perceptual = None if lpips_weights is None else LPIPS.load(lpips_weights)
-    geometry = model.decode_geometry()
+    decoded = model.decode()
     solid = np.array(model.config.solid, dtype=np.float32)
     device = model.gaussians.positions.device
     names = file_names([view.name for view in views])
     drawn = evenly_spaced(range(len(views)), picture_count) if pictures is not None else []
 
-    render(model, views[0].camera, settings, geometry=geometry)  # compiles kernels and fills caches
+    render(model, views[0].camera, settings, decoded=decoded)  # compiles kernels and fills caches
     scores: list[ViewScore] = []
     skipped: list[str] = []
     seconds: list[float] = []
@@ -112,7 +113,7 @@ def evaluate(
             skipped.append(view.name)
             continue
         started = _now(device)
-        rendering = render(model, view.camera, settings, geometry=geometry)
+        rendering = render(model, view.camera, settings, decoded=decoded)
         seconds.append(_now(device) - started)
         image = to_8bit(rendering.rgb)
         distance = None

@@ -9,9 +9,8 @@ import torch
 
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format.info import SECTIONS
-from hyrfpack.model.background import RADIUS
+from hyrfpack.model import BACKGROUND_RADIUS, DIRECTION_FEATURES
 from hyrfpack.model.config import ModelConfig
-from hyrfpack.model.field import DIRECTION_FEATURES
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.model.hash_grid import FEATURES, HashGridConfig
 from hyrfpack.model.hybrid import HybridModel
@@ -19,7 +18,7 @@ from hyrfpack.model.hybrid import HybridModel
 # What every model of this version computes and no setting of it says; `docs/format.md` has the equations.
 RULES = {
     "activations": "sigmoid",
-    "background_radius": RADIUS,
+    "background_radius": BACKGROUND_RADIUS,
     "contraction": "l2",
     "decoders": "relu",
     "hash": "instant-ngp",

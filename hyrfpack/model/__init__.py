@@ -1,8 +1,24 @@
 """The representation: explicit Gaussians, two neural fields and a background, in one frame."""
 
 from hyrfpack.model.config import ModelConfig
-from hyrfpack.model.frame import Frame, contract, viewpoint_of
+from hyrfpack.model.frame import Frame
 from hyrfpack.model.hash_grid import HashGridConfig
-from hyrfpack.model.hybrid import Geometry, HybridModel
+from hyrfpack.model.hybrid import Decoded, Geometry, HybridModel
+from hyrfpack.ops.background import RADIUS as BACKGROUND_RADIUS
+from hyrfpack.ops.background import viewpoint_of
+from hyrfpack.ops.contraction import contract, expand
+from hyrfpack.ops.shade import DIRECTION_FEATURES
 
-__all__ = ["Frame", "Geometry", "HashGridConfig", "HybridModel", "ModelConfig", "contract", "viewpoint_of"]
+__all__ = [
+    "BACKGROUND_RADIUS",
+    "DIRECTION_FEATURES",
+    "Decoded",
+    "Frame",
+    "Geometry",
+    "HashGridConfig",
+    "HybridModel",
+    "ModelConfig",
+    "contract",
+    "expand",
+    "viewpoint_of",
+]

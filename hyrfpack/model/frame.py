@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from hyrfpack.errors import HyrfDataError
@@ -77,42 +76,3 @@ class Frame:
     def normalize(self, local: Tensor) -> Tensor:
         """Local positions (..., 3) to u = local / half_extent, where the box is [-1, 1]^3."""
         return local / local.new_tensor(self.half_extent)
-
-
-def viewpoint_of(pose: Tensor) -> Tensor:
-    """Where a camera stands (3,), local units, by its pose camera_from_local (4, 4): -R^T t."""
-    return -(pose[:3, :3].T @ pose[:3, 3])
-
-
-def contract(u: Tensor) -> Tensor:
-    """Map normalised coordinates into the open unit cube.
-
-    The ball |u| <= 1 fills the inner half; everything outside is squeezed into the shell around it
-    (mip-NeRF 360 contraction, shifted and scaled to (0, 1) as HyRF eq. 3 intends):
-
-        c(u) = 0.25 u + 0.5                          |u| <= 1
-        c(u) = 0.25 (2 - 1/|u|) u/|u| + 0.5          otherwise
-
-    Args:
-        u: (..., 3) normalised coordinates, any finite value.
-
-    Returns:
-        (..., 3) in [0, 1]. Differentiable everywhere, also at |u| = 1 (C1).
-    """
-    # Divided by the largest component first: the square of 1e30 would overflow float32.
-    largest = u.abs().amax(-1, keepdim=True).clamp_min(1)
-    radius = torch.linalg.vector_norm(u / largest, dim=-1, keepdim=True).clamp_min(1 / largest) * largest
-    return 0.25 * (2 - 1 / radius) * (u / radius) + 0.5
-
-
-def expand(c: Tensor) -> Tensor:
-    """The inverse of `contract`: points (..., 3) of the cube to normalised coordinates u.
-
-        u = y                             |y| <= 1,     y = 4 (c - 0.5)
-        u = y / (|y| (2 - |y|))           otherwise
-
-    Points at or past |y| = 2, which no finite u maps to, are taken just inside: |u| stays below 2^20.
-    """
-    y = 4 * (c - 0.5)
-    radius = torch.linalg.vector_norm(y, dim=-1, keepdim=True).clamp_min(1)
-    return y / (radius * (2 - radius.clamp_max(2 - 2**-20)))

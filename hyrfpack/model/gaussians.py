@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 
+import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 LOGIT_LIMIT = 12.0  # sigmoid is within 7e-6 of its ends there; beyond, gradients die
 
@@ -38,3 +40,25 @@ class Gaussians(nn.Module):
 
     def __len__(self) -> int:
         return len(self.positions)
+
+
+def take_rows(values: Tensor, index: Tensor) -> Tensor:
+    """values[index], (n, C), for (n,) int64 in which no row comes twice; differentiable.
+
+    Rows that are taken once need no sum: a copy is enough to pull a gradient back, where torch sorts the indices.
+    """
+    return _TakeRows.apply(values, index)
+
+
+class _TakeRows(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, values: Tensor, index: Tensor) -> Tensor:
+        ctx.save_for_backward(index)
+        ctx.shape = values.shape
+        return values.index_select(0, index)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
+        (index,) = ctx.saved_tensors
+        return grad.new_zeros(ctx.shape).index_copy_(0, index, grad), None

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from hyrfpack.model.background import pixel_directions, sphere_points
 from hyrfpack.model.config import ModelConfig
-from hyrfpack.model.field import DIRECTION_FEATURES, Field, encode_directions
-from hyrfpack.model.frame import contract, viewpoint_of
-from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.model.field import Field
+from hyrfpack.model.gaussians import Gaussians, take_rows
+from hyrfpack.ops.background import background_colors, background_grid
+from hyrfpack.ops.contraction import contract
+from hyrfpack.ops.mlp import mlp
+from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_directions
+
+SHADED_AT_ONCE = 1 << 20  # Gaussians whose hash features are in memory together in `shading`
 
 
 @dataclass(frozen=True)
@@ -30,6 +35,20 @@ class Geometry:
 
     def __getitem__(self, index: Tensor) -> Geometry:
         return Geometry(self.scales[index], self.quats[index], self.opacities[index])
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """What of a model does not depend on the view, to be kept from view to view.
+
+    Attributes:
+        geometry: of all Gaussians.
+        shading: the colour decoder's first layer as far as places decide it, and what comes after it; None where
+            there is no kernel that is faster with it.
+    """
+
+    geometry: Geometry
+    shading: Shading | None
 
 
 def scale_bounds(positions: Tensor, config: ModelConfig) -> Tensor:
@@ -51,11 +70,16 @@ class HybridModel(nn.Module):
         scale = S(p) sigmoid(s_n + s_e)   rotation = normalize(r_n + (1, 0, 0, 0))
 
     with S(p) = max(1, |u|) local units. All positions are local to `config.frame`.
+
+    Attributes:
+        precision: how GPU kernels multiply in the decoders, not stored in files: "mixed" rounds factors to bfloat16
+            and adds up in float32, "float32" rounds nothing. The CPU always works in float32.
     """
 
     def __init__(self, config: ModelConfig, gaussians: Gaussians, generator: torch.Generator | None = None) -> None:
         super().__init__()
         self.config = config
+        self.precision = "mixed"
         self.gaussians = gaussians
         self.geometry = Field(config.geometry, outputs=8, hidden=config.hidden, generator=generator)
         self.radiance = Field(
@@ -74,15 +98,46 @@ class HybridModel(nn.Module):
         """S(p), (N, 1), at local positions (N, 3); see `scale_bounds`."""
         return scale_bounds(positions, self.config)
 
+    @property
+    def _mixed(self) -> bool:
+        return self.precision == "mixed" and self.gaussians.positions.device.type == "cuda"
+
     def _field_positions(self, positions: Tensor) -> Tensor:
         return positions if self.config.position_gradients else positions.detach()
+
+    @torch.no_grad()
+    def decode(self) -> Decoded:
+        """What does not depend on the view, of all Gaussians: for many views of a model that does not change."""
+        on_gpu = self.gaussians.positions.device.type == "cuda"
+        return Decoded(self.decode_geometry(), self.shading() if on_gpu else None)
+
+    @torch.no_grad()
+    def shading(self) -> Shading:
+        """The colour decoder with what of its first layer does not depend on the view worked out for all Gaussians."""
+        field, explicit = self.radiance, self.gaussians
+        places = field.grid.features
+        (weight, *weights), (bias, *biases) = field.weights, field.biases
+        rows = [
+            mlp(field.grid(self.cube_coords(some)), [weight[:, :places]], [bias], mixed=self._mixed)
+            for some in explicit.positions.split(SHADED_AT_ONCE)
+        ]
+        first = torch.cat(rows)
+        return Shading(
+            first.bfloat16() if self._mixed else first,
+            weight[:, places:].contiguous(),
+            tuple(weights),
+            tuple(biases),
+            explicit.color_logits.detach(),
+            self.config.direction_encoding,
+            self._mixed,
+        )
 
     def decode_geometry(self, index: Tensor | None = None) -> Geometry:
         """Scales, rotations and opacities of the Gaussians at `index` (n,) int64, or of all."""
         explicit = self.gaussians
-        pick = (lambda values: values) if index is None else (lambda values: values[index])
+        pick = (lambda values: values) if index is None else (lambda values: take_rows(values, index))
         positions = self._field_positions(pick(explicit.positions))
-        raw = self.geometry(self.cube_coords(positions))
+        raw = self.geometry(self.cube_coords(positions), mixed=self._mixed)
         opacities = torch.sigmoid(raw[:, 0] + pick(explicit.opacity_logits)[:, 0])
         scales = self.activate_scales(raw[:, 1:4], pick(explicit.scale_logits)) * self.scale_bounds(positions)
         return Geometry(scales, raw[:, 4:] + raw.new_tensor((1, 0, 0, 0)), opacities)
@@ -98,7 +153,7 @@ class HybridModel(nn.Module):
         explicit = self.gaussians
         positions, logits = explicit.positions, explicit.color_logits
         if index is not None:
-            positions, logits = positions[index], logits[index]
+            positions, logits = take_rows(positions, index), take_rows(logits, index)
         positions = self._field_positions(positions)
         directions = torch.nn.functional.normalize(positions - viewpoint, dim=-1, eps=1e-12)
         return torch.sigmoid(self._radiance(positions, directions) + logits)
@@ -109,11 +164,38 @@ class HybridModel(nn.Module):
         Args:
             pose: (4, 4) camera_from_local.
         """
-        directions = pixel_directions(points, intrinsics, pose)
-        return torch.sigmoid(self._radiance(sphere_points(viewpoint_of(pose), directions), directions))
+        return background_colors(points, **self._sphere(intrinsics, pose))
+
+    def background_grid(
+        self,
+        transmittance: Tensor,
+        intrinsics: tuple[float, float, float, float],
+        pose: Tensor,
+        *,
+        threshold: float,
+        stride: int,
+    ) -> Tensor:
+        """Background colours (rows, columns, 3) of every stride-th pixel; see `ops.background.background_grid`."""
+        return background_grid(transmittance, threshold=threshold, stride=stride, **self._sphere(intrinsics, pose))
+
+    def _sphere(self, intrinsics: tuple[float, float, float, float], pose: Tensor) -> dict[str, Any]:
+        """What the colours of the background depend on."""
+        return {
+            "pose": pose,
+            "intrinsics": intrinsics,
+            "half_extent": self.config.frame.half_extent,
+            "table": self.radiance.grid.table,
+            "resolutions": self.config.radiance.resolutions,
+            "log2_table_size": self.config.radiance.log2_table_size,
+            "weights": list(self.radiance.weights),
+            "biases": list(self.radiance.biases),
+            "encoding": self.config.direction_encoding,
+            "mixed": self._mixed,
+        }
 
     def _radiance(self, positions: Tensor, directions: Tensor) -> Tensor:
-        return self.radiance(self.cube_coords(positions), encode_directions(directions, self.config.direction_encoding))
+        encoded = encode_directions(directions, self.config.direction_encoding)
+        return self.radiance(self.cube_coords(positions), encoded, mixed=self._mixed)
 
     def __len__(self) -> int:
         return len(self.gaussians)

@@ -54,9 +54,7 @@ def choose(implementation: str, available: tuple[str, ...], *tensors: Tensor) ->
             raise ValueError(f"no implementation '{implementation}'; there are {', '.join(available)}")
         if not fits[implementation]:
             where = {"cpu": "on the CPU", "gpu": "on a CUDA or ROCm device"}[implementation]
-            raise ValueError(
-                f"the {implementation} kernels take float32 {where}, not {first.dtype} on {first.device}"
-            )
+            raise ValueError(f"the {implementation} kernels take float32 {where}, not {first.dtype} on {first.device}")
         return implementation
     if "gpu" in available and fits["gpu"] and place == "cuda" and has_triton():
         return "gpu"

@@ -41,10 +41,10 @@ def render_files(
         HyrfError: a picture cannot be written.
     """
     with torch.no_grad():
-        geometry = model.decode_geometry()
+        decoded = model.decode()
     for name, (_, camera) in zip(file_names([name for name, _ in cameras]), cameras, strict=True):
         with torch.no_grad():
-            rendering = render(model, camera, settings, geometry=geometry, depth=depth)
+            rendering = render(model, camera, settings, decoded=decoded, depth=depth)
         path = Path(folder) / f"{name}.png"
         save_picture(path, to_image(rendering.rgb))
         if depth:

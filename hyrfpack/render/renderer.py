@@ -11,11 +11,13 @@ import torch
 from torch import Tensor
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.model import Geometry, HybridModel, viewpoint_of
+from hyrfpack.model import Decoded, HybridModel, viewpoint_of
+from hyrfpack.model.gaussians import take_rows
 from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
+from hyrfpack.ops.rasterize.shaded import rasterize_shaded
 from hyrfpack.parallel.pool import torch_on_one_thread
-from hyrfpack.render.cull import frustum_cull
 from hyrfpack.scene import Camera
 
 
@@ -78,7 +80,7 @@ def render(
     camera: Camera,
     settings: RenderSettings = RenderSettings(),
     *,
-    geometry: Geometry | None = None,
+    decoded: Decoded | None = None,
     depth: bool = False,
     absgrad: bool = False,
     solid: Tensor | None = None,
@@ -90,8 +92,8 @@ def render(
         model: what to render.
         camera: from where, in world units.
         settings: accuracy against speed.
-        geometry: `model.decode_geometry()` of all Gaussians, when the caller keeps it between views (it does not
-            depend on the view, so inference decodes it once).
+        decoded: `model.decode()`, when the caller keeps it between views: it does not depend on them, so inference
+            makes it once. Nothing is differentiable then.
         depth: also return depth.
         absgrad: also collect absolute gradients of the projected centres during backward.
         solid: (3,) colour behind everything instead of the model's own; for models without a background sphere.
@@ -102,41 +104,47 @@ def render(
     """
     seconds: dict[str, float] = {}
     positions = model.gaussians.positions
-    pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=positions.dtype, device=positions.device)
-    _refuse_nonfinite(pose=pose, positions=positions)
-    with _timed(seconds, "cull"), torch.no_grad():
-        index = frustum_cull(
-            positions, pose, camera.intrinsics, camera.width, camera.height, settings.near, settings.cull_tolerance
-        )
-    with _timed(seconds, "decode"):
-        geometry = model.decode_geometry(index) if geometry is None else geometry[index]
-        colors = model.decode_colors(viewpoint_of(pose), index)
-    _refuse_nonfinite(scales=geometry.scales, rotations=geometry.quats, opacities=geometry.opacities, colours=colors)
-    gradients = positions.new_zeros(len(index), 2) if absgrad else None
-    raster = rasterize(
-        positions[index],
-        geometry.quats,
-        geometry.scales,
-        geometry.opacities,
-        colors,
-        pose,
-        camera.intrinsics,
-        camera.width,
-        camera.height,
-        near=settings.near,
-        antialiased=model.config.antialiased,
-        transmittance_min=settings.transmittance_min,
-        depth=depth,
-        absgrad=gradients,
-    )
+    pose_here = torch.as_tensor(model.config.frame.local_pose(camera), dtype=positions.dtype)
+    pose = pose_here.to(positions.device, non_blocking=True)
+    on_cpu = positions.device.type == "cpu"
+    _refuse_nonfinite(pose=pose_here)
+    view = pose_here, camera.intrinsics, camera.width, camera.height
+    how = {
+        "near": settings.near,
+        "antialiased": model.config.antialiased,
+        "transmittance_min": settings.transmittance_min,
+        "depth": depth,
+    }
+    gradients = None
+    if decoded is not None and decoded.shading is not None:
+        geometry = decoded.geometry
+        explicit = positions, geometry.quats, geometry.scales, geometry.opacities
+        index = torch.arange(len(model), device=positions.device)
+        raster = rasterize_shaded(*explicit, decoded.shading, *view, cull_tolerance=settings.cull_tolerance, **how)
+    else:
+        _refuse_nonfinite(positions=positions)  # culling would leave them out
+        with _timed(seconds, "cull"), torch.no_grad():
+            index = frustum_cull(positions, pose, *view[1:], settings.near, settings.cull_tolerance)
+        with _timed(seconds, "decode"):
+            geometry = model.decode_geometry(index) if decoded is None else decoded.geometry[index]
+            colors = model.decode_colors(viewpoint_of(pose), index)
+        gradients = positions.new_zeros(len(index), 2) if absgrad else None
+        explicit = take_rows(positions, index), geometry.quats, geometry.scales, geometry.opacities
+        raster = rasterize(*explicit, colors, *view, absgrad=gradients, **how)
+    if raster.nonfinite:
+        raise _nonfinite(raster.nonfinite[0])
     seconds.update(raster.seconds)
     with _timed(seconds, "background"):
         if model.config.background and background:
-            behind = _background(model, camera, pose, raster.transmittance, settings)
+            behind = _background(model, camera, pose_here, raster.transmittance, settings)
         else:
-            behind = positions.new_tensor(model.config.solid) if solid is None else solid
-            _refuse_nonfinite(background=behind)
+            behind = torch.tensor(model.config.solid).to(positions, non_blocking=True) if solid is None else solid
+            if on_cpu:
+                _refuse_nonfinite(background=behind)
         rgb = raster.rgb + raster.transmittance[..., None] * behind
+    if not (on_cpu or rgb.requires_grad):
+        # Once, at the end, for each question waits for the device; in training the loss is asked.
+        _refuse_nonfinite(background=rgb)
     return Rendering(
         rgb=rgb,
         alpha=1 - raster.transmittance,
@@ -153,10 +161,14 @@ def _refuse_nonfinite(**values: Tensor) -> None:
     """Raise HyrfError for NaN and infinity: further on they fail every comparison and are left out without a word."""
     for name, tensor in values.items():
         if tensor.numel() and not torch.stack(tensor.detach().aminmax()).isfinite().all():
-            raise HyrfError(
-                f"the view's {name} hold NaN or infinity, from a broken model or a pose beyond float32; "
-                "train the model again or mend the pose"
-            )
+            raise _nonfinite(name)
+
+
+def _nonfinite(name: str) -> HyrfError:
+    return HyrfError(
+        f"the view's {name} hold NaN or infinity, from a broken model or a pose beyond float32; "
+        "train the model again or mend the pose"
+    )
 
 
 def _background(
@@ -165,22 +177,13 @@ def _background(
     """(H, W, 3) colours of the sphere where it shines through; anything where it does not."""
     height, width = transmittance.shape
     stride = settings.background_stride
-    rows, columns = (-(-(size - 1) // stride) + 1 for size in (height, width))  # nodes, the last at or past the edge
-    # A node is needed when light passes at any pixel whose colour it takes part in.
-    reach = stride - 1
-    padded = torch.nn.functional.pad(
-        transmittance.detach()[None], (reach, columns * stride - width, reach, rows * stride - height)
+    grid = model.background_grid(
+        transmittance, camera.intrinsics, pose, threshold=settings.background_threshold, stride=stride
     )
-    light = torch.nn.functional.max_pool2d(padded, kernel_size=2 * stride - 1, stride=stride)[0]
-    nodes = torch.nonzero(light.reshape(-1) > settings.background_threshold).squeeze(-1)
-    colors = transmittance.new_zeros(rows * columns, 3)
-    if len(nodes):
-        places = torch.stack((nodes % columns, torch.div(nodes, columns, rounding_mode="floor")), dim=-1)
-        points = places.to(transmittance.dtype) * stride + 0.5
-        shades = model.decode_background(points, camera.intrinsics, pose)
-        _refuse_nonfinite(background=shades)
-        colors = colors.index_put((nodes,), shades)
-    grid = colors.T.reshape(1, 3, rows, columns)
+    if grid.device.type == "cpu":  # on a GPU, what is NaN is NaN in the picture
+        _refuse_nonfinite(background=grid)
+    rows, columns, _ = grid.shape
+    grid = grid.permute(2, 0, 1)[None]
     if stride > 1:
         size = ((rows - 1) * stride + 1, (columns - 1) * stride + 1)
         grid = torch.nn.functional.interpolate(grid, size, mode="bilinear", align_corners=True)

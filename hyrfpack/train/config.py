@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass, field
 
+PRECISIONS = ("mixed", "float32")
 PRESETS = ("auto", "synthetic", "standard", "large", "street")
 FULL_STEPS = 30_000  # the length of a run that the paper's schedule is written for
 SHORT_STEPS = 1_000  # rates grow no further in runs shorter than this
@@ -74,6 +75,7 @@ class TrainConfig:
             every step; the model then has black behind it).
         ssim_weight: w in (1 - w) L1 + w (1 - SSIM).
         checkpoint_every: steps between checkpoints; None for a twentieth of the run.
+        precision: "mixed" or "float32", as `HybridModel.precision`: what GPU kernels multiply in.
         scale_rule, scale_grows, direction_encoding, position_gradients, antialiased: as in ModelConfig.
         learning_rates, density: see LearningRates and DensityConfig.
         grid_resolutions: vertices per axis of the coarsest and the finest level of both hash grids.
@@ -89,6 +91,7 @@ class TrainConfig:
     antialiased: bool = False
     ssim_weight: float = 0.2
     checkpoint_every: int | None = None
+    precision: str = "mixed"
     scale_rule: str = "sum"
     scale_grows: bool = True
     direction_encoding: str = "frequency"
@@ -102,6 +105,8 @@ class TrainConfig:
             raise ValueError(f"steps is {self.steps}; it must be at least 1")
         if self.preset not in PRESETS:
             raise ValueError(f"preset is '{self.preset}'; it must be one of {', '.join(PRESETS)}")
+        if self.precision not in PRECISIONS:
+            raise ValueError(f"precision is '{self.precision}'; it must be one of {', '.join(PRECISIONS)}")
         if self.background_color not in ("black", "white", "random"):
             raise ValueError(f"background_color is '{self.background_color}'; it must be black, white or random")
         for name in ("max_gaussians", "checkpoint_every"):

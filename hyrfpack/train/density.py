@@ -28,11 +28,20 @@ class DensityControl:
         views: (N,) in how many views each Gaussian was visible since the last round.
     """
 
-    def __init__(self, config: DensityConfig, steps: int, budget: int, initial: int, seed: int) -> None:
+    def __init__(
+        self,
+        config: DensityConfig,
+        steps: int,
+        budget: int,
+        initial: int,
+        seed: int,
+        device: torch.device | None = None,
+    ) -> None:
         self.config = config
         self.budget = budget
         self.initial = initial
         self.seed = seed
+        self.device = device
         self.first = max(1, round(config.start * steps))
         self.last = round(config.stop * steps)
         self.interval = max(1, (self.last - self.first) // max(1, config.rounds))
@@ -41,8 +50,8 @@ class DensityControl:
 
     def clear(self, count: int) -> None:
         """Forget what was collected; there are `count` Gaussians now."""
-        self.gradients = torch.zeros(count)
-        self.views = torch.zeros(count)
+        self.gradients = torch.zeros(count, device=self.device)
+        self.views = torch.zeros(count, device=self.device)
 
     def watching(self, step: int) -> bool:
         """Whether gradients of this step (counted from 1) will still be used."""
@@ -52,10 +61,11 @@ class DensityControl:
         """Collect the gradients of one view, after backward."""
         if rendering.absgrad is None:
             return
-        index = rendering.decoded[rendering.visible]
-        ndc = rendering.absgrad[rendering.visible] * rendering.absgrad.new_tensor((width / 2, height / 2))
-        self.gradients.index_add_(0, index, torch.linalg.vector_norm(ndc, dim=-1).to(self.gradients.dtype))
-        self.views.index_add_(0, index, torch.ones_like(index, dtype=torch.float32))
+        # To pick the visible would make the host wait for the device: zeros are added instead.
+        ndc = rendering.absgrad * rendering.absgrad.new_tensor((width / 2, height / 2))
+        lengths = torch.where(rendering.visible, torch.linalg.vector_norm(ndc, dim=-1), 0)
+        self.gradients.index_add_(0, rendering.decoded, lengths.to(self.gradients.dtype))
+        self.views.index_add_(0, rendering.decoded, rendering.visible.to(self.views.dtype))
 
     def act(self, step: int, model: HybridModel, optimizer: Optimizer) -> None:
         """Run a round or a reset if one is due after this step (counted from 1)."""
@@ -105,7 +115,8 @@ class DensityControl:
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + step)
         twice = split.repeat(2)
         scales, quats = geometry.scales[twice], geometry.quats[twice]
-        offsets = torch.randn(len(twice), 3, generator=generator) * scales
+        # Drawn on the CPU: the same numbers on every device.
+        offsets = torch.randn(len(twice), 3, generator=generator).to(scales.device) * scales
         positions = explicit.positions[twice] + rotate(quats, offsets)
 
         # The neural part stays as it is, so the explicit logit alone must bring the shrinking about.

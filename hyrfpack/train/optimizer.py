@@ -2,43 +2,84 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.ops.adam import adam_step
 from hyrfpack.train.config import LearningRates
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
+@dataclass
+class _State:
+    """What Adam keeps of one parameter: running means of gradients and of their squares, and the steps taken."""
+
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
+    step: int = 0
+
+
 class Optimizer:
-    """Adam (betas 0.9, 0.999, eps 1e-15) with one parameter group for each kind of Gaussian property and one for
-    the fields."""
+    """Adam (betas 0.9, 0.999, eps 1e-15) with one group for each kind of Gaussian property and one for the fields.
+
+    Attributes:
+        groups: parameters by the group's name, which is that of its learning rate.
+    """
 
     def __init__(self, model: HybridModel, rates: LearningRates) -> None:
         self.model = model
         self.rates = rates
-        groups = [{"name": name, "params": [getattr(model.gaussians, name)]} for name in Gaussians.NAMES]
-        groups.append({"name": "fields", "params": [*model.geometry.parameters(), *model.radiance.parameters()]})
-        self.adam = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
+        self.groups: dict[str, list[nn.Parameter]] = {
+            name: [getattr(model.gaussians, name)] for name in Gaussians.NAMES
+        }
+        self.groups["fields"] = [*model.geometry.parameters(), *model.radiance.parameters()]
+        self._states: dict[nn.Parameter, _State] = {}
 
-    def step(self, step: int, steps: int) -> None:
-        """Take one step with the learning rates due at `step` (from 0) of `steps`, and clear the gradients."""
-        for group in self.adam.param_groups:
-            group["lr"] = self.rates.at(group["name"], step, steps)
-        self.adam.step()
-        self.adam.zero_grad(set_to_none=True)
+    def step(self, step: int, steps: int) -> Tensor:
+        """Take one step with the learning rates due at `step` (from 0) of `steps`, and clear the gradients.
 
-    def nonfinite_groups(self) -> list[str]:
-        """Names of the groups that hold a gradient that is not finite."""
-        return [
-            group["name"]
-            for group in self.adam.param_groups
-            if any(p.grad is not None and not torch.isfinite(p.grad).all() for p in group["params"])
-        ]
+        Returns:
+            (groups,) float32 on the model's device: not 0 for a group with a gradient that is not finite, whose numbers
+            are then not to be used. Nothing waits for the device.
+        """
+        broken = []
+        for name, parameters in self.groups.items():
+            alike: dict[int, list[nn.Parameter]] = defaultdict(list)  # by the steps taken
+            for parameter in parameters:
+                if parameter.grad is None:
+                    continue
+                if parameter not in self._states:
+                    zeros = torch.zeros_like(parameter, memory_format=torch.contiguous_format)
+                    self._states[parameter] = _State(zeros, zeros.clone())
+                state = self._states[parameter]
+                state.step += 1
+                alike[state.step].append(parameter)
+            flag = self.model.gaussians.positions.new_zeros(())
+            for count, some in alike.items():
+                states = [self._states[parameter] for parameter in some]
+                flag = flag + adam_step(
+                    [parameter.detach() for parameter in some],
+                    [parameter.grad for parameter in some],
+                    [state.exp_avg for state in states],
+                    [state.exp_avg_sq for state in states],
+                    step=count,
+                    rate=self.rates.at(name, step, steps),
+                )
+                for parameter in some:
+                    parameter.grad = None
+            broken.append(flag)
+        return torch.stack(broken)
+
+    def names(self, broken: Sequence[float]) -> list[str]:
+        """The groups that `step` found broken."""
+        return [name for name, flag in zip(self.groups, broken, strict=True) if flag]
 
     def replace_gaussians(self, keep: Tensor, new: dict[str, Tensor]) -> None:
         """Keep the rows at `keep` (int64), with their moments, and append new rows with moments of zero."""
@@ -56,30 +97,29 @@ class Optimizer:
         self._edit(name, lambda _: values, torch.zeros_like)
 
     def _edit(self, name: str, values: Callable[[Tensor], Tensor], moments: Callable[[Tensor], Tensor]) -> None:
-        group = next(group for group in self.adam.param_groups if group["name"] == name)
-        old = group["params"][0]
+        (old,) = self.groups[name]
         new = nn.Parameter(values(old.detach()).contiguous())
-        state = self.adam.state.pop(old, None)
-        if state:
-            for moment in MOMENTS:
-                state[moment] = moments(state[moment]).contiguous()
-            self.adam.state[new] = state
-        group["params"][0] = new
+        state = self._states.pop(old, None)
+        if state is not None:
+            exp_avg, exp_avg_sq = (moments(getattr(state, moment)).contiguous() for moment in MOMENTS)
+            self._states[new] = _State(exp_avg, exp_avg_sq, state.step)
+        self.groups[name] = [new]
         setattr(self.model.gaussians, name, new)
 
-    def state_dict(self) -> dict:
+    def state_dict(self) -> dict[str, Tensor]:
         """Moments and step counts, tensors only, by group and position."""
         return {
-            f"{group['name']}.{i}.{key}": value
-            for group in self.adam.param_groups
-            for i, parameter in enumerate(group["params"])
-            for key, value in self.adam.state.get(parameter, {}).items()
+            f"{name}.{i}.{key}": torch.as_tensor(getattr(self._states[parameter], key))
+            for name, parameters in self.groups.items()
+            for i, parameter in enumerate(parameters)
+            if parameter in self._states
+            for key in (*MOMENTS, "step")
         }
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """The inverse of `state_dict`; the parameters must have the shapes they had then."""
-        for group in self.adam.param_groups:
-            for i, parameter in enumerate(group["params"]):
-                entry = {key: state.get(f"{group['name']}.{i}.{key}") for key in (*MOMENTS, "step")}
-                if entry["step"] is not None:
-                    self.adam.state[parameter] = {key: value.clone() for key, value in entry.items()}
+        for name, parameters in self.groups.items():
+            for i, parameter in enumerate(parameters):
+                if (step := state.get(f"{name}.{i}.step")) is not None:
+                    moments = (state[f"{name}.{i}.{moment}"].to(parameter.device).clone() for moment in MOMENTS)
+                    self._states[parameter] = _State(*moments, int(step))

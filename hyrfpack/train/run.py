@@ -17,6 +17,7 @@ import torch
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import check_writable, make_folder, write_atomic
 from hyrfpack.data import PictureCache
+from hyrfpack.device import choose_device, describe_device
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate import Evaluation, evaluate
 from hyrfpack.evaluate.figures import training_curve
@@ -58,6 +59,7 @@ def train(
     resume: bool = False,
     overwrite: bool = False,
     cache: PictureCache | None = None,
+    device: str | torch.device = "auto",
     quiet: bool = False,
 ) -> TrainResult:
     """Train a model on a scene and leave everything about the run in a folder.
@@ -73,6 +75,8 @@ def train(
         resume: go on from the folder's checkpoint; the result is the one an uninterrupted run gives.
         overwrite: replace what an earlier run left in the folder.
         cache: holds decoded photos; by default a quarter of the memory.
+        device: where to train, see `hyrfpack.device.choose_device`. A run may be resumed on another one. On a GPU
+            sums of gradients vary in their last bits from run to run.
         quiet: print nothing.
 
     Raises:
@@ -82,8 +86,9 @@ def train(
     out = Path(out)
     config = config or TrainConfig()
     checkpoint = out / CHECKPOINT
+    device = device if isinstance(device, torch.device) else choose_device(device)
     _prepare(out, resume, overwrite)
-    trainer = Trainer(scene, config, cache)
+    trainer = Trainer(scene, config, cache, device)
     if resume:
         trainer.load(checkpoint)
     with _naming_the_checkpoint(trainer):
@@ -123,6 +128,7 @@ def _finish(trainer: Trainer, out: Path) -> dict:
     report = hyrf_format.save(model, path, profile="raw", provenance=provenance)
     metrics = {
         "settings": config.to_dict(),
+        "device": describe_device(trainer.device),
         "scene": {"path": scene.path, "layout": scene.layout, "train": len(scene.train), "test": len(scene.test)},
         "choices": trainer.choices,
         "notes": scene.notes,
@@ -135,7 +141,9 @@ def _finish(trainer: Trainer, out: Path) -> dict:
     }
     if scene.test:
         # Scored on the file as it was written, not on what is in memory.
-        scores: Evaluation = evaluate(hyrf_format.load(path), scene.test, pictures=out / "views")
+        written = hyrf_format.load(path, trainer.device)
+        written.precision = config.precision
+        scores: Evaluation = evaluate(written, scene.test, pictures=out / "views")
         metrics["evaluation"] = scores.to_dict()
     training_curve(trainer.records, out / "curve.png")
     write_atomic(out / METRICS, json.dumps(metrics, indent=1).encode())

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from hyrfpack.data import PictureCache
+from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
@@ -38,18 +39,31 @@ class Trainer:
         >>> trainer.model
     """
 
-    def __init__(self, scene: Scene, config: TrainConfig, cache: PictureCache | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        config: TrainConfig,
+        cache: PictureCache | None = None,
+        device: torch.device = torch.device("cpu"),  # noqa: B008 - a constant
+    ) -> None:
         self.scene = scene
         self.config = config
         self.cache = cache or PictureCache()
-        self.model, self.budget, self.choices = build_model(scene, config)
-        self.optimizer = Optimizer(self.model, config.learning_rates)
-        self.density = DensityControl(config.density, config.steps, self.budget, len(self.model), config.seed)
+        self.device = device
+        model, self.budget, self.choices = build_model(scene, config)
+        self._take(model)
+        self.density = DensityControl(config.density, config.steps, self.budget, len(self.model), config.seed, device)
         self.step = 0
         self.saved: int | None = None  # the step that the checkpoint on disk is of
         self.records: list[dict] = []
         self.seconds: dict[str, float] = defaultdict(float)  # by stage, over all parts of a resumed run
         self.elapsed = 0.0
+
+    def _take(self, model: HybridModel) -> None:
+        """Train this model from here on."""
+        model.precision = self.config.precision
+        self.model = model.to(self.device)
+        self.optimizer = Optimizer(self.model, self.config.learning_rates)
 
     # -- the loop ------------------------------------------------------------------------------------------------
 
@@ -115,14 +129,13 @@ class Trainer:
         self.step += 1
         with self._timed("data"):
             solid = self._solid()
-            target = torch.from_numpy(picture.composite(solid))
-            mask = None if picture.mask is None else torch.from_numpy(picture.mask)
+            target, mask = upload(picture, solid, self.device)
         try:
             rendering = render(
                 self.model,
                 view.camera,
                 absgrad=self.density.watching(self.step),
-                solid=None if solid is None else torch.from_numpy(solid),
+                solid=None if solid is None else torch.from_numpy(solid).to(self.device),
             )
         except HyrfError:
             self._refuse(view, "a number to be rendered is not finite", self._nonfinite_parameters())
@@ -130,21 +143,22 @@ class Trainer:
             self.seconds[stage] += seconds
         with self._timed("loss"):
             loss = photometric_loss(rendering.rgb, target, mask, ssim_weight=config.ssim_weight)
-            value = float(loss.detach())
-        if not np.isfinite(value):
-            self._refuse(view, "the loss is not finite", self._nonfinite_parameters())
         with self._timed("backward"):
             loss.backward()
         with self._timed("density"):
             self.density.observe(rendering, view.camera.width, view.camera.height)
         with self._timed("optimizer"):
-            if broken := self.optimizer.nonfinite_groups():
-                self._refuse(view, "a gradient is not finite", broken)
-            self.optimizer.step(self.step - 1, config.steps)
+            broken = self.optimizer.step(self.step - 1, config.steps)
+        with self._timed("loss"):
+            # All that the host wants to know of this step, in one wait for the device.
+            mse = _mean_square(rendering.rgb.detach() - target, mask)
+            value, mse, *broken = torch.stack((loss.detach(), mse, *broken)).tolist()
+        if not np.isfinite(value):
+            self._refuse(view, "the loss is not finite", self._nonfinite_parameters())
+        if any(broken):
+            self._refuse(view, "a gradient is not finite", self.optimizer.names(broken))
         with self._timed("density"):
             self.density.act(self.step, self.model, self.optimizer)
-        errors = (rendering.rgb.detach() - target) ** 2
-        mse = float((errors if mask is None else errors[mask]).mean())  # NaN where the whole photo is masked
         if np.isnan(mse):
             return value, mse
         if self.step % max(1, config.steps // RECORDS) == 0 or self.step == config.steps:
@@ -183,10 +197,11 @@ class Trainer:
 
     def save(self, path: Path) -> None:
         """Write the run's state to `path`."""
-        tensors = {f"model.{name}": p.detach() for name, p in self.model.named_parameters()}
+        tensors = {f"model.{name}": p for name, p in self.model.named_parameters()}
         tensors |= {f"adam.{name}": value for name, value in self.optimizer.state_dict().items()}
         tensors |= {"density.gradients": self.density.gradients, "density.views": self.density.views}
         progress = {"step": self.step, "records": self.records, "seconds": dict(self.seconds), "elapsed": self.elapsed}
+        tensors = {name: value.detach().cpu() for name, value in tensors.items()}
         save_checkpoint(path, settings=self._settings(), tensors=tensors, progress=progress)
         self.saved = self.step
 
@@ -198,18 +213,28 @@ class Trainer:
         """
         tensors, progress = load_checkpoint(path, self._settings())
         explicit = [tensors[f"model.gaussians.{name}"] for name in Gaussians.NAMES]
-        self.model = HybridModel(self.model.config, Gaussians(*explicit))
-        self.model.load_state_dict(
+        model = HybridModel(self.model.config, Gaussians(*explicit))
+        model.load_state_dict(
             {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
         )
-        self.optimizer = Optimizer(self.model, self.config.learning_rates)
+        self._take(model)
         self.optimizer.load_state_dict(
             {name.removeprefix("adam."): value for name, value in tensors.items() if name.startswith("adam.")}
         )
-        self.density.gradients, self.density.views = tensors["density.gradients"], tensors["density.views"]
+        self.density.gradients, self.density.views = (
+            tensors[f"density.{name}"].to(self.device) for name in ("gradients", "views")
+        )
         self.step, self.records = progress["step"], progress["records"]
         self.saved = self.step
         self.seconds, self.elapsed = defaultdict(float, progress["seconds"]), progress["elapsed"]
+
+
+def _mean_square(error: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+    """Mean of the squares over the pixels (H, W, 3) that count; NaN where none does."""
+    squares = error.square()
+    if mask is None:
+        return squares.mean()
+    return torch.where(mask[..., None], squares, 0).sum() / (squares.shape[-1] * mask.sum())
 
 
 def _psnr(mse: float) -> float:

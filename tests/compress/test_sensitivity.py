@@ -12,7 +12,7 @@ from hyrfpack.compress.views import WIDER, views_between
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.arrays import GROUPS
 from hyrfpack.model import HybridModel
-from hyrfpack.model.frame import contract, expand
+from hyrfpack.ops.contraction import contract, expand
 from hyrfpack.render import render
 from hyrfpack.scene import Camera
 

@@ -12,7 +12,7 @@ from scenes import small_model
 from torch import Tensor
 
 from hyrfpack.model import contract
-from hyrfpack.model.background import RADIUS, sphere_points
+from hyrfpack.ops.background import RADIUS, sphere_points
 from hyrfpack.ops.hash_encode import hash_encode, level_offsets
 from hyrfpack.ops.mlp import mlp
 

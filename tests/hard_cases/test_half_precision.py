@@ -17,7 +17,7 @@ from scenes import ball_scene, camera_at, small_model
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.model import Frame, HybridModel
-from hyrfpack.model.frame import contract
+from hyrfpack.ops.contraction import contract
 from hyrfpack.render import render
 from hyrfpack.train import TrainConfig, Trainer
 

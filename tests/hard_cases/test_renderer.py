@@ -16,8 +16,8 @@ from torch import Tensor
 import hyrfpack
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.model import HybridModel
-from hyrfpack.model.background import RADIUS
 from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.ops.background import RADIUS
 from hyrfpack.render import Rendering, RenderSettings, render
 from hyrfpack.scene import Camera
 from hyrfpack.train import TrainConfig
@@ -162,10 +162,10 @@ def test_one_nan_position_among_many_is_refused_though_it_is_culled() -> None:
 
 def test_kept_geometry_and_solid_colours_that_are_not_finite_are_refused() -> None:
     model, camera = _balls(background=False), _camera(FRONT)
-    geometry = model.decode_geometry()
-    geometry.opacities[:] = math.nan
+    decoded = model.decode()
+    decoded.geometry.opacities[:] = math.nan
     with pytest.raises(HyrfError, match="opacities"):
-        render(model, camera, geometry=geometry)
+        render(model, camera, decoded=decoded)
     with pytest.raises(HyrfError, match="background"):
         render(model, camera, solid=torch.tensor([0.0, math.nan, 0.0]))
 

@@ -7,8 +7,9 @@ import pytest
 import torch
 from scipy.special import lpmv
 
-from hyrfpack.model.field import DIRECTION_FEATURES, Field, encode_directions, spherical_harmonics
+from hyrfpack.model.field import Field
 from hyrfpack.model.hash_grid import HashGridConfig
+from hyrfpack.ops.shade import DIRECTION_FEATURES, encode_directions, spherical_harmonics
 
 GRID = HashGridConfig(log2_table_size=7, levels=3, base=3, finest=12)
 

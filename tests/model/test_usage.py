@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from hyrfpack.model import HashGridConfig, contract
-from hyrfpack.model.frame import expand
+from hyrfpack.model import HashGridConfig, contract, expand
 from hyrfpack.ops.hash_encode.reference import cells, corner_rows
 
 GRIDS = {

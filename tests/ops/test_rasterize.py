@@ -6,17 +6,35 @@ import math
 import platform
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import pytest
 import torch
+from ops.device import DEVICE, INTERPRETED, gpu, needs_triton
 from torch import Tensor
 
+from hyrfpack.ops.dispatch import has_triton
 from hyrfpack.ops.rasterize import Rasterization, rasterize
 from hyrfpack.ops.rasterize.reference import blend, project
 
+if has_triton():
+    import triton
+    import triton.language as tl
+
+    from hyrfpack.ops.rasterize.gpu_project import in_frustum, load_camera, load_rows_3
+
+    @triton.jit
+    def _frustum_kernel(means, camera, total, inside):
+        index = tl.program_id(0) * 128 + tl.arange(0, 128)
+        mean = load_rows_3(means, index, index < total)
+        found = in_frustum(mean, load_camera(camera)) & (index < total)
+        tl.store(inside + index, found.to(tl.int32))
+
+
 NAMES = ("means", "quats", "scales", "opacities", "colors")
+GPU = pytest.param("gpu", marks=needs_triton)
+IMPLEMENTATIONS = ["cpu", GPU, "reference"]
 
 
 @dataclass(frozen=True)
@@ -171,12 +189,43 @@ CASES: dict[str, Callable[[], Case]] = {
 }
 
 
+# Triton's interpreter takes 20 ms for a pair of a Gaussian and a tile: it gets this many Gaussians of a case ...
+FEW = 8
+# ... but where fewer or more make the case what it is.
+FEW_OF = {"10,000 layers": 100, "scales from 1e-6 to 1e5": 15, "thick fog, all of it": 15}
+
+
+def _fitting(case: Case, implementation: str, few: int = FEW) -> Case:
+    """The case, or every so many-th of its Gaussians for the interpreter."""
+    step = -(-len(case.gaussians["means"]) // few) if implementation == "gpu" and INTERPRETED else 1
+    return replace(case, gaussians={key: value[:: max(step, 1)].clone() for key, value in case.gaussians.items()})
+
+
 def _run(case: Case, implementation: str, dtype: torch.dtype) -> tuple[Rasterization, dict[str, Tensor], Tensor]:
-    """The picture, the gradients under random cotangents, and the abs-gradient."""
-    inputs = {name: case.gaussians[name].to(dtype, copy=True).requires_grad_() for name in NAMES}
-    absgrad = torch.zeros(len(inputs["means"]), 2, dtype=dtype)
+    """The picture, the gradients under random cotangents, and the abs-gradient; on the CPU."""
+    inputs, absgrad = _inputs(case, implementation, dtype)
+    for tensor in inputs:
+        tensor.requires_grad_()
+    picture = _draw(case, implementation, inputs, absgrad)
+    torch.autograd.backward([picture.rgb, picture.transmittance], _cotangents(case.height, case.width, dtype))
+    return picture, {name: tensor.grad.cpu() for name, tensor in zip(NAMES, inputs, strict=True)}, absgrad.cpu()
+
+
+def _picture(case: Case, implementation: str, dtype: torch.dtype = torch.float32) -> Rasterization:
+    """The picture alone, on the CPU."""
+    return _draw(case, implementation, *_inputs(case, implementation, dtype))
+
+
+def _inputs(case: Case, implementation: str, dtype: torch.dtype) -> tuple[list[Tensor], Tensor]:
+    """Copies of the Gaussians and a buffer of zeros for absgrad, where the implementation takes them."""
+    device = DEVICE if implementation == "gpu" else "cpu"
+    inputs = [case.gaussians[name].to(device, dtype, copy=True) for name in NAMES]
+    return inputs, torch.zeros(len(inputs[0]), 2, dtype=dtype, device=device)
+
+
+def _draw(case: Case, implementation: str, inputs: list[Tensor], absgrad: Tensor) -> Rasterization:
     picture = rasterize(
-        *inputs.values(),
+        *inputs,
         case.camera,
         case.intrinsics,
         case.width,
@@ -186,16 +235,24 @@ def _run(case: Case, implementation: str, dtype: torch.dtype) -> tuple[Rasteriza
         implementation=implementation,
         **case.options,
     )
+    return replace(picture, **{name: value.cpu() for name, value in vars(picture).items() if torch.is_tensor(value)})
+
+
+def _cotangents(height: int, width: int, dtype: torch.dtype) -> list[Tensor]:
     generator = torch.Generator().manual_seed(7)
-    grad_rgb = torch.randn(case.height, case.width, 3, generator=generator).to(dtype)
-    grad_transmittance = torch.randn(case.height, case.width, generator=generator).to(dtype)
-    torch.autograd.backward([picture.rgb, picture.transmittance], [grad_rgb, grad_transmittance])
-    return picture, {name: tensor.grad for name, tensor in inputs.items()}, absgrad
+    rgb = torch.randn(height, width, 3, generator=generator)
+    return [rgb.to(dtype), torch.randn(height, width, generator=generator).to(dtype)]
+
+
+def _case(name: str, implementation: str) -> Case:
+    return _fitting(CASES[name](), implementation, FEW_OF.get(name, FEW))
 
 
 @cache
-def _expected(name: str) -> tuple[Rasterization, dict[str, Tensor], Tensor]:
-    return _run(CASES[name](), "reference", torch.float64)
+def _expected(name: str, implementation: str) -> tuple[Rasterization, dict[str, Tensor], Tensor]:
+    if implementation == "gpu" and not INTERPRETED:
+        return _expected(name, "cpu")
+    return _run(_case(name, implementation), "reference", torch.float64)
 
 
 def _assert_picture_close(actual: Tensor, expected: Tensor, tolerance: float = 1e-4) -> None:
@@ -213,10 +270,10 @@ def _assert_gradient_close(actual: Tensor, expected: Tensor, tolerance: float = 
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_matches_the_float64_reference(implementation: str, name: str) -> None:
-    case = CASES[name]()
-    expected, expected_grads, expected_absgrad = _expected(name)
+    case = _case(name, implementation)
+    expected, expected_grads, expected_absgrad = _expected(name, "gpu" if implementation == "gpu" else "cpu")
 
     picture, grads, absgrad = _run(case, implementation, torch.float32)
 
@@ -235,9 +292,9 @@ def test_matches_the_float64_reference(implementation: str, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["random scene", "needles and pancakes", "256 x 16 picture"])
-@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_tiles_and_bounds_do_not_change_the_picture(implementation: str, name: str) -> None:
-    case = CASES[name]()
+    case = _case(name, implementation)
     gaussians = {key: value.double() for key, value in case.gaussians.items()}
     shapes = [gaussians[key] for key in NAMES[:4]]
     splats = project(*shapes, case.camera, case.intrinsics, case.width, case.height, 0.01, False)
@@ -247,14 +304,13 @@ def test_tiles_and_bounds_do_not_change_the_picture(implementation: str, name: s
     colors = gaussians["colors"][splats.index]
     rgb, transmittance, _ = blend(splats.means2d, splats.conics, splats.opacities, colors, pixels)
 
-    dtype = torch.float32 if implementation == "cpu" else torch.float64
-    picture, _, _ = _run(case, implementation, dtype)
+    picture = _picture(case, implementation, torch.float64 if implementation == "reference" else torch.float32)
 
     _assert_picture_close(picture.rgb, rgb.view(case.height, case.width, 3))
     _assert_picture_close(picture.transmittance, transmittance.view(case.height, case.width))
 
 
-@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_one_isotropic_gaussian_has_the_closed_form(implementation: str) -> None:
     focal, sigma, distance, opacity = 60.0, 0.2, 3.0, 0.7
     gaussian = {
@@ -266,9 +322,7 @@ def test_one_isotropic_gaussian_has_the_closed_form(implementation: str) -> None
     }
     camera = torch.eye(4, dtype=torch.float64)
 
-    picture = rasterize(
-        *gaussian.values(), camera, (focal, focal, 16.5, 12.5), 33, 25, depth=True, implementation=implementation
-    )
+    picture = _picture(Case(gaussian, 33, 25, (focal, focal, 16.5, 12.5), camera), implementation)
 
     ys, xs = torch.meshgrid(torch.arange(25.0) - 12, torch.arange(33.0) - 16, indexing="ij")
     variance = (focal * sigma / distance) ** 2 + 0.3
@@ -279,7 +333,7 @@ def test_one_isotropic_gaussian_has_the_closed_form(implementation: str) -> None
     torch.testing.assert_close(picture.depth, torch.where(alpha > 0, distance, 0.0), atol=1e-3, rtol=0)
 
 
-@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_antialiasing_keeps_the_light_of_a_small_gaussian(implementation: str) -> None:
     # Its integral over the picture is opacity 2 pi sqrt(det Sigma), with the low-pass or without.
     focal, sigma, distance, opacity = 60.0, 0.02, 3.0, 0.9
@@ -291,28 +345,26 @@ def test_antialiasing_keeps_the_light_of_a_small_gaussian(implementation: str) -
         "colors": torch.ones(1, 3),
     }
 
-    picture = rasterize(
-        *gaussian.values(),
-        torch.eye(4, dtype=torch.float64),
-        (focal, focal, 8.0, 8.0),
-        16,
-        16,
-        antialiased=True,
-        implementation=implementation,
-    )
+    camera = torch.eye(4, dtype=torch.float64)
+    case = Case(gaussian, 16, 16, (focal, focal, 8.0, 8.0), camera, {"antialiased": True})
+    picture = _picture(case, implementation)
 
     light = opacity * 2 * math.pi * (focal * sigma / distance) ** 2
     assert picture.rgb[..., 0].sum() == pytest.approx(light, rel=0.02)
 
 
 @pytest.mark.parametrize("transmittance_min", [1e-4, 1 / 512, 0.05])
-@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_stopping_early_misses_no_more_than_the_light_that_is_left(
     implementation: str, transmittance_min: float
 ) -> None:
-    whole, _, _ = _run(_thick_fog(0.0), implementation, torch.float32)
+    def fog(least: float) -> Case:
+        case = _fitting(_thick_fog(least), implementation, few=80)
+        return replace(case, width=6, height=5, intrinsics=(50.0, 50.0, 3.0, 2.5))
 
-    picture, _, _ = _run(_thick_fog(transmittance_min), implementation, torch.float32)
+    whole = _picture(fog(0.0), implementation)
+
+    picture = _picture(fog(transmittance_min), implementation)
 
     for name in ("rgb", "transmittance"):
         missed = (getattr(picture, name) - getattr(whole, name)).abs().max()
@@ -333,17 +385,15 @@ def test_reference_passes_gradcheck(antialiased: bool) -> None:
     assert torch.autograd.gradcheck(run, inputs)
 
 
-@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_absgrad_is_the_sum_of_absolute_gradients_of_single_pixels(implementation: str) -> None:
-    case = Case(_gaussians(12), width=18, height=17, intrinsics=(18.0, 18.0, 9.0, 8.5))
+    case = _fitting(Case(_gaussians(12), width=18, height=17, intrinsics=(18.0, 18.0, 9.0, 8.5)), implementation)
     gaussians = [case.gaussians[name].double() for name in NAMES]
     splats = project(*gaussians[:4], case.camera, case.intrinsics, 18, 17, 0.01, False)
     splats = splats.select(torch.argsort(splats.depths, stable=True))
     colors = gaussians[4][splats.index]
-    generator = torch.Generator().manual_seed(7)
-    grad_rgb = torch.randn(17, 18, 3, generator=generator).double()
-    grad_transmittance = torch.randn(17, 18, generator=generator).double()
-    expected = torch.zeros(12, 2, dtype=torch.float64)
+    grad_rgb, grad_transmittance = _cotangents(17, 18, torch.float64)
+    expected = torch.zeros(len(gaussians[0]), 2, dtype=torch.float64)
     for y in range(17):
         for x in range(18):
             means2d = splats.means2d.clone().requires_grad_()
@@ -358,18 +408,19 @@ def test_absgrad_is_the_sum_of_absolute_gradients_of_single_pixels(implementatio
     torch.testing.assert_close(absgrad.double(), expected, atol=1e-4, rtol=1e-4)
 
 
-def test_absgrad_is_added_to_what_the_buffer_holds() -> None:
-    case = Case(_gaussians(5))
-    _, _, once = _run(case, "cpu", torch.float32)
-    inputs = [case.gaussians[name].clone().requires_grad_() for name in NAMES]
-    buffer = torch.full((5, 2), 3.0)
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_absgrad_is_added_to_what_the_buffer_holds(implementation: str) -> None:
+    case = Case(_gaussians(5), width=18, height=17, intrinsics=(18.0, 18.0, 9.0, 8.5))
+    _, _, once = _run(case, implementation, torch.float32)
+    place = gpu if implementation == "gpu" else Tensor.clone
+    inputs = [place(case.gaussians[name]).requires_grad_() for name in NAMES]
+    buffer = place(torch.full((5, 4), 3.0))[:, ::2]  # with gaps
 
-    picture = rasterize(*inputs, case.camera, case.intrinsics, 48, 40, absgrad=buffer, implementation="cpu")
-    generator = torch.Generator().manual_seed(7)
-    cotangents = [torch.randn(40, 48, 3, generator=generator), torch.randn(40, 48, generator=generator)]
+    picture = rasterize(*inputs, case.camera, case.intrinsics, 18, 17, absgrad=buffer, implementation=implementation)
+    cotangents = [place(tensor) for tensor in _cotangents(17, 18, torch.float32)]
     torch.autograd.backward([picture.rgb, picture.transmittance], cotangents)
 
-    torch.testing.assert_close(buffer, once + 3)
+    torch.testing.assert_close(buffer.cpu(), once + 3)
 
 
 def test_same_bytes_with_any_number_of_threads_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -385,36 +436,120 @@ def test_same_bytes_with_any_number_of_threads_and_again(monkeypatch: pytest.Mon
             assert torch.equal(tensor, first)
 
 
+@needs_triton
+def test_same_bytes_on_the_gpu_again() -> None:
+    # Nothing is added up in an order that chance decides.
+    case = _fitting(Case(_gaussians(3000, size=0.2), 40, 20, (50.0, 50.0, 20.0, 10.0)), "gpu")
+    (first, first_grads, first_absgrad), (again, grads, absgrad) = (_run(case, "gpu", torch.float32) for _ in range(2))
+
+    for name in ("rgb", "transmittance", "depth"):
+        assert torch.equal(getattr(again, name), getattr(first, name))
+    assert all(torch.equal(grads[name], first_grads[name]) for name in NAMES)
+    assert torch.equal(absgrad, first_absgrad)
+
+
+@needs_triton
+@pytest.mark.parametrize("more", [-1, 1])
+def test_tiles_counted_otherwise_than_listed_change_nothing_else(monkeypatch: pytest.MonkeyPatch, more: int) -> None:
+    # Two kernels of one compiler may round differently, however alike they read.
+    from hyrfpack.ops.rasterize import gpu as module
+
+    case = Case(_gaussians(4, size=0.3), width=33, height=17)
+    expected, expected_grads, _ = _run(case, "gpu", torch.float32)
+    unwrapped = module._project
+
+    def project_miscounted(*arguments):
+        projection = unwrapped(*arguments)
+        projection.counts[projection.counts > 1] += more
+        return projection
+
+    monkeypatch.setattr(module, "_project", project_miscounted)
+    picture, grads, _ = _run(case, "gpu", torch.float32)
+
+    assert (picture.pairs - expected.pairs) * more > 0
+    if more > 0:
+        assert torch.equal(picture.rgb, expected.rgb)
+        assert all(torch.equal(grads[name], expected_grads[name]) for name in NAMES)
+    assert all(torch.isfinite(grads[name]).all() for name in NAMES)
+
+
+@needs_triton
+def test_more_pairs_than_can_be_numbered_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    from hyrfpack.ops.rasterize import gpu_bin
+
+    monkeypatch.setattr(gpu_bin, "PAIRS_MAX", 3)
+    with pytest.raises(MemoryError, match="pairs"):
+        _picture(Case(_gaussians(8)), "gpu")
+
+
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf, 3e38])
-def test_numbers_that_are_not_finite_do_no_harm_to_others_memory(name: str, poison: float) -> None:
-    # Such input is refused at the door; here it must only not crash or hang.
-    case = Case(_gaussians(64))
-    case.gaussians[name][::3] = poison
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_numbers_that_are_not_finite_are_named_and_do_no_harm_to_others_memory(
+    implementation: str, poison: float, name: str
+) -> None:
+    case = Case(_gaussians(4 if implementation == "gpu" and INTERPRETED else 64), 17, 16, (20.0, 20.0, 8.0, 8.0))
+    case.gaussians[name][1::3] = poison
 
-    picture, grads, _ = _run(case, "cpu", torch.float32)
+    picture, grads, _ = _run(case, implementation, torch.float32)
 
-    assert picture.rgb.shape == (40, 48, 3)
+    assert picture.nonfinite == (() if poison == 3e38 else (name,))
+    assert picture.rgb.shape == (16, 17, 3)
     assert all(grads[key].shape == case.gaussians[key].shape for key in NAMES)
 
 
-def test_picture_without_gradients_needs_none() -> None:
-    case = Case(_gaussians(30))
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_every_input_that_is_not_finite_is_named(implementation: str) -> None:
+    case = Case(_gaussians(3), 8, 8, (20.0, 20.0, 4.0, 4.0))
+    case.gaussians["opacities"][2], case.gaussians["means"][0, 1] = math.nan, math.inf
+
+    picture = _picture(case, implementation)
+
+    assert picture.nonfinite == ("means", "opacities")
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_picture_without_gradients_needs_none(implementation: str) -> None:
+    case = _fitting(Case(_gaussians(30)), implementation, few=4)
+    inputs, _ = _inputs(case, implementation, torch.float32)
     with torch.no_grad():
-        picture = rasterize(*case.gaussians.values(), case.camera, case.intrinsics, 48, 40)
+        picture = rasterize(
+            *(tensor.requires_grad_() for tensor in inputs), case.camera, case.intrinsics, 48, 40,
+            implementation=implementation,
+        )  # fmt: skip
 
     assert picture.depth is None
     assert not picture.rgb.requires_grad
 
 
-def test_depth_and_visible_are_not_differentiable() -> None:
-    picture, _, _ = _run(Case(_gaussians(30)), "cpu", torch.float32)
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_depth_and_visible_are_not_differentiable(implementation: str) -> None:
+    picture, _, _ = _run(_fitting(Case(_gaussians(30)), implementation, few=4), implementation, torch.float32)
 
     assert picture.rgb.requires_grad
     assert picture.transmittance.requires_grad
     assert not picture.depth.requires_grad
     assert not picture.visible.requires_grad
-    assert set(picture.seconds) == {"project", "sort", "bin", "blend"}
+    assert set(picture.seconds) == (set() if implementation == "gpu" else {"project", "sort", "bin", "blend"})
+
+
+@needs_triton
+@pytest.mark.parametrize("tolerance", [0.0, 0.3])
+def test_frustum_of_the_gpu_is_the_picture_and_a_band_around_it(tolerance: float) -> None:
+    from hyrfpack.ops.rasterize.gpu_project import camera_numbers
+
+    positions = _gaussians(400, spread=3.0)["means"]
+    camera, intrinsics = _camera(2.0), (30.0, 50.0, 20.0, 24.0)
+    x, y, z = (positions.double() @ camera[:3, :3].T + camera[:3, 3]).unbind(-1)
+    across, down = (30 * x / z + 20) / 24 - 1, (50 * y / z + 24) / 20 - 1  # -1 to 1 in the picture
+    expected = (z > 0.5) & (across.abs() < 1 + tolerance) & (down.abs() < 1 + tolerance)
+
+    numbers = camera_numbers(camera, intrinsics, 48, 40, 0.5, torch.device(DEVICE), tolerance)
+    inside = gpu(torch.zeros(512, dtype=torch.int32))
+    _frustum_kernel[(4,)](gpu(positions), numbers, 400, inside, num_warps=4, enable_fp_fusion=True)
+
+    assert 20 < expected.sum() < 300
+    assert torch.equal(inside[:400].cpu() > 0, expected)
 
 
 def test_unfit_arguments_are_refused() -> None:

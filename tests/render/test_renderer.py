@@ -8,8 +8,8 @@ import torch
 from scenes import ball_points, camera_at, look_at, ring, small_model
 
 from hyrfpack.model import Frame
-from hyrfpack.model.background import RADIUS
 from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.ops.background import RADIUS, reference
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Camera
 
@@ -231,8 +231,10 @@ def test_a_background_stride_interpolates_between_exact_pixels(stride, width, he
 def test_every_second_pixel_of_the_background_is_evaluated_by_default(monkeypatch):
     model, camera = small_model(np.zeros((0, 3)), background=True), camera_at((0, -3.0, 0), width=31, height=18)
     asked = []
-    decode = model.decode_background
-    monkeypatch.setattr(model, "decode_background", lambda points, *rest: asked.append(points) or decode(points, *rest))
+    decode = reference.background_colors
+    monkeypatch.setattr(
+        reference, "background_colors", lambda points, **sphere: asked.append(points) or decode(points, **sphere)
+    )
     picture(model, camera)
     expected = [(x + 0.5, y + 0.5) for y in range(0, 20, 2) for x in range(0, 32, 2)]
     assert [tuple(point) for point in asked[0].tolist()] == expected and len(asked) == 1
@@ -290,12 +292,12 @@ def test_impossible_settings_are_refused(wrong):
 # -- caching, repeatability, statistics ------------------------------------------------------------------------------
 
 
-def test_kept_geometry_gives_the_same_picture():
+def test_what_is_decoded_beforehand_gives_the_same_picture():
     model = ball_model(background=True)
     with torch.no_grad():
-        geometry = model.decode_geometry()
+        decoded = model.decode()
     for camera in ring(3):
-        torch.testing.assert_close(picture(model, camera, geometry=geometry), picture(model, camera), rtol=0, atol=1e-6)
+        torch.testing.assert_close(picture(model, camera, decoded=decoded), picture(model, camera), rtol=0, atol=1e-6)
 
 
 def test_rendering_twice_gives_the_same_bits():

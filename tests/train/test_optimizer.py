@@ -82,7 +82,7 @@ def test_a_step_clears_the_gradients():
 
 def test_every_parameter_belongs_to_one_group():
     model = a_model()
-    owned = [p for group in Optimizer(model, RATES).adam.param_groups for p in group["params"]]
+    owned = [p for group in Optimizer(model, RATES).groups.values() for p in group]
     assert {id(p) for p in owned} == {id(p) for p in model.parameters()} and len(owned) == len(set(map(id, owned)))
 
 
@@ -187,11 +187,18 @@ def test_the_group_with_a_broken_gradient_is_named(bad, group):
     set_gradients(model, 0)
     broken = model.radiance.weights[1] if group == "fields" else getattr(model.gaussians, group)
     broken.grad.view(-1)[3] = bad
-    assert Optimizer(model, RATES).nonfinite_groups() == [group]
+    before = {name: p.detach().clone() for name, p in model.named_parameters()}
+    optimizer = Optimizer(model, RATES)
+
+    assert optimizer.names(optimizer.step(0, 20).tolist()) == [group]
+
+    assert all(torch.isfinite(p).all() for p in model.parameters())
+    assert broken.view(-1)[3] == before[next(n for n, p in model.named_parameters() if p is broken)].view(-1)[3]
 
 
 def test_healthy_gradients_name_no_group():
     model = a_model()
     set_gradients(model, 0)
     model.radiance.biases[0].grad = None
-    assert Optimizer(model, RATES).nonfinite_groups() == []
+    optimizer = Optimizer(model, RATES)
+    assert optimizer.names(optimizer.step(0, 20).tolist()) == []

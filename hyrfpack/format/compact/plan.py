@@ -13,8 +13,9 @@ from hyrfpack.format.compact.channels import LIMIT
 from hyrfpack.format.compact.groups import Groups
 from hyrfpack.format.compact.quantize import ERROR_PER_BIT
 from hyrfpack.format.compact.sensitivity import Sensitivity
+from hyrfpack.model import expand
 from hyrfpack.model.config import ModelConfig
-from hyrfpack.model.frame import Frame, expand
+from hyrfpack.model.frame import Frame
 from hyrfpack.model.hash_grid import FEATURES
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.quant.morton import MAX_BITS

@@ -14,7 +14,14 @@ from hyrfpack.ops.mlp import reference
 __all__ = ["mlp"]
 
 
-def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], *, implementation: str = "auto") -> Tensor:
+def mlp(
+    x: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    *,
+    mixed: bool = False,
+    implementation: str = "auto",
+) -> Tensor:
     """Run rows through linear layers with ReLU between them and nothing after the last.
 
         h_0 = x,    h_l = relu(h_{l-1} W_l^T + b_l),    y = h_{L-1} W_L^T + b_L
@@ -23,11 +30,14 @@ def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], *, imple
         x: (N, I) rows, in any memory layout; its gradient comes back in the same.
         weights: one (out, in) matrix for each layer, at least one.
         biases: one (out,) vector for each layer.
-        implementation: "auto", "reference" or "cpu" (float32).
+        mixed: products, here and in backward, take factors rounded to bfloat16 and are added up in float32: what the
+            matrix units of a GPU are fast at. "cpu" multiplies in float32 whatever is asked.
+        implementation: "auto", "reference", "cpu" or "gpu" (both float32). What the GPU kernels do not take - other
+            than two hidden layers, inputs or hidden layers wider than 128, more than 16 outputs - runs as "reference".
 
     Returns:
-        (N, O). Differentiable once in everything. In the backward pass of "cpu", rows whose gradient is all zero
-        are skipped.
+        (N, O). Differentiable once in everything. In the backward pass of "cpu" rows whose gradient is all zero are
+        skipped, in that of "gpu" blocks of such rows.
 
     Raises:
         ValueError: shapes, types or devices do not fit together.
@@ -42,12 +52,15 @@ def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], *, imple
     ):
         shapes = [tuple(tensor.shape) for tensor in (x, *weights, *biases)]
         raise ValueError(f"x, weights and biases do not form layers: {shapes}")
-    if choose(implementation, ("reference", "cpu"), x, *weights, *biases) == "reference":
-        return reference.mlp(x, weights, biases)
-    return _Mlp.apply(x, *weights, *biases)
+    chosen = choose(implementation, ("reference", "cpu", "gpu"), x, *weights, *biases)
+    if chosen == "cpu":
+        return _CpuMlp.apply(x, *weights, *biases)
+    if chosen == "gpu" and len(weights) == 3 and max(widths[:3]) <= 128 and widths[3] <= 16:
+        return _GpuMlp.apply(x, mixed, *weights, *biases)
+    return reference.mlp(x, weights, biases, mixed)
 
 
-class _Mlp(torch.autograd.Function):
+class _CpuMlp(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x: Tensor, *parameters: Tensor) -> Tensor:
         from hyrfpack.ops.mlp import cpu
@@ -66,3 +79,26 @@ class _Mlp(torch.autograd.Function):
         needs_x = ctx.needs_input_grad[0]
         grad_x, grad_weights, grad_biases = cpu.backward(x, parameters[:layers], parameters[layers:], grad, needs_x)
         return grad_x, *grad_weights, *grad_biases
+
+
+class _GpuMlp(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x: Tensor, mixed: bool, *parameters: Tensor) -> Tensor:
+        from hyrfpack.ops.mlp import gpu
+
+        weights, biases = parameters[:3], parameters[3:]
+        result, packed = gpu.forward(x, weights, biases, mixed)
+        ctx.save_for_backward(x, packed, *biases)
+        ctx.mixed = mixed
+        ctx.widths = x.shape[1], *(weight.shape[0] for weight in weights)
+        return result
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
+        from hyrfpack.ops.mlp import gpu
+
+        x, packed, *biases = ctx.saved_tensors
+        needs_x = ctx.needs_input_grad[0]
+        grad_x, grad_weights, grad_biases = gpu.backward(x, packed, biases, ctx.widths, grad, needs_x, ctx.mixed)
+        return grad_x, None, *grad_weights, *grad_biases

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 
 from torch import Tensor
 
@@ -23,7 +24,10 @@ class Rasterization:
             None unless asked for.
         visible: (N,) bool, in front of the near plane and reaching alpha >= 1/255 in at least one tile.
         pairs: number of (Gaussian, tile) pairs blended.
-        seconds: wall time of the stages project, sort, bin and blend.
+        seconds: wall time of the stages project, sort, bin and blend; empty on the GPU, where they overlap with what
+            the caller does.
+        nonfinite: names of the inputs (means, quats, scales, opacities, colors) that hold NaN or infinity anywhere.
+            Such Gaussians are left out or spoil what they cover; it is for the caller to refuse them.
     """
 
     rgb: Tensor
@@ -32,6 +36,7 @@ class Rasterization:
     visible: Tensor
     pairs: int
     seconds: dict[str, float]
+    nonfinite: tuple[str, ...]
 
 
 def rasterize(
@@ -80,10 +85,11 @@ def rasterize(
         depth: also return depth.
         absgrad: (N, 2) buffer to which backward adds the sums over pixels of |dL/d mean2d| (x, y) in 1/px,
             the signal of abs-gradient densification.
-        implementation: "auto", "reference" or "cpu".
+        implementation: "auto", "reference", "cpu" or "gpu".
 
     Raises:
         ValueError: shapes, dtypes or devices that do not fit, or a picture without pixels.
+        MemoryError: more pairs of a Gaussian and a tile than "cpu" (2^28) or "gpu" (2^31) can number.
     """
     count = len(means)
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "colors": (3,)}
@@ -102,22 +108,29 @@ def rasterize(
     if width < 1 or height < 1:
         raise ValueError(f"a picture of {width} x {height} has no pixels")
 
-    chosen = choose(implementation, ("reference", "cpu"), *inputs)
-    if chosen == "cpu":
+    chosen = choose(implementation, ("reference", "cpu", "gpu"), *inputs)
+    if chosen == "gpu":
+        from hyrfpack.ops.rasterize.gpu import rasterize as run
+    elif chosen == "cpu":
         from hyrfpack.ops.rasterize.cpu import rasterize as run
     else:
         from hyrfpack.ops.rasterize.reference import rasterize as run
-    return Rasterization(
-        *run(
-            *inputs,
-            camera_from_world,
-            intrinsics,
-            width,
-            height,
-            near=near,
-            antialiased=antialiased,
-            transmittance_min=transmittance_min,
-            depth=depth,
-            absgrad=absgrad,
-        )
+    results = run(
+        *inputs,
+        camera_from_world,
+        intrinsics,
+        width,
+        height,
+        near=near,
+        antialiased=antialiased,
+        transmittance_min=transmittance_min,
+        depth=depth,
+        absgrad=absgrad,
     )
+    if chosen != "gpu":  # whose kernels look at every number anyway
+        results += (tuple(name for name, tensor in zip(shapes, inputs, strict=True) if not _finite(tensor.detach())),)
+    return Rasterization(*results)
+
+
+def _finite(tensor: Tensor) -> bool:
+    return tensor.numel() == 0 or all(isfinite(extreme) for extreme in map(float, tensor.aminmax()))

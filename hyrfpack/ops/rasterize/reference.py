@@ -70,9 +70,10 @@ def project(
     Gaussians at z <= near are dropped. Arguments as in `hyrfpack.ops.rasterize.rasterize`.
     """
     fx, fy, cx, cy = intrinsics
-    # In float64: far from the origin, R m and t are large and cancel.
-    camera = camera_from_world.to(means.device, torch.float64)
-    seen = means.double() @ camera[:3, :3].T + camera[:3, 3]
+    # In float64 where there is one (Apple's GPUs have none): far from the origin, R m and t are large and cancel.
+    exact = torch.float32 if means.device.type == "mps" else torch.float64
+    camera = camera_from_world.to(exact).to(means.device)
+    seen = means.to(exact) @ camera[:3, :3].T + camera[:3, 3]
     index = torch.nonzero(seen[:, 2] > near)[:, 0]
     x, y, z = seen[index].to(means.dtype).unbind(-1)
     x_z, y_z = x / z, y / z

@@ -11,7 +11,7 @@ from hyrfpack.ops.ssim import reference as _reference
 
 __all__ = ["photometric_loss", "ssim"]
 
-_AVAILABLE = ("reference", "cpu")
+_AVAILABLE = ("reference", "cpu", "gpu")
 
 
 def ssim(image: Tensor, reference: Tensor, *, implementation: str = "auto") -> Tensor:
@@ -24,7 +24,7 @@ def ssim(image: Tensor, reference: Tensor, *, implementation: str = "auto") -> T
 
     Args:
         image, reference: (H, W, 3) in [0, 1], at least one pixel.
-        implementation: "auto", "reference" or "cpu" (float32).
+        implementation: "auto", "reference", "cpu" or "gpu" (these two: float32).
 
     Returns:
         Scalar in [-1, 1]; 1 for equal pictures. Differentiable once, in `image` only.
@@ -33,9 +33,11 @@ def ssim(image: Tensor, reference: Tensor, *, implementation: str = "auto") -> T
         ValueError: shapes, types or devices do not fit together.
     """
     _check(image, reference, None)
-    if choose(implementation, _AVAILABLE, image, reference) == "reference":
+    chosen = choose(implementation, _AVAILABLE, image, reference)
+    if chosen == "reference":
         return _reference.ssim(image, reference.detach())
-    return 1 - _Loss.apply(image, reference, None, 0.0, 1.0)
+    loss = _GpuLoss if chosen == "gpu" else _CpuLoss
+    return 1 - loss.apply(image, reference, None, 0.0, 1.0)
 
 
 def photometric_loss(
@@ -55,7 +57,7 @@ def photometric_loss(
         image, target: (H, W, 3) in [0, 1], at least one pixel.
         mask: (H, W) bool, True where the photo counts; None counts all of it.
         ssim_weight: w, in [0, 1].
-        implementation: "auto", "reference" or "cpu" (float32).
+        implementation: "auto", "reference", "cpu" or "gpu" (these two: float32).
 
     Returns:
         Scalar, 0 for equal pictures and where nothing counts. Differentiable once, in `image` only.
@@ -64,9 +66,11 @@ def photometric_loss(
         ValueError: shapes, types or devices do not fit together.
     """
     _check(image, target, mask)
-    if choose(implementation, _AVAILABLE, image, target) == "reference":
+    chosen = choose(implementation, _AVAILABLE, image, target)
+    if chosen == "reference":
         return _reference.photometric_loss(image, target.detach(), mask, ssim_weight)
-    return _Loss.apply(image, target, mask, 1 - ssim_weight, ssim_weight)
+    loss = _GpuLoss if chosen == "gpu" else _CpuLoss
+    return loss.apply(image, target, mask, 1 - ssim_weight, ssim_weight)
 
 
 def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
@@ -76,7 +80,7 @@ def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
         raise ValueError(f"mask must be bool {tuple(image.shape[:2])}, not {mask.dtype} {tuple(mask.shape)}")
 
 
-class _Loss(torch.autograd.Function):
+class _CpuLoss(torch.autograd.Function):
     """l1_weight * mean |image - target| + ssim_weight * (1 - mean SSIM); the gradient is made in the same pass."""
 
     @staticmethod
@@ -100,3 +104,27 @@ class _Loss(torch.autograd.Function):
     def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
         return grad * gradient, None, None, None, None
+
+
+class _GpuLoss(torch.autograd.Function):
+    """As `_CpuLoss`, all on the device; the gradient is made when it is asked for."""
+
+    @staticmethod
+    def forward(
+        ctx, image: Tensor, target: Tensor, mask: Tensor | None, l1_weight: float, ssim_weight: float
+    ) -> Tensor:
+        from hyrfpack.ops.ssim import gpu
+
+        image, target = image.contiguous(), target.contiguous()
+        mask = None if mask is None else mask.contiguous()
+        loss, derivatives, share = gpu.loss_and_derivatives(image, target, mask, l1_weight, ssim_weight)
+        ctx.save_for_backward(image, target, mask, derivatives, share)
+        ctx.weights = l1_weight, ssim_weight
+        return loss
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
+        from hyrfpack.ops.ssim import gpu
+
+        return gpu.gradient(*ctx.saved_tensors, *ctx.weights, grad), None, None, None, None

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scenes import look_at
 
-from hyrfpack.render.cull import frustum_cull
+from hyrfpack.ops.rasterize.cull import frustum_cull
 
 WIDTH, HEIGHT, INTRINSICS = 64, 40, (50.0, 60.0, 20.0, 25.0)
 

@@ -1,0 +1,236 @@
+"""The background at the nodes of a grid on a GPU: one kernel from the light that is left to colours. No gradients.
+
+A program does a block of neighbouring nodes, or nothing where no light passes. Neighbours look at neighbouring points
+of the sphere and so mostly read the same rows of the tables: hash features are tiles [level, node], and a warp's lanes
+are nodes. The decoder runs on the matrix units with nodes as rows, so that what comes out of one layer goes into the
+next without leaving the registers. A level's two features are two tiles, and with the direction's three products make
+the first layer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from hyrfpack.ops.background.reference import RADIUS, grid_size, viewpoint_of
+from hyrfpack.ops.hash_encode.gpu import _axis, _levels, _row, _whole_rows
+from hyrfpack.ops.mlp.tiles import factor, precision, product, relu_factor
+from hyrfpack.ops.shade.gpu_directions import encode_block
+
+_BLOCK_ROWS = tl.constexpr(8)
+_RADIUS, _OUTPUTS, _OUTPUTS_P = tl.constexpr(RADIUS), tl.constexpr(3), tl.constexpr(16)
+
+
+def _launch(mixed: bool, hidden: int) -> tuple[int, int, int]:
+    """Columns of nodes in a block, its warps, and neurons of the second layer that are worked out together.
+
+    A thread has a node, and as many threads share a multiprocessor as registers allow. Wide layers and float32 factors
+    take so many of them that several threads share a node. The weights, which every program loads, are about as much
+    as what 128 nodes read of the tables.
+    """
+    if mixed:
+        columns, warps, part = (16, 4, 64) if hidden <= 64 else (16, 8, 64)
+    else:
+        columns, warps, part = (8, 4, 32) if hidden <= 64 else (4, 8, 16)
+    return columns, warps // 2 if torch.version.hip else warps, part
+
+
+@triton.jit
+def _light(transmittance, height, width, y, x, threshold, stride, STRIDE: tl.constexpr):
+    """Whether more light than `threshold` passes at any pixel nearer to (y, x) than STRIDE in both axes."""
+    lit = y < 0
+    down = 1 - stride  # not a constant, lest compilers unroll both loops and run out of registers
+    while down < stride:
+        row = y + down
+        for right in tl.static_range(1 - STRIDE, STRIDE):
+            column = x + right
+            inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+            light = tl.load(transmittance + row.to(tl.int64) * width + column, mask=inside, other=0.0)
+            lit |= inside & (light > threshold)
+        down += 1
+    return lit
+
+
+@triton.jit
+def _contract(x, y, z):
+    """`contraction.contract`."""
+    largest = tl.maximum(tl.maximum(tl.maximum(tl.abs(x), tl.abs(y)), tl.abs(z)), 1.0)
+    a, b, c = x / largest, y / largest, z / largest
+    radius = tl.maximum(tl.sqrt_rn(a * a + b * b + c * c), 1 / largest) * largest
+    shrink = 0.25 * (2 - 1 / radius)
+    return shrink * (x / radius) + 0.5, shrink * (y / radius) + 0.5, shrink * (z / radius) + 0.5
+
+
+@triton.jit
+def _features(x, y, z, table, levels, needed, LEVELS: tl.constexpr, HEIGHT: tl.constexpr):
+    """Hash features of points [BLOCK] as two tiles [HEIGHT, BLOCK]; no row is read where a point is not needed."""
+    place = tl.arange(0, HEIGHT)[:, None]
+    features0 = tl.zeros([HEIGHT, x.shape[0]], tl.float32)
+    features1 = tl.zeros([HEIGHT, x.shape[0]], tl.float32)
+    for level in range(LEVELS):
+        span = tl.load(levels).to(tl.float32)
+        x1, row_x0, row_x1 = _axis(x, span, 1)
+        y1, row_y0, row_y1 = _axis(y, span, tl.load(levels + 1).to(tl.uint32))
+        z1, row_z0, row_z1 = _axis(z, span, tl.load(levels + 2).to(tl.uint32))
+        mask, rows = tl.load(levels + 3).to(tl.uint32), table + tl.load(levels + 4)
+        feature0, feature1 = tl.zeros_like(x), tl.zeros_like(x)
+        for corner in tl.static_range(8):
+            weight_x, row_x = (x1, row_x1) if corner & 1 else (1 - x1, row_x0)
+            weight_y, row_y = (y1, row_y1) if corner & 2 else (1 - y1, row_y0)
+            weight_z, row_z = (z1, row_z1) if corner & 4 else (1 - z1, row_z0)
+            pair = tl.load(rows + _row(row_x, row_y, row_z, mask), mask=needed, other=0)
+            weight = weight_x * (weight_y * weight_z)
+            feature0 += weight * pair.to(tl.int32).to(tl.float32, bitcast=True)
+            feature1 += weight * (pair >> 32).to(tl.int32).to(tl.float32, bitcast=True)
+        features0 = tl.where(place == level, feature0[None, :], features0)
+        features1 = tl.where(place == level, feature1[None, :], features1)
+        levels += 5
+    return features0, features1
+
+
+@triton.jit
+def _weight(
+    weight, start, INPUTS: tl.constexpr, FIRST: tl.constexpr, STEP: tl.constexpr, count,
+    OUTPUTS: tl.constexpr, HEIGHT: tl.constexpr, WIDTH: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
+    """Of a weight (OUTPUTS, INPUTS), columns FIRST, FIRST + STEP, ... (count of them) and rows start, start + 1, ... as
+    a transposed tile [HEIGHT, WIDTH], zero around."""
+    row, column = tl.arange(0, HEIGHT)[:, None], start + tl.arange(0, WIDTH)[None, :]
+    inside = (row < count) & (column < OUTPUTS)
+    return factor(tl.load(weight + column * INPUTS + (FIRST + row * STEP), mask=inside, other=0.0), PRECISION)
+
+
+@triton.jit
+def _bias(bias, start, OUTPUTS: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
+    """Numbers start, start + 1, ... of a bias as rows of a tile [BLOCK, WIDTH], zero past its end."""
+    column = start + tl.arange(0, WIDTH)[None, :]
+    return tl.broadcast_to(tl.load(bias + column, mask=column < OUTPUTS, other=0.0), [BLOCK, WIDTH])
+
+
+@triton.jit(do_not_specialize=["height", "width", "stride", "rows", "columns"])
+def draw_nodes(
+    transmittance, height, width, threshold, stride, rows, columns,
+    corner_x, corner_y, corner_z, right_x, right_y, right_z, down_x, down_y, down_z, origin_x, origin_y, origin_z,
+    half_x, half_y, half_z, table, levels, w1, b1, w2, b2, w3, b3, out,
+    STRIDE: tl.constexpr, LEVELS: tl.constexpr, EXTRA: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr,
+    LEVELS_P: tl.constexpr, EXTRA_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, PART: tl.constexpr,
+    BLOCK_COLUMNS: tl.constexpr, FREQUENCY: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
+    """Colours of a block of nodes; the ray of node (i, j) is along corner + i down + j right."""
+    BLOCK: tl.constexpr = _BLOCK_ROWS * BLOCK_COLUMNS
+    INPUTS: tl.constexpr = 2 * LEVELS + EXTRA
+    blocks = tl.cdiv(columns, BLOCK_COLUMNS)
+    lane = tl.arange(0, BLOCK)
+    i = tl.program_id(0) // blocks * _BLOCK_ROWS + lane // BLOCK_COLUMNS
+    j = tl.program_id(0) % blocks * BLOCK_COLUMNS + lane % BLOCK_COLUMNS
+    inside = (i < rows) & (j < columns)
+    needed = inside & _light(transmittance, height, width, i * STRIDE, j * STRIDE, threshold, stride, STRIDE)
+    colors = tl.zeros([BLOCK, _OUTPUTS_P], tl.float32)
+    if tl.max(needed.to(tl.int32), 0) > 0:
+        row, column = i.to(tl.float32), j.to(tl.float32)
+        x = corner_x + row * down_x + column * right_x
+        y = corner_y + row * down_y + column * right_y
+        z = corner_z + row * down_z + column * right_z
+        length = tl.sqrt_rn(x * x + y * y + z * z)
+        x, y, z = tl.div_rn(x, length), tl.div_rn(y, length), tl.div_rn(z, length)
+        # `reference.sphere_points`.
+        along = x * origin_x + y * origin_y + z * origin_z
+        px, py, pz = origin_x - along * x, origin_y - along * y, origin_z - along * z
+        rest = tl.sqrt_rn(tl.maximum(_RADIUS * _RADIUS - (px * px + py * py + pz * pz), 0.0))
+        u, v, w = _contract((px + rest * x) / half_x, (py + rest * y) / half_y, (pz + rest * z) / half_z)
+        features0, features1 = _features(u, v, w, table, levels, needed, LEVELS, LEVELS_P)
+
+        hidden = _bias(b1, 0, H1, H1_P, BLOCK)
+        weight = _weight(w1, 0, INPUTS, 0, 2, LEVELS, H1, LEVELS_P, H1_P, PRECISION)
+        hidden = product(tl.trans(factor(features0, PRECISION)), weight, hidden, PRECISION)
+        weight = _weight(w1, 0, INPUTS, 1, 2, LEVELS, H1, LEVELS_P, H1_P, PRECISION)
+        hidden = product(tl.trans(factor(features1, PRECISION)), weight, hidden, PRECISION)
+        weight = _weight(w1, 0, INPUTS, 2 * LEVELS, 1, EXTRA, H1, EXTRA_P, H1_P, PRECISION)
+        encoded = factor(encode_block(x, y, z, FREQUENCY, 0, EXTRA_P), PRECISION)
+        hidden = relu_factor(product(tl.trans(encoded), weight, hidden, PRECISION), PRECISION)
+
+        logits = _bias(b3, 0, _OUTPUTS, _OUTPUTS_P, BLOCK)
+        for start in range(0, H2_P, PART):
+            second = _weight(w2, start, H1, 0, 1, H1, H2, H1_P, PART, PRECISION)
+            part = relu_factor(product(hidden, second, _bias(b2, start, H2, PART, BLOCK), PRECISION), PRECISION)
+            third = _weight(w3 + start, 0, H2, 0, 1, H2 - start, _OUTPUTS, PART, _OUTPUTS_P, PRECISION)
+            logits = product(part, third, logits, PRECISION)
+        colors = tl.where(needed[:, None], tl.sigmoid(logits), 0.0)
+    channel = tl.arange(0, _OUTPUTS_P)[None, :]
+    at = out + (channel.to(tl.int64) * rows + i[:, None]) * columns + j[:, None]
+    tl.store(at, colors, mask=inside[:, None] & (channel < _OUTPUTS))
+
+
+def background_grid(
+    transmittance: Tensor,
+    threshold: float,
+    stride: int,
+    pose: Tensor,
+    intrinsics: tuple[float, float, float, float],
+    half_extent: tuple[float, float, float],
+    table: Tensor,
+    resolutions: tuple[int, ...],
+    log2_table_size: int,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    encoding: str,
+    mixed: bool,
+) -> Tensor:
+    """As `hyrfpack.ops.background.background_grid`, of a field that fits and with no gradients."""
+    height, width = transmittance.shape
+    rows, columns = grid_size(height, width, stride)
+    w1, w2, w3 = (weight.detach().contiguous() for weight in weights)
+    b1, b2, b3 = (bias.detach().contiguous() for bias in biases)
+    levels, extra = len(resolutions), w1.shape[1] - 2 * len(resolutions)
+    widths = _padded(len(w1)), _padded(len(w2))
+    block_columns, warps, part = _launch(mixed, max(widths))
+    colors = table.new_empty((3, rows, columns))
+    draw_nodes[(triton.cdiv(rows, _BLOCK_ROWS.value) * triton.cdiv(columns, block_columns),)](
+        transmittance.detach().contiguous(),
+        height,
+        width,
+        threshold,
+        stride,
+        rows,
+        columns,
+        *_rays(pose, intrinsics, stride),
+        *half_extent,
+        _whole_rows(table),
+        _levels(resolutions, log2_table_size, table.device),
+        *(w1, b1, w2, b2, w3, b3),
+        colors,
+        STRIDE=stride,
+        LEVELS=levels,
+        EXTRA=extra,
+        H1=len(w1),
+        H2=len(w2),
+        LEVELS_P=_padded(levels),
+        EXTRA_P=_padded(extra),
+        H1_P=widths[0],
+        H2_P=widths[1],
+        PART=min(widths[1], part),
+        BLOCK_COLUMNS=block_columns,
+        FREQUENCY=encoding == "frequency",
+        PRECISION=precision(mixed),
+        num_warps=warps,
+        enable_fp_fusion=True,
+    )
+    return colors.permute(1, 2, 0)
+
+
+def _rays(pose: Tensor, intrinsics: tuple[float, float, float, float], stride: int) -> list[float]:
+    """The first node's ray, its steps from column to column and from row to row, and the origin: 12 numbers."""
+    fx, fy, cx, cy = intrinsics
+    pose = pose.detach().cpu().double()
+    seen = [[(0.5 - cx) / fx, (0.5 - cy) / fy, 1], [stride / fx, 0, 0], [0, stride / fy, 0]]
+    rays = torch.tensor(seen, dtype=torch.float64) @ pose[:3, :3]
+    return torch.cat((rays.reshape(-1), viewpoint_of(pose))).tolist()
+
+
+def _padded(width: int) -> int:
+    """The side of a tile that holds this many numbers; the matrix units take no less than 16."""
+    return max(16, triton.next_power_of_2(width))

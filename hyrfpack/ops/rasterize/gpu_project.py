@@ -1,0 +1,492 @@
+"""Projection on the GPU: 3D Gaussians to the records that binning and blending read, and the way back for gradients.
+
+In float64, which costs little for something done once for a Gaussian and keeps far-away scenes, needles and huge
+Gaussians exact; the records are float32. A Gaussian whose numbers overflow is left out like one behind the camera.
+`project_block` and `store_records` are functions of their own, so that a kernel that makes its Gaussians itself can
+project them before they reach memory.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from hyrfpack.ops.rasterize import reference
+from hyrfpack.ops.rasterize.gpu_ellipse import TILE, UNIT, ellipse, tile_columns, tile_rows
+
+# One record of a projected Gaussian: 16 float32, read and written two at a time as one 64-bit word, which halves the
+# number of loads. With Sigma = its 2D covariance and d = pixel - mean,
+#     u = U_X (x - REF_X) + U_Y (y - REF_Y) + U_0,  v = V_X (x - REF_X) + V_0,  d^T Sigma^-1 d = 2 ln 2 (u^2 + v^2)
+# so that alpha = 2^(LOG_OPACITY - u^2 - v^2). Squares of a triangular form lose nothing to cancellation on long
+# needles, and are never negative. REF is the mean, or the picture's point next to it: the form of a needle whose mean
+# is far outside is exact where it is seen. Word by word:
+#     REF_X REF_Y | U_0 V_0 | U_X U_Y | V_X LOG_OPACITY | RED GREEN | BLUE DEPTH | MEAN_X MEAN_Y | COV_XX COV_YY
+REFERENCE, OFFSET, U_SLOPES, V_SLOPE_OPACITY, RED_GREEN, BLUE_DEPTH, MEAN, COVARIANCE = map(tl.constexpr, range(8))
+WORDS = tl.constexpr(8)
+
+# One gradient row of a (Gaussian, tile) pair: sums over pixels of p = dL/d(ln alpha) times u, v, uu, uv, vv and 1;
+# dL/d(color); sums of |p (U_X u + V_X v)| and |p u|, where they are asked for.
+SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_P, SUM_RED, SUM_GREEN, SUM_BLUE, SUM_ABS_X, SUM_ABS_Y = map(
+    tl.constexpr, range(11)
+)
+ROW = tl.constexpr(12)  # floats: 48 bytes
+
+HIDDEN = tl.constexpr(2**31 - 1)  # the sort key of a Gaussian that is not drawn
+NAMES = "means", "quats", "scales", "opacities", "colors"  # the bits of the flag of numbers that are not finite
+BLOCK = 128  # Gaussians a program: float64 takes many registers, so that small programs fill a processor best
+WARPS = 4
+
+_LOW_PASS = tl.constexpr(reference.LOW_PASS)
+_ALPHA_MIN = tl.constexpr(reference.ALPHA_MIN)
+_COMPENSATION_MIN = tl.constexpr(reference.COMPENSATION_MIN)
+_QUAT_NORM_MIN = tl.constexpr(reference.QUAT_NORM_MIN)
+_ROOT = tl.constexpr(math.sqrt(0.5 / math.log(2)))  # sqrt(1 / UNIT)
+_OVERFLOW = tl.constexpr(1e30)
+_FLOAT_MAX = tl.constexpr(3.4028234663852886e38)
+
+
+@dataclass(frozen=True)
+class Projection:
+    """What a kernel that projects writes of N Gaussians.
+
+    Attributes:
+        records: (N, 8) int64, set for what is drawn.
+        keys: (N,) int32 that sort by depth, HIDDEN for what is not drawn.
+        counts: (N,) int32 tiles touched.
+        visible: (N,) uint8 whether any.
+        numbers: (1 + N,) int64, first the flag of inputs that are not finite (zero before), the rest for binning.
+    """
+
+    records: Tensor
+    keys: Tensor
+    counts: Tensor
+    visible: Tensor
+    numbers: Tensor
+
+    @classmethod
+    def empty(cls, total: int, device: torch.device) -> Projection:
+        """To be filled."""
+
+        def new(*shape: int, dtype: torch.dtype) -> Tensor:
+            return torch.empty(shape, dtype=dtype, device=device)
+
+        numbers = new(1 + total, dtype=torch.int64)
+        numbers[0] = 0
+        keys, counts = new(total, dtype=torch.int32), new(total, dtype=torch.int32)
+        return cls(new(total, WORDS.value, dtype=torch.int64), keys, counts, new(total, dtype=torch.uint8), numbers)
+
+
+def camera_numbers(
+    camera_from_world: Tensor,
+    intrinsics: tuple[float, float, float, float],
+    width: int,
+    height: int,
+    near: float,
+    device: torch.device,
+    tolerance: float = 0.0,
+) -> Tensor:
+    """What the kernels need of a camera, as one small float64 tensor on the device.
+
+    Args:
+        camera_from_world: (4, 4), best on the CPU: reading it from the device waits for all that is under way there.
+        intrinsics: (fx, fy, cx, cy) in pixels.
+        near: in world units.
+        tolerance: of `in_frustum`, as a fraction of half the picture's size.
+
+    Returns:
+        (25,): the rows of the rotation and the translation (12), fx, fy, cx, cy, near, the limits of x/z (low, high)
+        and of y/z in the Jacobian, the limits of fx x/z (low, high) and of fy y/z in the frustum.
+    """
+    fx, fy, cx, cy = (float(number) for number in intrinsics)
+    pose = camera_from_world.detach().to("cpu", torch.float64)
+    slack_x, slack_y = 0.15 * width / fx, 0.15 * height / fy
+    margin_x, margin_y = tolerance * width / 2, tolerance * height / 2
+    numbers = [
+        *pose[:3, :3].flatten().tolist(), *pose[:3, 3].tolist(), fx, fy, cx, cy, near,
+        -cx / fx - slack_x, (width - cx) / fx + slack_x, -cy / fy - slack_y, (height - cy) / fy + slack_y,
+        -margin_x - cx, width + margin_x - cx, -margin_y - cy, height + margin_y - cy,
+    ]  # fmt: skip
+    # Not blocking: so small a copy is taken over at once, and a blocking one would wait for the device.
+    return torch.tensor(numbers, dtype=torch.float64).to(device, non_blocking=True)
+
+
+@triton.jit
+def _load_3(pointer):
+    return tl.load(pointer), tl.load(pointer + 1), tl.load(pointer + 2)
+
+
+@triton.jit
+def _load_4(pointer):
+    return tl.load(pointer), tl.load(pointer + 1), tl.load(pointer + 2), tl.load(pointer + 3)
+
+
+@triton.jit
+def load_camera(camera):
+    """The numbers of `camera_numbers`: axes (three rows of the rotation), shift, lens (fx, fy, cx, cy), near, the
+    limits in the Jacobian (4) and those of the frustum (4)."""
+    axes = _load_3(camera), _load_3(camera + 3), _load_3(camera + 6)
+    shift, lens, near = _load_3(camera + 9), _load_4(camera + 12), tl.load(camera + 16)
+    return axes, shift, lens, near, _load_4(camera + 17), _load_4(camera + 21)
+
+
+@triton.jit
+def load_rows_3(pointer, index, live):
+    """Rows of an (N, 3) tensor, column by column; 0 where not live."""
+    at = pointer + index.to(tl.int64) * 3
+    first, second = tl.load(at, mask=live, other=0.0), tl.load(at + 1, mask=live, other=0.0)
+    return first, second, tl.load(at + 2, mask=live, other=0.0)
+
+
+@triton.jit
+def load_rows_4(pointer, index, live):
+    """Rows of an (N, 4) tensor, column by column; 0 where not live."""
+    at = pointer + index.to(tl.int64) * 4
+    first, second = tl.load(at, mask=live, other=0.0), tl.load(at + 1, mask=live, other=0.0)
+    return first, second, tl.load(at + 2, mask=live, other=0.0), tl.load(at + 3, mask=live, other=0.0)
+
+
+@triton.jit
+def pack(first, second):
+    """Two float32 in one 64-bit word."""
+    low = first.to(tl.uint32, bitcast=True).to(tl.uint64)
+    high = second.to(tl.uint32, bitcast=True).to(tl.uint64)
+    return (low | (high << 32)).to(tl.int64, bitcast=True)
+
+
+@triton.jit
+def unpack(word):
+    """The two float32 of a 64-bit word."""
+    return word.to(tl.int32).to(tl.float32, bitcast=True), (word >> 32).to(tl.int32).to(tl.float32, bitcast=True)
+
+
+@triton.jit
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@triton.jit
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@triton.jit
+def _combine(s, a, t, b):
+    """s a + t b."""
+    return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
+
+
+@triton.jit
+def _times(a, b):
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
+
+
+@triton.jit
+def _clamp(value, low, high):
+    return tl.minimum(tl.maximum(value, low), high)
+
+
+@triton.jit
+def _double_3(a):
+    return a[0].to(tl.float64), a[1].to(tl.float64), a[2].to(tl.float64)
+
+
+@triton.jit
+def _double_4(a):
+    return a[0].to(tl.float64), a[1].to(tl.float64), a[2].to(tl.float64), a[3].to(tl.float64)
+
+
+@triton.jit
+def _columns(q):
+    """The rotation matrix of a unit quaternion wxyz, column by column."""
+    return (
+        (1 - 2 * (q[2] * q[2] + q[3] * q[3]), 2 * (q[1] * q[2] + q[0] * q[3]), 2 * (q[1] * q[3] - q[0] * q[2])),
+        (2 * (q[1] * q[2] - q[0] * q[3]), 1 - 2 * (q[1] * q[1] + q[3] * q[3]), 2 * (q[2] * q[3] + q[0] * q[1])),
+        (2 * (q[1] * q[3] + q[0] * q[2]), 2 * (q[2] * q[3] - q[0] * q[1]), 1 - 2 * (q[1] * q[1] + q[2] * q[2])),
+    )
+
+
+@triton.jit
+def _locate(mean, axes, shift):
+    """The mean in the camera's frame."""
+    mean = _double_3(mean)
+    return _dot(axes[0], mean) + shift[0], _dot(axes[1], mean) + shift[1], _dot(axes[2], mean) + shift[2]
+
+
+@triton.jit
+def in_frustum(mean, camera):
+    """Which means lie in front of the near plane and in the picture or the band around it that `camera_numbers` was
+    given as tolerance."""
+    axes, shift, lens, near, _, limits = camera
+    x, y, z = _locate(mean, axes, shift)
+    u, v = lens[0] * x, lens[1] * y  # compared after multiplying by z > 0: no division, nothing to guard
+    inside = (u > limits[0] * z) & (u < limits[1] * z) & (v > limits[2] * z) & (v < limits[3] * z)
+    return inside & (z > near)
+
+
+@triton.jit
+def _spread(x_z, y_z, inv_z, quat, axes, lens, limits):
+    """The factors of the covariance.
+
+    Returns:
+        a, b: the rows of J R; e, f: the rows of J R Q; the columns of Q; q: the unit quaternion; norm: its length
+        before.
+    """
+    quat = _double_4(quat)
+    norm = tl.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
+    scale = 1 / tl.maximum(norm, _QUAT_NORM_MIN)
+    q = quat[0] * scale, quat[1] * scale, quat[2] * scale, quat[3] * scale
+    columns = _columns(q)
+    j_x, j_y = lens[0] * inv_z, lens[1] * inv_z
+    a = _combine(j_x, axes[0], -j_x * _clamp(x_z, limits[0], limits[1]), axes[2])
+    b = _combine(j_y, axes[1], -j_y * _clamp(y_z, limits[2], limits[3]), axes[2])
+    e = _dot(a, columns[0]), _dot(a, columns[1]), _dot(a, columns[2])
+    f = _dot(b, columns[0]), _dot(b, columns[1]), _dot(b, columns[2])
+    return a, b, e, f, columns, q, norm
+
+
+@triton.jit
+def _covariance(g, h):
+    """xx, xy, yy of the filtered covariance whose root has rows g and h; determinants before and after the filter."""
+    xx, xy, yy = _dot(g, g), _dot(g, h), _dot(h, h)
+    # |g x h|^2 = xx yy - xy^2 without the cancellation that needles suffer from.
+    normal = _cross(g, h)
+    raw = _dot(normal, normal)
+    det = raw + (xx + yy) * _LOW_PASS + _LOW_PASS * _LOW_PASS
+    return xx + _LOW_PASS, xy, yy + _LOW_PASS, raw, det
+
+
+@triton.jit
+def _triangle(xx, xy, det):
+    """U_X, U_Y and V_X of a record."""
+    inv_xx = 1 / xx
+    u_y = tl.sqrt(xx / det) * _ROOT
+    return -u_y * xy * inv_xx, u_y, tl.sqrt(inv_xx) * _ROOT
+
+
+@triton.jit
+def project_block(mean, quat, scale, opacity, camera, width, height, ANTIALIASED: tl.constexpr):
+    """Project a block of Gaussians.
+
+    Args:
+        mean, quat, scale: tuples of 3, 4 and 3 blocks of float32; opacity: one. Opacity 0 hides.
+        camera: of `load_camera`.
+        width, height: int32.
+
+    Returns:
+        The float32 pairs of a record, without the colours, for `store_records`; int32 keys that sort by
+        depth, HIDDEN for what is not drawn; int32 counts of tiles that the ellipse alpha >= 1/255 touches.
+    """
+    axes, shift, lens, near, limits, _ = camera
+    x, y, z = _locate(mean, axes, shift)
+    opacity = opacity.to(tl.float64)
+    # Written so that NaN fails every test and is not drawn.
+    drawn = (z > near) & (z < _OVERFLOW) & (opacity >= _ALPHA_MIN) & (opacity < _OVERFLOW)
+    z = tl.where(drawn, z, 1.0)
+    inv_z = 1 / z
+    x_z, y_z = x * inv_z, y * inv_z
+    _, _, e, f, _, _, _ = _spread(x_z, y_z, inv_z, quat, axes, lens, limits)
+    scale = _double_3(scale)
+    xx, xy, yy, raw, det = _covariance(_times(e, scale), _times(f, scale))
+    if ANTIALIASED:
+        opacity *= tl.sqrt(tl.maximum(raw / det, _COMPENSATION_MIN))
+    mean_x, mean_y = lens[0] * x_z + lens[2], lens[1] * y_z + lens[3]
+    drawn &= (opacity >= _ALPHA_MIN) & (xx < _OVERFLOW) & (yy < _OVERFLOW)
+    drawn &= (tl.abs(mean_x) < _OVERFLOW) & (tl.abs(mean_y) < _OVERFLOW)
+    # Any numbers in place of those that overflow.
+    xx, xy, yy = tl.where(drawn, xx, 1.0), tl.where(drawn, xy, 0.0), tl.where(drawn, yy, 1.0)
+    det = tl.where(drawn, det, 1.0)
+    mean_x, mean_y = tl.where(drawn, mean_x, 0.0), tl.where(drawn, mean_y, 0.0)
+
+    u_x, u_y, v_x = _triangle(xx, xy, det)
+    ref_x = _clamp(mean_x, 0.0, width.to(tl.float64)).to(tl.float32)
+    ref_y = _clamp(mean_y, 0.0, height.to(tl.float64)).to(tl.float32)
+    from_x, from_y = ref_x.to(tl.float64) - mean_x, ref_y.to(tl.float64) - mean_y
+    u_0, v_0 = (u_x * from_x + u_y * from_y).to(tl.float32), (v_x * from_x).to(tl.float32)
+    u_x, u_y, v_x = u_x.to(tl.float32), u_y.to(tl.float32), v_x.to(tl.float32)
+    log_opacity = tl.log2(tl.where(drawn, opacity, 1.0).to(tl.float32))
+    mean_x, mean_y = mean_x.to(tl.float32), mean_y.to(tl.float32)
+    xx, yy, depth = xx.to(tl.float32), yy.to(tl.float32), z.to(tl.float32)
+
+    shape = ellipse(mean_x, mean_y, xx, yy, u_x, u_y, log_opacity)
+    top, bottom = tile_rows(shape, height)
+    bottom = tl.where(drawn, bottom, -1)
+    row, last = top // TILE, tl.where(top <= bottom, bottom // TILE, -1)
+    count = tl.zeros_like(row)
+    going = tl.max(last - row, 0) >= 0
+    while going:
+        _column, touched = tile_columns(shape, row, top, bottom, width)
+        count += tl.where(row <= last, touched, 0)
+        row += 1
+        going = tl.max(last - row, 0) >= 0
+    key = tl.where(count > 0, depth.to(tl.int32, bitcast=True), HIDDEN)
+    words = ((ref_x, ref_y), (u_0, v_0), (u_x, u_y), (v_x, log_opacity), depth, (mean_x, mean_y), (xx, yy))
+    return words, key, count
+
+
+@triton.jit
+def store_records(records, index, drawn, words, color):
+    """Write records (N, 8) int64 of Gaussians `index` where drawn.
+
+    words: of `project_block`; color: tuple of 3 blocks.
+    """
+    reference, offset, u_slopes, v_slope_opacity, depth, mean, covariance = words
+    at = records + index.to(tl.int64) * WORDS
+    tl.store(at + REFERENCE, pack(reference[0], reference[1]), mask=drawn)
+    tl.store(at + OFFSET, pack(offset[0], offset[1]), mask=drawn)
+    tl.store(at + U_SLOPES, pack(u_slopes[0], u_slopes[1]), mask=drawn)
+    tl.store(at + V_SLOPE_OPACITY, pack(v_slope_opacity[0], v_slope_opacity[1]), mask=drawn)
+    tl.store(at + RED_GREEN, pack(color[0], color[1]), mask=drawn)
+    tl.store(at + BLUE_DEPTH, pack(color[2], depth), mask=drawn)
+    tl.store(at + MEAN, pack(mean[0], mean[1]), mask=drawn)
+    tl.store(at + COVARIANCE, pack(covariance[0], covariance[1]), mask=drawn)
+
+
+@triton.jit
+def _finite(a):
+    return tl.abs(a) <= _FLOAT_MAX
+
+
+@triton.jit
+def flag_nonfinite(flags, mean, quat, scale, opacity, color):
+    """Set a bit, in the order of NAMES, of the one int64 `flags` for each input that is not finite somewhere."""
+    means = _finite(mean[0]) & _finite(mean[1]) & _finite(mean[2])
+    quats = _finite(quat[0]) & _finite(quat[1]) & _finite(quat[2]) & _finite(quat[3])
+    scales = _finite(scale[0]) & _finite(scale[1]) & _finite(scale[2])
+    colors = _finite(color[0]) & _finite(color[1]) & _finite(color[2])
+    bits = tl.where(means, 0, 1) | tl.where(quats, 0, 2) | tl.where(scales, 0, 4)
+    bits |= tl.where(_finite(opacity), 0, 8) | tl.where(colors, 0, 16)
+    if tl.max(bits, 0) > 0:
+        tl.atomic_or(flags + tl.zeros_like(bits), bits.to(tl.int64), mask=bits > 0)
+
+
+@triton.jit(do_not_specialize=["total", "width", "height"])
+def project(
+    means, quats, scales, opacities, colors, camera, total, width, height, records, keys, counts, visible, flags,
+    ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Fill records (N, 8) int64, keys (N,) int32 that sort by depth, counts (N,) int32 of tiles touched and visible
+    (N,) uint8; flags int64, zero before, gets a bit for each input that is not finite somewhere.
+
+    A record is written only for what is drawn.
+    """
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = index < total
+    mean, quat = load_rows_3(means, index, live), load_rows_4(quats, index, live)
+    scale, color = load_rows_3(scales, index, live), load_rows_3(colors, index, live)
+    opacity = tl.load(opacities + index, mask=live, other=0.0)
+    flag_nonfinite(flags, mean, quat, scale, opacity, color)
+    words, key, count = project_block(mean, quat, scale, opacity, load_camera(camera), width, height, ANTIALIASED)
+    store_records(records, index, count > 0, words, color)
+    tl.store(keys + index, key, mask=live)
+    tl.store(counts + index, count, mask=live)
+    tl.store(visible + index, (count > 0).to(tl.uint8), mask=live)
+
+
+@triton.jit
+def _store_rows_3(pointer, index, live, a):
+    at = pointer + index.to(tl.int64) * 3
+    tl.store(at, a[0].to(tl.float32), mask=live)
+    tl.store(at + 1, a[1].to(tl.float32), mask=live)
+    tl.store(at + 2, a[2].to(tl.float32), mask=live)
+
+
+@triton.jit(do_not_specialize=["total", "absgrad_row", "absgrad_column"])
+def project_backward(
+    rows, begins, counts, means, quats, scales, opacities, camera, total,
+    grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, absgrad, absgrad_row, absgrad_column,
+    ANTIALIASED: tl.constexpr, ABSGRAD: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Pull the gradient row of each Gaussian, its sum over tiles, back through the projection.
+
+    rows: (P, 12), a Gaussian's at begins[i]; begins, counts: (N,) int32. The gradients are written, absgrad ((N, 2)
+    with these strides) is added to.
+    """
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = index < total
+    drawn = live & (tl.load(counts + index, mask=live, other=0) > 0)
+    at = rows + tl.load(begins + index, mask=drawn, other=0).to(tl.int64) * ROW
+    sum_u, sum_v = tl.load(at + SUM_U, mask=drawn, other=0.0), tl.load(at + SUM_V, mask=drawn, other=0.0)
+    sum_uu, sum_uv = tl.load(at + SUM_UU, mask=drawn, other=0.0), tl.load(at + SUM_UV, mask=drawn, other=0.0)
+    sum_vv, sum_p = tl.load(at + SUM_VV, mask=drawn, other=0.0), tl.load(at + SUM_P, mask=drawn, other=0.0)
+    red, green = tl.load(at + SUM_RED, mask=drawn, other=0.0), tl.load(at + SUM_GREEN, mask=drawn, other=0.0)
+    blue = tl.load(at + SUM_BLUE, mask=drawn, other=0.0)
+    _store_rows_3(grad_colors, index, live, (red, green, blue))
+    opacity = tl.load(opacities + index, mask=drawn, other=1.0)
+    tl.store(grad_opacities + index, sum_p / opacity, mask=live)
+
+    axes, shift, lens, _, limits, _ = load_camera(camera)
+    # What is not drawn may hold any numbers: it is replaced by zeros in front of the camera, its gradients by zeros.
+    x, y, z = _locate(load_rows_3(means, index, drawn), axes, shift)
+    inv_z = 1 / tl.where(drawn, z, 1.0)
+    x_z, y_z = x * inv_z, y * inv_z
+    quat = load_rows_4(quats, index, drawn)
+    a, b, e, f, columns, q, norm = _spread(x_z, y_z, inv_z, quat, axes, lens, limits)
+    scale = _double_3(load_rows_3(scales, index, drawn))
+    g, h = _times(e, scale), _times(f, scale)
+    xx, xy, yy, raw, det = _covariance(g, h)
+    u_x, u_y, v_x = _triangle(xx, xy, det)
+    if ABSGRAD:
+        to = absgrad + index.to(tl.int64) * absgrad_row
+        abs_x, abs_y = tl.load(at + SUM_ABS_X, mask=drawn, other=0.0), tl.load(at + SUM_ABS_Y, mask=drawn, other=0.0)
+        before_x = tl.load(to, mask=drawn, other=0.0)
+        before_y = tl.load(to + absgrad_column, mask=drawn, other=0.0)
+        tl.store(to, before_x + abs_x * UNIT, mask=drawn)
+        tl.store(to + absgrad_column, before_y + (u_y * UNIT).to(tl.float32) * abs_y, mask=drawn)
+
+    # Sigma^-1 d = UNIT (U_X u + V_X v, U_Y u), and dL/dSigma = 1/2 sum p (Sigma^-1 d)(Sigma^-1 d)^T.
+    su, sv, sum_p = sum_u.to(tl.float64), sum_v.to(tl.float64), sum_p.to(tl.float64)
+    suu, suv, svv = sum_uu.to(tl.float64), sum_uv.to(tl.float64), sum_vv.to(tl.float64)
+    grad_x, grad_y = (u_x * su + v_x * sv) * UNIT, u_y * su * UNIT
+    grad_xx = (u_x * u_x * suu + 2 * u_x * v_x * suv + v_x * v_x * svv) * (0.5 * UNIT * UNIT)
+    grad_xy = u_y * (u_x * suu + v_x * suv) * (UNIT * UNIT)
+    grad_yy = u_y * u_y * suu * (0.5 * UNIT * UNIT)
+    if ANTIALIASED:
+        # The exponent gains 1/2 log(raw / det).
+        compensated = raw >= det * _COMPENSATION_MIN
+        by_p = tl.where(compensated, sum_p, 0.0)
+        inv_raw, inv_det = 1 / tl.where(compensated, raw, 1.0), 1 / det
+        grad_xx += 0.5 * by_p * ((yy - _LOW_PASS) * inv_raw - yy * inv_det)
+        grad_yy += 0.5 * by_p * ((xx - _LOW_PASS) * inv_raw - xx * inv_det)
+        grad_xy -= by_p * xy * (inv_raw - inv_det)
+
+    grad_g, grad_h = _combine(2 * grad_xx, g, grad_xy, h), _combine(2 * grad_yy, h, grad_xy, g)
+    by_e, by_f = _times(grad_g, e), _times(grad_h, f)
+    _store_rows_3(grad_scales, index, live, (by_e[0] + by_f[0], by_e[1] + by_f[1], by_e[2] + by_f[2]))
+    grad_e, grad_f = _times(grad_g, scale), _times(grad_h, scale)
+
+    # Through e = a Q and f = b Q: the rotation's matrix, then its unit quaternion, then the length.
+    d0 = _combine(a[0], grad_e, b[0], grad_f)
+    d1 = _combine(a[1], grad_e, b[1], grad_f)
+    d2 = _combine(a[2], grad_e, b[2], grad_f)
+    x_turn, y_turn, z_turn = d2[1] - d1[2], d0[2] - d2[0], d1[0] - d0[1]
+    w0 = 2 * (q[1] * x_turn + q[2] * y_turn + q[3] * z_turn)
+    w1 = 2 * (q[0] * x_turn + q[2] * (d0[1] + d1[0]) + q[3] * (d0[2] + d2[0]) - 2 * q[1] * (d1[1] + d2[2]))
+    w2 = 2 * (q[0] * y_turn + q[1] * (d0[1] + d1[0]) + q[3] * (d1[2] + d2[1]) - 2 * q[2] * (d0[0] + d2[2]))
+    w3 = 2 * (q[0] * z_turn + q[1] * (d0[2] + d2[0]) + q[2] * (d1[2] + d2[1]) - 2 * q[3] * (d0[0] + d1[1]))
+    along = tl.where(norm > _QUAT_NORM_MIN, q[0] * w0 + q[1] * w1 + q[2] * w2 + q[3] * w3, 0.0)
+    inv_norm = 1 / tl.maximum(norm, _QUAT_NORM_MIN)
+    to = grad_quats + index.to(tl.int64) * 4
+    tl.store(to, ((w0 - along * q[0]) * inv_norm).to(tl.float32), mask=live)
+    tl.store(to + 1, ((w1 - along * q[1]) * inv_norm).to(tl.float32), mask=live)
+    tl.store(to + 2, ((w2 - along * q[2]) * inv_norm).to(tl.float32), mask=live)
+    tl.store(to + 3, ((w3 - along * q[3]) * inv_norm).to(tl.float32), mask=live)
+
+    # Through a = j_x R_x - j_x clamp(x/z) R_z and likewise b: the Jacobian, then the mean.
+    grad_a = _combine(1.0, _combine(grad_e[0], columns[0], grad_e[1], columns[1]), grad_e[2], columns[2])
+    grad_b = _combine(1.0, _combine(grad_f[0], columns[0], grad_f[1], columns[1]), grad_f[2], columns[2])
+    right, down, forward = axes
+    j_x, j_y = lens[0] * inv_z, lens[1] * inv_z
+    towards_x, towards_y = _dot(grad_a, forward), _dot(grad_b, forward)
+    free_x, free_y = (x_z >= limits[0]) & (x_z <= limits[1]), (y_z >= limits[2]) & (y_z <= limits[3])
+    grad_x_z = lens[0] * grad_x - tl.where(free_x, j_x * towards_x, 0.0)
+    grad_y_z = lens[1] * grad_y - tl.where(free_y, j_y * towards_y, 0.0)
+    by_j_x = _dot(grad_a, right) - _clamp(x_z, limits[0], limits[1]) * towards_x
+    by_j_y = _dot(grad_b, down) - _clamp(y_z, limits[2], limits[3]) * towards_y
+    grad_z = -(by_j_x * j_x + by_j_y * j_y + grad_x_z * x_z + grad_y_z * y_z) * inv_z
+    in_plane = _combine(grad_x_z * inv_z, right, grad_y_z * inv_z, down)
+    _store_rows_3(grad_means, index, live, _combine(1.0, in_plane, grad_z, forward))

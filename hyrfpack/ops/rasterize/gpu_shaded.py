@@ -1,0 +1,93 @@
+"""Projecting and shading in one kernel: of a Gaussian that is not drawn, not even the colour's inputs are read."""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from hyrfpack.ops.rasterize import Rasterization
+from hyrfpack.ops.rasterize.gpu import draw
+from hyrfpack.ops.rasterize.gpu_project import (
+    Projection,
+    camera_numbers,
+    flag_nonfinite,
+    in_frustum,
+    load_camera,
+    load_rows_3,
+    load_rows_4,
+    project_block,
+    store_records,
+)
+from hyrfpack.ops.shade import Shading
+from hyrfpack.ops.shade.gpu import launch_size, operands, shade_block
+
+
+@triton.jit(do_not_specialize=["total", "width", "height"])
+def project_shaded(
+    means, quats, scales, opacities, viewpoint, first_layer, packed, b2, b3, color_logits, camera, total, width, height,
+    records, keys, counts, visible, flags,
+    IN: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, OUT: tl.constexpr,
+    IN_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, OUT_P: tl.constexpr,
+    FREQUENCY: tl.constexpr, PRECISION: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """As `gpu_project.project`, of means in the frustum alone, with colours as of `shade_block`."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = index < total
+    mean, quat = load_rows_3(means, index, live), load_rows_4(quats, index, live)
+    scale, opacity = load_rows_3(scales, index, live), tl.load(opacities + index, mask=live, other=0.0)
+    numbers = load_camera(camera)
+    shown = tl.where(in_frustum(mean, numbers), opacity, 0.0)
+    words, key, count = project_block(mean, quat, scale, shown, numbers, width, height, ANTIALIASED)
+    drawn = count > 0
+    color = (tl.zeros_like(opacity), tl.zeros_like(opacity), tl.zeros_like(opacity))
+    if tl.max(count, 0) > 0:
+        color = shade_block(
+            mean, index, drawn, viewpoint, first_layer, packed, b2, b3, color_logits,
+            IN, H1, H2, OUT, IN_P, H1_P, H2_P, OUT_P, FREQUENCY, PRECISION,
+        )  # fmt: skip
+        color = (tl.where(drawn, color[0], 0.0), tl.where(drawn, color[1], 0.0), tl.where(drawn, color[2], 0.0))
+        store_records(records, index, drawn, words, color)
+    flag_nonfinite(flags, mean, quat, scale, opacity, color)
+    tl.store(keys + index, key, mask=live)
+    tl.store(counts + index, count, mask=live)
+    tl.store(visible + index, drawn.to(tl.uint8), mask=live)
+
+
+def rasterize_shaded(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    shading: Shading,
+    camera_from_world: Tensor,
+    intrinsics: tuple[float, float, float, float],
+    width: int,
+    height: int,
+    *,
+    near: float,
+    cull_tolerance: float,
+    antialiased: bool,
+    transmittance_min: float,
+    depth: bool,
+) -> Rasterization:
+    """As `hyrfpack.ops.rasterize.shaded.rasterize_shaded`."""
+    total, device = len(means), means.device
+    inputs = (tensor.detach().contiguous() for tensor in (means, quats, scales, opacities))
+    camera = camera_numbers(camera_from_world, intrinsics, width, height, near, device, cull_tolerance)
+    pose = camera_from_world.detach().to("cpu", torch.float64)
+    viewpoint = (-(pose[:3, :3].T @ pose[:3, 3])).float().to(device, non_blocking=True)
+    tensors, constants = operands(shading)
+    projection = Projection.empty(total, device)
+    if total:
+        block, warps = launch_size(shading.mixed)
+        project_shaded[(triton.cdiv(total, block),)](
+            *inputs, viewpoint, *tensors, camera, total, width, height,
+            projection.records, projection.keys, projection.counts, projection.visible, projection.numbers,
+            **constants, ANTIALIASED=bool(antialiased), BLOCK=block, num_warps=warps, enable_fp_fusion=True,
+        )  # fmt: skip
+    drawn = draw(projection, int(width), int(height), float(transmittance_min), bool(depth))
+    pairs = drawn.pairs
+    visible = projection.visible.view(torch.bool)
+    return Rasterization(drawn.rgb, drawn.transmittance, drawn.depth, visible, len(pairs.owners), {}, pairs.nonfinite)

@@ -1,0 +1,90 @@
+"""Shading: the view-dependent colours of Gaussians, from what of the colour decoder does not depend on the view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.shade import reference
+from hyrfpack.ops.shade.directions import (
+    DIRECTION_FEATURES,
+    FREQUENCY_OCTAVES,
+    encode_directions,
+    frequency_encoding,
+    spherical_harmonics,
+)
+
+__all__ = [
+    "DIRECTION_FEATURES",
+    "FREQUENCY_OCTAVES",
+    "Shading",
+    "encode_directions",
+    "frequency_encoding",
+    "shade",
+    "spherical_harmonics",
+]
+
+
+@dataclass(frozen=True)
+class Shading:
+    """The colour decoder as far as one model's Gaussians decide it. Nothing is differentiable.
+
+    Its first layer reads hash features of the place and an encoded direction; the part of the place, with the bias,
+    is worked out once.
+
+    Attributes:
+        first_layer: (N, H) contiguous, W1 features + b1 before the ReLU; float32, or bfloat16 when mixed.
+        direction_weight: (H, E) the first layer's columns for the encoded direction.
+        weights, biases: of the layers after it: (H2, H), (H2,), then (3, H2), (3,).
+        color_logits: (N, 3) the explicit ones, added to the decoder's.
+        encoding: "frequency" (E = 24) or "sh" (E = 9), see `encode_directions`.
+        mixed: products take factors rounded to bfloat16, as in `hyrfpack.ops.mlp`.
+    """
+
+    first_layer: Tensor
+    direction_weight: Tensor
+    weights: tuple[Tensor, Tensor]
+    biases: tuple[Tensor, Tensor]
+    color_logits: Tensor
+    encoding: str
+    mixed: bool
+
+
+@torch.no_grad()
+def shade(positions: Tensor, viewpoint: Tensor, shading: Shading, *, implementation: str = "auto") -> Tensor:
+    """Colours of Gaussians seen from a point.
+
+        d = (p - o) / |p - o|,   h1 = relu(first_layer + W1' e(d)),   h2 = relu(W2 h1 + b2)
+        color = sigmoid(W3 h2 + b3 + color_logits)
+
+    Args:
+        positions: (N, 3) p.
+        viewpoint: (3,) o, in the same units.
+        shading: of these N Gaussians.
+        implementation: "auto", "reference" or "gpu" (float32, two hidden layers of at most 128).
+
+    Returns:
+        (N, 3) in (0, 1). Not differentiable.
+
+    Raises:
+        ValueError: shapes, types or devices do not fit together.
+    """
+    count, hidden = shading.first_layer.shape
+    widths = [tuple(weight.shape) for weight in (shading.direction_weight, *shading.weights)]
+    features = DIRECTION_FEATURES.get(shading.encoding)
+    fits = len(widths) == 3 and widths == [(hidden, features), (widths[1][0], hidden), (3, widths[1][0])]
+    if not fits or positions.shape != (count, 3) or shading.color_logits.shape != (count, 3) or viewpoint.shape != (3,):
+        raise ValueError(
+            f"{tuple(positions.shape)} positions, first layer {(count, hidden)}, {shading.encoding} encoding and "
+            f"weights {widths} do not form a decoder"
+        )
+    inputs = (positions, viewpoint, shading.direction_weight, *shading.weights, *shading.biases, shading.color_logits)
+    available = ("reference", "gpu") if max(hidden, widths[1][0]) <= 128 else ("reference",)
+    if choose(implementation, available, *inputs) == "gpu":
+        from hyrfpack.ops.shade import gpu
+
+        return gpu.shade(positions, viewpoint, shading)
+    return reference.shade(positions, viewpoint, shading)

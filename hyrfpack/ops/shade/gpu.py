@@ -1,0 +1,108 @@
+"""Shading in Triton: a block of Gaussians is a tile [width, BLOCK] that goes through the decoder on the matrix units.
+
+`shade_block` is a function of its own, so that the kernel that projects Gaussians can shade those that it draws.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from hyrfpack.ops.mlp.tiles import factor, linear, pack, precision, product, relu_factor, sizes
+from hyrfpack.ops.shade.gpu_directions import encode_block
+
+if TYPE_CHECKING:
+    from hyrfpack.ops.shade import Shading
+
+
+def launch_size(mixed: bool) -> tuple[int, int]:
+    """Gaussians and warps a program: as many as registers allow, and float32 factors take more of them."""
+    return (128, 4) if mixed else (64, 8)
+
+
+@triton.jit
+def shade_block(
+    mean, index, live, viewpoint, first_layer, packed, b2, b3, color_logits,
+    IN: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, OUT: tl.constexpr,
+    IN_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, OUT_P: tl.constexpr,
+    FREQUENCY: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
+    """Colours, tuple of 3 blocks, of Gaussians `index` where live; anything elsewhere.
+
+    Args:
+        mean: tuple of 3 blocks.
+        viewpoint: pointer to 3 float32; first_layer, color_logits: pointers to (N, H1) and (N, 3).
+        packed: of `tiles.pack`, the direction's weight first; b2, b3: the later biases.
+    """
+    x, y, z = (mean[0] - tl.load(viewpoint), mean[1] - tl.load(viewpoint + 1), mean[2] - tl.load(viewpoint + 2))
+    inverse = 1 / tl.maximum(tl.sqrt(x * x + y * y + z * z), 1e-12)
+    x, y, z = x * inverse, y * inverse, z * inverse
+    neuron = tl.arange(0, H1_P)[:, None]
+    at = first_layer + index[None, :].to(tl.int64) * H1 + neuron
+    hidden = tl.load(at, mask=live[None, :] & (neuron < H1), other=0.0).to(tl.float32)
+    for row in tl.static_range(0, IN_P, 16):  # the least that the matrix units take: a whole tile would cost registers
+        weight = tl.load(packed + neuron * IN_P + (row + tl.arange(0, 16)[None, :]))
+        encoded = factor(encode_block(x, y, z, FREQUENCY, row, 16), PRECISION)
+        hidden = product(weight, encoded, hidden, PRECISION)
+    hidden = relu_factor(hidden, PRECISION)
+    w2 = packed + H1_P * IN_P
+    hidden = relu_factor(linear(w2, b2, hidden, H2, H2_P, H1_P, PRECISION), PRECISION)
+    raw = linear(w2 + H2_P * H1_P, b3, hidden, OUT, OUT_P, H2_P, PRECISION)
+    channel = tl.arange(0, OUT_P)[:, None]
+    logits = color_logits + index.to(tl.int64) * 3
+    red = tl.sum(tl.where(channel == 0, raw, 0.0), 0) + tl.load(logits, mask=live, other=0.0)
+    green = tl.sum(tl.where(channel == 1, raw, 0.0), 0) + tl.load(logits + 1, mask=live, other=0.0)
+    blue = tl.sum(tl.where(channel == 2, raw, 0.0), 0) + tl.load(logits + 2, mask=live, other=0.0)
+    return tl.sigmoid(red), tl.sigmoid(green), tl.sigmoid(blue)
+
+
+@triton.jit(do_not_specialize=["total"])
+def shade_kernel(
+    means, viewpoint, first_layer, packed, b2, b3, color_logits, colors, total,
+    IN: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, OUT: tl.constexpr,
+    IN_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, OUT_P: tl.constexpr,
+    FREQUENCY: tl.constexpr, PRECISION: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Write colours (N, 3)."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = index < total
+    row = index.to(tl.int64) * 3
+    mean = (
+        tl.load(means + row, mask=live, other=0.0),
+        tl.load(means + row + 1, mask=live, other=0.0),
+        tl.load(means + row + 2, mask=live, other=0.0),
+    )
+    red, green, blue = shade_block(
+        mean, index, live, viewpoint, first_layer, packed, b2, b3, color_logits,
+        IN, H1, H2, OUT, IN_P, H1_P, H2_P, OUT_P, FREQUENCY, PRECISION,
+    )  # fmt: skip
+    tl.store(colors + row, red, mask=live)
+    tl.store(colors + row + 1, green, mask=live)
+    tl.store(colors + row + 2, blue, mask=live)
+
+
+def operands(shading: Shading) -> tuple[tuple[Tensor, ...], dict]:
+    """What `shade_block` takes after the viewpoint: tensors, and constants by name."""
+    kind = precision(shading.mixed)
+    weights = (shading.direction_weight, *shading.weights)
+    tensors = shading.first_layer, pack(weights, kind), *(bias.detach() for bias in shading.biases)
+    widths = [shading.direction_weight.shape[1], *(weight.shape[0] for weight in weights)]
+    constants = sizes(widths) | {"FREQUENCY": shading.encoding == "frequency", "PRECISION": kind}
+    return (*tensors, shading.color_logits.detach()), constants
+
+
+def shade(positions: Tensor, viewpoint: Tensor, shading: Shading) -> Tensor:
+    """As `hyrfpack.ops.shade.shade`."""
+    tensors, constants = operands(shading)
+    colors = torch.empty_like(positions, memory_format=torch.contiguous_format)
+    if len(positions):
+        block, warps = launch_size(shading.mixed)
+        shade_kernel[(triton.cdiv(len(positions), block),)](
+            positions.detach().contiguous(), viewpoint.detach(), *tensors, colors, len(positions),
+            **constants, BLOCK=block, num_warps=warps, enable_fp_fusion=True,
+        )  # fmt: skip
+    return colors

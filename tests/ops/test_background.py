@@ -1,0 +1,280 @@
+"""background_grid: every implementation against the reference in float64, the reference against other arithmetic."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from ops.device import gpu, needs_triton
+from scenes import look_at
+
+from hyrfpack.ops.background import (
+    RADIUS,
+    background_colors,
+    background_grid,
+    grid_size,
+    pixel_directions,
+    sphere_points,
+)
+from hyrfpack.ops.hash_encode import level_offsets, level_resolutions
+from hyrfpack.ops.shade.directions import DIRECTION_FEATURES
+
+IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
+
+
+def uniform(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A camera, what of its light is left, and the shape of a field."""
+
+    height: int = 13
+    width: int = 21
+    stride: int = 2
+    threshold: float = 0.5
+    light: str = "patches"
+    position: tuple[float, float, float] = (0.3, -2.0, 0.6)
+    target: tuple[float, float, float] = (0.1, 0.2, 0.0)
+    focal: float = 15.0
+    encoding: str = "frequency"
+    levels: int = 4
+    finest: int = 40
+    hidden: tuple[int, int] = (16, 16)
+
+    def transmittance(self) -> torch.Tensor:
+        if self.light == "patches":  # smooth, so that whole blocks are dark, and others in part
+            rows = torch.arange(self.height)[:, None] / 11
+            columns = torch.arange(self.width)[None, :] / 9
+            return 0.5 + 0.4999 * torch.sin(rows + 1) * torch.cos(columns)
+        if self.light == "one pixel":
+            light = torch.zeros(self.height, self.width)
+            light[self.height // 2, self.width // 2] = 1
+            return light
+        return torch.full((self.height, self.width), float(self.light))
+
+    def arguments(self) -> dict[str, Any]:
+        """What `background_grid` takes after the transmittance, float32."""
+        resolutions = level_resolutions(self.levels, 4, self.finest)
+        widths = [2 * self.levels + DIRECTION_FEATURES[self.encoding], *self.hidden, 3]
+        generator = torch.Generator().manual_seed(1)
+        shapes = list(zip(widths[1:], widths, strict=False))
+        return {
+            "threshold": self.threshold,
+            "stride": self.stride,
+            "pose": torch.from_numpy(look_at(self.position, self.target)).float(),
+            "intrinsics": (self.focal, 1.1 * self.focal, 0.4 * self.width, 0.6 * self.height),
+            "half_extent": (1.0, 0.5, 0.25),
+            "table": 2 * torch.rand(level_offsets(resolutions, 9)[-1], 2, generator=generator) - 1,
+            "resolutions": resolutions,
+            "log2_table_size": 9,
+            "weights": [torch.randn(o, i, generator=generator) / math.sqrt(i) for o, i in shapes],
+            "biases": [0.1 * torch.randn(o, generator=generator) for o, _ in shapes],
+            "encoding": self.encoding,
+        }
+
+    def run(self, dtype: torch.dtype, implementation: str, mixed: bool = False) -> torch.Tensor:
+        """The grid, on the CPU, with no gradients."""
+
+        def placed(value: Any) -> Any:
+            if isinstance(value, list):
+                return [placed(one) for one in value]
+            if not isinstance(value, torch.Tensor):
+                return value
+            value = value.to(dtype)
+            return gpu(value) if implementation == "gpu" else value
+
+        arguments = {name: value if name == "pose" else placed(value) for name, value in self.arguments().items()}
+        light = placed(self.transmittance())
+        with torch.no_grad():
+            return background_grid(light, **arguments, mixed=mixed, implementation=implementation).cpu()
+
+
+CASES = {
+    "stride 1, no multiple of a block": Case(stride=1),
+    "stride 2": Case(),
+    "stride 3, the last nodes past the edge": Case(height=12, width=30, stride=3),
+    "stride 7 is wider than the picture": Case(height=3, width=5, stride=7, light="0.75"),
+    "one pixel, one node": Case(height=1, width=1, stride=1, light="1"),
+    "spherical harmonics": Case(encoding="sh", stride=1),
+    "sixteen levels, wide layers": Case(levels=16, finest=60, hidden=(64, 128)),
+    "widths that are no powers of two": Case(levels=5, hidden=(20, 36), encoding="sh"),
+    "threshold 0 draws wherever any light passes": Case(threshold=0.0, light="1e-30"),
+    "one bright pixel": Case(threshold=0.0, light="one pixel", height=40, width=40, stride=3),
+    "all light": Case(threshold=0.9, light="1"),
+    "outside the sphere": Case(position=(0.0, -2.5 * RADIUS, 30.0), focal=20.0),
+    "outside, looking past it": Case(position=(0.0, -3 * RADIUS, 0.0), target=(RADIUS, -3 * RADIUS, 9.0)),
+}
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("case", CASES)
+def test_colors_match_the_float64_reference(implementation: str, case: str) -> None:
+    found, expected = CASES[case].run(torch.float32, implementation), CASES[case].run(torch.float64, "reference")
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-4)
+    assert torch.equal(found == 0, expected == 0)
+    assert 0 < (expected != 0).sum() and expected.max() < 1
+
+
+@needs_triton
+@pytest.mark.parametrize("encoding", ["frequency", "sh"])
+def test_mixed_precision_rounds_factors_alone(encoding: str) -> None:
+    case = dataclasses.replace(CASES["stride 2"], encoding=encoding, hidden=(64, 64), levels=8)
+    found = case.run(torch.float32, "gpu", mixed=True)
+    expected, exact = case.run(torch.float64, "reference", mixed=True), case.run(torch.float64, "reference")
+    # Numbers on the edge between two bfloat16 are rounded one way here and the other way there.
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=3e-3)
+    assert (found - expected).abs().mean() < 0.2 * (exact - expected).abs().mean()
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("distance", [1e3, 1e5])
+@pytest.mark.parametrize("past", [0.0, 0.5, 1.5])
+def test_far_cameras_lose_no_more_than_float32_must(implementation: str, distance: float, past: float) -> None:
+    """A ray's direction is rounded, by 2^-24 a coordinate, and so its point on the sphere by that times the way."""
+    position = np.array([0.6, -0.8, 0.3]) * distance
+    aside = np.array([0.8, 0.6, 0.0]) * past * RADIUS
+    case = Case(position=tuple(position), target=tuple(aside), focal=0.1 * distance, stride=3, finest=8, light="1")
+    found, expected = case.run(torch.float32, implementation), case.run(torch.float64, "reference")
+    off = 4 * 2**-24 * distance / RADIUS  # in the cube; features change by up to 2 a vertex, and 7 of them span it
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-4 + 14 * off)
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize(("threshold", "light"), [(1.0, "1"), (0.5, "0.5"), (0.0, "0")])
+def test_nothing_is_drawn_where_no_more_than_the_threshold_passes(implementation, threshold, light) -> None:
+    found = Case(threshold=threshold, light=light).run(torch.float32, implementation)
+    assert found.shape == (7, 11, 3) and not found.any()
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("stride", [1, 2, 3])
+def test_a_node_is_drawn_for_each_pixel_that_it_takes_part_in(implementation: str, stride: int) -> None:
+    case = Case(height=20, width=17, stride=stride, threshold=0.0, light="one pixel")
+    found = case.run(torch.float32, implementation)
+    rows, columns = grid_size(20, 17, stride)
+    near = [(i, j) for i in range(rows) for j in range(columns)
+            if abs(i * stride - 10) < stride and abs(j * stride - 8) < stride]  # fmt: skip
+    assert [tuple(node) for node in found.any(-1).nonzero().tolist()] == near
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("part", ["table", "weights", "biases"])
+def test_what_is_not_a_number_shows(implementation: str, part: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = Case(light="1")
+    arguments = case.arguments()
+    (arguments[part] if part == "table" else arguments[part][0]).fill_(math.nan)
+    monkeypatch.setattr(Case, "arguments", lambda self: arguments)
+    assert case.run(torch.float32, implementation).isnan().all()
+
+
+def test_nodes_are_the_colors_at_their_pixels_centres() -> None:
+    case = Case(light="1", stride=3)
+    arguments = case.arguments()
+    threshold, stride = arguments.pop("threshold"), arguments.pop("stride")
+    grid = background_grid(case.transmittance(), threshold=threshold, stride=stride, **arguments)
+    points = [(3 * j + 0.5, 3 * i + 0.5) for i in range(grid.shape[0]) for j in range(grid.shape[1])]
+    expected = background_colors(torch.tensor(points), **arguments, mixed=False)
+    torch.testing.assert_close(grid.reshape(-1, 3), expected)
+
+
+def test_reference_passes_gradcheck_in_the_field() -> None:
+    case = Case(height=4, width=5, hidden=(6, 5), levels=2, finest=6)
+    arguments = case.arguments()
+    parts = [arguments.pop("table"), *arguments.pop("weights"), *arguments.pop("biases")]
+    inputs = [part.double().requires_grad_() for part in parts]
+
+    def run(table, *rest):
+        light = case.transmittance().double()
+        return background_grid(light, table=table, weights=rest[:3], biases=rest[3:], **arguments)
+
+    assert torch.autograd.gradcheck(run, inputs)
+
+
+@needs_triton
+def test_the_kernel_is_not_taken_where_gradients_are_wanted() -> None:
+    case = Case()
+    arguments = case.arguments()
+    arguments["table"].requires_grad_()
+    with pytest.raises(ValueError, match="no implementation 'gpu'"):
+        background_grid(case.transmittance(), **arguments, implementation="gpu")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"stride": 0},
+        {"pose": torch.eye(3)},
+        {"encoding": "sh"},
+        {"encoding": "none"},
+        {"weights": [torch.rand(16, 32), torch.rand(16, 16), torch.rand(4, 16)]},
+    ],
+    ids=["no stride", "pose", "another encoding's width", "unknown encoding", "four outputs"],
+)
+def test_refuses_what_does_not_fit(change: dict) -> None:
+    with pytest.raises(ValueError):
+        background_grid(Case().transmittance(), **(Case().arguments() | change))
+
+
+# -- rays ------------------------------------------------------------------------------------------------------------
+
+
+def random_directions(count: int) -> torch.Tensor:
+    vectors = torch.randn(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    return torch.nn.functional.normalize(vectors, dim=1)
+
+
+@pytest.mark.parametrize("origin", [(0, 0, 0), (3, -1, 2), (60, 60, 40), (0, 0, -99.999)])
+def test_sphere_points_lie_on_the_sphere_ahead_of_the_camera(origin):
+    origin, directions = torch.tensor(origin, dtype=torch.float64), random_directions(500)
+
+    points = sphere_points(origin, directions)
+
+    torch.testing.assert_close(torch.linalg.vector_norm(points, dim=1), torch.full((500,), RADIUS).double())
+    steps = points - origin
+    lengths = torch.linalg.vector_norm(steps, dim=1, keepdim=True)
+    torch.testing.assert_close(steps, lengths * directions, rtol=1e-9, atol=1e-9)
+
+
+def test_sphere_points_of_float32_cameras_are_on_the_sphere():
+    points = sphere_points(torch.tensor([1.0, 2.0, -0.5]), random_directions(500).float())
+    torch.testing.assert_close(torch.linalg.vector_norm(points, dim=1), torch.full((500,), RADIUS), rtol=1e-6, atol=0)
+
+
+def test_sphere_points_from_outside_are_where_the_ray_leaves():
+    points = sphere_points(torch.tensor([0.0, 0.0, -250.0]), torch.tensor([[0.0, 0.0, 1.0]]))
+    torch.testing.assert_close(points, torch.tensor([[0.0, 0.0, RADIUS]]))
+
+
+def test_sphere_points_of_a_ray_that_misses_are_nearest_to_the_centre():
+    origin = torch.tensor([0.0, 150.0, -300.0], dtype=torch.float64)
+    points = sphere_points(origin, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64))
+    torch.testing.assert_close(points, torch.tensor([[0.0, 150.0, 0.0]], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("distance", [1e3, 1e6, 1e12])
+def test_sphere_points_are_finite_however_far_outside(distance):
+    points = sphere_points(torch.tensor([distance, -distance, 0.0]), random_directions(500).float())
+    assert torch.isfinite(points).all()
+
+
+def test_pixel_directions_project_back_to_their_points():
+    width, height, intrinsics = 7, 5, (11.0, 9.0, 3.2, 2.9)
+    pose = torch.from_numpy(look_at((1.0, 2.0, 0.5), (0.3, -1.0, 0.2)))
+    fx, fy, cx, cy = intrinsics
+
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(50, 2, dtype=torch.float64, generator=generator) * torch.tensor([width, height])
+
+    directions = pixel_directions(points, intrinsics, pose)
+
+    x, y, z = (directions @ pose[:3, :3].T).unbind(1)
+    np.testing.assert_allclose((fx * x / z + cx).numpy(), points[:, 0].numpy(), atol=1e-12)
+    np.testing.assert_allclose((fy * y / z + cy).numpy(), points[:, 1].numpy(), atol=1e-12)
+    assert (z > 0).all()
+    np.testing.assert_allclose(torch.linalg.vector_norm(directions, dim=1).numpy(), 1, atol=1e-12)

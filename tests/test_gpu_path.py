@@ -1,0 +1,147 @@
+"""Training and rendering on a GPU, from end to end: on a pretended one where there is none (see `pretend_gpu`).
+
+Wrong devices and hidden copies fail here as they would there; the numbers agree with the CPU's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from contextlib import nullcontext
+
+import pytest
+import torch
+from commands import succeeded
+from ops.device import needs_triton
+from pretend_gpu import pretended_gpu
+from scenes import ball_points, ball_scene, camera_at, small_model
+
+import hyrfpack
+from hyrfpack.data.demo_scene import write_demo_scene
+from hyrfpack.model import HashGridConfig
+from hyrfpack.render import render
+from hyrfpack.train import DensityConfig, TrainConfig, Trainer
+
+pytestmark = needs_triton
+
+# A round of density control after steps 1 and 3.
+DENSITY = DensityConfig(start=0.1, stop=1.0, rounds=2, gradient=1e-5, resets=1)
+CONFIG = TrainConfig(steps=3, max_gaussians=30, density=DENSITY, precision="float32", log2_table_size=5)
+
+
+@pytest.fixture(autouse=True)
+def few_levels(monkeypatch):
+    """Models of 2 levels: the interpreter is slow."""
+    monkeypatch.setattr(
+        "hyrfpack.train.setup.HashGridConfig",
+        lambda log2_table_size, **sizes: HashGridConfig(log2_table_size, levels=2, **sizes),
+    )
+
+
+@pytest.fixture
+def gpu():
+    """A CUDA device, for the time of a test."""
+    with nullcontext(torch.device("cuda", 0)) if torch.cuda.is_available() else pretended_gpu() as device:
+        yield device
+
+
+def a_scene():
+    scene = ball_scene(views=3, points=20, side=16)
+    return dataclasses.replace(scene, test=scene.train[:1])
+
+
+def curve(trainer: Trainer) -> list[tuple[float, float, int]]:
+    """Loss, mean squared error and number of Gaussians of each step."""
+    found = []
+    trainer.run(report=lambda trainer, loss, mse: found.append((loss, mse, len(trainer.model))))
+    return found
+
+
+def numbers(trainer: Trainer) -> dict[str, torch.Tensor]:
+    return {name: p.detach().cpu() for name, p in trainer.model.named_parameters()}
+
+
+def test_training_takes_the_same_course_as_on_the_cpu(gpu):
+    here, there = Trainer(a_scene(), CONFIG), Trainer(a_scene(), CONFIG, device=gpu)
+
+    torch.testing.assert_close(curve(there), curve(here), rtol=1e-4, atol=1e-6)
+
+    assert all(p.device == gpu for p in there.model.parameters())
+    for (name, value), expected in zip(numbers(there).items(), numbers(here).values(), strict=True):
+        # Adam's first steps are as long for a rounded gradient as for a large one.
+        assert (value - expected).abs().median() < 1e-4, name
+
+
+def test_mixed_precision_starts_where_float32_does(gpu):
+    config = dataclasses.replace(CONFIG, steps=1)
+    mixed = curve(Trainer(a_scene(), dataclasses.replace(config, precision="mixed"), device=gpu))
+    ((loss, *_),), ((expected, *_),) = mixed, curve(Trainer(a_scene(), config))
+    assert loss == pytest.approx(expected, rel=1e-2) and loss != expected
+
+
+def test_a_run_goes_on_on_another_device(gpu, tmp_path):
+    first = Trainer(a_scene(), CONFIG, device=gpu)
+    assert not first.run(checkpoint=tmp_path / "c.pt", stop=lambda: first.step == 2)
+    second, whole = Trainer(a_scene(), CONFIG), Trainer(a_scene(), CONFIG)
+
+    second.load(tmp_path / "c.pt")
+
+    assert second.step == 2
+    torch.testing.assert_close(curve(second), curve(whole)[2:], rtol=1e-4, atol=1e-6)
+
+
+def test_a_gradient_that_is_not_finite_is_named(gpu):
+    trainer = Trainer(a_scene(), CONFIG, device=gpu)
+    trainer.model.gaussians.scale_logits.register_hook(lambda grad: grad * float("nan"))
+    with pytest.raises(hyrfpack.HyrfTrainingError, match="gradient is not finite.*: scale_logits"):
+        trainer.run()
+
+
+def a_model(**settings):
+    points, colors = ball_points(40)
+    colors = torch.from_numpy(colors) * 4 - 2
+    return small_model(points, color_logits=colors, scale_logits=-2.0, fields=1.0, **settings)
+
+
+@pytest.mark.parametrize("kept", [False, True])
+@pytest.mark.parametrize("encoding", ["frequency", "sh"])
+def test_pictures_are_those_of_the_cpu(gpu, kept, encoding):
+    camera = camera_at((0.3, -2.2, 0.6), (0.2, 0, 0), width=30, height=20)
+    model = a_model(background=True, direction_encoding=encoding)
+    model.precision = "float32"
+    with torch.no_grad():
+        expected = render(model, camera, depth=True)
+        model = model.to(gpu)
+        found = render(model, camera, decoded=model.decode() if kept else None, depth=True)
+
+    torch.testing.assert_close(found.rgb.cpu(), expected.rgb, rtol=0, atol=1e-4)
+    torch.testing.assert_close(found.alpha.cpu(), expected.alpha, rtol=0, atol=1e-4)
+    torch.testing.assert_close(found.depth.cpu(), expected.depth, rtol=1e-3, atol=1e-3)
+    assert found.pairs >= expected.pairs
+
+
+@pytest.mark.parametrize("kept", [False, True])
+@pytest.mark.parametrize("part", ["positions", "color_logits", "opacity_logits", "table", "background"])
+def test_numbers_that_are_not_finite_are_refused(gpu, part, kept):
+    model = a_model(background=part == "background")
+    with torch.no_grad():
+        if part == "table":
+            model.geometry.grid.table.fill_(float("nan"))
+        elif part == "background":
+            model.gaussians.positions.mul_(1e-3)  # cells of their own, away from those of the sphere
+            model.radiance.grid.table[model.config.radiance.offsets[-2] :: 2] = float("inf")
+        else:
+            getattr(model.gaussians, part)[3, 0] = float("nan")
+        model = model.to(gpu)
+        decoded = model.decode() if kept else None
+        with pytest.raises(hyrfpack.HyrfError, match="NaN or infinity"):
+            render(model, camera_at((0.3, -2.2, 0.6), width=16, height=16), decoded=decoded)
+
+
+def test_the_command_line_trains_and_renders_on_a_gpu(gpu, tmp_path):
+    data, run, options = write_demo_scene(tmp_path / "data", views=2, size=16), tmp_path / "run", ["--device", "cuda"]
+    succeeded("train", data, "-o", run, "--steps", 1, "--max-gaussians", 20, "--log2-table-size", 5, *options)
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["device"].startswith("cuda:0 (") and metrics["evaluation"]["psnr"] > 5
+    succeeded("render", run / "model.hyrf", "-o", tmp_path / "out", "--orbit", 1, "--precision", "float32", *options)
+    assert (tmp_path / "out" / "0000.png").is_file()

@@ -1,0 +1,215 @@
+"""A made-up room of any number of Gaussians, for measurements of speed: not trained, yet shaped like what is.
+
+Gaussians lie on surfaces (floor, ceiling, walls, boxes, spheres), as large as the gaps between them, with a share in
+the leaves of two plants. Most are opaque, a fifth is faint. One wall has a window; behind it is nothing but the
+background sphere. What is measured is drawn from the same numbers on every machine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyrfpack.model import Frame, Geometry, HashGridConfig, HybridModel, ModelConfig, viewpoint_of
+from hyrfpack.model.gaussians import Gaussians, logit
+from hyrfpack.ops.rasterize.reference import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, project
+from hyrfpack.render import render
+from hyrfpack.scene import Camera, Picture, Scene, View
+
+ROOM = (1.5, 1.1, 0.6)  # half-extents, local units; z is up
+WINDOW = ((-0.6, 0.5), (-0.25, 0.4))  # y and z of the opening in the wall at x = +1.5
+BOXES = (((0.5, 0.45, -0.4), (0.3, 0.2, 0.2)), ((-0.7, -0.6, -0.35), (0.2, 0.3, 0.25)), ((0.1, -0.2, -0.5), (0.1,) * 3))
+SPHERES = (((0.5, 0.45, -0.08), 0.12), ((-0.2, 0.55, -0.42), 0.18), ((-0.65, -0.6, 0.03), 0.13))
+PLANTS = (((-1.1, 0.6, -0.1), 0.28), ((0.9, -0.6, -0.2), 0.24))
+LEAVES = 0.2  # share of the Gaussians that are in plants
+FAINT = 0.2  # share that is nearly transparent
+GAUSSIANS_PER_ROW = 20  # as training sizes the hash tables
+FOCAL = 0.75  # in picture widths
+
+
+def make_model(gaussians: int, device: torch.device, seed: int = 0) -> HybridModel:
+    """The room as a model of that many Gaussians, on a device."""
+    generator = torch.Generator().manual_seed(seed)
+    points, colors, sizes, opacities = _scatter(gaussians, generator)
+    log2 = min(21, max(8, round(math.log2(max(1, gaussians / GAUSSIANS_PER_ROW)))))
+    frame = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
+    config = ModelConfig(frame=frame, geometry=HashGridConfig(log2 - 1), radiance=HashGridConfig(log2))
+    bounds = torch.linalg.vector_norm(points, dim=-1, keepdim=True).clamp_min(1)
+    explicit = Gaussians(points, logit(colors), logit(sizes / bounds), logit(opacities))
+    return HybridModel(config, explicit, generator).to(device)
+
+
+def make_cameras(count: int, width: int, height: int) -> list[Camera]:
+    """Cameras on an ellipse inside the room, each looking across it and a little down; every fourth at the window."""
+    cameras = []
+    for number in range(count):
+        angle = 2 * math.pi * (number + 0.25) / count
+        position = np.array([0.95 * math.cos(angle), 0.7 * math.sin(angle), 0.15 + 0.2 * math.sin(3 * angle)])
+        target = np.array([-0.5 * math.cos(angle + 0.5), -0.4 * math.sin(angle + 0.5), -0.2])
+        if number % 4 == 0:
+            position, target = np.array([-0.9, 0.1 * number / count, 0.1]), np.array([1.5, -0.05, 0.05])
+        cameras.append(_look_at(position, target, width, height))
+    return cameras
+
+
+def make_scene(truth: HybridModel, cameras: list[Camera]) -> Scene:
+    """Photos of the model from the cameras, kept in memory, and a few of its points to start from."""
+    views = []
+    for number, camera in enumerate(cameras):
+        with torch.no_grad():
+            rgb = (255 * render(truth, camera).rgb.clamp(0, 1)).round().byte().cpu().numpy()
+        views.append(View(f"{number:04d}", camera, _keep(Picture(rgb))))
+    some = truth.gaussians.positions.detach()[:: max(1, len(truth) // 500)].double().cpu().numpy()
+    return Scene("a made-up room", "nerfstudio", views[1:], views[:1], some, np.full(some.shape, 0.5, np.float32))
+
+
+def _keep(picture: Picture) -> Callable[[], Picture]:
+    return lambda: picture
+
+
+@torch.no_grad()
+def disturb(model: HybridModel, seed: int = 1) -> HybridModel:
+    """Move the model's colours, sizes and opacities away from what they should be, so that training has work."""
+    generator = torch.Generator().manual_seed(seed)
+    explicit = model.gaussians
+    for values, size in ((explicit.color_logits, 0.5), (explicit.scale_logits, 0.15), (explicit.opacity_logits, 0.3)):
+        values += (size * torch.randn(values.shape, generator=generator)).to(values.device)
+    return model
+
+
+@dataclass(frozen=True)
+class Splats:
+    """What the rasteriser gets of a model for one view: `inputs` in the order of its arguments, and the view."""
+
+    inputs: dict[str, Tensor]
+    pose: Tensor
+    camera: Camera
+
+    @property
+    def view(self) -> tuple[Tensor, tuple[float, float, float, float], int, int]:
+        """The arguments that follow the inputs."""
+        return self.pose, self.camera.intrinsics, self.camera.width, self.camera.height
+
+
+@torch.no_grad()
+def splats_of(model: HybridModel, camera: Camera) -> Splats:
+    """All Gaussians of the model, decoded for one view."""
+    geometry: Geometry = model.decode_geometry()
+    pose = torch.as_tensor(model.config.frame.local_pose(camera), device=model.gaussians.positions.device)
+    inputs = {
+        "means": model.gaussians.positions,
+        "quats": geometry.quats,
+        "scales": geometry.scales,
+        "opacities": geometry.opacities,
+        "colors": model.decode_colors(viewpoint_of(pose).float()),
+    }
+    return Splats({name: tensor.detach().contiguous() for name, tensor in inputs.items()}, pose, camera)
+
+
+@torch.no_grad()
+def count_blended(splats: Splats, tiles: int = 48, near: float = 0.01) -> tuple[float, float]:
+    """What the blending comes to, from some of the picture's tiles, evenly spread.
+
+    Returns:
+        The mean number of Gaussians that add to a pixel, and the mean share of a tile's Gaussians that come before
+        all its pixels are finished.
+    """
+    camera = splats.camera
+    values = [splats.inputs[name] for name in ("means", "quats", "scales", "opacities")]
+    seen = project(*values, *splats.view, near, False)
+    seen = seen.select(torch.argsort(seen.depths))
+    reach = (2 * torch.log(255 * seen.opacities).clamp_min(0))[:, None] * seen.covs2d[:, [0, 2]]
+    lower, upper = seen.means2d - reach.sqrt(), seen.means2d + reach.sqrt()
+    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
+    places = torch.linspace(0, columns * rows - 1, min(tiles, columns * rows)).long().tolist()
+    corners = torch.stack(torch.meshgrid(torch.arange(TILE), torch.arange(TILE), indexing="xy"), -1).view(-1, 2)
+    added = reached = pairs = 0.0
+    for place in places:
+        corner = torch.tensor([TILE * (place % columns), TILE * (place // columns)])
+        pixels = (corner + corners + 0.5).to(lower)
+        inside = (lower <= pixels[-1]).all(-1) & (upper >= pixels[0]).all(-1) & (seen.opacities >= ALPHA_MIN)
+        here = seen.select(torch.nonzero(inside)[:, 0])
+        dx, dy = (here.means2d - pixels[:, None]).unbind(-1)
+        a, b, c = here.conics.unbind(-1)
+        alphas = here.opacities * torch.exp((-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy).clamp_max(0))
+        alphas = torch.where(alphas >= ALPHA_MIN, alphas.clamp_max(ALPHA_MAX), 0)
+        touched = (alphas > 0).any(0)
+        alphas = alphas[:, touched]
+        light = torch.cumprod(1 - alphas, 1).roll(1, 1)
+        light[:, :1] = 1
+        open_ = light > TRANSMITTANCE_MIN
+        added += float((open_ & (alphas > 0)).sum()) / len(pixels)
+        reached += float(open_.any(0).sum())
+        pairs += alphas.shape[1]
+    return added / len(places), reached / max(1.0, pairs)
+
+
+def _scatter(count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Positions (N, 3), colours (N, 3) in (0, 1), sizes (N, 1) in local units and opacities (N, 1)."""
+    leaves = int(LEAVES * count)
+    surface, area = _surfaces(count - leaves, generator)
+    spacing = math.sqrt(area / max(1, len(surface)))
+    groups = [surface]
+    sizes = [torch.full((len(surface), 1), 0.6 * spacing)]
+    for number, (center, radius) in enumerate(PLANTS):
+        some = leaves // len(PLANTS) + (number < leaves % len(PLANTS))
+        radii = radius * torch.rand(some, 1, generator=generator) ** (1 / 3)
+        groups.append(torch.tensor(center) + radii * _unit(some, generator))
+        gap = (4 / 3 * math.pi * radius**3 / max(1, some)) ** (1 / 3)
+        sizes.append(torch.full((some, 1), 0.35 * gap))
+    points = torch.cat(groups)
+    size = torch.cat(sizes) * torch.exp(0.5 * torch.randn(count, 1, generator=generator))
+    faint = torch.rand(count, 1, generator=generator) < FAINT
+    draw = torch.rand(count, 1, generator=generator)
+    opacities = torch.where(faint, 0.01 + 0.2 * draw, 0.6 + 0.38 * draw)
+    # Stripes and checks of several sizes: something for the radiance to vary over.
+    phases = points @ (8 * torch.randn(3, 6, generator=generator))
+    colors = 0.5 + 0.4 * torch.sin(phases[:, :3]) * torch.cos(0.4 * phases[:, 3:])
+    order = torch.randperm(count, generator=generator)
+    return points[order], colors[order], size[order], opacities[order]
+
+
+def _surfaces(count: int, generator: torch.Generator) -> tuple[Tensor, float]:
+    """Points spread evenly over all surfaces but the window, and how large the surfaces are."""
+    boxes = [((0.0, 0.0, 0.0), ROOM), *BOXES]
+    areas = [8 * (x * y + y * z + x * z) for _, (x, y, z) in boxes] + [4 * math.pi * r * r for _, r in SPHERES]
+    counts = [int(count * area / sum(areas)) for area in areas]
+    counts[0] += count - sum(counts)
+    parts = [_box(some, center, half, generator) for some, (center, half) in zip(counts, boxes, strict=False)]
+    for some, (center, radius) in zip(counts[len(boxes) :], SPHERES, strict=True):
+        parts.append(torch.tensor(center) + radius * _unit(some, generator))
+    points = torch.cat(parts)
+    (low_y, high_y), (low_z, high_z) = WINDOW
+    _, y, z = points.unbind(-1)
+    glass = (points[:, 0] >= ROOM[0]) & (y > low_y) & (y < high_y) & (z > low_z) & (z < high_z)
+    points[glass, 0] = -ROOM[0]  # what would lie in the window thickens the wall across
+    return points, sum(areas)
+
+
+def _box(count: int, center: tuple, half: tuple, generator: torch.Generator) -> Tensor:
+    """Points on the faces of a box, in proportion to their areas."""
+    x, y, z = half
+    axis = torch.multinomial(torch.tensor([y * z, x * z, x * y]), max(1, count), True, generator=generator)[:count]
+    points = 2 * torch.rand(count, 3, generator=generator) - 1
+    side = torch.where(torch.rand(count, generator=generator) < 0.5, -1.0, 1.0)
+    points[torch.arange(count), axis] = side
+    return torch.tensor(center) + points * torch.tensor(half)
+
+
+def _unit(count: int, generator: torch.Generator) -> Tensor:
+    return torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+
+
+def _look_at(position: np.ndarray, target: np.ndarray, width: int, height: int) -> Camera:
+    forward = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(forward, (0, 0, 1))
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ position
+    return Camera(width, height, FOCAL * width, FOCAL * width, width / 2, height / 2, pose)

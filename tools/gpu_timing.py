@@ -1,0 +1,148 @@
+"""Times of tasks on a device, and what the device can do at best: copied bytes and multiplied numbers a second."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from statistics import median
+
+import torch
+
+# Written before each measurement: more than any L2 cache holds, so that each starts cold, and so much that the host has
+# queued a short task before it begins.
+FLUSHED_BYTES = 1 << 30
+WARM_RUNS = 3
+
+
+@dataclass(frozen=True)
+class Rates:
+    """What was measured on this very device.
+
+    Attributes:
+        copy: bytes a second of a large copy, those read and those written.
+        bf16, fp32: floating point operations a second of a large matrix product; fp32 without TF32.
+    """
+
+    copy: float
+    bf16: float
+    fp32: float
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait until the device has done what it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def take_turns(
+    tasks: Mapping[str, Callable[[], object]], repeats: int, device: torch.device, seconds: float = 10.0
+) -> dict[str, float]:
+    """Median milliseconds of each task; they take turns.
+
+    On a GPU between two events of the stream, warm and each after a cache flush; elsewhere by the wall clock.
+
+    Args:
+        repeats: turns, at least 1.
+        seconds: no further turn is begun after this long.
+    """
+    flushed = torch.empty(FLUSHED_BYTES, dtype=torch.uint8, device=device) if device.type == "cuda" else None
+    if flushed is not None:
+        for task in tasks.values():
+            for _ in range(WARM_RUNS):
+                task()
+        synchronize(device)
+    times: dict[str, list[float]] = {name: [] for name in tasks}
+    began = time.perf_counter()
+    for turn in range(repeats):
+        if turn and time.perf_counter() - began > seconds:
+            break
+        for name, task in tasks.items():
+            times[name].append(_measure(task, flushed))
+    return {name: median(measured) for name, measured in times.items()}
+
+
+def _measure(task: Callable[[], object], flushed: torch.Tensor | None) -> float:
+    if flushed is None:
+        start = time.perf_counter()
+        task()
+        return 1e3 * (time.perf_counter() - start)
+    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    flushed.zero_()
+    start.record()
+    task()
+    end.record()
+    end.synchronize()
+    return start.elapsed_time(end)
+
+
+@cache
+def measure_rates(device: torch.device) -> Rates:
+    """Best of several: a copy of 1 GiB and products of 8192 x 8192 random matrices; small ones on a CPU."""
+    large = device.type == "cuda"
+    count, side = (1 << 28, 8192) if large else (1 << 18, 128)
+    source = torch.rand(count, device=device)
+    target = torch.empty_like(source)
+    single = torch.randn(side, side, device=device)
+    half = single.bfloat16()
+    tf32 = torch.backends.cuda.matmul.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = False
+    try:
+        times = take_turns(
+            {
+                "copy": lambda: target.copy_(source),
+                "bf16": lambda: half @ half,
+                "fp32": lambda: single @ single,
+            },
+            7,
+            device,
+        )
+    finally:
+        torch.backends.cuda.matmul.allow_tf32 = tf32
+    return Rates(
+        copy=2 * 4 * count / (1e-3 * times["copy"]),
+        bf16=2 * side**3 / (1e-3 * times["bf16"]),
+        fp32=2 * side**3 / (1e-3 * times["fp32"]),
+    )
+
+
+def kernel_times(task: Callable[[], object], runs: int, device: torch.device) -> dict[str, float]:
+    """Milliseconds that one run of the task spends in each kernel of the GPU, by name, longest first.
+
+    From torch's profiler; empty where there is no GPU.
+    """
+    if device.type != "cuda":
+        return {}
+    from torch.profiler import ProfilerActivity, profile
+
+    task()
+    synchronize(device)
+    with profile(activities=[ProfilerActivity.CUDA]) as profiler:
+        for _ in range(runs):
+            task()
+        synchronize(device)
+    return sum_kernels(profiler.key_averages(), runs)
+
+
+def sum_kernels(events: object, runs: int) -> dict[str, float]:
+    """Milliseconds a run by kernel, longest first, from the averages of torch's profiler."""
+    times: dict[str, float] = {}
+    for event in events:
+        if str(event.device_type).endswith("CUDA") and event.self_device_time_total:
+            times[event.key] = times.get(event.key, 0.0) + 1e-3 * event.self_device_time_total / runs
+    return dict(sorted(times.items(), key=lambda item: -item[1]))
+
+
+def group_kernels(
+    times: Mapping[str, float], groups: Mapping[str, tuple[str, ...]], rest: str = "other"
+) -> dict[str, float]:
+    """Milliseconds of each group of kernels; a kernel belongs to the first group one of whose words is in its name.
+
+    Those that belong to none are under `rest`.
+    """
+    grouped = dict.fromkeys((*groups, rest), 0.0)
+    for name, ms in times.items():
+        lower = name.lower()
+        grouped[next((group for group, words in groups.items() if any(w in lower for w in words)), rest)] += ms
+    return grouped
