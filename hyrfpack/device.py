@@ -27,8 +27,11 @@ def choose_device(name: str = "auto", say: Callable[[str], None] = lambda senten
 
     Args:
         name: "auto" (a CUDA or ROCm device where one is usable and Triton is installed, the CPU otherwise), "cpu",
-            "cuda" or "cuda:N" (ROCm too is called so in torch), or "mps".
+            "cuda" (torch's current one; ROCm too is called so) or "cuda:N", or "mps".
         say: told in a sentence where the choice runs without kernels.
+
+    Returns:
+        The device; "cuda:N" is also made torch's current one, on which kernels are launched.
 
     Raises:
         HyrfError: there is no such device.
@@ -37,7 +40,7 @@ def choose_device(name: str = "auto", say: Callable[[str], None] = lambda senten
         raise HyrfError(f"'{name}' is no device; use auto, cpu, cuda, cuda:N or mps")
     kind, _, number = name.partition(":")
     if kind == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() and has_triton() else "cpu")
+        kind = name = "cuda" if torch.cuda.is_available() and has_triton() else "cpu"
     if kind == "cuda":
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
         if int(number or 0) >= count:
@@ -45,6 +48,8 @@ def choose_device(name: str = "auto", say: Callable[[str], None] = lambda senten
             raise HyrfError(f"device '{name}' is not there, {there}; install a GPU build of torch or use --device cpu")
         if not has_triton():
             say(NO_TRITON)
+        if number:
+            torch.cuda.set_device(int(number))  # kernels are launched on the current device
     if kind == "mps":
         if not torch.backends.mps.is_available():
             raise HyrfError("device 'mps' is not there, torch sees no Apple GPU; use --device cpu")

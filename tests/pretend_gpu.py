@@ -149,6 +149,8 @@ def pretended_gpu() -> Iterator[torch.device]:
         mock.patch.object(torch.__future__, "get_overwrite_module_params_on_conversion", lambda: True),
         mock.patch.object(torch.cuda, "is_available", lambda: True),
         mock.patch.object(torch.cuda, "device_count", lambda: 1),
+        mock.patch.object(torch.cuda, "current_device", lambda: 0),
+        mock.patch.object(torch.cuda, "set_device", lambda _: None),
         mock.patch.object(torch.cuda, "synchronize", lambda *_: None),
         mock.patch.object(torch.cuda, "get_device_properties", lambda *_: properties),
         mock.patch.object(torch.cuda, "get_device_capability", lambda *_: (9, 0)),

@@ -10,6 +10,7 @@ from pretend_gpu import CUDA, OnGpu, pretended_gpu
 from hyrfpack import device as devices
 from hyrfpack.device import choose_device, upload
 from hyrfpack.errors import HyrfError
+from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.scene import Picture
 
 needs_no_gpu = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
@@ -43,6 +44,13 @@ def test_what_is_no_device_is_refused_in_one_sentence(name):
 def test_a_gpu_beyond_the_last_is_refused():
     with pretended_gpu(), pytest.raises(HyrfError, match="cuda:1.*sees 1 of them"):
         choose_device("cuda:1")
+
+
+def test_kernels_refuse_tensors_of_another_gpu_than_the_current_one(monkeypatch):
+    with pretended_gpu() as gpu:
+        monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
+        with pytest.raises(ValueError, match=r"set_device\(0\)"):
+            hash_encode(torch.zeros(1, 3, device=gpu), torch.zeros(8, 2, device=gpu), (2,), 3)
 
 
 def test_a_slow_choice_is_told(monkeypatch):

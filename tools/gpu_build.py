@@ -165,9 +165,35 @@ def shade_runs(count: int, width: int, height: int) -> Iterator[Run]:
         yield partial(run, *options)
 
 
+def background_runs(count: int, width: int, height: int) -> Iterator[Run]:
+    from hyrfpack.model.hash_grid import HashGridConfig
+    from hyrfpack.ops.background import background_grid
+    from hyrfpack.ops.shade import DIRECTION_FEATURES
+
+    grid = HashGridConfig(log2_table_size=10)
+    for encoding, mixed in (("frequency", True), ("frequency", False), ("sh", True), ("sh", False)):
+        widths = [2 * grid.levels + DIRECTION_FEATURES[encoding], 64, 64, 3]
+        settings = {
+            "threshold": 0.1,
+            "stride": 2 if mixed else 4,
+            "pose": torch.eye(4),
+            "intrinsics": (50.0, 50.0, width / 2, height / 2),
+            "half_extent": (1.0, 1.0, 1.0),
+            "table": torch.rand(grid.rows, 2),
+            "resolutions": grid.resolutions,
+            "log2_table_size": grid.log2_table_size,
+            "weights": [torch.rand(shape) for shape in zip(widths[1:], widths, strict=False)],
+            "biases": [torch.rand(size) for size in widths[1:]],
+            "encoding": encoding,
+            "mixed": mixed,
+        }
+        yield partial(background_grid, torch.rand(height, width), **settings)
+
+
 OPERATIONS = {
     "mlp": mlp_runs,
     "shade": shade_runs,
+    "background": background_runs,
     "rasterize": rasterize_runs,
     "ssim": ssim_runs,
     "hash_encode": hash_encode_runs,

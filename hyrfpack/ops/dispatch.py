@@ -55,9 +55,18 @@ def choose(implementation: str, available: tuple[str, ...], *tensors: Tensor) ->
         if not fits[implementation]:
             where = {"cpu": "on the CPU", "gpu": "on a CUDA or ROCm device"}[implementation]
             raise ValueError(f"the {implementation} kernels take float32 {where}, not {first.dtype} on {first.device}")
+        if implementation == "gpu" and place == "cuda":
+            _check_current(first.device)
         return implementation
     if "gpu" in available and fits["gpu"] and place == "cuda" and has_triton():
+        _check_current(first.device)
         return "gpu"
     if "cpu" in available and fits["cpu"] and has_numba():
         return "cpu"
     return "reference"
+
+
+def _check_current(device: torch.device) -> None:
+    """Kernels are launched on torch's current device, whatever their tensors are on."""
+    if device.index != torch.cuda.current_device():
+        raise ValueError(f"kernels run on the current GPU; make it this one by torch.cuda.set_device({device.index})")

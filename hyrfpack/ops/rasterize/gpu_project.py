@@ -329,10 +329,10 @@ def project_block(mean, quat, scale, opacity, camera, width, height, ANTIALIASED
 
 
 @triton.jit
-def store_records(records, index, drawn, words, color):
-    """Write records (N, 8) int64 of Gaussians `index` where drawn.
+def store_records(records, index, drawn, words):
+    """Write records (N, 8) int64 of Gaussians `index` where drawn, all but what `store_colors` writes.
 
-    words: of `project_block`; color: tuple of 3 blocks.
+    words: of `project_block`.
     """
     reference, offset, u_slopes, v_slope_opacity, depth, mean, covariance = words
     at = records + index.to(tl.int64) * WORDS
@@ -340,10 +340,16 @@ def store_records(records, index, drawn, words, color):
     tl.store(at + OFFSET, pack(offset[0], offset[1]), mask=drawn)
     tl.store(at + U_SLOPES, pack(u_slopes[0], u_slopes[1]), mask=drawn)
     tl.store(at + V_SLOPE_OPACITY, pack(v_slope_opacity[0], v_slope_opacity[1]), mask=drawn)
-    tl.store(at + RED_GREEN, pack(color[0], color[1]), mask=drawn)
-    tl.store(at + BLUE_DEPTH, pack(color[2], depth), mask=drawn)
     tl.store(at + MEAN, pack(mean[0], mean[1]), mask=drawn)
     tl.store(at + COVARIANCE, pack(covariance[0], covariance[1]), mask=drawn)
+
+
+@triton.jit
+def store_colors(records, index, drawn, color, depth):
+    """Write what of records depends on colours, a tuple of 3 blocks, and the depth that shares a word with one."""
+    at = records + index.to(tl.int64) * WORDS
+    tl.store(at + RED_GREEN, pack(color[0], color[1]), mask=drawn)
+    tl.store(at + BLUE_DEPTH, pack(color[2], depth), mask=drawn)
 
 
 @triton.jit
@@ -352,16 +358,25 @@ def _finite(a):
 
 
 @triton.jit
-def flag_nonfinite(flags, mean, quat, scale, opacity, color):
+def _flag(flags, bits):
+    if tl.max(bits, 0) > 0:
+        tl.atomic_or(flags + tl.zeros_like(bits), bits.to(tl.int64), mask=bits > 0)
+
+
+@triton.jit
+def flag_geometry(flags, mean, quat, scale, opacity):
     """Set a bit, in the order of NAMES, of the one int64 `flags` for each input that is not finite somewhere."""
     means = _finite(mean[0]) & _finite(mean[1]) & _finite(mean[2])
     quats = _finite(quat[0]) & _finite(quat[1]) & _finite(quat[2]) & _finite(quat[3])
     scales = _finite(scale[0]) & _finite(scale[1]) & _finite(scale[2])
-    colors = _finite(color[0]) & _finite(color[1]) & _finite(color[2])
     bits = tl.where(means, 0, 1) | tl.where(quats, 0, 2) | tl.where(scales, 0, 4)
-    bits |= tl.where(_finite(opacity), 0, 8) | tl.where(colors, 0, 16)
-    if tl.max(bits, 0) > 0:
-        tl.atomic_or(flags + tl.zeros_like(bits), bits.to(tl.int64), mask=bits > 0)
+    _flag(flags, bits | tl.where(_finite(opacity), 0, 8))
+
+
+@triton.jit
+def flag_colors(flags, color):
+    """As `flag_geometry`, the last bit, for colours."""
+    _flag(flags, tl.where(_finite(color[0]) & _finite(color[1]) & _finite(color[2]), 0, 16))
 
 
 @triton.jit(do_not_specialize=["total", "width", "height"])
@@ -379,9 +394,11 @@ def project(
     mean, quat = load_rows_3(means, index, live), load_rows_4(quats, index, live)
     scale, color = load_rows_3(scales, index, live), load_rows_3(colors, index, live)
     opacity = tl.load(opacities + index, mask=live, other=0.0)
-    flag_nonfinite(flags, mean, quat, scale, opacity, color)
+    flag_geometry(flags, mean, quat, scale, opacity)
+    flag_colors(flags, color)
     words, key, count = project_block(mean, quat, scale, opacity, load_camera(camera), width, height, ANTIALIASED)
-    store_records(records, index, count > 0, words, color)
+    store_records(records, index, count > 0, words)
+    store_colors(records, index, count > 0, color, words[4])
     tl.store(keys + index, key, mask=live)
     tl.store(counts + index, count, mask=live)
     tl.store(visible + index, (count > 0).to(tl.uint8), mask=live)

@@ -12,12 +12,14 @@ from hyrfpack.ops.rasterize.gpu import draw
 from hyrfpack.ops.rasterize.gpu_project import (
     Projection,
     camera_numbers,
-    flag_nonfinite,
+    flag_colors,
+    flag_geometry,
     in_frustum,
     load_camera,
     load_rows_3,
     load_rows_4,
     project_block,
+    store_colors,
     store_records,
 )
 from hyrfpack.ops.shade import Shading
@@ -41,18 +43,20 @@ def project_shaded(
     shown = tl.where(in_frustum(mean, numbers), opacity, 0.0)
     words, key, count = project_block(mean, quat, scale, shown, numbers, width, height, ANTIALIASED)
     drawn = count > 0
-    color = (tl.zeros_like(opacity), tl.zeros_like(opacity), tl.zeros_like(opacity))
+    # Stored before the colours are worked out, which takes all registers.
+    store_records(records, index, drawn, words)
+    flag_geometry(flags, mean, quat, scale, opacity)
+    tl.store(keys + index, key, mask=live)
+    tl.store(counts + index, count, mask=live)
+    tl.store(visible + index, drawn.to(tl.uint8), mask=live)
     if tl.max(count, 0) > 0:
         color = shade_block(
             mean, index, drawn, viewpoint, first_layer, packed, b2, b3, color_logits,
             IN, H1, H2, OUT, IN_P, H1_P, H2_P, OUT_P, FREQUENCY, PRECISION,
         )  # fmt: skip
         color = (tl.where(drawn, color[0], 0.0), tl.where(drawn, color[1], 0.0), tl.where(drawn, color[2], 0.0))
-        store_records(records, index, drawn, words, color)
-    flag_nonfinite(flags, mean, quat, scale, opacity, color)
-    tl.store(keys + index, key, mask=live)
-    tl.store(counts + index, count, mask=live)
-    tl.store(visible + index, drawn.to(tl.uint8), mask=live)
+        store_colors(records, index, drawn, color, words[4])
+        flag_colors(flags, color)
 
 
 def rasterize_shaded(
