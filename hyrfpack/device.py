@@ -64,6 +64,11 @@ def describe_device(device: torch.device) -> str:
     return f"cuda:{device.index or 0} ({torch.cuda.get_device_properties(device).name})"
 
 
+def upload_array(array: np.ndarray, device: torch.device) -> Tensor:
+    """An array on a device. CUDA takes it over at once; a blocking copy would also wait for what is under way there."""
+    return torch.from_numpy(array).to(device, non_blocking=device.type == "cuda")
+
+
 def upload(picture: Picture, solid: np.ndarray | None, device: torch.device) -> tuple[Tensor, Tensor | None]:
     """A photo over a solid colour, on a device.
 
@@ -74,14 +79,14 @@ def upload(picture: Picture, solid: np.ndarray | None, device: torch.device) -> 
     Returns:
         (H, W, 3) float32 in [0, 1], and the (H, W) bool mask or None. As `Picture.composite`.
     """
-    mask = None if picture.mask is None else torch.from_numpy(picture.mask).to(device)
+    mask = None if picture.mask is None else upload_array(picture.mask, device)
     if device.type == "cpu":
         return torch.from_numpy(picture.composite(solid)), mask
     # Bytes travel, a quarter of the floats; the arithmetic is done there.
-    rgb = torch.from_numpy(picture.rgb).to(device).float() * (1 / 255)
+    rgb = upload_array(picture.rgb, device).float() * (1 / 255)
     if picture.alpha is not None:
-        alpha = torch.from_numpy(picture.alpha).to(device).float()[..., None] * (1 / 255)
+        alpha = upload_array(picture.alpha, device).float()[..., None] * (1 / 255)
         rgb *= alpha
         if solid is not None:
-            rgb += (1 - alpha) * torch.from_numpy(solid).to(device)
+            rgb += (1 - alpha) * upload_array(solid, device)
     return rgb, mask

@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from hyrfpack.errors import HyrfDataError
@@ -75,4 +76,6 @@ class Frame:
 
     def normalize(self, local: Tensor) -> Tensor:
         """Local positions (..., 3) to u = local / half_extent, where the box is [-1, 1]^3."""
-        return local / local.new_tensor(self.half_extent)
+        # Not blocking: a blocking copy would make the host wait for all that a GPU still has to do.
+        half_extent = torch.tensor(self.half_extent, dtype=local.dtype).to(local.device, non_blocking=local.is_cuda)
+        return local / half_extent

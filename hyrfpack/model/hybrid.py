@@ -140,7 +140,8 @@ class HybridModel(nn.Module):
         raw = self.geometry(self.cube_coords(positions), mixed=self._mixed)
         opacities = torch.sigmoid(raw[:, 0] + pick(explicit.opacity_logits)[:, 0])
         scales = self.activate_scales(raw[:, 1:4], pick(explicit.scale_logits)) * self.scale_bounds(positions)
-        return Geometry(scales, raw[:, 4:] + raw.new_tensor((1, 0, 0, 0)), opacities)
+        no_turn = torch.eye(1, 4, dtype=raw.dtype, device=raw.device)  # made there: a copy would make the host wait
+        return Geometry(scales, raw[:, 4:] + no_turn, opacities)
 
     def activate_scales(self, neural: Tensor, explicit: Tensor) -> Tensor:
         """Scales (N, 3) as a fraction of S(p), from neural (N, 3) and explicit (N, 1) logits."""

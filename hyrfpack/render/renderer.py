@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from math import isfinite
 
 import torch
 from torch import Tensor
@@ -105,7 +106,6 @@ def render(
     seconds: dict[str, float] = {}
     positions = model.gaussians.positions
     pose_here = torch.as_tensor(model.config.frame.local_pose(camera), dtype=positions.dtype)
-    pose = pose_here.to(positions.device, non_blocking=True)
     on_cpu = positions.device.type == "cpu"
     _refuse_nonfinite(pose=pose_here)
     view = pose_here, camera.intrinsics, camera.width, camera.height
@@ -123,6 +123,7 @@ def render(
         raster = rasterize_shaded(*explicit, decoded.shading, *view, cull_tolerance=settings.cull_tolerance, **how)
     else:
         _refuse_nonfinite(positions=positions)  # culling would leave them out
+        pose = pose_here.to(positions.device, non_blocking=True)
         with _timed(seconds, "cull"), torch.no_grad():
             index = frustum_cull(positions, pose, *view[1:], settings.near, settings.cull_tolerance)
         with _timed(seconds, "decode"):
@@ -160,7 +161,7 @@ def render(
 def _refuse_nonfinite(**values: Tensor) -> None:
     """Raise HyrfError for NaN and infinity: further on they fail every comparison and are left out without a word."""
     for name, tensor in values.items():
-        if tensor.numel() and not torch.stack(tensor.detach().aminmax()).isfinite().all():
+        if tensor.numel() and not all(map(isfinite, torch.stack(tensor.detach().aminmax()).tolist())):
             raise _nonfinite(name)
 
 

@@ -61,8 +61,10 @@ class DensityControl:
         """Collect the gradients of one view, after backward."""
         if rendering.absgrad is None:
             return
-        # To pick the visible would make the host wait for the device: zeros are added instead.
-        ndc = rendering.absgrad * rendering.absgrad.new_tensor((width / 2, height / 2))
+        # To pick the visible, or a blocking copy, would make the host wait for the device: zeros are added instead.
+        absgrad = rendering.absgrad
+        half = torch.tensor((width / 2, height / 2), dtype=absgrad.dtype)
+        ndc = absgrad * half.to(absgrad.device, non_blocking=absgrad.is_cuda)
         lengths = torch.where(rendering.visible, torch.linalg.vector_norm(ndc, dim=-1), 0)
         self.gradients.index_add_(0, rendering.decoded, lengths.to(self.gradients.dtype))
         self.views.index_add_(0, rendering.decoded, rendering.visible.to(self.views.dtype))

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from hyrfpack.data import PictureCache
-from hyrfpack.device import upload
+from hyrfpack.device import upload, upload_array
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
@@ -135,7 +135,7 @@ class Trainer:
                 self.model,
                 view.camera,
                 absgrad=self.density.watching(self.step),
-                solid=None if solid is None else torch.from_numpy(solid).to(self.device),
+                solid=None if solid is None else upload_array(solid, self.device),
             )
         except HyrfError:
             self._refuse(view, "a number to be rendered is not finite", self._nonfinite_parameters())

@@ -222,6 +222,19 @@ def test_memory_layout_of_coords_and_gradients_does_not_matter(implementation: s
         torch.testing.assert_close(other, expected, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("implementation", KERNELS)
+def test_a_table_may_lie_anywhere_in_a_larger_tensor(implementation: str) -> None:
+    resolutions, log2_table_size = (5, 9, 33), 9
+    coords, table = (placed(t, implementation) for t in (uniform(300, 3), table_for(resolutions, log2_table_size)))
+    inside = torch.cat((table.new_zeros(1), table.reshape(-1)))[1:].view(table.shape)
+
+    features = hash_encode(coords, inside, resolutions, log2_table_size, implementation=implementation)
+
+    assert torch.equal(
+        features, hash_encode(coords, table, resolutions, log2_table_size, implementation=implementation)
+    )
+
+
 @pytest.mark.skipif(not has_numba(), reason="no numba")
 def test_bytes_do_not_depend_on_threads_or_on_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     resolutions, log2_table_size = level_resolutions(8, 8, 128), 10

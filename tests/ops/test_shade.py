@@ -105,6 +105,25 @@ def test_mixed_precision_stays_near(encoding: str, implementation: str) -> None:
     assert (colors.cpu().double() - exact).abs().max() < 2e-2
 
 
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_memory_layout_does_not_matter(implementation: str) -> None:
+    positions, viewpoint, widths = CASES["random"]
+    shading = single(shading_of(*decoder(len(positions), "sh", widths), "sh"))
+    positions, viewpoint = gpu(positions.float()), gpu(viewpoint.float())
+
+    def spread(tensor: torch.Tensor) -> torch.Tensor:
+        """The same numbers, the last axis in steps of two."""
+        return tensor.repeat_interleave(2, -1)[..., ::2]
+
+    others = {name: spread(getattr(shading, name)) for name in ("first_layer", "direction_weight", "color_logits")}
+    others |= {name: tuple(map(spread, getattr(shading, name))) for name in ("weights", "biases")}
+    colors = shade(
+        spread(positions), spread(viewpoint), dataclasses.replace(shading, **others), implementation=implementation
+    )
+
+    torch.testing.assert_close(colors, shade(positions, viewpoint, shading, implementation=implementation))
+
+
 @pytest.mark.parametrize("wrong", ["first_layer", "direction_weight", "color_logits", "encoding"])
 def test_what_does_not_fit_together_is_refused(wrong: str) -> None:
     positions, viewpoint, widths = CASES["random"]

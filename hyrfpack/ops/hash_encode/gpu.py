@@ -185,7 +185,10 @@ def _blocks(points: int) -> int:
 
 def _whole_rows(table: Tensor) -> Tensor:
     """The (rows, 2) float32 table as one 64-bit number a row."""
-    return table.detach().contiguous().view(torch.int64)
+    table = table.detach().contiguous()
+    if table.storage_offset() % 2:  # between two such numbers of the memory that it is a part of
+        table = table.clone()
+    return table.view(torch.int64)
 
 
 def encode(coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int) -> Tensor:

@@ -76,7 +76,7 @@ def backward(
         grad_x = x.new_empty(x.shape[1], x.shape[0]).T if planar else torch.empty_like(x)
     inputs, hidden1, hidden2, outputs = widths
     lengths = [hidden1 * inputs, hidden2 * hidden1, outputs * hidden2, hidden1, hidden2, outputs]
-    block = _backward_block(way)
+    block = _backward_block(way, x.device)
     programs = _programs(x, block, _BACKWARD_RESIDENT)
     partials = x.new_empty(programs, sum(lengths))
     parts = [{"UPPER": True, "LOWER": True, "NEEDS_X": needs_x}]
@@ -117,14 +117,14 @@ def _warps(constants: dict[str, int]) -> int:
 
 
 @cache
-def _backward_block(precision: str) -> int:
-    """Points a block of the backward pass: the most that do not spill, here.
+def _backward_block(precision: str, device: torch.device) -> int:
+    """Points a block of the backward pass: the most that do not spill on this device.
 
     Matrix units that read a factor from shared memory (compute capability 9 and 10) leave registers for more.
     """
     if interpreting():
         return 32
-    reads_shared = not torch.version.hip and torch.cuda.get_device_capability()[0] in (9, 10)
+    reads_shared = not torch.version.hip and torch.cuda.get_device_capability(device)[0] in (9, 10)
     return 32 if reads_shared and precision == "bf16" else 16
 
 

@@ -76,7 +76,7 @@ class Projection:
             return torch.empty(shape, dtype=dtype, device=device)
 
         numbers = new(1 + total, dtype=torch.int64)
-        numbers[0] = 0
+        numbers[:1].zero_()  # numbers[0] = 0 would copy from the host, and wait
         keys, counts = new(total, dtype=torch.int32), new(total, dtype=torch.int32)
         return cls(new(total, WORDS.value, dtype=torch.int64), keys, counts, new(total, dtype=torch.uint8), numbers)
 

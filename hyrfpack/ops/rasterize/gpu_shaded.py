@@ -87,7 +87,7 @@ def rasterize_shaded(
     if total:
         block, warps = launch_size(shading.mixed)
         project_shaded[(triton.cdiv(total, block),)](
-            *inputs, viewpoint, *tensors, camera, total, width, height,
+            *inputs, viewpoint, *tensors, camera, total, int(width), int(height),
             projection.records, projection.keys, projection.counts, projection.visible, projection.numbers,
             **constants, ANTIALIASED=bool(antialiased), BLOCK=block, num_warps=warps, enable_fp_fusion=True,
         )  # fmt: skip

@@ -89,10 +89,11 @@ def operands(shading: Shading) -> tuple[tuple[Tensor, ...], dict]:
     """What `shade_block` takes after the viewpoint: tensors, and constants by name."""
     kind = precision(shading.mixed)
     weights = (shading.direction_weight, *shading.weights)
-    tensors = shading.first_layer, pack(weights, kind), *(bias.detach() for bias in shading.biases)
+    later = (tensor.detach().contiguous() for tensor in (*shading.biases, shading.color_logits))
+    tensors = shading.first_layer.contiguous(), pack(weights, kind), *later
     widths = [shading.direction_weight.shape[1], *(weight.shape[0] for weight in weights)]
     constants = sizes(widths) | {"FREQUENCY": shading.encoding == "frequency", "PRECISION": kind}
-    return (*tensors, shading.color_logits.detach()), constants
+    return tensors, constants
 
 
 def shade(positions: Tensor, viewpoint: Tensor, shading: Shading) -> Tensor:
@@ -102,7 +103,7 @@ def shade(positions: Tensor, viewpoint: Tensor, shading: Shading) -> Tensor:
     if len(positions):
         block, warps = launch_size(shading.mixed)
         shade_kernel[(triton.cdiv(len(positions), block),)](
-            positions.detach().contiguous(), viewpoint.detach(), *tensors, colors, len(positions),
+            positions.detach().contiguous(), viewpoint.detach().contiguous(), *tensors, colors, len(positions),
             **constants, BLOCK=block, num_warps=warps, enable_fp_fusion=True,
         )  # fmt: skip
     return colors
