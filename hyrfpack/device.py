@@ -17,6 +17,10 @@ NO_TRITON = (
     "Triton is not installed, so the GPU runs plain torch, far slower than kernels would be; install the package "
     "'triton' that fits this torch"
 )
+OLD_GPU = (
+    "this GPU is of a generation before NVIDIA's Ampere, which the kernels are not made for: they run slowly; "
+    "--precision float32 and --device cpu are worth a try"
+)
 NO_METAL = (
     "there are no kernels for Apple's GPU: it runs the plain torch reference, which is slow; --device cpu is faster"
 )
@@ -48,6 +52,11 @@ def choose_device(name: str = "auto", say: Callable[[str], None] = lambda senten
             raise HyrfError(f"device '{name}' is not there, {there}; install a GPU build of torch or use --device cpu")
         if not has_triton():
             say(NO_TRITON)
+        elif not torch.version.hip and torch.cuda.get_device_capability(int(number or torch.cuda.current_device())) < (
+            8,
+            0,
+        ):
+            say(OLD_GPU)
         if number:
             torch.cuda.set_device(int(number))  # kernels are launched on the current device
     if kind == "mps":

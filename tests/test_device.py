@@ -60,7 +60,12 @@ def test_a_slow_choice_is_told(monkeypatch):
     assert choose_device("mps", said.append).type == "mps"
     with pretended_gpu():
         assert choose_device("cuda", said.append).type == "cuda"
-    assert said == [devices.NO_METAL, devices.NO_TRITON]
+    monkeypatch.setattr(devices, "has_triton", lambda: True)
+    with pretended_gpu():
+        choose_device("cuda", said.append)
+        monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _: (7, 5))
+        choose_device("cuda", said.append)
+    assert said == [devices.NO_METAL, devices.NO_TRITON, devices.OLD_GPU]
 
 
 @pytest.mark.parametrize("solid", [None, np.array([0.25, 0.5, 1.0], np.float32)])

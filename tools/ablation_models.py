@@ -44,6 +44,11 @@ class SingleField(HybridModel):
     def _radiance(self, positions: Tensor, directions: Tensor) -> Tensor:
         return super()._radiance(positions, directions)[:, :3]
 
+    def _color_layers(self) -> tuple[list[Tensor], list[Tensor]]:
+        *weights, weight = self.radiance.weights
+        *biases, bias = self.radiance.biases
+        return [*weights, weight[:3]], [*biases, bias[:3]]
+
 
 class _GeometryOf(nn.Module):
     """The geometry outputs of a single field; owns none of its parameters."""

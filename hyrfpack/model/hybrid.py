@@ -116,7 +116,7 @@ class HybridModel(nn.Module):
         """The colour decoder with what of its first layer does not depend on the view worked out for all Gaussians."""
         field, explicit = self.radiance, self.gaussians
         places = field.grid.features
-        (weight, *weights), (bias, *biases) = field.weights, field.biases
+        (weight, *weights), (bias, *biases) = self._color_layers()
         rows = [
             mlp(field.grid(self.cube_coords(some)), [weight[:, :places]], [bias], mixed=self._mixed)
             for some in explicit.positions.split(SHADED_AT_ONCE)
@@ -181,18 +181,23 @@ class HybridModel(nn.Module):
 
     def _sphere(self, intrinsics: tuple[float, float, float, float], pose: Tensor) -> dict[str, Any]:
         """What the colours of the background depend on."""
+        weights, biases = self._color_layers()
         return {
             "pose": pose,
             "intrinsics": intrinsics,
             "half_extent": self.config.frame.half_extent,
             "table": self.radiance.grid.table,
-            "resolutions": self.config.radiance.resolutions,
-            "log2_table_size": self.config.radiance.log2_table_size,
-            "weights": list(self.radiance.weights),
-            "biases": list(self.radiance.biases),
+            "resolutions": self.radiance.grid.config.resolutions,
+            "log2_table_size": self.radiance.grid.config.log2_table_size,
+            "weights": weights,
+            "biases": biases,
             "encoding": self.config.direction_encoding,
             "mixed": self._mixed,
         }
+
+    def _color_layers(self) -> tuple[list[Tensor], list[Tensor]]:
+        """Weights and biases of the decoder of colours."""
+        return list(self.radiance.weights), list(self.radiance.biases)
 
     def _radiance(self, positions: Tensor, directions: Tensor) -> Tensor:
         encoded = encode_directions(directions, self.config.direction_encoding)

@@ -55,6 +55,8 @@ def choose(implementation: str, available: tuple[str, ...], *tensors: Tensor) ->
         if not fits[implementation]:
             where = {"cpu": "on the CPU", "gpu": "on a CUDA or ROCm device"}[implementation]
             raise ValueError(f"the {implementation} kernels take float32 {where}, not {first.dtype} on {first.device}")
+        if implementation == "gpu" and not has_triton():
+            raise ValueError("the gpu kernels need Triton, which is not installed")
         if implementation == "gpu" and place == "cuda":
             _check_current(first.device)
         return implementation

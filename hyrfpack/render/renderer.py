@@ -123,7 +123,7 @@ def render(
         raster = rasterize_shaded(*explicit, decoded.shading, *view, cull_tolerance=settings.cull_tolerance, **how)
     else:
         _refuse_nonfinite(positions=positions)  # culling would leave them out
-        pose = pose_here.to(positions.device, non_blocking=True)
+        pose = pose_here.to(positions.device, non_blocking=positions.is_cuda)
         with _timed(seconds, "cull"), torch.no_grad():
             index = frustum_cull(positions, pose, *view[1:], settings.near, settings.cull_tolerance)
         with _timed(seconds, "decode"):
@@ -139,12 +139,15 @@ def render(
         if model.config.background and background:
             behind = _background(model, camera, pose_here, raster.transmittance, settings)
         else:
-            behind = torch.tensor(model.config.solid).to(positions, non_blocking=True) if solid is None else solid
+            behind = (
+                torch.tensor(model.config.solid).to(positions, non_blocking=positions.is_cuda)
+                if solid is None
+                else solid
+            )
             if on_cpu:
                 _refuse_nonfinite(background=behind)
         rgb = raster.rgb + raster.transmittance[..., None] * behind
-    if not (on_cpu or rgb.requires_grad):
-        # Once, at the end, for each question waits for the device; in training the loss is asked.
+    if not on_cpu:  # once, at the end, for each question waits for the device
         _refuse_nonfinite(background=rgb)
     return Rendering(
         rgb=rgb,

@@ -105,6 +105,16 @@ def test_mixed_precision_stays_near() -> None:
 
 
 @pytest.mark.parametrize("index", range(4))
+def test_shapes_that_disagree_are_refused_before_a_kernel_reads_past_an_end(index: int) -> None:
+    splats, colors = gaussians(20), shading(20)
+    with pytest.raises(ValueError):
+        drawn(splats, shading(19), camera())
+    splats[index] = splats[index][:19]
+    with pytest.raises(ValueError):
+        drawn(splats, colors, camera())
+
+
+@pytest.mark.parametrize("index", range(4))
 def test_inputs_that_are_not_finite_are_named(index: int) -> None:
     splats, colors = gaussians(20), shading(20)
     splats[index].view(-1)[7] = float("nan")

@@ -75,9 +75,10 @@ def background_colors(
 
     sigmoid(mlp([hash_encode(contract(p / half_extent)), e(d)])),  p where the ray along d leaves the sphere
     """
-    pose = pose.to(table)
+    pose = pose.to(table, non_blocking=table.is_cuda)
+    half_extent = torch.tensor(half_extent, dtype=table.dtype).to(table.device, non_blocking=table.is_cuda)
     directions = pixel_directions(points, intrinsics, pose)
-    u = sphere_points(viewpoint_of(pose), directions) / table.new_tensor(half_extent)
+    u = sphere_points(viewpoint_of(pose), directions) / half_extent
     features = hash_encode(contract(u), table, resolutions, log2_table_size)
     # Hash features are stored by columns, and joined so.
     inputs = torch.cat((features.T, encode_directions(directions, encoding).T)).T

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
 
@@ -10,7 +11,10 @@ from torch import Tensor
 from hyrfpack.ops.dispatch import choose
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
 
-__all__ = ["Rasterization", "rasterize"]
+__all__ = ["SHAPES", "Rasterization", "check", "rasterize"]
+
+# What each input holds of one Gaussian.
+SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "colors": (3,)}
 
 
 @dataclass(frozen=True)
@@ -91,22 +95,11 @@ def rasterize(
         ValueError: shapes, dtypes or devices that do not fit, or a picture without pixels.
         MemoryError: more pairs of a Gaussian and a tile than "cpu" (2^28) or "gpu" (2^31) can number.
     """
-    count = len(means)
-    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "colors": (3,)}
     inputs = (means, quats, scales, opacities, colors)
-    for (name, shape), tensor in zip(shapes.items(), inputs, strict=True):
-        if tensor.shape != (count, *shape):
-            raise ValueError(f"{name} is {tuple(tensor.shape)}, expected {(count, *shape)}")
-    if camera_from_world.shape != (4, 4):
-        raise ValueError(f"camera_from_world is {tuple(camera_from_world.shape)}, expected (4, 4)")
-    if absgrad is not None and (absgrad.shape != (count, 2) or absgrad.dtype != means.dtype):
-        raise ValueError(f"absgrad is {absgrad.dtype} {tuple(absgrad.shape)}, expected {means.dtype} {(count, 2)}")
-    if not near >= 0:
-        raise ValueError(f"near is {near}, expected a distance in front of the camera")
-    if not 0 <= transmittance_min < 1:
-        raise ValueError(f"transmittance_min is {transmittance_min}; it must lie in [0, 1)")
-    if width < 1 or height < 1:
-        raise ValueError(f"a picture of {width} x {height} has no pixels")
+    named = dict(zip(SHAPES, inputs, strict=True))
+    check(named, camera_from_world, width, height, near, transmittance_min)
+    if absgrad is not None and (absgrad.shape != (len(means), 2) or absgrad.dtype != means.dtype):
+        raise ValueError(f"absgrad is {absgrad.dtype} {tuple(absgrad.shape)}, expected {means.dtype} {(len(means), 2)}")
 
     chosen = choose(implementation, ("reference", "cpu", "gpu"), *inputs)
     if chosen == "gpu":
@@ -128,8 +121,31 @@ def rasterize(
         absgrad=absgrad,
     )
     if chosen != "gpu":  # whose kernels look at every number anyway
-        results += (tuple(name for name, tensor in zip(shapes, inputs, strict=True) if not _finite(tensor.detach())),)
+        results += (tuple(name for name, tensor in named.items() if not _finite(tensor.detach())),)
     return Rasterization(*results)
+
+
+def check(
+    inputs: Mapping[str, Tensor],
+    camera_from_world: Tensor,
+    width: int,
+    height: int,
+    near: float,
+    transmittance_min: float,
+) -> None:
+    """Raise the ValueErrors of `rasterize` for inputs by name, some or all, and a view."""
+    count = len(inputs["means"])
+    for name, tensor in inputs.items():
+        if tensor.shape != (count, *SHAPES[name]):
+            raise ValueError(f"{name} is {tuple(tensor.shape)}, expected {(count, *SHAPES[name])}")
+    if camera_from_world.shape != (4, 4):
+        raise ValueError(f"camera_from_world is {tuple(camera_from_world.shape)}, expected (4, 4)")
+    if not near >= 0:
+        raise ValueError(f"near is {near}, expected a distance in front of the camera")
+    if not 0 <= transmittance_min < 1:
+        raise ValueError(f"transmittance_min is {transmittance_min}; it must lie in [0, 1)")
+    if width < 1 or height < 1:
+        raise ValueError(f"a picture of {width} x {height} has no pixels")
 
 
 def _finite(tensor: Tensor) -> bool:

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from hyrfpack.ops.dispatch import choose
-from hyrfpack.ops.rasterize import Rasterization, rasterize
+from hyrfpack.ops.rasterize import Rasterization, check, rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
-from hyrfpack.ops.shade import Shading, shade
+from hyrfpack.ops.shade import Shading, check_shading, shade
 
 
 @torch.no_grad()
@@ -52,7 +52,10 @@ def rasterize_shaded(
     Raises:
         ValueError, MemoryError: as `rasterize` and `shade`.
     """
-    inputs = (means, quats, scales, opacities, shading.direction_weight, *shading.weights, *shading.biases)
+    geometry = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+    check(geometry, camera_from_world, width, height, near, transmittance_min)
+    check_shading(shading, len(means))
+    inputs = (*geometry.values(), shading.direction_weight, *shading.weights, *shading.biases, shading.color_logits)
     hidden = max(weight.shape[1] for weight in shading.weights)
     available = ("reference", "gpu") if hidden <= 128 else ("reference",)
     if choose(implementation, available, *inputs) == "gpu":

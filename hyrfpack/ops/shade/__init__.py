@@ -21,6 +21,7 @@ __all__ = [
     "DIRECTION_FEATURES",
     "FREQUENCY_OCTAVES",
     "Shading",
+    "check_shading",
     "encode_directions",
     "frequency_encoding",
     "shade",
@@ -53,6 +54,19 @@ class Shading:
     mixed: bool
 
 
+def check_shading(shading: Shading, count: int) -> None:
+    """Raise ValueError unless it is a decoder for so many Gaussians."""
+    rows, hidden = shading.first_layer.shape
+    widths = [tuple(weight.shape) for weight in (shading.direction_weight, *shading.weights)]
+    features = DIRECTION_FEATURES.get(shading.encoding)
+    fits = len(widths) == 3 and widths == [(hidden, features), (widths[1][0], hidden), (3, widths[1][0])]
+    if not fits or rows != count or shading.color_logits.shape != (count, 3):
+        raise ValueError(
+            f"first layer {(rows, hidden)}, {shading.encoding} encoding, weights {widths} and color logits "
+            f"{tuple(shading.color_logits.shape)} do not form a decoder for {count} Gaussians"
+        )
+
+
 @torch.no_grad()
 def shade(positions: Tensor, viewpoint: Tensor, shading: Shading, *, implementation: str = "auto") -> Tensor:
     """Colours of Gaussians seen from a point.
@@ -72,17 +86,12 @@ def shade(positions: Tensor, viewpoint: Tensor, shading: Shading, *, implementat
     Raises:
         ValueError: shapes, types or devices do not fit together.
     """
-    count, hidden = shading.first_layer.shape
-    widths = [tuple(weight.shape) for weight in (shading.direction_weight, *shading.weights)]
-    features = DIRECTION_FEATURES.get(shading.encoding)
-    fits = len(widths) == 3 and widths == [(hidden, features), (widths[1][0], hidden), (3, widths[1][0])]
-    if not fits or positions.shape != (count, 3) or shading.color_logits.shape != (count, 3) or viewpoint.shape != (3,):
-        raise ValueError(
-            f"{tuple(positions.shape)} positions, first layer {(count, hidden)}, {shading.encoding} encoding and "
-            f"weights {widths} do not form a decoder"
-        )
+    check_shading(shading, len(positions))
+    if positions.shape != (len(positions), 3) or viewpoint.shape != (3,):
+        raise ValueError(f"{tuple(positions.shape)} positions and viewpoint {tuple(viewpoint.shape)}, not (N, 3), (3,)")
     inputs = (positions, viewpoint, shading.direction_weight, *shading.weights, *shading.biases, shading.color_logits)
-    available = ("reference", "gpu") if max(hidden, widths[1][0]) <= 128 else ("reference",)
+    hidden = max(weight.shape[1] for weight in shading.weights)
+    available = ("reference", "gpu") if hidden <= 128 else ("reference",)
     if choose(implementation, available, *inputs) == "gpu":
         from hyrfpack.ops.shade import gpu
 
