@@ -52,10 +52,7 @@ def choose_device(name: str = "auto", say: Callable[[str], None] = lambda senten
             raise HyrfError(f"device '{name}' is not there, {there}; install a GPU build of torch or use --device cpu")
         if not has_triton():
             say(NO_TRITON)
-        elif not torch.version.hip and torch.cuda.get_device_capability(int(number or torch.cuda.current_device())) < (
-            8,
-            0,
-        ):
+        elif not torch.version.hip and torch.cuda.get_device_capability(name) < (8, 0):
             say(OLD_GPU)
         if number:
             torch.cuda.set_device(int(number))  # kernels are launched on the current device
