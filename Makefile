@@ -33,7 +33,7 @@ test: lint ## check style, then run all tests
 bench: $(READY) ## time each hot operation at several sizes against its references
 	$(BIN)/python tools/bench.py
 
-gpu: $(READY) ## check and measure the GPU kernels on this machine's GPU; results in docs/gpu/ (nine minutes)
+gpu: $(READY) ## check and measure the GPU kernels on this machine's GPU; results in docs/gpu/ (nine minutes at most)
 	$(BIN)/python tools/gpu_check.py
 
 speed: $(READY) ## time beside error of every setting, on a small model; plot in runs/speed.png (two to four minutes)

@@ -110,6 +110,14 @@ def test_work_of_the_fields_is_that_counted_by_hand() -> None:
     work = gpu_roofline.shade(100, (24, 64, 64, 3), mixed=True)
     assert work.bytes == 100 * ((3 + 3 + 3) * 4 + 64 * 2)
     assert work.flops == 100 * (2 * (24 * 64 + 64 * 64 + 64 * 3) + 60)
+    # Of 500 Gaussians 100 are drawn, whose positions are read once.
+    fused = gpu_roofline.project_shaded(500, 100, (24, 64, 64, 3), mixed=True)
+    assert fused.bytes == 500 * 72 + 100 * ((3 + 3) * 4 + 64 * 2)
+    assert (fused.flops, fused.unit) == (work.flops, "bf16")
+    # 100 of 180 nodes are needed; their 12,800 corners may be all of 5,000 rows.
+    work = gpu_roofline.background(700, 180, 100, (56, 64, 64, 3), 16, 5000, mixed=False)
+    assert work.bytes == 700 * 4 + 180 * 3 * 4 + 5000 * 8 and work.unit == "fp32"
+    assert work.flops == 100 * (16 * (49 + 32) + 2 * (56 * 64 + 64 * 64 + 64 * 3) + 130)
     work = gpu_roofline.mlp_backward(100, (32, 64, 64, 8), mixed=False)
     assert work.flops == 2 * 100 * (2 * weights + 32 * 64 + 64 * 64) and work.unit == "fp32"
 

@@ -1,4 +1,4 @@
-"""Checks and measures hyrfpack's GPU kernels on this machine, and writes what came out: nine minutes on an H200.
+"""Checks and measures hyrfpack's GPU kernels on this machine, and writes what came out: in nine minutes at most.
 
     python tools/gpu_check.py                          everything; docs/gpu/<machine>.json and .md
     python tools/gpu_check.py --parts tests kernels    some of it
@@ -22,7 +22,7 @@ import importlib
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -65,7 +65,7 @@ def check(parts: Sequence[str], setup: Setup, scale: float = 1.0) -> list[Row]:
     return rows
 
 
-def run_part(part: str, setup: Setup, seconds: float):
+def run_part(part: str, setup: Setup, seconds: float) -> Iterator[Row]:
     """Rows of one part."""
     try:
         items = importlib.import_module(PARTS[part][0]).items(setup)

@@ -148,7 +148,7 @@ def _gsplat(splats: Splats) -> Callable[[dict[str, Tensor]], Tensor]:
     from gsplat import rasterization
 
     fx, fy, cx, cy = splats.camera.intrinsics
-    view = splats.pose.float()[None]
+    view = splats.pose.to(splats.inputs["means"])[None]
     intrinsics = view.new_tensor([[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]])
     size = splats.camera.width, splats.camera.height
 

@@ -6,7 +6,6 @@ import copy
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
-from importlib import import_module
 
 import gpu_roofline as roofline
 import torch
@@ -20,11 +19,14 @@ from torch import Tensor
 
 from hyrfpack.model import HybridModel
 from hyrfpack.model.field import Field
+from hyrfpack.ops.adam import adam_step
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
-from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.rasterize import Rasterization, rasterize
+from hyrfpack.ops.rasterize.shaded import rasterize_shaded
 from hyrfpack.ops.shade import Shading, encode_directions, shade
 from hyrfpack.ops.ssim import photometric_loss
+from hyrfpack.render import RenderSettings
 
 TABLE = "Kernels"
 # Words in the names of the GPU's kernels that tell which stage of the rasteriser they are; the rest of a forward pass,
@@ -59,7 +61,7 @@ def rasterize_rows(setup: Setup) -> Iterator[Row]:
     pairs, pixels, count = int(drawn.pairs), setup.width * setup.height, len(splats.inputs["means"])
     blended, reached = count_blended(splats)
     tiles = -(-setup.width // 16) * -(-setup.height // 16)
-    seen = int((drawn.visible).sum())
+    seen = int(drawn.visible.sum())
     size = f"{count:,} Gaussians, {seen:,} visible, {pairs:,} pairs, {setup.width} x {setup.height}"
     works = {
         "project": roofline.project(count),
@@ -167,12 +169,8 @@ def shade_rows(setup: Setup) -> Iterator[Row]:
     model, camera = _model(setup), make_cameras(1, setup.width, setup.height)[0]
     positions = model.gaussians.positions.detach()
     viewpoint = torch.as_tensor(camera.position, dtype=torch.float32, device=setup.torch_device)
-    ours, shadings = setup.implementation, {}
-    for precision in ("float32", "mixed"):  # the model is left as it was; on a CPU the two are one
-        model.precision = precision
-        shading = model.shading()
-        shadings["mixed" if shading.mixed else "float32"] = shading
-    for precision, shading in shadings.items():
+    ours = setup.implementation
+    for precision, shading in _shadings(model).items():
         task = {"shade": lambda shading=shading: shade(positions, viewpoint, shading, implementation=ours)}
         ms = take_turns(task, setup.repeats, setup.torch_device)["shade"]
         part, exact = _shading_sample(shading, setup), _shading_sample(shading, setup, torch.float64)
@@ -181,30 +179,111 @@ def shade_rows(setup: Setup) -> Iterator[Row]:
             shade(some, viewpoint, part, implementation=ours),
             shade(some.double(), viewpoint.double(), exact, implementation="reference"),
         )
-        widths = [shading.direction_weight.shape[1], *(len(bias) for bias in (shading.first_layer[0], *shading.biases))]
-        work = roofline.shade(len(positions), widths, shading.mixed)
+        work = roofline.shade(len(positions), _widths(shading), shading.mixed)
         row = _row(f"shade, {precision}", "forward", f"{len(positions):,} Gaussians", ms, work, setup)
         yield row | {"value error": error} | within(error, 3e-3 if shading.mixed else 1e-4)
 
 
+def _shadings(model: HybridModel) -> dict[str, Shading]:
+    """The model's shading by its precision; on a CPU the two are one."""
+    shadings = {}
+    for precision in ("float32", "mixed"):  # the second is the default: the model is left as it was
+        model.precision = precision
+        shading = model.shading()
+        shadings["mixed" if shading.mixed else "float32"] = shading
+    return shadings
+
+
+def _widths(shading: Shading) -> list[int]:
+    """Of the encoded direction, the hidden layers and the colours."""
+    return [shading.direction_weight.shape[1], *(len(bias) for bias in (shading.first_layer[0], *shading.biases))]
+
+
 def _shading_sample(shading: Shading, setup: Setup, dtype: torch.dtype | None = None) -> Shading:
     """The rows whose error is measured; numbers as they are, or all of one precision."""
+    rows = {name: _sample(getattr(shading, name), setup) for name in ("first_layer", "color_logits")}
+    return _cast(replace(shading, **rows), dtype)
+
+
+def _cast(shading: Shading, dtype: torch.dtype | None) -> Shading:
+    """The same shading, contiguous and in one precision, or in those it has."""
 
     def cast(tensor: Tensor) -> Tensor:
         return (tensor if dtype is None else tensor.to(dtype)).contiguous()
 
     return replace(
         shading,
-        first_layer=cast(_sample(shading.first_layer, setup)),
-        color_logits=cast(_sample(shading.color_logits, setup)),
+        first_layer=cast(shading.first_layer),
+        color_logits=cast(shading.color_logits),
         direction_weight=cast(shading.direction_weight),
         weights=tuple(map(cast, shading.weights)),
         biases=tuple(map(cast, shading.biases)),
     )
 
 
+@torch.no_grad()
+def rasterize_shaded_rows(setup: Setup) -> Iterator[Row]:
+    """Culling, shading and rasterising in one, as a frame of a model that does not change asks for it; the error is
+    that of a part of the picture."""
+    model, splats = _model(setup), _splats(setup)
+    explicit = [splats.inputs[name] for name in ("means", "quats", "scales", "opacities")]
+    exact = [tensor.double() for tensor in explicit]
+    blended, reached = count_blended(splats)
+    tiles = -(-setup.width // 16) * -(-setup.height // 16)
+    pixels = setup.width * setup.height
+    for precision, shading in _shadings(model).items():
+
+        def draw(view: tuple = splats.view, shading: Shading = shading) -> Rasterization:
+            return rasterize_shaded(*explicit, shading, *view, implementation=setup.implementation)
+
+        drawn = draw()
+        pairs, seen = int(drawn.pairs), int(drawn.visible.sum())
+        ms = take_turns({"draw": draw}, setup.repeats, setup.torch_device)["draw"]
+        project = roofline.project_shaded(len(model), seen, _widths(shading), shading.mixed)
+        # The decoder's arithmetic is left to the row of its stage: it is of other units than the blending's.
+        whole = Work(project.bytes, 0) + roofline.bin_pairs(seen, pairs, tiles)
+        whole += roofline.blend(pairs, pixels, reached, blended)
+        view = cropped(splats, setup.crop).view
+        wanted = rasterize_shaded(*exact, _cast(shading, torch.float64), *view, implementation="reference")
+        error = relative_error(_picture(draw(view)), _picture(wanted))
+        size = f"{len(model):,} Gaussians, {seen:,} visible, {pairs:,} pairs, {setup.width} x {setup.height}"
+        row = _row(f"rasterize shaded, {precision}", "forward", size, ms, whole, setup)
+        yield row | {"value error": error} | within(error, 3e-3 if shading.mixed else 1e-3)
+        stages = group_kernels(kernel_times(draw, 5, setup.torch_device), STAGES, "bin")
+        if stages["project"]:
+            yield _row("- project and shade", "forward", size, stages["project"], project, setup)
+
+
+@torch.no_grad()
+def background_rows(setup: Setup) -> Iterator[Row]:
+    """The background's grid at the window, as a frame asks for it; the error is of what rounding comes to in all."""
+    model, camera = _model(setup), make_cameras(setup.views, setup.width, setup.height)[0]
+    splats, defaults = splats_of(model, camera), RenderSettings()
+    light = rasterize(*splats.inputs.values(), *splats.view).transmittance
+    how = {"threshold": defaults.background_threshold, "stride": defaults.background_stride}
+    view = camera.intrinsics, splats.pose
+    exact = copy.deepcopy(model).double()
+    exact.precision = "float32"  # no factor of the reference's products is rounded to bfloat16
+    wanted = exact.background_grid(light.double(), *view, **how)
+    on_gpu = setup.torch_device.type == "cuda"
+    field, grid = model.radiance, model.radiance.grid.config
+    widths = [field.weights[0].shape[1], *(weight.shape[0] for weight in field.weights)]
+    nodes, needed = wanted[..., 0].numel(), int((wanted > 0).any(-1).sum())
+    size = f"{needed:,} of {nodes:,} nodes, {setup.width} x {setup.height}"
+    for precision in ("float32", "mixed") if on_gpu else ("mixed",):  # on a CPU they are one
+        model.precision = precision  # the second is the default: the model is left as it was
+        mixed = on_gpu and precision == "mixed"
+        found = model.background_grid(light, *view, **how)
+        task = {"grid": lambda: model.background_grid(light, *view, **how)}
+        ms = take_turns(task, setup.repeats, setup.torch_device)["grid"]
+        work = roofline.background(light.numel(), nodes, needed, widths, grid.levels, grid.rows, mixed)
+        error = relative_error(found, wanted)
+        row = _row(f"background, {'mixed' if mixed else 'float32'}", "forward", size, ms, work, setup)
+        yield row | {"value error": error} | within(error, 1e-2 if mixed else 1e-3)
+
+
 def ssim_rows(setup: Setup) -> Iterator[Row]:
-    """Loss and gradient of a whole picture; the gradient is made in the forward pass."""
+    """Loss and gradient of a whole picture."""
     generator = torch.Generator().manual_seed(0)
     small = torch.rand(1, 3, max(1, setup.height // 20), max(1, setup.width // 20), generator=generator)
     size = (setup.height, setup.width)
@@ -229,7 +308,6 @@ def ssim_rows(setup: Setup) -> Iterator[Row]:
 
 def adam_rows(setup: Setup) -> Iterator[Row]:
     """One step of as many numbers as the Gaussians have."""
-    adam_step = import_module("hyrfpack.ops.adam").adam_step
     count = 8 * setup.kernel_gaussians
     generator = torch.Generator().manual_seed(0)
     states = [0.1 * torch.randn(count, generator=generator) for _ in range(3)]
@@ -279,11 +357,15 @@ def _row(name: str, way: str, size: str, ms: float, work: Work, setup: Setup) ->
 
 def _rasterize_call(splats: Splats) -> Call:
     def draw(implementation: str, **tensors: Tensor) -> Tensor:
-        drawn = rasterize(*tensors.values(), *splats.view, implementation=implementation)
-        return torch.cat((drawn.rgb, drawn.transmittance[..., None]), dim=-1)
+        return _picture(rasterize(*tensors.values(), *splats.view, implementation=implementation))
 
     # A few pixels' alpha or T falls on the other side of its threshold; their share of the length is below this.
     return Call(draw, splats.inputs, tuple(splats.inputs), (1e-3, 1e-2))
+
+
+def _picture(drawn: Rasterization) -> Tensor:
+    """(H, W, 4) colours and transmittance."""
+    return torch.cat((drawn.rgb, drawn.transmittance[..., None]), dim=-1)
 
 
 def cropped(splats: Splats, side: int) -> Splats:
@@ -322,6 +404,8 @@ ITEMS: dict[str, Callable[[Setup], Iterator[Row]]] = {
     "mlp float32": lambda setup: mlp_rows(False, setup),
     "decode": decode_rows,
     "shade": shade_rows,
+    "rasterize shaded": rasterize_shaded_rows,
+    "background": background_rows,
     "loss": ssim_rows,
     "adam": adam_rows,
 }

@@ -6,15 +6,12 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from statistics import fmean
 
-import numpy as np
 import torch
 from gpu_rows import Row
 from gpu_setup import Setup
 from gpu_timing import synchronize
 
-from hyrfpack.model import HybridModel
 from hyrfpack.scene import Scene
 
 PROBE_STEPS = 25  # on the CPU, to see how many it has time for
@@ -66,6 +63,7 @@ def _affordable_steps(scene: Scene, setup: Setup) -> int:
 
 def _train(scene: Scene, steps: int, precision: str, device: torch.device) -> tuple[float, Row]:
     """Held-out PSNR in dB after training, and cells of the row."""
+    from hyrfpack.evaluate import evaluate
     from hyrfpack.train import TrainConfig, Trainer
 
     start = time.perf_counter()
@@ -73,22 +71,6 @@ def _train(scene: Scene, steps: int, precision: str, device: torch.device) -> tu
     trainer.run()
     synchronize(device)
     seconds = time.perf_counter() - start
-    psnr = _held_out(trainer.model, scene)
+    psnr = evaluate(trainer.model, scene.test).psnr
     cells = {"PSNR dB": f"{psnr:.3f}", "Gaussians": f"{len(trainer.model):,}", "steps/s": steps / seconds}
     return psnr, {**cells, "seconds": seconds}
-
-
-@torch.no_grad()
-def _held_out(model: HybridModel, scene: Scene) -> float:
-    """Mean PSNR of 8-bit renders over the held-out views."""
-    from hyrfpack.evaluate.metrics import psnr, to_8bit
-    from hyrfpack.render import render
-
-    solid = np.array(model.config.solid, np.float32)
-    scores = []
-    for view in scene.test:
-        picture = view.load()
-        mask = None if picture.mask is None else torch.from_numpy(picture.mask)
-        target = torch.from_numpy(picture.composite(solid))
-        scores.append(psnr(to_8bit(render(model, view.camera).rgb).cpu(), target, mask))
-    return fmean(scores)

@@ -160,3 +160,28 @@ def shade(gaussians: int, widths: Sequence[int], mixed: bool) -> Work:
     decoder = mlp(gaussians, widths, mixed)
     bytes_moved = gaussians * (4 * 9 + (2 if mixed else 4) * widths[1])
     return Work(bytes_moved, decoder.flops + 60 * gaussians, decoder.unit)
+
+
+def project_shaded(gaussians: int, drawn: int, widths: Sequence[int], mixed: bool) -> Work:
+    """Moves what `project` does of all Gaussians, and what `shade` does, but for the position, of those that are drawn.
+
+    The arithmetic is the shading's: that of the projection, a few hundredths of it, runs beside it on other units.
+
+    Args:
+        widths: as for `shade`.
+    """
+    shading = shade(drawn, widths, mixed)
+    return Work(project(gaussians).bytes + shading.bytes - 12 * drawn, shading.flops, shading.unit)
+
+
+def background(
+    pixels: int, nodes: int, needed: int, widths: Sequence[int], levels: int, rows: int, mixed: bool
+) -> Work:
+    """Reads T of each pixel and the table rows that needed nodes can ask for; writes 3 colours of each node.
+
+    The arithmetic is that of the encoding and the decoder at needed nodes, and there 130 operations: the ray, its point
+    on the sphere and the contraction 70, the encoded direction and the sigmoids 60.
+    """
+    encoding, decoder = hash_encode(needed, levels, rows), mlp(needed, widths, mixed)
+    table = encoding.bytes - needed * (12 + 8 * levels)
+    return Work(4 * pixels + 12 * nodes + table, encoding.flops + decoder.flops + 130 * needed, decoder.unit)

@@ -84,7 +84,10 @@ def disturb(model: HybridModel, seed: int = 1) -> HybridModel:
 
 @dataclass(frozen=True)
 class Splats:
-    """What the rasteriser gets of a model for one view: `inputs` in the order of its arguments, and the view."""
+    """What the rasteriser gets of a model for one view: `inputs` in the order of its arguments, and the view.
+
+    The pose is on the CPU, where the rasteriser wants it.
+    """
 
     inputs: dict[str, Tensor]
     pose: Tensor
@@ -100,13 +103,13 @@ class Splats:
 def splats_of(model: HybridModel, camera: Camera) -> Splats:
     """All Gaussians of the model, decoded for one view."""
     geometry: Geometry = model.decode_geometry()
-    pose = torch.as_tensor(model.config.frame.local_pose(camera), device=model.gaussians.positions.device)
+    pose = torch.as_tensor(model.config.frame.local_pose(camera))
     inputs = {
         "means": model.gaussians.positions,
         "quats": geometry.quats,
         "scales": geometry.scales,
         "opacities": geometry.opacities,
-        "colors": model.decode_colors(viewpoint_of(pose).float()),
+        "colors": model.decode_colors(viewpoint_of(pose).to(model.gaussians.positions)),
     }
     return Splats({name: tensor.detach().contiguous() for name, tensor in inputs.items()}, pose, camera)
 

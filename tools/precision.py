@@ -42,12 +42,13 @@ from hyrfpack.train import TrainConfig
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.trainer import Trainer
 
-MLP = "hyrfpack.model.field.mlp"
+MLPS = ("hyrfpack.model.field.mlp", "hyrfpack.ops.background.reference.mlp")
 # Where the product looks each operation up.
 OPERATIONS = {
     "hyrfpack.render.renderer.rasterize": rasterize,
     "hyrfpack.model.hash_grid.hash_encode": hash_encode,
-    MLP: mlp,
+    "hyrfpack.ops.background.reference.hash_encode": hash_encode,
+    **dict.fromkeys(MLPS, mlp),
     "hyrfpack.train.trainer.photometric_loss": photometric_loss,
 }
 RASTERIZE = "hyrfpack.render.renderer.rasterize"
@@ -98,7 +99,7 @@ def train(scene: Scene, config: TrainConfig, row: str) -> tuple[HybridModel, flo
         dtype = torch.float32 if row == "adam" else torch.float64
         patches = {place: computed_in(dtype, operation) for place, operation in OPERATIONS.items()}
     elif row == "mixed":
-        patches = {MLP: lambda *layers, mixed: mlp(*layers, mixed=True, implementation="reference")}
+        patches = dict.fromkeys(MLPS, lambda *layers, mixed: mlp(*layers, mixed=True, implementation="reference"))
     elif row == "rasterizer":
         patches = {RASTERIZE: computed_in(torch.float64, rasterize)}
     started = time.perf_counter()

@@ -59,7 +59,7 @@ def device_options(command: Command) -> Command:
             metavar="NAME",
             default="auto",
             show_default=True,
-            help="cpu, cuda (NVIDIA and AMD), cuda:N or mps; auto takes cuda where it is.",
+            help="cpu, cuda (NVIDIA and AMD), cuda:N or mps; auto takes cuda where it and Triton are.",
         ),
     ):
         command = option(command)

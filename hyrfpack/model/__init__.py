@@ -5,9 +5,8 @@ from hyrfpack.model.frame import Frame
 from hyrfpack.model.hash_grid import HashGridConfig
 from hyrfpack.model.hybrid import Decoded, Geometry, HybridModel
 from hyrfpack.ops.background import RADIUS as BACKGROUND_RADIUS
-from hyrfpack.ops.background import viewpoint_of
 from hyrfpack.ops.contraction import contract, expand
-from hyrfpack.ops.shade import DIRECTION_FEATURES
+from hyrfpack.ops.shade import DIRECTION_FEATURES, viewpoint_of
 
 __all__ = [
     "BACKGROUND_RADIUS",

@@ -14,7 +14,6 @@ from hyrfpack.ops.background.reference import (
     grid_size,
     pixel_directions,
     sphere_points,
-    viewpoint_of,
 )
 from hyrfpack.ops.dispatch import choose
 from hyrfpack.ops.shade.directions import DIRECTION_FEATURES
@@ -26,7 +25,6 @@ __all__ = [
     "grid_size",
     "pixel_directions",
     "sphere_points",
-    "viewpoint_of",
 ]
 
 

@@ -16,9 +16,11 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyrfpack.ops.background.reference import RADIUS, grid_size, viewpoint_of
-from hyrfpack.ops.hash_encode.gpu import _axis, _levels, _row, _whole_rows
+from hyrfpack.ops.background.reference import RADIUS, grid_size
+from hyrfpack.ops.gpu_words import unpack
+from hyrfpack.ops.hash_encode.gpu import axis_vertices, level_numbers, vertex_row, whole_rows
 from hyrfpack.ops.mlp.tiles import factor, precision, product, relu_factor
+from hyrfpack.ops.shade.directions import viewpoint_of
 from hyrfpack.ops.shade.gpu_directions import encode_block
 
 _BLOCK_ROWS = tl.constexpr(8)
@@ -73,19 +75,19 @@ def _features(x, y, z, table, levels, needed, LEVELS: tl.constexpr, HEIGHT: tl.c
     features1 = tl.zeros([HEIGHT, x.shape[0]], tl.float32)
     for level in range(LEVELS):
         span = tl.load(levels).to(tl.float32)
-        x1, row_x0, row_x1 = _axis(x, span, 1)
-        y1, row_y0, row_y1 = _axis(y, span, tl.load(levels + 1).to(tl.uint32))
-        z1, row_z0, row_z1 = _axis(z, span, tl.load(levels + 2).to(tl.uint32))
+        x1, row_x0, row_x1 = axis_vertices(x, span, 1)
+        y1, row_y0, row_y1 = axis_vertices(y, span, tl.load(levels + 1).to(tl.uint32))
+        z1, row_z0, row_z1 = axis_vertices(z, span, tl.load(levels + 2).to(tl.uint32))
         mask, rows = tl.load(levels + 3).to(tl.uint32), table + tl.load(levels + 4)
         feature0, feature1 = tl.zeros_like(x), tl.zeros_like(x)
         for corner in tl.static_range(8):
             weight_x, row_x = (x1, row_x1) if corner & 1 else (1 - x1, row_x0)
             weight_y, row_y = (y1, row_y1) if corner & 2 else (1 - y1, row_y0)
             weight_z, row_z = (z1, row_z1) if corner & 4 else (1 - z1, row_z0)
-            pair = tl.load(rows + _row(row_x, row_y, row_z, mask), mask=needed, other=0)
+            value0, value1 = unpack(tl.load(rows + vertex_row(row_x, row_y, row_z, mask), mask=needed, other=0))
             weight = weight_x * (weight_y * weight_z)
-            feature0 += weight * pair.to(tl.int32).to(tl.float32, bitcast=True)
-            feature1 += weight * (pair >> 32).to(tl.int32).to(tl.float32, bitcast=True)
+            feature0 += weight * value0
+            feature1 += weight * value1
         features0 = tl.where(place == level, feature0[None, :], features0)
         features1 = tl.where(place == level, feature1[None, :], features1)
         levels += 5
@@ -140,7 +142,8 @@ def draw_nodes(
         # `reference.sphere_points`.
         along = x * origin_x + y * origin_y + z * origin_z
         px, py, pz = origin_x - along * x, origin_y - along * y, origin_z - along * z
-        rest = tl.sqrt_rn(tl.maximum(_RADIUS * _RADIUS - (px * px + py * py + pz * pz), 0.0))
+        outside = px * px + py * py + pz * pz - _RADIUS * _RADIUS
+        rest = tl.sqrt_rn(tl.maximum(-outside, 0.0))
         u, v, w = _contract((px + rest * x) / half_x, (py + rest * y) / half_y, (pz + rest * z) / half_z)
         features0, features1 = _features(u, v, w, table, levels, needed, LEVELS, LEVELS_P)
 
@@ -199,8 +202,8 @@ def background_grid(
         columns,
         *_rays(pose, intrinsics, stride),
         *half_extent,
-        _whole_rows(table),
-        _levels(resolutions, log2_table_size, table.device),
+        whole_rows(table),
+        level_numbers(resolutions, log2_table_size, table.device),
         *(w1, b1, w2, b2, w3, b3),
         colors,
         STRIDE=stride,

@@ -10,14 +10,9 @@ from torch import Tensor
 from hyrfpack.ops.contraction import contract
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
-from hyrfpack.ops.shade.directions import encode_directions
+from hyrfpack.ops.shade.directions import encode_directions, viewpoint_of
 
 RADIUS = 100.0  # local units, around the frame's centre
-
-
-def viewpoint_of(pose: Tensor) -> Tensor:
-    """Where a camera stands (3,), local units, by its pose camera_from_local (4, 4): -R^T t."""
-    return -(pose[:3, :3].T @ pose[:3, 3])
 
 
 def sphere_points(origin: Tensor, directions: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from hyrfpack.ops.gpu_words import unpack
 from hyrfpack.ops.hash_encode.reference import PRIME_Y, PRIME_Z, level_offsets
 
 # One point a thread: no value changes threads on its way to a fetch or an atomic, and 32 registers let every thread
@@ -27,7 +28,7 @@ _WARPS = _POINTS // (64 if torch.version.hip else 32)
 
 
 @triton.jit
-def _axis(coords, span, factor):
+def axis_vertices(coords, span, factor):
     """Place within the cell along one axis, and the shares of its two vertices in the row; always inside the level."""
     x = coords * span
     cell = tl.minimum(tl.where(x > 0, tl.floor(x), 0.0), span - 1)  # a NaN, too, is in a cell
@@ -44,24 +45,17 @@ def _cell(coords, axis_stride, point_stride, levels, level, start, lane, inside)
     x = tl.load(first + lane * point_stride, mask=inside, other=0.0)
     y = tl.load(first + axis_stride.to(tl.int64) + lane * point_stride, mask=inside, other=0.0)
     z = tl.load(first + axis_stride.to(tl.int64) * 2 + lane * point_stride, mask=inside, other=0.0)
-    x1, row_x0, row_x1 = _axis(x, span, 1)
-    y1, row_y0, row_y1 = _axis(y, span, tl.load(levels + 1).to(tl.uint32))
-    z1, row_z0, row_z1 = _axis(z, span, tl.load(levels + 2).to(tl.uint32))
+    x1, row_x0, row_x1 = axis_vertices(x, span, 1)
+    y1, row_y0, row_y1 = axis_vertices(y, span, tl.load(levels + 1).to(tl.uint32))
+    z1, row_z0, row_z1 = axis_vertices(z, span, tl.load(levels + 2).to(tl.uint32))
     mask, offset = tl.load(levels + 3).to(tl.uint32), tl.load(levels + 4)
     return x1, y1, z1, row_x0, row_x1, row_y0, row_y1, row_z0, row_z1, span, mask, offset
 
 
 @triton.jit
-def _row(x, y, z, mask):
+def vertex_row(x, y, z, mask):
     """Row of a vertex within its level, from its shares; `mask` is 0 on a dense level."""
     return tl.where(mask == 0, x + y + z, (x ^ y ^ z) & mask).to(tl.int32)
-
-
-@triton.jit
-def _fetch(rows):
-    """The two features at pointers to whole rows."""
-    pair = tl.load(rows)
-    return pair.to(tl.int32).to(tl.float32, bitcast=True), (pair >> 32).to(tl.int32).to(tl.float32, bitcast=True)
 
 
 @triton.jit(do_not_specialize=["points", "axis_stride"])
@@ -79,7 +73,7 @@ def encode_level(coords, axis_stride, point_stride, table, levels, out, points, 
         x, row_x = (x1, row_x1) if corner & 1 else (1 - x1, row_x0)
         y, row_y = (y1, row_y1) if corner & 2 else (1 - y1, row_y0)
         z, row_z = (z1, row_z1) if corner & 4 else (1 - z1, row_z0)
-        value0, value1 = _fetch(table + _row(row_x, row_y, row_z, mask))
+        value0, value1 = unpack(tl.load(table + vertex_row(row_x, row_y, row_z, mask)))
         weight = x * (y * z)
         feature0 += weight * value0
         feature1 += weight * value1
@@ -110,7 +104,7 @@ def scatter_level(
         x, row_x = (x1, row_x1) if corner & 1 else (1 - x1, row_x0)
         y, row_y = (y1, row_y1) if corner & 2 else (1 - y1, row_y0)
         z, row_z = (z1, row_z1) if corner & 4 else (1 - z1, row_z0)
-        row = _row(row_x, row_y, row_z, mask)
+        row = vertex_row(row_x, row_y, row_z, mask)
         weight = x * (y * z)
         tl.atomic_add(
             out + (row[:, None] * 2 + feature[None, :]), weight[:, None] * pair, mask=live[:, None], sem="relaxed"
@@ -154,7 +148,7 @@ def descend_levels(
             x, row_x = (x1, row_x1) if corner & 1 else (1 - x1, row_x0)
             y, row_y = (y1, row_y1) if corner & 2 else (1 - y1, row_y0)
             z, row_z = (z1, row_z1) if corner & 4 else (1 - z1, row_z0)
-            value0, value1 = _fetch(table + offset + _row(row_x, row_y, row_z, mask))
+            value0, value1 = unpack(tl.load(table + offset + vertex_row(row_x, row_y, row_z, mask)))
             value = grad0 * value0 + grad1 * value1
             along_x += (value if corner & 1 else -value) * (y * z)
             along_y += (value if corner & 2 else -value) * (x * z)
@@ -169,7 +163,7 @@ def descend_levels(
 
 
 @cache
-def _levels(resolutions: tuple[int, ...], log2_table_size: int, device: torch.device) -> Tensor:
+def level_numbers(resolutions: tuple[int, ...], log2_table_size: int, device: torch.device) -> Tensor:
     """(L, 5) int64 on the device: span, what a step along y and along z adds, hash mask (0: dense), first row."""
     size, rows = 1 << log2_table_size, []
     for resolution, offset in zip(resolutions, level_offsets(resolutions, log2_table_size), strict=False):
@@ -183,7 +177,7 @@ def _blocks(points: int) -> int:
     return triton.cdiv(points, _POINTS)
 
 
-def _whole_rows(table: Tensor) -> Tensor:
+def whole_rows(table: Tensor) -> Tensor:
     """The (rows, 2) float32 table as one 64-bit number a row."""
     table = table.detach().contiguous()
     if table.storage_offset() % 2:  # between two such numbers of the memory that it is a part of
@@ -200,8 +194,8 @@ def encode(coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_tab
             coords.detach(),
             coords.stride(1),
             coords.stride(0),
-            _whole_rows(table),
-            _levels(resolutions, log2_table_size, coords.device),
+            whole_rows(table),
+            level_numbers(resolutions, log2_table_size, coords.device),
             features,
             points,
             POINTS=_POINTS,
@@ -226,7 +220,7 @@ def grad_table(
             coords.detach(),
             coords.stride(1),
             coords.stride(0),
-            _levels(resolutions, log2_table_size, coords.device),
+            level_numbers(resolutions, log2_table_size, coords.device),
             grad,
             grad.stride(1),
             grad.stride(0),
@@ -250,8 +244,8 @@ def grad_coords(
             coords.detach(),
             coords.stride(1),
             coords.stride(0),
-            _whole_rows(table),
-            _levels(resolutions, log2_table_size, coords.device),
+            whole_rows(table),
+            level_numbers(resolutions, log2_table_size, coords.device),
             grad,
             grad.stride(1),
             grad.stride(0),

@@ -113,7 +113,9 @@ def _project(inputs: tuple[Tensor, ...], view: _View) -> Projection:
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means, quats, scales, opacities, colors, view, report):
+    def forward(
+        ctx, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, view: _View, report: dict
+    ) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
         inputs = tuple(tensor.detach().contiguous() for tensor in (means, quats, scales, opacities, colors))
         projection = _project(inputs, view)
         drawn = draw(projection, view.width, view.height, view.transmittance_min, view.depth)
@@ -126,7 +128,9 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad_rgb, grad_transmittance, _grad_depth, _grad_visible):
+    def backward(
+        ctx, grad_rgb: Tensor, grad_transmittance: Tensor, _grad_depth: Tensor | None, _grad_visible: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
         *inputs, rgb, transmittance = ctx.saved_tensors
         projection, pairs, view = ctx.projection, ctx.pairs, ctx.view
         total, count, with_absgrad = len(inputs[0]), len(pairs.owners), view.absgrad is not None

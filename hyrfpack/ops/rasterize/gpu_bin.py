@@ -14,6 +14,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from hyrfpack.ops.gpu_words import unpack
 from hyrfpack.ops.rasterize.gpu_ellipse import TILE, ellipse, tile_columns, tile_rows
 from hyrfpack.ops.rasterize.gpu_project import (
     COVARIANCE,
@@ -23,7 +24,6 @@ from hyrfpack.ops.rasterize.gpu_project import (
     V_SLOPE_OPACITY,
     WORDS,
     Projection,
-    unpack,
 )
 
 PAIRS_MAX = 2**31 - 64  # 32 bits number them, and a little past the end

@@ -12,6 +12,7 @@ import math
 import triton
 import triton.language as tl
 
+from hyrfpack.ops.gpu_words import pack
 from hyrfpack.ops.rasterize import reference
 from hyrfpack.ops.rasterize.gpu_ellipse import EXPONENT_MIN, TILE
 from hyrfpack.ops.rasterize.gpu_project import (
@@ -25,7 +26,6 @@ from hyrfpack.ops.rasterize.gpu_project import (
     U_SLOPES,
     V_SLOPE_OPACITY,
     WORDS,
-    pack,
 )
 
 _LANES = tl.constexpr(32)

@@ -16,6 +16,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from hyrfpack.ops.gpu_words import pack
 from hyrfpack.ops.rasterize import reference
 from hyrfpack.ops.rasterize.gpu_ellipse import TILE, UNIT, ellipse, tile_columns, tile_rows
 
@@ -148,20 +149,6 @@ def load_rows_4(pointer, index, live):
     at = pointer + index.to(tl.int64) * 4
     first, second = tl.load(at, mask=live, other=0.0), tl.load(at + 1, mask=live, other=0.0)
     return first, second, tl.load(at + 2, mask=live, other=0.0), tl.load(at + 3, mask=live, other=0.0)
-
-
-@triton.jit
-def pack(first, second):
-    """Two float32 in one 64-bit word."""
-    low = first.to(tl.uint32, bitcast=True).to(tl.uint64)
-    high = second.to(tl.uint32, bitcast=True).to(tl.uint64)
-    return (low | (high << 32)).to(tl.int64, bitcast=True)
-
-
-@triton.jit
-def unpack(word):
-    """The two float32 of a 64-bit word."""
-    return word.to(tl.int32).to(tl.float32, bitcast=True), (word >> 32).to(tl.int32).to(tl.float32, bitcast=True)
 
 
 @triton.jit

@@ -22,7 +22,7 @@ from hyrfpack.ops.rasterize.gpu_project import (
     store_colors,
     store_records,
 )
-from hyrfpack.ops.shade import Shading
+from hyrfpack.ops.shade import Shading, viewpoint_of
 from hyrfpack.ops.shade.gpu import launch_size, operands, shade_block
 
 
@@ -81,7 +81,7 @@ def rasterize_shaded(
     inputs = (tensor.detach().contiguous() for tensor in (means, quats, scales, opacities))
     camera = camera_numbers(camera_from_world, intrinsics, width, height, near, device, cull_tolerance)
     pose = camera_from_world.detach().to("cpu", torch.float64)
-    viewpoint = (-(pose[:3, :3].T @ pose[:3, 3])).float().to(device, non_blocking=True)
+    viewpoint = viewpoint_of(pose).float().to(device, non_blocking=True)
     tensors, constants = operands(shading)
     projection = Projection.empty(total, device)
     if total:

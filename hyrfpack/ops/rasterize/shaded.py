@@ -7,11 +7,10 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.dispatch import choose
 from hyrfpack.ops.rasterize import Rasterization, check, rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
-from hyrfpack.ops.shade import Shading, check_shading, shade
+from hyrfpack.ops.shade import Shading, check_shading, choose_for, shade, viewpoint_of
 
 
 @torch.no_grad()
@@ -55,10 +54,7 @@ def rasterize_shaded(
     geometry = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     check(geometry, camera_from_world, width, height, near, transmittance_min)
     check_shading(shading, len(means))
-    inputs = (*geometry.values(), shading.direction_weight, *shading.weights, *shading.biases, shading.color_logits)
-    hidden = max(weight.shape[1] for weight in shading.weights)
-    available = ("reference", "gpu") if hidden <= 128 else ("reference",)
-    if choose(implementation, available, *inputs) == "gpu":
+    if choose_for(shading, implementation, *geometry.values()) == "gpu":
         from hyrfpack.ops.rasterize.gpu_shaded import rasterize_shaded as run
 
         return run(
@@ -82,7 +78,7 @@ def rasterize_shaded(
     seen = dataclasses.replace(
         shading, first_layer=shading.first_layer[index], color_logits=shading.color_logits[index]
     )
-    colors = shade(means[index], -(pose[:3, :3].T @ pose[:3, 3]), seen)
+    colors = shade(means[index], viewpoint_of(pose), seen)
     drawn = rasterize(
         means[index],
         quats[index],

@@ -15,6 +15,7 @@ from hyrfpack.ops.shade.directions import (
     encode_directions,
     frequency_encoding,
     spherical_harmonics,
+    viewpoint_of,
 )
 
 __all__ = [
@@ -22,10 +23,12 @@ __all__ = [
     "FREQUENCY_OCTAVES",
     "Shading",
     "check_shading",
+    "choose_for",
     "encode_directions",
     "frequency_encoding",
     "shade",
     "spherical_harmonics",
+    "viewpoint_of",
 ]
 
 
@@ -67,6 +70,14 @@ def check_shading(shading: Shading, count: int) -> None:
         )
 
 
+def choose_for(shading: Shading, implementation: str, *tensors: Tensor) -> str:
+    """As `dispatch.choose`, for kernels that take these tensors and a shading."""
+    parameters = (shading.direction_weight, *shading.weights, *shading.biases, shading.color_logits)
+    hidden = max(weight.shape[1] for weight in shading.weights)
+    available = ("reference", "gpu") if hidden <= 128 else ("reference",)
+    return choose(implementation, available, *tensors, *parameters)
+
+
 @torch.no_grad()
 def shade(positions: Tensor, viewpoint: Tensor, shading: Shading, *, implementation: str = "auto") -> Tensor:
     """Colours of Gaussians seen from a point.
@@ -89,10 +100,7 @@ def shade(positions: Tensor, viewpoint: Tensor, shading: Shading, *, implementat
     check_shading(shading, len(positions))
     if positions.shape != (len(positions), 3) or viewpoint.shape != (3,):
         raise ValueError(f"{tuple(positions.shape)} positions and viewpoint {tuple(viewpoint.shape)}, not (N, 3), (3,)")
-    inputs = (positions, viewpoint, shading.direction_weight, *shading.weights, *shading.biases, shading.color_logits)
-    hidden = max(weight.shape[1] for weight in shading.weights)
-    available = ("reference", "gpu") if hidden <= 128 else ("reference",)
-    if choose(implementation, available, *inputs) == "gpu":
+    if choose_for(shading, implementation, positions, viewpoint) == "gpu":
         from hyrfpack.ops.shade import gpu
 
         return gpu.shade(positions, viewpoint, shading)
