@@ -5,19 +5,25 @@ from __future__ import annotations
 
 import os
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-import torch
-
-sys.path += [str(Path(__file__).parent), str(Path(__file__).parents[1] / "tools")]
 
 # OpenMP's threads spin while they wait and take the cores from the kernels' own: tiny pictures train 3 times slower on
 # a quiet machine and 20 times on a busy one. Read once, when torch is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
+import torch
+
+sys.path += [str(Path(__file__).parent), str(Path(__file__).parents[1] / "tools")]
+
 # Without a GPU its kernels run in Triton's interpreter. Read once, when they are defined.
 os.environ.setdefault("TRITON_INTERPRET", "0" if torch.cuda.is_available() else "1")
+if os.environ["TRITON_INTERPRET"] == "1" and find_spec("triton"):
+    from interpreter import patch_once
+
+    patch_once()
 
 
 @pytest.fixture(scope="session")
