@@ -17,6 +17,7 @@ from hyrfpack.bench.rows import difference
 from hyrfpack.compress.run import default_noise
 from hyrfpack.data import load_scene
 from hyrfpack.data.demo_scene import write_demo_scene
+from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.format import describe, load
@@ -135,11 +136,10 @@ def _photos(scene: Scene, model: HybridModel) -> tuple[list[View], list[tuple[Te
     solid = np.array(model.config.solid, np.float32)
     views, photos = [], []
     for view in evenly_spaced(scene.test, VIEWS):
-        photo = view.load()
-        mask = None if photo.mask is None else torch.from_numpy(photo.mask)
+        photo, mask = upload(view.load(), solid, model.gaussians.positions.device)
         if mask is None or mask.any():
             views.append(view)
-            photos.append((torch.from_numpy(photo.composite(solid)), mask))
+            photos.append((photo, mask))
     if not views:
         raise HyrfError(f"{scene.path}: no held-out photo can be scored; name a smaller --test-every or other masks")
     return views, photos

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from hyrfpack.data import PictureCache
+from hyrfpack.device import upload
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.format.arrays import GROUPS
 from hyrfpack.format.compact import Plan, Quantized, quantize
@@ -84,8 +85,7 @@ def finetune(
             exact = {name: parameter.detach().clone() for name, parameter in tuned.named_parameters()}
             _load(tuned, quantized.arrays(rounding))
             solid = None if tuned.config.background else np.array(tuned.config.solid, np.float32)
-            target = torch.from_numpy(picture.composite(solid))
-            mask = None if picture.mask is None else torch.from_numpy(picture.mask)
+            target, mask = upload(picture, solid, tuned.gaussians.positions.device)
             loss = photometric_loss(render(tuned, view.camera).rgb, target, mask)
             loss.backward()
             with torch.no_grad():

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.figures import comparison
 from hyrfpack.evaluate.lpips import LPIPS
@@ -107,8 +108,7 @@ def evaluate(
     seconds: list[float] = []
     for number, view in enumerate(views):
         photo = view.load()
-        reference = torch.from_numpy(photo.composite(solid)).to(device)
-        mask = None if photo.mask is None else torch.from_numpy(photo.mask).to(device)
+        reference, mask = upload(photo, solid, device)
         if mask is not None and not mask.any():
             skipped.append(view.name)
             continue

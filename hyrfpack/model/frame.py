@@ -13,10 +13,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from hyrfpack.errors import HyrfDataError
+from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.scene import Camera
 
 # No axis of the box is thinner than this fraction of the longest: a row of cameras still sees a volume.
@@ -76,6 +76,4 @@ class Frame:
 
     def normalize(self, local: Tensor) -> Tensor:
         """Local positions (..., 3) to u = local / half_extent, where the box is [-1, 1]^3."""
-        # Not blocking: a blocking copy would make the host wait for all that a GPU still has to do.
-        half_extent = torch.tensor(self.half_extent, dtype=local.dtype).to(local.device, non_blocking=local.is_cuda)
-        return local / half_extent
+        return local / tensor_like(self.half_extent, local)

@@ -18,6 +18,7 @@ from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
 from hyrfpack.ops.rasterize.shaded import rasterize_shaded
+from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.scene import Camera
 
@@ -139,11 +140,7 @@ def render(
         if model.config.background and background:
             behind = _background(model, camera, pose_here, raster.transmittance, settings)
         else:
-            behind = (
-                torch.tensor(model.config.solid).to(positions, non_blocking=positions.is_cuda)
-                if solid is None
-                else solid
-            )
+            behind = tensor_like(model.config.solid, positions) if solid is None else solid
             if on_cpu:
                 _refuse_nonfinite(background=behind)
         rgb = raster.rgb + raster.transmittance[..., None] * behind

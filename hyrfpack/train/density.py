@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.gaussians import Gaussians, logit
+from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.render import Rendering
 from hyrfpack.train.config import DensityConfig
 from hyrfpack.train.optimizer import Optimizer
@@ -61,10 +62,8 @@ class DensityControl:
         """Collect the gradients of one view, after backward."""
         if rendering.absgrad is None:
             return
-        # To pick the visible, or a blocking copy, would make the host wait for the device: zeros are added instead.
-        absgrad = rendering.absgrad
-        half = torch.tensor((width / 2, height / 2), dtype=absgrad.dtype)
-        ndc = absgrad * half.to(absgrad.device, non_blocking=absgrad.is_cuda)
+        # To pick the visible would make the host wait for the device: zeros are added instead.
+        ndc = rendering.absgrad * tensor_like((width / 2, height / 2), rendering.absgrad)
         lengths = torch.where(rendering.visible, torch.linalg.vector_norm(ndc, dim=-1), 0)
         self.gradients.index_add_(0, rendering.decoded, lengths.to(self.gradients.dtype))
         self.views.index_add_(0, rendering.decoded, rendering.visible.to(self.views.dtype))

@@ -46,8 +46,8 @@ class Optimizer:
         """Take one step with the learning rates due at `step` (from 0) of `steps`, and clear the gradients.
 
         Returns:
-            (groups,) float32 on the model's device: not 0 for a group with a gradient that is not finite, whose numbers
-            are then not to be used. Nothing waits for the device.
+            (groups,) float32 on the model's device: not 0 for a group with a gradient that is not finite; what has one
+            took no step. Nothing waits for the device.
         """
         broken = []
         for name, parameters in self.groups.items():

@@ -16,6 +16,7 @@ from hyrfpack.ops.background.reference import (
     sphere_points,
 )
 from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.mlp import WIDEST
 from hyrfpack.ops.shade.directions import DIRECTION_FEATURES
 
 __all__ = [
@@ -88,7 +89,7 @@ def background_grid(
         )
     field = (table, *weights, *biases)
     fits = table.shape[1] == 2 and len(resolutions) <= 16 and len(weights) == 3
-    fits = fits and max(weight.shape[0] for weight in weights) <= 128
+    fits = fits and max(weight.shape[0] for weight in weights) <= WIDEST
     wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in field)
     available = ("reference", "gpu") if fits and not wanted else ("reference",)
     if choose(implementation, available, transmittance, *field) == "gpu":

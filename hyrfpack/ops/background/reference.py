@@ -11,6 +11,7 @@ from hyrfpack.ops.contraction import contract
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.shade.directions import encode_directions, viewpoint_of
+from hyrfpack.ops.transfer import tensor_like
 
 RADIUS = 100.0  # local units, around the frame's centre
 
@@ -71,9 +72,8 @@ def background_colors(
     sigmoid(mlp([hash_encode(contract(p / half_extent)), e(d)])),  p where the ray along d leaves the sphere
     """
     pose = pose.to(table, non_blocking=table.is_cuda)
-    half_extent = torch.tensor(half_extent, dtype=table.dtype).to(table.device, non_blocking=table.is_cuda)
     directions = pixel_directions(points, intrinsics, pose)
-    u = sphere_points(viewpoint_of(pose), directions) / half_extent
+    u = sphere_points(viewpoint_of(pose), directions) / tensor_like(half_extent, table)
     features = hash_encode(contract(u), table, resolutions, log2_table_size)
     # Hash features are stored by columns, and joined so.
     inputs = torch.cat((features.T, encode_directions(directions, encoding).T)).T

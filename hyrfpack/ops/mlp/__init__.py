@@ -11,7 +11,9 @@ from torch.autograd.function import once_differentiable
 from hyrfpack.ops.dispatch import choose
 from hyrfpack.ops.mlp import reference
 
-__all__ = ["mlp"]
+__all__ = ["WIDEST", "mlp"]
+
+WIDEST = 128  # inputs and hidden layers that GPU kernels take
 
 
 def mlp(
@@ -55,7 +57,7 @@ def mlp(
     chosen = choose(implementation, ("reference", "cpu", "gpu"), x, *weights, *biases)
     if chosen == "cpu":
         return _CpuMlp.apply(x, *weights, *biases)
-    if chosen == "gpu" and len(weights) == 3 and max(widths[:3]) <= 128 and widths[3] <= 16:
+    if chosen == "gpu" and len(weights) == 3 and max(widths[:3]) <= WIDEST and widths[3] <= 16:
         return _GpuMlp.apply(x, mixed, *weights, *biases)
     return reference.mlp(x, weights, biases, mixed)
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from hyrfpack.ops.gpu_words import pack
 from hyrfpack.ops.rasterize import reference
 from hyrfpack.ops.rasterize.gpu_ellipse import TILE, UNIT, ellipse, tile_columns, tile_rows
+from hyrfpack.ops.shade.directions import viewpoint_of
 
 # One record of a projected Gaussian: 16 float32, read and written two at a time as one 64-bit word, which halves the
 # number of loads. With Sigma = its 2D covariance and d = pixel - mean,
@@ -37,6 +38,7 @@ SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_P, SUM_RED, SUM_GREEN, SUM_BLUE, SUM_A
 )
 ROW = tl.constexpr(12)  # floats: 48 bytes
 
+VIEWPOINT = tl.constexpr(25)  # in `camera_numbers`
 HIDDEN = tl.constexpr(2**31 - 1)  # the sort key of a Gaussian that is not drawn
 NAMES = "means", "quats", "scales", "opacities", "colors"  # the bits of the flag of numbers that are not finite
 BLOCK = 128  # Gaussians a program: float64 takes many registers, so that small programs fill a processor best
@@ -100,8 +102,9 @@ def camera_numbers(
         tolerance: of `in_frustum`, as a fraction of half the picture's size.
 
     Returns:
-        (25,): the rows of the rotation and the translation (12), fx, fy, cx, cy, near, the limits of x/z (low, high)
-        and of y/z in the Jacobian, the limits of fx x/z (low, high) and of fy y/z in the frustum.
+        (28,): the rows of the rotation and the translation (12), fx, fy, cx, cy, near, the limits of x/z (low, high)
+        and of y/z in the Jacobian, the limits of fx x/z (low, high) and of fy y/z in the frustum,
+        and, from VIEWPOINT on, where the camera stands.
     """
     fx, fy, cx, cy = (float(number) for number in intrinsics)
     pose = camera_from_world.detach().to("cpu", torch.float64)
@@ -111,6 +114,7 @@ def camera_numbers(
         *pose[:3, :3].flatten().tolist(), *pose[:3, 3].tolist(), fx, fy, cx, cy, near,
         -cx / fx - slack_x, (width - cx) / fx + slack_x, -cy / fy - slack_y, (height - cy) / fy + slack_y,
         -margin_x - cx, width + margin_x - cx, -margin_y - cy, height + margin_y - cy,
+        *viewpoint_of(pose).tolist(),
     ]  # fmt: skip
     # Not blocking: so small a copy is taken over at once, and a blocking one would wait for the device.
     return torch.tensor(numbers, dtype=torch.float64).to(device, non_blocking=True)

@@ -10,6 +10,7 @@ from torch import Tensor
 from hyrfpack.ops.rasterize import Rasterization
 from hyrfpack.ops.rasterize.gpu import draw
 from hyrfpack.ops.rasterize.gpu_project import (
+    VIEWPOINT,
     Projection,
     camera_numbers,
     flag_colors,
@@ -22,13 +23,13 @@ from hyrfpack.ops.rasterize.gpu_project import (
     store_colors,
     store_records,
 )
-from hyrfpack.ops.shade import Shading, viewpoint_of
-from hyrfpack.ops.shade.gpu import launch_size, operands, shade_block
+from hyrfpack.ops.shade import Shading
+from hyrfpack.ops.shade.gpu import launch_size, shade_block
 
 
 @triton.jit(do_not_specialize=["total", "width", "height"])
 def project_shaded(
-    means, quats, scales, opacities, viewpoint, first_layer, packed, b2, b3, color_logits, camera, total, width, height,
+    means, quats, scales, opacities, first_layer, packed, b2, b3, color_logits, camera, total, width, height,
     records, keys, counts, visible, flags,
     IN: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, OUT: tl.constexpr,
     IN_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, OUT_P: tl.constexpr,
@@ -50,6 +51,11 @@ def project_shaded(
     tl.store(counts + index, count, mask=live)
     tl.store(visible + index, drawn.to(tl.uint8), mask=live)
     if tl.max(count, 0) > 0:
+        viewpoint = (
+            tl.load(camera + VIEWPOINT).to(tl.float32),
+            tl.load(camera + VIEWPOINT + 1).to(tl.float32),
+            tl.load(camera + VIEWPOINT + 2).to(tl.float32),
+        )
         color = shade_block(
             mean, index, drawn, viewpoint, first_layer, packed, b2, b3, color_logits,
             IN, H1, H2, OUT, IN_P, H1_P, H2_P, OUT_P, FREQUENCY, PRECISION,
@@ -80,14 +86,12 @@ def rasterize_shaded(
     total, device = len(means), means.device
     inputs = (tensor.detach().contiguous() for tensor in (means, quats, scales, opacities))
     camera = camera_numbers(camera_from_world, intrinsics, width, height, near, device, cull_tolerance)
-    pose = camera_from_world.detach().to("cpu", torch.float64)
-    viewpoint = viewpoint_of(pose).float().to(device, non_blocking=True)
-    tensors, constants = operands(shading)
+    tensors, constants = shading.operands
     projection = Projection.empty(total, device)
     if total:
         block, warps = launch_size(shading.mixed)
         project_shaded[(triton.cdiv(total, block),)](
-            *inputs, viewpoint, *tensors, camera, total, int(width), int(height),
+            *inputs, *tensors, camera, total, int(width), int(height),
             projection.records, projection.keys, projection.counts, projection.visible, projection.numbers,
             **constants, ANTIALIASED=bool(antialiased), BLOCK=block, num_warps=warps, enable_fp_fusion=True,
         )  # fmt: skip

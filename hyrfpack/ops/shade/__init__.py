@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.mlp import WIDEST
 from hyrfpack.ops.shade import reference
 from hyrfpack.ops.shade.directions import (
     DIRECTION_FEATURES,
@@ -56,6 +58,13 @@ class Shading:
     encoding: str
     mixed: bool
 
+    @cached_property
+    def operands(self) -> tuple[tuple[Tensor, ...], dict]:
+        """What GPU kernels take of it, packed once for all views: tensors, and constants by name."""
+        from hyrfpack.ops.shade import gpu
+
+        return gpu.operands(self)
+
 
 def check_shading(shading: Shading, count: int) -> None:
     """Raise ValueError unless it is a decoder for so many Gaussians."""
@@ -74,7 +83,7 @@ def choose_for(shading: Shading, implementation: str, *tensors: Tensor) -> str:
     """As `dispatch.choose`, for kernels that take these tensors and a shading."""
     parameters = (shading.direction_weight, *shading.weights, *shading.biases, shading.color_logits)
     hidden = max(weight.shape[1] for weight in shading.weights)
-    available = ("reference", "gpu") if hidden <= 128 else ("reference",)
+    available = ("reference", "gpu") if hidden <= WIDEST else ("reference",)
     return choose(implementation, available, *tensors, *parameters)
 
 

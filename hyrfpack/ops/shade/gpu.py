@@ -35,10 +35,10 @@ def shade_block(
 
     Args:
         mean: tuple of 3 blocks.
-        viewpoint: pointer to 3 float32; first_layer, color_logits: pointers to (N, H1) and (N, 3).
+        viewpoint: tuple of 3 numbers; first_layer, color_logits: pointers to (N, H1) and (N, 3).
         packed: of `tiles.pack`, the direction's weight first; b2, b3: the later biases.
     """
-    x, y, z = (mean[0] - tl.load(viewpoint), mean[1] - tl.load(viewpoint + 1), mean[2] - tl.load(viewpoint + 2))
+    x, y, z = mean[0] - viewpoint[0], mean[1] - viewpoint[1], mean[2] - viewpoint[2]
     inverse = 1 / tl.maximum(tl.sqrt(x * x + y * y + z * z), 1e-12)
     x, y, z = x * inverse, y * inverse, z * inverse
     neuron = tl.arange(0, H1_P)[:, None]
@@ -76,8 +76,9 @@ def shade_kernel(
         tl.load(means + row + 1, mask=live, other=0.0),
         tl.load(means + row + 2, mask=live, other=0.0),
     )
+    place = tl.load(viewpoint), tl.load(viewpoint + 1), tl.load(viewpoint + 2)
     red, green, blue = shade_block(
-        mean, index, live, viewpoint, first_layer, packed, b2, b3, color_logits,
+        mean, index, live, place, first_layer, packed, b2, b3, color_logits,
         IN, H1, H2, OUT, IN_P, H1_P, H2_P, OUT_P, FREQUENCY, PRECISION,
     )  # fmt: skip
     tl.store(colors + row, red, mask=live)
@@ -98,7 +99,7 @@ def operands(shading: Shading) -> tuple[tuple[Tensor, ...], dict]:
 
 def shade(positions: Tensor, viewpoint: Tensor, shading: Shading) -> Tensor:
     """As `hyrfpack.ops.shade.shade`."""
-    tensors, constants = operands(shading)
+    tensors, constants = shading.operands
     colors = torch.empty_like(positions, memory_format=torch.contiguous_format)
     if len(positions):
         block, warps = launch_size(shading.mixed)
