@@ -1,0 +1,84 @@
+"""Splats drawn by our own rasteriser, as `hyrfpack.render` draws models: what files of other programs look like."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyrfpack.export.harmonics import harmonics_basis
+from hyrfpack.export.splats import Splats
+from hyrfpack.model import Frame, viewpoint_of
+from hyrfpack.ops.rasterize import Rasterization, rasterize
+from hyrfpack.ops.rasterize.cull import frustum_cull
+from hyrfpack.parallel.pool import torch_on_one_thread
+from hyrfpack.render import RenderSettings
+from hyrfpack.scene import Camera
+
+
+@dataclass(frozen=True)
+class Drawable:
+    """Splats ready to be drawn many times: float32 tensors in the local units of a frame.
+
+    Attributes:
+        frame: whose local units these are; near planes follow it.
+        positions (N, 3), scales (N, 3), quats (N, 4) wxyz, opacities (N,), harmonics (N, K, 3): as in Splats.
+        antialiased: as in Splats.
+    """
+
+    frame: Frame
+    positions: Tensor
+    scales: Tensor
+    quats: Tensor
+    opacities: Tensor
+    harmonics: Tensor
+    antialiased: bool
+
+    @classmethod
+    def of(cls, splats: Splats, frame: Frame) -> Drawable:
+        """Bring splats to the local units of a frame."""
+        return cls(
+            frame,
+            torch.from_numpy(frame.to_local(splats.positions).astype(np.float32)),
+            torch.from_numpy(splats.scales / np.float32(frame.scale)),
+            torch.from_numpy(splats.quats),
+            torch.from_numpy(splats.opacities),
+            torch.from_numpy(splats.harmonics),
+            splats.antialiased,
+        )
+
+
+@torch_on_one_thread()
+@torch.no_grad()
+def draw(
+    drawable: Drawable,
+    camera: Camera,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+) -> Rasterization:
+    """Draw splats as a camera sees them, over black; `transmittance` of the result says what lies behind.
+
+    Args:
+        drawable: what to draw.
+        camera: from where, in world units.
+        settings: near plane (local units), culling and transmittance as in `hyrfpack.render`.
+    """
+    pose = torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32)
+    size = camera.intrinsics, camera.width, camera.height
+    index = frustum_cull(drawable.positions, pose, *size, settings.near, settings.cull_tolerance)
+    positions, harmonics = drawable.positions[index], drawable.harmonics[index]
+    directions = torch.nn.functional.normalize(positions - viewpoint_of(pose), dim=-1, eps=1e-12)
+    basis = harmonics_basis(directions, round(harmonics.shape[1] ** 0.5) - 1)
+    return rasterize(
+        positions,
+        drawable.quats[index],
+        drawable.scales[index],
+        drawable.opacities[index],
+        (torch.einsum("nk,nkc->nc", basis, harmonics) + 0.5).clamp_min(0),
+        pose,
+        *size,
+        near=settings.near,
+        antialiased=drawable.antialiased,
+        transmittance_min=settings.transmittance_min,
+    )
