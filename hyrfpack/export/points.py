@@ -1,0 +1,102 @@
+"""The centres of splats as coloured points, with the cameras as frusta: a look at a scene in any 3D program."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from hyrfpack.errors import HyrfDataError, needs_package
+from hyrfpack.export.formats.gltf import GLTF_UP, linear_colors
+from hyrfpack.export.harmonics import BAND_0
+from hyrfpack.export.placement import local_origin, local_positions, upright_rotation
+from hyrfpack.export.splats import Splats
+from hyrfpack.scene import Camera
+
+_CAMERA_COLOR = (255, 106, 0, 255)  # orange: rare in photos
+_DEPTH = 0.06  # of a frustum, in distances from camera to scene
+_DOTS = 16  # along each edge of a frustum, where there are no lines
+# Apex 0, corners 1 to 4 clockwise from the top left, and 5, a tip that shows which side is up: one stroke draws all.
+_STROKE = (4, 0, 1, 2, 3, 4, 1, 5, 2, 0, 3)
+
+
+def encode_points(splats: Splats, cameras: Sequence[Camera], extension: Literal["glb", "ply"], up: np.ndarray) -> bytes:
+    """Splats and cameras as points and lines, in the input's axes and units.
+
+    A .glb holds two geometries, the points "gaussians" and the lines "cameras"; their nodes turn them upright, and
+    move them where the scene lies far from the origin compared to its size. A .ply holds vertices only, for few
+    programs draw its edges: the frusta are dotted lines, after the points, and positions are double where float would
+    be coarse. Colours are those of degree 0 with opacity as alpha. Same input, same bytes.
+
+    Args:
+        splats: (N) whose centres are shown.
+        cameras: any number.
+        extension: which file.
+        up: (3,) unit vector in the world: which way is up in the scene.
+
+    Raises:
+        HyrfError: trimesh is missing.
+        HyrfDataError: there is nothing to show, or positions are beyond float32.
+    """
+    if not len(splats) and not cameras:
+        raise HyrfDataError("there are neither points nor cameras to export; name a model that has some")
+    frusta = _frusta(cameras, splats.positions)
+    origin = local_origin(np.concatenate((splats.positions, frusta.reshape(-1, 3))))
+    return _glb(splats, frusta, origin, up) if extension == "glb" else _ply(splats, frusta, origin)
+
+
+def _glb(splats: Splats, frusta: np.ndarray, origin: np.ndarray, up: np.ndarray) -> bytes:
+    with needs_package("trimesh", "writing points as .glb"):
+        import trimesh
+        from trimesh.path.entities import Line
+
+    scene, place = trimesh.Scene(), np.eye(4)
+    place[:3, :3] = upright_rotation(up, np.array(GLTF_UP))
+    place[:3, 3] = place[:3, :3] @ origin
+    if len(splats):
+        cloud = trimesh.PointCloud(local_positions(splats, origin), colors=linear_colors(splats))
+        scene.add_geometry(cloud, node_name="gaussians", geom_name="gaussians", transform=place)
+    if len(frusta):
+        strokes = np.arange(len(frusta))[:, None] * frusta.shape[1] + _STROKE
+        lines = trimesh.path.Path3D(
+            entities=[Line(stroke) for stroke in strokes],
+            vertices=(frusta - origin).reshape(-1, 3),
+            colors=np.tile(np.array(_CAMERA_COLOR, np.uint8), (len(frusta), 1)),
+            process=False,
+        )
+        scene.add_geometry(lines, node_name="cameras", geom_name="cameras", transform=place)
+    return scene.export(file_type="glb")
+
+
+def _ply(splats: Splats, frusta: np.ndarray, origin: np.ndarray) -> bytes:
+    ends = frusta[:, _STROKE, None]  # (cameras, corners along the stroke, 1, 3)
+    steps = np.arange(_DOTS)[:, None] / _DOTS
+    dots = (ends[:, :-1] * (1 - steps) + ends[:, 1:] * steps).reshape(-1, 3)
+    number = "double" if origin.any() else "float"
+    kind = [("position", "<f8" if origin.any() else "<f4", 3), ("color", "u1", 4)]
+    vertices = np.empty(len(splats) + len(dots), kind)
+    vertices["position"] = np.concatenate((splats.positions, dots))
+    srgb = np.clip(0.5 + BAND_0 * splats.harmonics[:, 0], 0, 1)
+    vertices["color"][: len(splats)] = np.round(255 * np.column_stack((srgb, splats.opacities)))
+    vertices["color"][len(splats) :] = _CAMERA_COLOR
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header += [f"property {number} {axis}" for axis in "xyz"]
+    header += [f"property uchar {channel}" for channel in ("red", "green", "blue", "alpha")]
+    return "\n".join((*header, "end_header", "")).encode() + vertices.tobytes()
+
+
+def _frusta(cameras: Sequence[Camera], positions: np.ndarray) -> np.ndarray:
+    """(cameras, 6, 3) world positions of apex, corners and tip; see _STROKE."""
+    if not cameras:
+        return np.zeros((0, 6, 3))
+    centers = np.stack([camera.position for camera in cameras])
+    middle = np.median(positions if len(positions) else centers, axis=0)
+    depth = _DEPTH * float(np.median(np.linalg.norm(centers - middle, axis=1))) or _DEPTH
+    frusta = np.empty((len(cameras), 6, 3))
+    for frustum, camera in zip(frusta, cameras, strict=True):
+        width, height = camera.width, camera.height
+        pixels = np.array([(0, 0), (width, 0), (width, height), (0, height), (width / 2, -height / 4)])
+        rays = np.column_stack(((pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones(len(pixels))))
+        frustum[0], frustum[1:] = camera.position, camera.position + depth * rays @ camera.rotation
+    return frusta
