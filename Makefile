@@ -7,6 +7,7 @@ SHELL := bash
 
 BIN := .venv/bin
 READY := .venv/.ready
+PEERS := tests/node/node_modules/.ready
 
 .PHONY: help demo test bench gpu speed sets choices ablations precision kill fuzz lint format clean
 
@@ -24,11 +25,18 @@ $(READY): pyproject.toml constraints.txt
 		| { grep --line-buffered -oE '^(Collecting|Building|Installing|Successfully installed) ?[^ ]*' || true; }
 	@touch $@
 
+# Programs of others that read our files. Where there is no npm, or off CI no network, the tests that need them skip.
+$(PEERS): tests/node/package.json tests/node/package-lock.json
+	@if ! command -v npm >/dev/null; then echo "npm is not here: the tests with programs under node will skip"; \
+	elif echo "Installing programs that read splats into tests/node ..." && npm ci --prefix tests/node --loglevel error; \
+	then touch $@; \
+	else echo "npm could not install: the tests with programs under node will skip"; test -z "$${CI:-}"; fi
+
 demo: $(READY) ## train, compress and render a small made-up scene; results in demo/
 	$(BIN)/hyrfpack demo -o demo
 
-test: lint ## check style, then run all tests
-	$(BIN)/python -m pytest
+test: lint $(PEERS) ## check style, then run all tests
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 
 bench: $(READY) ## time each hot operation at several sizes against its references
 	$(BIN)/python tools/bench.py
@@ -65,6 +73,6 @@ format: $(READY) ## rewrite the code in the house style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-clean: ## remove what was made here, but for .venv and runs/
+clean: ## remove what was made here, but for .venv, node_modules and runs/
 	rm -rf build dist demo *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find hyrfpack tests tools -name __pycache__ -type d -prune -exec rm -rf {} +

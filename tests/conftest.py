@@ -1,12 +1,17 @@
-"""Shared fixtures: photos. Tests may also import what lies beside this (`scenes`, tiny made-up worlds; `commands`), and
-`plans` of tools, which writes files of any profile."""
+"""Shared fixtures: photos, programs under node. Tests may also import what lies beside this (`scenes`, tiny made-up
+worlds; `commands`), and `plans` of tools, which writes files of any profile."""
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
+import subprocess
 import sys
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -41,3 +46,21 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"real data sets not found at {folder} (set HYRFPACK_DATA)")
     return folder
+
+
+@pytest.fixture(scope="session")
+def node() -> Callable[..., Any]:
+    """Runs a script of tests/node with arguments; returns the last line it prints, which is JSON."""
+    program, folder = shutil.which("node"), Path(__file__).parent / "node"
+    if program is None:
+        pytest.skip("node is not on this machine")
+    if not (folder / "node_modules").is_dir():
+        pytest.skip("node's packages are not installed (npm ci --prefix tests/node)")
+
+    def run(script: str, *arguments: object) -> Any:
+        command = [program, str(folder / script), *map(str, arguments)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout.splitlines()[-1])
+
+    return run

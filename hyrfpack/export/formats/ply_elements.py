@@ -1,0 +1,151 @@
+"""PLY, the container (Turk 1994): a header in text that names elements and their properties, and then their rows."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrfpack.errors import HyrfDataError
+
+_LONGEST_HEADER = 1 << 16
+_ENDS = re.compile(rb"^end_header\r?\n", re.MULTILINE)
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_KINDS = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"} | {
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"
+} | {"float32": "f4", "float64": "f8"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Element:
+    """One element of the header.
+
+    Attributes:
+        count: of its rows.
+        properties: name of each -> numpy's name of its type without byte order; "" for a list.
+    """
+
+    count: int
+    properties: dict[str, str]
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """What the text at the start of a PLY file says.
+
+    Attributes:
+        order: "<" or ">" for binary rows, "=" for rows in text.
+        elements: by name, in the order of the file.
+        length: bytes of the header; rows follow.
+    """
+
+    order: str
+    elements: dict[str, Element]
+    length: int
+
+
+def read_header(data: bytes, name: str) -> PlyHeader:
+    """Read the header of a PLY file.
+
+    Raises:
+        HyrfDataError: this is no PLY file, or its header breaks the rules of the format.
+    """
+    if not re.match(rb"ply\r?\n", data):
+        raise HyrfDataError(f"{name}: this is no PLY file, for its first line is not 'ply'")
+    end = _ENDS.search(data, 0, _LONGEST_HEADER)
+    if end is None:
+        raise HyrfDataError(f"{name}: its PLY header has no end within {_LONGEST_HEADER:,} bytes; it is damaged")
+    order, elements, properties = "", {}, None
+    for line in data[: end.start()].decode("utf-8", "replace").splitlines()[1:]:
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", kind, _] if kind in _BYTE_ORDERS:
+                order = _BYTE_ORDERS[kind]
+            case ["element", element, count] if re.fullmatch("[0-9]{1,15}", count) and element not in elements:
+                properties = {}
+                elements[element] = Element(int(count), properties)
+            case ["property", kind, label] if kind in _KINDS and properties is not None and label not in properties:
+                properties[label] = _KINDS[kind]
+            case ["property", "list", _, _, label] if properties is not None and label not in properties:
+                properties[label] = ""
+            case _:
+                raise HyrfDataError(f"{name}: the line '{line[:80]}' of its PLY header is not understood")
+    if not order:
+        raise HyrfDataError(f"{name}: its PLY header does not say in which format its rows are; it is damaged")
+    return PlyHeader(order, elements, end.end())
+
+
+def read_elements(data: bytes, header: PlyHeader, wanted: set[str], name: str) -> dict[str, np.ndarray]:
+    """Rows of those `wanted` elements that the file has; others are skipped.
+
+    Args:
+        data: the whole file.
+        header: of it.
+        wanted: names of elements.
+        name: what messages call the file.
+
+    Returns:
+        By name, a structured array (count,) with the file's property names. Rows in text come as float64.
+
+    Raises:
+        HyrfDataError: the file ends too early, a row in text is not made of numbers, or lists stand in the way.
+    """
+    rows, place = {}, header.length
+    text = io.StringIO(data[place:].decode("ascii", "replace")) if header.order == "=" else None
+    for label, element in header.elements.items():
+        if wanted <= rows.keys():
+            break
+        kinds = element.properties
+        if "" in kinds.values() and element.count and (text is None or label in wanted):
+            raise HyrfDataError(
+                f"{name}: its element '{label}' has properties that are lists; no file of Gaussians needs them, export "
+                "it again as a plain one"
+            )
+        if text is not None:
+            lines = (line for line in text if not line.isspace())
+            taken = [line for _, line in zip(range(element.count), lines, strict=False)]
+            if len(taken) < element.count:
+                raise _ends_early(name, label, element.count)
+            if label in wanted:
+                rows[label] = _numbers(taken, kinds, label, name)
+            continue
+        layout = np.dtype([(key, header.order + kind) for key, kind in kinds.items()])
+        if element.count * layout.itemsize > len(data) - place:
+            raise _ends_early(name, label, element.count)
+        if label in wanted:
+            rows[label] = np.ndarray(element.count if kinds else 0, layout, data, place)
+        place += element.count * layout.itemsize
+    return rows
+
+
+def columns(rows: np.ndarray, names: Collection[str]) -> np.ndarray:
+    """The properties `names` of rows, as one array (count, len(names)) of their widest type."""
+    names = list(names)
+    kinds = {rows.dtype[name] for name in rows.dtype.names}
+    if len(kinds) == 1:  # as all programs write it: one table, many times faster
+        table = rows.view(kinds.pop()).reshape(len(rows), len(rows.dtype))
+        return table[:, [rows.dtype.names.index(name) for name in names]]
+    return np.stack([rows[name] for name in names], axis=1)
+
+
+def _numbers(lines: list[str], kinds: dict[str, str], label: str, name: str) -> np.ndarray:
+    layout = np.dtype([(key, "f8") for key in kinds])
+    if not lines or not kinds:
+        return np.zeros(0, layout)
+    try:
+        table = np.loadtxt(lines, np.float64, comments=None, ndmin=2)
+    except ValueError as error:
+        raise HyrfDataError(f"{name}: a row of its element '{label}' is not made of numbers; it is damaged") from error
+    if table.shape != (len(lines), len(kinds)):
+        raise HyrfDataError(
+            f"{name}: rows of its element '{label}' have {table.shape[1]} numbers, and the header says {len(kinds)}"
+        )
+    return np.ascontiguousarray(table).view(layout)[:, 0]
+
+
+def _ends_early(name: str, label: str, count: int) -> HyrfDataError:
+    return HyrfDataError(f"{name}: the file ends before the {count:,} rows of its element '{label}'; it is truncated")
