@@ -1,0 +1,192 @@
+"""Bake: a hybrid model as explicit Gaussians with spherical harmonics, for programs that know no neural field."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from hyrfpack.errors import HyrfError
+from hyrfpack.export.harmonics import harmonics_basis, terms_of
+from hyrfpack.export.splats import Splats, normalized_quats
+from hyrfpack.model import Geometry, HybridModel, viewpoint_of
+from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.rasterize.cull import frustum_cull
+from hyrfpack.ops.rasterize.reference import ALPHA_MIN
+from hyrfpack.ops.shade import Shading, shade
+from hyrfpack.parallel.pool import run_tasks, torch_on_one_thread
+from hyrfpack.render import RenderSettings
+from hyrfpack.scene import Camera
+
+LONGEST_SIDE = 512  # pixels of the pictures in which light is measured
+SPHERE_DIRECTIONS = 32
+SPHERE_WEIGHT = 3e-3  # of all these together, against 1 for all cameras
+RIDGE = 1e-5
+BLOCK = 2048  # Gaussians that a thread fits together: 24 kB each with 128 cameras
+
+
+@torch_on_one_thread()
+@torch.no_grad()
+def bake(model: HybridModel, cameras: Sequence[Camera], degrees: Sequence[int] = (3,)) -> dict[int, Splats]:
+    """A model as explicit Gaussians in world units, in the model's order, for each degree of spherical harmonics.
+
+    Scales, rotations and opacities are the model's own. Colours minimise, for each Gaussian over the cameras v that it
+    sends light w_v to (the sum over pixels of T alpha; sum_v w_v = 1), seen along the directions d_v,
+
+        sum_v w_v |f(d_v) - color(d_v)|^2 + SPHERE_WEIGHT mean_s |f(d_s) - color(d_s)|^2 + RIDGE sum_{k > 0} |h_k|^2
+
+    with f(d) = 0.5 + sum_k h_k Y_k(d) and directions d_s that cover the sphere evenly: from where no camera stood the
+    colours follow the model, too, as far as that costs the cameras' views nothing.
+
+    One thing is mended. The model is trained with Gaussians left out whose centres project far outside the picture
+    (`RenderSettings.cull_tolerance`). Many programs draw these, and large ones near a camera would cover its picture.
+    So opacities are multiplied by 1 - s^2, where s is the share of a Gaussian's light, were nothing left out, that
+    would go to cameras which the model draws without it; most have s = 0, and those that this makes invisible are
+    dropped.
+
+    Args:
+        model: on the CPU.
+        cameras: from where it was photographed, world units; when there are none, colours are fitted on the sphere
+            alone and no opacity changes.
+        degrees: of the harmonics, each 0 to 3. More than one costs little more.
+
+    Raises:
+        HyrfError: a number of the model, or a camera's pose, is NaN, infinite or beyond float32.
+    """
+    geometry, positions = model.decode_geometry(), model.gaussians.positions.detach()
+    scales = geometry.scales * model.config.frame.scale
+    for name, values in {**vars(geometry), "positions": positions, "scales": scales}.items():
+        refuse_nonfinite(name, values)
+    views = [_view(model, geometry, camera) for camera in cameras]
+    light, stray = torch.zeros(2, len(model), dtype=torch.float64)
+    for view in views:
+        light[view.index] += view.light
+        stray[view.left_out] += view.stray
+    share = stray / (light + stray).clamp_min(torch.finfo().tiny)
+    opacities = geometry.opacities * (1 - share.float().square())
+    keep = ((share == 0) | (opacities >= ALPHA_MIN)).numpy()
+
+    shared = (
+        model.config.frame.to_world(positions.numpy()),
+        scales.numpy(),
+        normalized_quats(geometry.quats.numpy()),
+        opacities.numpy(),
+    )
+    baked = {}
+    for degree, harmonics in _fit(model, views, light, degrees).items():
+        refuse_nonfinite("colors", harmonics)
+        baked[degree] = Splats(*shared, harmonics.numpy(), model.config.antialiased)[keep]
+    return baked
+
+
+@dataclass(frozen=True)
+class _View:
+    """The light that Gaussians send to a picture: the sum over its pixels of T alpha.
+
+    Attributes:
+        viewpoint: (3,) where the camera stands, local units.
+        index, light: (n,) int64 ascending and float32: of those that the model draws.
+        left_out, stray: (m,) the same of those that it leaves out, were all drawn.
+    """
+
+    viewpoint: Tensor
+    index: Tensor
+    light: Tensor
+    left_out: Tensor
+    stray: Tensor
+
+
+def _view(model: HybridModel, geometry: Geometry, camera: Camera) -> _View:
+    settings, positions = RenderSettings(), model.gaussians.positions.detach()
+    camera = small_camera(camera)
+    pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=torch.float32)
+    refuse_nonfinite("camera poses", pose)
+    size = camera.intrinsics, camera.width, camera.height
+    drawn = frustum_cull(positions, pose, *size, settings.near, settings.cull_tolerance)
+
+    def light(means: Tensor, some: Geometry) -> Tensor:
+        with torch.enable_grad():  # T alpha, summed over pixels, is the derivative of summed pixels by the colour
+            colors = torch.zeros_like(means, requires_grad=True)
+            how = {"near": settings.near, "antialiased": model.config.antialiased}
+            raster = rasterize(means, some.quats, some.scales, some.opacities, colors, pose, *size, **how)
+            return torch.autograd.grad(raster.rgb[..., 0].sum(), colors)[0][:, 0]
+
+    received, all_drawn = light(positions[drawn], geometry[drawn]), light(positions, geometry)
+    all_drawn[drawn] = 0
+    lit, left_out = received > 0, torch.nonzero(all_drawn).squeeze(-1)
+    return _View(viewpoint_of(pose), drawn[lit], received[lit], left_out, all_drawn[left_out])
+
+
+def small_camera(camera: Camera) -> Camera:
+    """The same view in a picture of at most LONGEST_SIDE pixels: enough to learn what can be seen from there."""
+    shrink = min(1.0, LONGEST_SIDE / max(camera.width, camera.height))
+    width, height = max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink))
+    x, y = width / camera.width, height / camera.height
+    return replace(
+        camera, width=width, height=height, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y
+    )
+
+
+def _fit(model: HybridModel, views: Sequence[_View], light: Tensor, degrees: Iterable[int]) -> dict[int, Tensor]:
+    """Harmonics (N, K, 3) of all Gaussians by degree."""
+    shading, positions = model.shading(), model.gaussians.positions.detach()
+    fitted = {degree: positions.new_empty(len(model), terms_of(degree), 3) for degree in degrees}
+    highest = max(fitted)
+    sphere = fibonacci_sphere(SPHERE_DIRECTIONS)
+    edges = torch.arange(0, len(model) + BLOCK, BLOCK)
+    ranges = [torch.searchsorted(view.index, edges) for view in views]
+
+    def fit_block(block: int) -> None:
+        start, stop = block * BLOCK, min((block + 1) * BLOCK, len(model))
+        # Rows of the least-squares problem, one for each camera and direction: basis functions and colour.
+        rows = positions.new_zeros(len(views) + len(sphere), stop - start, terms_of(highest) + 3)
+        for row, view, bounds in zip(rows, views, ranges, strict=False):
+            seen = slice(int(bounds[block]), int(bounds[block + 1]))
+            index = view.index[seen]
+            directions = torch.nn.functional.normalize(positions[index] - view.viewpoint, dim=-1, eps=1e-12)
+            weights = view.light[seen] / light[index]
+            row[index - start] = _equations(directions, _part(shading, index), weights.float(), highest)
+        here = _part(shading, slice(start, stop))
+        weights = torch.full((stop - start,), SPHERE_WEIGHT / len(sphere))
+        for row, direction in zip(rows[len(views) :], sphere, strict=True):
+            row[:] = _equations(direction.expand(stop - start, 3), here, weights, highest)
+        rows = rows.permute(1, 2, 0)
+        products = (rows @ rows.mT).double()
+        for degree, harmonics in fitted.items():
+            terms = terms_of(degree)
+            ridge = torch.full((terms,), RIDGE, dtype=torch.float64)
+            ridge[0] = 0
+            factors = torch.linalg.cholesky_ex(products[:, :terms, :terms] + ridge.diag()).L
+            harmonics[start:stop] = torch.cholesky_solve(products[:, :terms, -3:], factors)
+
+    run_tasks(fit_block, len(edges) - 1)
+    return fitted
+
+
+def _equations(directions: Tensor, shading: Shading, weights: Tensor, degree: int) -> Tensor:
+    """(n, K + 3) basis functions and the colours less 0.5 along directions (n, 3), times the roots of weights (n,)."""
+    colors = shade(directions, torch.zeros(3), shading, implementation="reference")
+    return torch.cat((harmonics_basis(directions, degree), colors - 0.5), -1) * weights.sqrt()[:, None]
+
+
+def _part(shading: Shading, index: Tensor | slice) -> Shading:
+    return replace(shading, first_layer=shading.first_layer[index], color_logits=shading.color_logits[index])
+
+
+def fibonacci_sphere(count: int) -> Tensor:
+    """(count, 3) unit vectors spread evenly over the sphere: points of a Fibonacci lattice."""
+    numbers = torch.arange(count, dtype=torch.float64)
+    heights, angles = 1 - (2 * numbers + 1) / count, torch.pi * (1 + 5**0.5) * numbers
+    radii = (1 - heights**2).sqrt()
+    return torch.stack((radii * angles.cos(), radii * angles.sin(), heights), -1).float()
+
+
+def refuse_nonfinite(name: str, values: Tensor) -> None:
+    """Raise HyrfError, naming what they are, unless all values are finite."""
+    if not values.isfinite().all():
+        raise HyrfError(
+            f"the bake's {name} hold NaN or infinity, from a broken model or numbers beyond float32; "
+            "train the model again or mend the cameras"
+        )

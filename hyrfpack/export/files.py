@@ -1,0 +1,89 @@
+"""Splat files by their extension: which format it is, writing and reading it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.export.formats import gltf, ply, sog, splat, spz, usd
+from hyrfpack.export.splats import Splats
+from hyrfpack.scene import Camera
+
+USD = (".usda", ".usdc", ".usdz")
+WRITTEN = (".ply", ".splat", ".spz", ".glb", *USD, ".sog")
+READ = (".ply", ".splat", ".spz", ".sog")  # by `read_splats`; .compressed.ply is among .ply
+MAX_BYTES = 1 << 32  # of a file to be read: 17 million Gaussians as PLY
+
+
+def encode_splats(splats: Splats, extension: str, *, up: np.ndarray, camera: Camera | None) -> bytes:
+    """Splats as the bytes of a file.
+
+    Args:
+        splats: in the input's axes and units.
+        extension: one of WRITTEN. ".splat" holds no harmonics beyond degree 0.
+        up: (3,) unit vector in the world, for the formats that know up (glTF, USD).
+        camera: to look from first, for the formats that hold one (USD).
+
+    Raises:
+        HyrfError: the format's package is missing.
+    """
+    if extension in USD:
+        return usd.encode(splats, extension=extension[1:], up=up, camera=camera)
+    if extension == ".glb":
+        return gltf.encode(splats, up=up)
+    return {".ply": ply, ".splat": splat, ".spz": spz, ".sog": sog}[extension].encode(splats)
+
+
+def decode_splats(data: bytes, extension: str, name: str) -> Splats:
+    """The splats in the bytes of a file, in the axes that `encode_splats` was given.
+
+    Args:
+        data: the file.
+        extension: one of WRITTEN.
+        name: what error messages call the file.
+
+    Raises:
+        HyrfDataError: the bytes are no such file, or are damaged.
+    """
+    if extension in USD:
+        return usd.decode(data, name, extension[1:])
+    if extension == ".glb":
+        return gltf.decode(data, name)
+    if extension == ".sog":
+        return sog.decode(sog.unzip(data, name), name)
+    if extension == ".ply":
+        return ply.read_ply(data, name)
+    return {".splat": splat, ".spz": spz}[extension].decode(data, name)
+
+
+def read_splats(path: str | os.PathLike[str]) -> Splats:
+    """Read a file of 3D Gaussians: .ply (plain or compressed), .splat, .spz, .sog, or the folder of a loose SOG.
+
+    Raises:
+        HyrfDataError: there is no such file, or it is none of these, or it is damaged.
+    """
+    path = Path(path)
+    if path.name == "meta.json":
+        path = path.parent
+    extension = path.suffix.lower()
+    try:
+        if path.is_dir():
+            return sog.decode(_loose_sog(path), str(path))
+        if extension not in READ:
+            raise HyrfDataError(f"{path}: files with this ending are not known; name one of {', '.join(READ)}")
+        if path.stat().st_size > MAX_BYTES:
+            raise HyrfDataError(f"{path}: the file is larger than {MAX_BYTES:,} bytes; split it first")
+        return decode_splats(path.read_bytes(), extension, str(path))
+    except OSError as error:
+        raise HyrfDataError(f"{path}: the file cannot be read ({error.strerror or error}); check the path") from error
+
+
+def _loose_sog(folder: Path) -> dict[str, bytes]:
+    """The files of a SOG that is not bundled, by name: meta.json and the pictures that it names."""
+    files = {"meta.json": (folder / "meta.json").read_bytes()}
+    for name in sog.picture_names(files["meta.json"], str(folder)):
+        files[name] = (folder / name).read_bytes()
+    return files

@@ -1,0 +1,98 @@
+"""What an export loses: pictures of splats beside those of the model they came from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyrfpack.evaluate.metrics import psnr, to_8bit
+from hyrfpack.export.draw import Drawable, draw
+from hyrfpack.export.splats import Splats
+from hyrfpack.model import HybridModel
+from hyrfpack.ops.background import pixel_directions
+from hyrfpack.render import render
+from hyrfpack.scene import Camera, View
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """PSNR in dB, means over views.
+
+    Attributes:
+        model: of the splats' pictures against the model's.
+        photos: of the splats' pictures against the photos; None without photos.
+    """
+
+    model: float
+    photos: float | None
+
+
+@torch.no_grad()
+def likeness(
+    model: HybridModel,
+    contenders: Mapping[str, Splats],
+    views: Sequence[tuple[Camera, View | None]],
+    *,
+    behind: np.ndarray | None,
+    sphere: bool,
+) -> dict[str, Likeness]:
+    """How like a model splats look.
+
+    Args:
+        model: what they were made of; scored itself, too, as "model".
+        contenders: splats by name.
+        views: where to look from; photos are scored where all views have them.
+        behind: (H, 2H, 3) an equirectangular picture that lies behind the splats, as `background_picture` makes it;
+            the model's solid colour where None.
+        sphere: whether the model shows its background sphere.
+    """
+    decoded, frame = model.decode(), model.config.frame
+    solid = torch.tensor(model.config.solid)
+    drawables = {name: Drawable.of(splats, frame) for name, splats in contenders.items()}
+    scores: dict[str, list[tuple[float, float | None]]] = {}
+    for camera, view in views:
+        own = to_8bit(render(model, camera, decoded=decoded, background=sphere).rgb)
+        backdrop = solid if behind is None else _equirect_colors(torch.from_numpy(behind), camera)
+        pictures = {"model": own}
+        for name, drawable in drawables.items():
+            raster = draw(drawable, camera)
+            pictures[name] = to_8bit(raster.rgb + raster.transmittance[..., None] * backdrop)
+        photo, mask = (None, None) if view is None else _photo(view, model)
+        if mask is not None and not mask.any():
+            continue
+        for name, picture in pictures.items():
+            against = None if photo is None else psnr(picture, photo, mask)
+            scores.setdefault(name, []).append((psnr(picture, own, mask), against))
+    return {name: _mean(values) for name, values in scores.items()}
+
+
+def _equirect_colors(picture: Tensor, camera: Camera) -> Tensor:
+    """(H, W, 3) what a camera sees of an equirectangular picture infinitely far away; see `background_picture`."""
+    height, width, _ = picture.shape
+    rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    points = torch.stack((columns, rows), -1).reshape(-1, 2) + 0.5
+    directions = pixel_directions(points.double(), camera.intrinsics, torch.from_numpy(camera.camera_from_world))
+    x, y, z = directions.float().unbind(-1)
+    # Half a pixel of the other side beyond each edge, so that interpolation goes around.
+    around = torch.cat((picture[:, -1:], picture, picture[:, :1]), dim=1).permute(2, 0, 1)[None]
+    across = torch.atan2(x, z) / torch.pi * width / (width + 2)
+    down = 2 * torch.atan2(y, torch.hypot(x, z)) / torch.pi
+    places = torch.stack((across, down), -1)[None, None]
+    sampled = torch.nn.functional.grid_sample(around, places, padding_mode="border", align_corners=False)
+    return sampled[0, :, 0].T.reshape(camera.height, camera.width, 3)
+
+
+def _photo(view: View, model: HybridModel) -> tuple[Tensor, Tensor | None]:
+    picture = view.load()
+    photo = torch.from_numpy(picture.composite(np.array(model.config.solid, np.float32)))
+    return photo, None if picture.mask is None else torch.from_numpy(picture.mask)
+
+
+def _mean(scores: Sequence[tuple[float, float | None]]) -> Likeness:
+    own, photos = zip(*scores, strict=True)
+    return Likeness(fmean(own), None if None in photos else fmean(photos))

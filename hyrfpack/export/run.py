@@ -1,0 +1,223 @@
+"""Exporting a model: bake, choose, write, read back, measure."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from hyrfpack.atomic import write_atomic
+from hyrfpack.errors import HyrfError
+from hyrfpack.export.background import background_picture, background_splats
+from hyrfpack.export.bake import bake
+from hyrfpack.export.cameras import encode_transforms, write_colmap
+from hyrfpack.export.files import WRITTEN, decode_splats, encode_splats
+from hyrfpack.export.harmonics import MAX_DEGREE
+from hyrfpack.export.html import decode_page, encode_page
+from hyrfpack.export.measure import likeness
+from hyrfpack.export.points import encode_points
+from hyrfpack.export.source import Source
+from hyrfpack.export.splats import Splats, concatenate
+from hyrfpack.render import RenderSettings
+from hyrfpack.scene import Scene, evenly_spaced
+
+PAGE, TRANSFORMS, COLMAP = ".html", ".json", ""
+POINTS = (".points.ply", ".points.glb")
+ENDINGS = (*POINTS, *WRITTEN, PAGE, TRANSFORMS)
+PAGE_CAMERAS = 12  # that a page can be stepped through
+
+
+@dataclass(frozen=True)
+class ExportReport:
+    """What an export came to. PSNR in dB, means over views.
+
+    Attributes:
+        file: what was written.
+        bytes: on disk.
+        gaussians: in the file, those of the background included.
+        background: how many of these make the background.
+        degree: of the spherical harmonics in the file.
+        views: how many views the loss was measured at; 0 where it was not.
+        by_degree: PSNR of the baked model's pictures against the model's own, by degree, before anything is rounded
+            to what the file holds.
+        psnr: PSNR of the file's pictures, as read back from its bytes, against the model's own.
+        photos_model, photos_file: PSNR of the model's and of the file's pictures against held-out photos, if given.
+    """
+
+    file: str
+    bytes: int
+    gaussians: int = 0
+    background: int = 0
+    degree: int = 0
+    views: int = 0
+    by_degree: dict[int, float] = field(default_factory=dict)
+    psnr: float | None = None
+    photos_model: float | None = None
+    photos_file: float | None = None
+
+
+def export(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    degree: int = MAX_DEGREE,
+    data: Scene | None = None,
+    crop: Sequence[float] | None = None,
+    min_opacity: float = 0.0,
+    background: bool = True,
+    say: Callable[[str], None] = lambda sentence: None,
+) -> ExportReport:
+    """Write a `.hyrf` model as what other programs read, in its own axes and units, and measure what was lost.
+
+    The ending of `target` names the format:
+
+    - .ply, .splat, .spz, .glb, .usda, .usdc, .usdz, .sog: 3D Gaussians with spherical harmonics;
+    - .html: a page that shows the scene in any browser, by itself;
+    - .points.ply, .points.glb: the Gaussians' centres as coloured points, and the cameras as frusta;
+    - .json: the cameras as a transforms.json; no ending: a folder with cameras and points as a COLMAP model.
+
+    Nothing is measured where a part of the scene was cropped, or only points or cameras were written.
+
+    Args:
+        source: the model.
+        target: the file, or for COLMAP the folder, to write.
+        degree: of the spherical harmonics, 0 to 3; ".splat" has 0.
+        data: photos of the scene: colours are fitted where they were taken from, the held-out ones are scored. Without
+            them the cameras that the file keeps serve, or else rings of them around the scene.
+        crop: (min x, min y, min z, max x, max y, max z) in world units; Gaussians whose centres lie outside, and the
+            background, are left out.
+        min_opacity: fainter Gaussians are left out.
+        background: whether the model's background goes along.
+        say: told what is going on.
+
+    Raises:
+        HyrfError: a file cannot be read or written, or the options do not go together.
+    """
+    kind = kind_of(target)
+    read = Source.read(source, data)
+    if kind in (TRANSFORMS, COLMAP, *POINTS):
+        return _export_capture(read, kind, target, crop, min_opacity)
+    degree = 0 if kind == ".splat" else degree
+    where = (
+        "cameras" if read.cameras else "places around the scene, for the file keeps no cameras (--data names photos)"
+    )
+    say(f"fitting colours of degree {degree} at {len(read.fitted)} {where}")
+    baked = {
+        d: chosen(splats, crop, min_opacity) for d, splats in bake(read.model, read.fitted, range(degree + 1)).items()
+    }
+    sphere = background and crop is None and read.model.config.background
+    picture = background_picture(read.model) if sphere and kind == PAGE else None
+    behind = background_splats(read.model, read.fitted) if sphere and kind != PAGE else None
+    whole = {d: splats if behind is None else concatenate((splats, behind)) for d, splats in baked.items()}
+    say(f"writing {len(whole[degree]):,} Gaussians")
+    if kind == PAGE:
+        data = page(read, whole[degree], picture, Path(source).stem)
+        back = decode_page(data, str(target))
+    else:
+        first = read.cameras[0][1] if read.cameras else None
+        data = encode_splats(whole[degree], kind, up=read.up, camera=first)
+        back = decode_splats(data, kind, str(target))
+    write_atomic(target, data)
+    count = 0 if behind is None else len(behind)
+    report = ExportReport(str(target), len(data), len(whole[degree]), count, degree)
+    if crop is not None or not read.measured:
+        return report
+    say(f"measuring at {len(read.measured)} views")
+    contenders = {**{str(d): splats for d, splats in whole.items()}, "file": back}
+    scores = likeness(read.model, contenders, read.measured, behind=picture, sphere=sphere)
+    return replace(
+        report,
+        views=len(read.measured),
+        by_degree={d: scores[str(d)].model for d in whole},
+        psnr=scores["file"].model,
+        photos_model=scores["model"].photos,
+        photos_file=scores["file"].photos,
+    )
+
+
+def page_of(source: str | os.PathLike[str], degree: int = MAX_DEGREE) -> bytes:
+    """The page that shows a `.hyrf` model in a browser, as `export` writes it to .html.
+
+    Raises:
+        HyrfError: the file cannot be read.
+    """
+    read = Source.read(source)
+    picture = background_picture(read.model) if read.model.config.background else None
+    return page(read, bake(read.model, read.fitted, (degree,))[degree], picture, Path(source).stem)
+
+
+def page(read: Source, splats: Splats, picture: np.ndarray | None, title: str) -> bytes:
+    """The page that shows splats of a model.
+
+    Args:
+        read: the model.
+        splats: what it was baked to.
+        picture: (H, 2H, 3) its background, see `background_picture`; None for its solid colour.
+        title: of the page.
+    """
+    cameras = [camera for _, camera in read.cameras] or [camera for camera, _ in read.measured]
+    return encode_page(
+        splats,
+        title=title,
+        cameras=evenly_spaced(cameras, PAGE_CAMERAS),
+        up=read.up,
+        center=read.center,
+        background=picture,
+        solid=read.model.config.solid,
+        near=RenderSettings().near * read.model.config.frame.scale,
+    )
+
+
+def kind_of(target: str | os.PathLike[str]) -> str:
+    """The ending that decides the format, one of ENDINGS; COLMAP for a folder or a name without ending.
+
+    Raises:
+        HyrfError: it is none of them.
+    """
+    name = Path(target).name.lower()
+    if Path(target).is_dir() or not Path(name).suffix:
+        return COLMAP
+    for kind in ENDINGS:
+        if name.endswith(kind):
+            return kind
+    raise HyrfError(f"{target}: the ending names the format; end it in one of {', '.join(ENDINGS)}")
+
+
+def chosen(splats: Splats, crop: Sequence[float] | None = None, min_opacity: float = 0.0) -> Splats:
+    """Those with centres in the box `crop` and not fainter than `min_opacity`; see `export`.
+
+    Raises:
+        HyrfError: none is left.
+    """
+    keep = splats.opacities >= min_opacity
+    if crop is not None:
+        keep &= ((splats.positions >= crop[:3]) & (splats.positions <= crop[3:])).all(axis=1)
+    if not keep.any():
+        low, high = (corner.round(4).tolist() for corner in (splats.positions.min(0), splats.positions.max(0)))
+        raise HyrfError(
+            f"no Gaussian is left: centres lie between {low} and {high}, opacities reach {splats.opacities.max():.3f}; "
+            "widen --crop or lower --min-opacity"
+        )
+    return splats[keep]
+
+
+def _export_capture(
+    read: Source, kind: str, target: str | os.PathLike[str], crop: Sequence[float] | None, min_opacity: float
+) -> ExportReport:
+    """Points and cameras."""
+    if kind not in POINTS and not read.cameras:
+        raise HyrfError("the file keeps no cameras; export them from the file that training wrote, or name --data")
+    splats = chosen(bake(read.model, read.fitted, (0,))[0], crop, min_opacity)
+    if kind == COLMAP:
+        write_colmap(read.cameras, target, splats)
+        size = sum(file.stat().st_size for file in Path(target).rglob("*.bin"))
+        return ExportReport(str(target), size, len(splats))
+    if kind == TRANSFORMS:
+        data = encode_transforms(read.cameras)
+    else:
+        data = encode_points(splats, [camera for _, camera in read.cameras], Path(kind).suffix[1:], read.up)
+    write_atomic(target, data)
+    return ExportReport(str(target), len(data), len(splats))

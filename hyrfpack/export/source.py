@@ -1,0 +1,79 @@
+"""What is exported: a model, and from where it was photographed."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hyrfpack.errors import HyrfError
+from hyrfpack.format import describe, load
+from hyrfpack.model import HybridModel
+from hyrfpack.render.capture import stored_cameras
+from hyrfpack.render.paths import look_at, orbit, stored_viewpoint
+from hyrfpack.scene import Camera, Scene, View, evenly_spaced
+
+MEASURED = 12  # views at most that a loss is measured at
+HELD_OUT = 8  # every so many of the cameras that a file keeps are not fitted, but measured at
+FEW = 16  # cameras, of which none can be spared
+RING, LIFTS = 24, (-0.2, 0.0, 0.2)  # cameras around what kept none: in rings, raised by so much of their distance
+
+
+@dataclass(frozen=True)
+class Source:
+    """A model and what is known of how it was photographed.
+
+    Attributes:
+        model: the model.
+        cameras: those it was trained on, by name; empty where the file keeps none and there are no photos.
+        fitted: those that colours shall be fitted at; where none are known, some around what the model shows.
+        measured: cameras to measure at, with their photos where there are any. None of them is fitted, but where
+            there are fewer than FEW in all.
+        up, center: (3,) which way is up, unit length, and what is looked at, world units.
+    """
+
+    model: HybridModel
+    cameras: list[tuple[str, Camera]]
+    fitted: list[Camera]
+    measured: list[tuple[Camera, View | None]]
+    up: np.ndarray
+    center: np.ndarray
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str], data: Scene | None = None) -> Source:
+        """Read a `.hyrf` file; cameras are those of the photos, if given, or those that the file keeps.
+
+        Raises:
+            HyrfError: the file cannot be read, or there is no Gaussian in it.
+        """
+        facts, model = describe(path), load(path)
+        if not len(model):
+            raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to export; train it again")
+        viewpoint = stored_viewpoint(facts)
+        up, center = (np.array(viewpoint[name], np.float64) for name in ("up", "center"))
+        up = up / np.linalg.norm(up)
+        if data is not None and data.train:
+            named = [(view.name, view.camera) for view in data.train]
+            measured = [(view.camera, view) for view in evenly_spaced(data.test, MEASURED)]
+            return cls(model, named, [camera for _, camera in named], measured, up, center)
+        stored = stored_cameras(facts)
+        if not facts["provenance"].get("cameras"):
+            between = evenly_spaced(stored[1::2], MEASURED)  # of an orbit with twice as many cameras as RING
+            measured = [(camera, None) for camera in between]
+            return cls(model, [], _around(viewpoint, center, up), measured, up, center)
+        named = [(f"{number:04d}.png", camera) for number, camera in enumerate(stored)]
+        spare = stored[::HELD_OUT] if len(stored) >= FEW else stored
+        fitted = [c for number, c in enumerate(stored) if number % HELD_OUT] if len(stored) >= FEW else stored
+        return cls(model, named, fitted, [(camera, None) for camera in evenly_spaced(spare, MEASURED)], up, center)
+
+
+def _around(viewpoint: dict, center: np.ndarray, up: np.ndarray) -> list[Camera]:
+    """Where a scene may have been photographed from: rings about it, at several heights."""
+    cameras = []
+    for camera in orbit(viewpoint, RING):
+        distance = np.linalg.norm(camera.position - center)
+        for lift in LIFTS:
+            pose = look_at(camera.position + lift * distance * up, center, up)
+            cameras.append(replace(camera, camera_from_world=pose))
+    return cameras
