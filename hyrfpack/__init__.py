@@ -40,13 +40,14 @@ _PUBLIC = {
     "TrainConfig": "hyrfpack.train",
     "TrainResult": "hyrfpack.train",
     "Evaluation": "hyrfpack.evaluate",
+    "ExportReport": "hyrfpack.export",
     "CompressionReport": "hyrfpack.format",
     "describe": "hyrfpack.format",
     "load": "hyrfpack.format",
     "save": "hyrfpack.format",
 }
 # Sub-packages that are also the one function they are about: `hyrfpack.render(...)` calls `hyrfpack.render.render`.
-_CALLABLE = ("bench", "compress", "evaluate", "render", "train")
+_CALLABLE = ("bench", "compress", "evaluate", "export", "render", "train")
 
 __all__ = ["__version__", *_CALLABLE, *_PUBLIC]
 

@@ -62,7 +62,7 @@ def main() -> None:
         picture = background_picture(source.model)
         print(f", the background as {len(behind):,} more in {seconds:.1f} s", end="")
     whole = {d: splats if behind is None else concatenate((splats, behind)) for d, splats in baked.items()}
-    own = score(source, {"model": whole[0]}, None)["model"]
+    own = score(source, {}, None)["model"]
     print(f"; the model itself: {arguments.model.stat().st_size:,} bytes, {own.photos:.2f} dB on photos\n")
     print("| format | degree | bytes | write (s) | read (s) | dB, model | dB, photos | checked by |")
     print("|---|---|---|---|---|---|---|---|")

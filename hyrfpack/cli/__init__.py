@@ -14,8 +14,10 @@ import click
 import hyrfpack
 from hyrfpack.cli.bench import bench
 from hyrfpack.cli.demo import demo
+from hyrfpack.cli.export import export
 from hyrfpack.cli.files import compress, decompress, info
 from hyrfpack.cli.train import train
+from hyrfpack.cli.view import view
 from hyrfpack.cli.views import evaluate, render
 from hyrfpack.errors import HyrfError
 
@@ -58,5 +60,5 @@ def main() -> None:
     """
 
 
-for _command in (train, compress, decompress, render, evaluate, bench, info, demo):
+for _command in (train, compress, decompress, render, evaluate, export, view, bench, info, demo):
     main.add_command(_command)

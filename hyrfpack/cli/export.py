@@ -38,7 +38,7 @@ degree_option = click.option(
     type=click.IntRange(0, 3),
     default=3,
     show_default=True,
-    help="Of the spherical harmonics: how finely colour follows the direction.",
+    help="Of the spherical harmonics: how finely colour follows the direction. A .splat has 0.",
 )
 
 
@@ -46,12 +46,19 @@ degree_option = click.option(
 @click.argument("model", type=PATH)
 @click.option("-o", "--output", type=PATH, required=True, metavar="FILE", help="What to write; its ending says how.")
 @degree_option
-@click.option("--crop", type=_Box(), metavar="BOX", help="Keep MINX,MINY,MINZ,MAXX,MAXY,MAXZ, world units.")
+@click.option(
+    "--crop",
+    type=_Box(),
+    metavar="BOX",
+    help="Keep what is in MINX,MINY,MINZ,MAXX,MAXY,MAXZ, world units, without the background.",
+)
 @click.option(
     "--min-opacity", type=click.FloatRange(0, 1), default=0.0, show_default=True, help="Leave out fainter Gaussians."
 )
 @click.option("--background/--no-background", default=True, help="Take the background along.  [default: do]")
-@click.option("--data", type=PATH, help="Photos of the scene, for files that keep no cameras, and to score against.")
+@click.option(
+    "--data", type=PATH, help="Photos of the scene: for a file that keeps no cameras, and to score held-out ones."
+)
 @scene_options
 @json_option
 def export(
@@ -111,6 +118,7 @@ def _print(report: ExportReport) -> None:
         click.echo(table([f"against the model, {report.views} views", "PSNR (dB)"], rows))
     behind = f", {report.background:,} of them for the background" if report.background else ""
     holds = f", {report.gaussians:,} Gaussians{behind}" if report.gaussians else ""
-    click.echo(f"{report.file}: {report.bytes:,} bytes{holds}")
+    cameras = f", {report.cameras:,} cameras" if report.cameras else ""
+    click.echo(f"{report.file}: {report.bytes:,} bytes{holds}{cameras}")
     if report.photos_model is not None:
         click.echo(f"held-out photos: PSNR {report.photos_model:.3f} to {report.photos_file:.3f} dB")

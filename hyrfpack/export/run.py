@@ -5,28 +5,33 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from hyrfpack.atomic import write_atomic
-from hyrfpack.errors import HyrfError
+from hyrfpack.atomic import check_writable, write_atomic
+from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.export.background import background_picture, background_splats
 from hyrfpack.export.bake import bake
 from hyrfpack.export.cameras import encode_transforms, write_colmap
-from hyrfpack.export.files import WRITTEN, decode_splats, encode_splats
+from hyrfpack.export.files import USD, WRITTEN, decode_splats, encode_splats
 from hyrfpack.export.harmonics import MAX_DEGREE
 from hyrfpack.export.html import decode_page, encode_page
 from hyrfpack.export.measure import likeness
 from hyrfpack.export.points import encode_points
 from hyrfpack.export.source import Source
 from hyrfpack.export.splats import Splats, concatenate
+from hyrfpack.model import HybridModel
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Scene, evenly_spaced
 
 PAGE, TRANSFORMS, COLMAP = ".html", ".json", ""
 POINTS = (".points.ply", ".points.glb")
 ENDINGS = (*POINTS, *WRITTEN, PAGE, TRANSFORMS)
+# What is imported for an ending alone, and what pip calls it.
+PACKAGES = {**dict.fromkeys(USD, ("pxr", "usd-core")), ".points.glb": ("trimesh",) * 2, COLMAP: ("pycolmap",) * 2}
 PAGE_CAMERAS = 12  # that a page can be stepped through
 
 
@@ -37,7 +42,7 @@ class ExportReport:
     Attributes:
         file: what was written.
         bytes: on disk.
-        gaussians: in the file, those of the background included.
+        gaussians: in the file, those of the background included; 0 where it is one of cameras.
         background: how many of these make the background.
         degree: of the spherical harmonics in the file.
         views: how many views the loss was measured at; 0 where it was not.
@@ -45,6 +50,7 @@ class ExportReport:
             to what the file holds.
         psnr: PSNR of the file's pictures, as read back from its bytes, against the model's own.
         photos_model, photos_file: PSNR of the model's and of the file's pictures against held-out photos, if given.
+        cameras: in the file, where it is one of points or cameras.
     """
 
     file: str
@@ -57,6 +63,7 @@ class ExportReport:
     psnr: float | None = None
     photos_model: float | None = None
     photos_file: float | None = None
+    cameras: int = 0
 
 
 def export(
@@ -88,7 +95,7 @@ def export(
         data: photos of the scene: colours are fitted where they were taken from, the held-out ones are scored. Without
             them the cameras that the file keeps serve, or else rings of them around the scene.
         crop: (min x, min y, min z, max x, max y, max z) in world units; Gaussians whose centres lie outside, and the
-            background, are left out.
+            background, are left out. Infinite numbers leave a side open.
         min_opacity: fainter Gaussians are left out.
         background: whether the model's background goes along.
         say: told what is going on.
@@ -97,24 +104,32 @@ def export(
         HyrfError: a file cannot be read or written, or the options do not go together.
     """
     kind = kind_of(target)
+    _check(kind, target, degree, crop, min_opacity)
     read = Source.read(source, data)
-    if kind in (TRANSFORMS, COLMAP, *POINTS):
-        return _export_capture(read, kind, target, crop, min_opacity)
-    degree = 0 if kind == ".splat" else degree
+    if kind in (TRANSFORMS, COLMAP) and not read.cameras:
+        raise HyrfError(f"{source}: it keeps no cameras; export them from the file that training wrote, or name --data")
+    if kind == TRANSFORMS:
+        frames = encode_transforms(read.cameras)
+        write_atomic(target, frames)
+        return ExportReport(str(target), len(frames), cameras=len(read.cameras))
+    _check_choice(read.model, crop, min_opacity)
+    degree = 0 if kind in (".splat", COLMAP, *POINTS) else degree
     where = (
         "cameras" if read.cameras else "places around the scene, for the file keeps no cameras (--data names photos)"
     )
     say(f"fitting colours of degree {degree} at {len(read.fitted)} {where}")
-    baked = {
-        d: chosen(splats, crop, min_opacity) for d, splats in bake(read.model, read.fitted, range(degree + 1)).items()
-    }
+    if kind in (COLMAP, *POINTS):
+        return _export_points(read, kind, target, chosen(bake(read.model, read.fitted, (0,))[0], crop, min_opacity))
+    measured = read.measured if crop is None else []
+    degrees = range(degree + 1) if measured else (degree,)
+    baked = {d: chosen(splats, crop, min_opacity) for d, splats in bake(read.model, read.fitted, degrees).items()}
     sphere = background and crop is None and read.model.config.background
     picture = background_picture(read.model) if sphere and kind == PAGE else None
     behind = background_splats(read.model, read.fitted) if sphere and kind != PAGE else None
     whole = {d: splats if behind is None else concatenate((splats, behind)) for d, splats in baked.items()}
     say(f"writing {len(whole[degree]):,} Gaussians")
     if kind == PAGE:
-        data = page(read, whole[degree], picture, Path(source).stem)
+        data = page(read, whole[degree], picture, Path(target).stem)
         back = decode_page(data, str(target))
     else:
         first = read.cameras[0][1] if read.cameras else None
@@ -123,14 +138,19 @@ def export(
     write_atomic(target, data)
     count = 0 if behind is None else len(behind)
     report = ExportReport(str(target), len(data), len(whole[degree]), count, degree)
-    if crop is not None or not read.measured:
+    if not measured:
+        why = "no photo is held out" if crop is None else "a part of the scene was cropped"
+        say(f"nothing is measured, for {why}")
         return report
-    say(f"measuring at {len(read.measured)} views")
+    say(f"measuring at {len(measured)} views")
     contenders = {**{str(d): splats for d, splats in whole.items()}, "file": back}
-    scores = likeness(read.model, contenders, read.measured, behind=picture, sphere=sphere)
+    scores = likeness(read.model, contenders, measured, behind=picture, sphere=sphere)
+    if not scores:
+        say("nothing is measured, for the masks leave no pixel of the held-out photos")
+        return report
     return replace(
         report,
-        views=len(read.measured),
+        views=len(measured),
         by_degree={d: scores[str(d)].model for d in whole},
         psnr=scores["file"].model,
         photos_model=scores["model"].photos,
@@ -180,10 +200,16 @@ def kind_of(target: str | os.PathLike[str]) -> str:
     name = Path(target).name.lower()
     if Path(target).is_dir() or not Path(name).suffix:
         return COLMAP
+    if name.endswith(".compressed.ply"):
+        raise HyrfError(
+            f"{target}: compressed PLY is read, not written; .sog and .spz are small, .ply is not compressed"
+        )
     for kind in ENDINGS:
         if name.endswith(kind):
             return kind
-    raise HyrfError(f"{target}: the ending names the format; end it in one of {', '.join(ENDINGS)}")
+    raise HyrfError(
+        f"{target}: the ending names the format; end it in one of {', '.join(ENDINGS)}, or name a folder for COLMAP"
+    )
 
 
 def chosen(splats: Splats, crop: Sequence[float] | None = None, min_opacity: float = 0.0) -> Splats:
@@ -192,32 +218,63 @@ def chosen(splats: Splats, crop: Sequence[float] | None = None, min_opacity: flo
     Raises:
         HyrfError: none is left.
     """
-    keep = splats.opacities >= min_opacity
+    keep = _kept(splats.positions, splats.opacities, crop, min_opacity)
+    return splats if keep.all() else splats[keep]
+
+
+def _kept(positions: np.ndarray, opacities: np.ndarray, crop: Sequence[float] | None, min_opacity: float) -> np.ndarray:
+    """(N,) bool: which Gaussians with positions (N, 3) and opacities (N,) `chosen` keeps. HyrfError when none."""
+    keep = opacities >= min_opacity
     if crop is not None:
-        keep &= ((splats.positions >= crop[:3]) & (splats.positions <= crop[3:])).all(axis=1)
+        keep &= ((positions >= crop[:3]) & (positions <= crop[3:])).all(axis=1)
     if not keep.any():
-        low, high = (corner.round(4).tolist() for corner in (splats.positions.min(0), splats.positions.max(0)))
+        low, high = (corner.round(4).tolist() for corner in (positions.min(0), positions.max(0)))
         raise HyrfError(
-            f"no Gaussian is left: centres lie between {low} and {high}, opacities reach {splats.opacities.max():.3f}; "
+            f"no Gaussian is left: centres lie between {low} and {high}, opacities reach {opacities.max():.3f}; "
             "widen --crop or lower --min-opacity"
         )
-    return splats[keep]
+    return keep
 
 
-def _export_capture(
-    read: Source, kind: str, target: str | os.PathLike[str], crop: Sequence[float] | None, min_opacity: float
-) -> ExportReport:
-    """Points and cameras."""
-    if kind not in POINTS and not read.cameras:
-        raise HyrfError("the file keeps no cameras; export them from the file that training wrote, or name --data")
-    splats = chosen(bake(read.model, read.fitted, (0,))[0], crop, min_opacity)
+def _check(
+    kind: str, target: str | os.PathLike[str], degree: int, crop: Sequence[float] | None, min_opacity: float
+) -> None:
+    """Refuse, before minutes of work, what would fail after them: see `export`."""
+    if degree not in range(MAX_DEGREE + 1):
+        raise HyrfError(f"spherical harmonics of degree {degree} are not known; name 0 to {MAX_DEGREE}")
+    if crop is not None and (np.shape(crop) != (6,) or np.isnan(crop).any()):
+        raise HyrfError(f"the crop {crop} is no box; name the least x, y, z, then the greatest, in world units")
+    if not 0 <= min_opacity <= 1:
+        raise HyrfError(f"an opacity of {min_opacity} cannot be asked for; name 0 to 1")
+    if kind == TRANSFORMS and (crop is not None or min_opacity > 0):
+        raise HyrfError(
+            f"{target}: this holds cameras only, and --crop and --min-opacity choose Gaussians; leave them out"
+        )
+    if kind in PACKAGES:
+        module, package = PACKAGES[kind]
+        with needs_package(package, f"{target}: writing this format"):
+            import_module(module)
+    place = Path(os.path.realpath(target))
+    place = place.parent if kind != COLMAP else next(path for path in (place, *place.parents) if path.exists())
+    if not place.exists():
+        raise HyrfError(f"{target}: there is no folder '{Path(target).parent}'; make it first")
+    check_writable(place)
+
+
+@torch.no_grad()
+def _check_choice(model: HybridModel, crop: Sequence[float] | None, min_opacity: float) -> None:
+    """Refuse a choice that leaves nothing, before the bake, which makes no Gaussian less faint."""
+    if crop is not None or min_opacity > 0:
+        positions = model.config.frame.to_world(model.gaussians.positions.numpy())
+        _kept(positions, model.decode_geometry().opacities.numpy(), crop, min_opacity)
+
+
+def _export_points(read: Source, kind: str, target: str | os.PathLike[str], splats: Splats) -> ExportReport:
+    """Centres of splats, and cameras."""
     if kind == COLMAP:
         write_colmap(read.cameras, target, splats)
-        size = sum(file.stat().st_size for file in Path(target).rglob("*.bin"))
-        return ExportReport(str(target), size, len(splats))
-    if kind == TRANSFORMS:
-        data = encode_transforms(read.cameras)
-    else:
-        data = encode_points(splats, [camera for _, camera in read.cameras], Path(kind).suffix[1:], read.up)
+        size = sum(table.stat().st_size for table in Path(target, "sparse", "0").glob("*.bin"))
+        return ExportReport(str(target), size, cameras=len(read.cameras))
+    data = encode_points(splats, [camera for _, camera in read.cameras], Path(kind).suffix[1:], read.up)
     write_atomic(target, data)
-    return ExportReport(str(target), len(data), len(splats))
+    return ExportReport(str(target), len(data), len(splats), cameras=len(read.cameras))

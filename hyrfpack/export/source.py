@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.format import describe, load
 from hyrfpack.model import HybridModel
 from hyrfpack.render.capture import stored_cameras
@@ -51,8 +51,7 @@ class Source:
         if not len(model):
             raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to export; train it again")
         viewpoint = stored_viewpoint(facts)
-        up, center = (np.array(viewpoint[name], np.float64) for name in ("up", "center"))
-        up = up / np.linalg.norm(up)
+        up, center = _up_and_center(viewpoint, path)
         if data is not None and data.train:
             named = [(view.name, view.camera) for view in data.train]
             measured = [(view.camera, view) for view in evenly_spaced(data.test, MEASURED)]
@@ -77,3 +76,15 @@ def _around(viewpoint: dict, center: np.ndarray, up: np.ndarray) -> list[Camera]
             pose = look_at(camera.position + lift * distance * up, center, up)
             cameras.append(replace(camera, camera_from_world=pose))
     return cameras
+
+
+def _up_and_center(viewpoint: dict, path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Which way is up, unit length, and what is looked at; HyrfDataError where they make no sense."""
+    try:
+        up, center = (np.array(viewpoint[name], np.float64) for name in ("up", "center"))
+        length = np.linalg.norm(up)
+        if not (up.shape == center.shape == (3,) and 0 < length < np.inf and np.isfinite(center).all()):
+            raise ValueError("'up' is no direction or 'center' no point")
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise HyrfDataError(f"{path}: its viewpoint cannot be used ({error!s:.160}); train the model again") from error
+    return up / length, center

@@ -1,0 +1,122 @@
+// Cameras. The page's axes are those of SPZ (right, up, back), its origin and unit are `scene.center` and `scene.unit`
+// of the world; a view is a pinhole camera in them: rows (right, down, forward), translation, eye, fx, fy, cx, cy.
+
+const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
+const sub = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+const mul = (a, s) => [a[0] * s, a[1] * s, a[2] * s];
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const unit = (a) => mul(a, 1 / (Math.hypot(...a) || 1));
+const turned = (a) => [a[0], -a[1], -a[2]]; // world axes to the page's and back
+
+// A vector turned about a unit axis (Rodrigues).
+function rotate(vector, axis, angle) {
+  const c = Math.cos(angle);
+  return add(add(mul(vector, c), mul(cross(axis, vector), Math.sin(angle))), mul(axis, dot(axis, vector) * (1 - c)));
+}
+
+const LARGEST_PICTURE = 8192; // pixels a side
+
+// The view of a camera of the world: {width, height, fx, fy, cx, cy, camera_from_world: 4 x 4 rows}.
+function viewOf({ width, height, fx, fy, cx, cy, camera_from_world: pose }, scene) {
+  const numbers = [width, height, fx, fy, cx, cy, ...(pose ?? []).slice(0, 3).flat()];
+  if (numbers.length !== 18 || !numbers.every(Number.isFinite)) {
+    throw new Error("it needs width, height, fx, fy, cx, cy and camera_from_world (4 x 4)");
+  }
+  if (![width, height].every((side) => Number.isInteger(side) && side > 0 && side <= LARGEST_PICTURE)) {
+    throw new Error(`width and height must be whole numbers up to ${LARGEST_PICTURE}`);
+  }
+  const rows = pose.slice(0, 3).map(turned);
+  const translation = pose.slice(0, 3).map((row) => (dot(row, scene.center) + row[3]) / scene.unit);
+  const eye = [0, 1, 2].map((k) => -rows.reduce((sum, row, r) => sum + row[k] * translation[r], 0));
+  return { rows, translation, eye, width, height, fx, fy, cx, cy };
+}
+
+// The camera of the world of a view: the inverse of `viewOf`.
+function cameraOf({ rows, translation, width, height, fx, fy, cx, cy }, scene) {
+  const world = rows.map((row, r) => {
+    const there = turned(row);
+    return [...there, translation[r] * scene.unit - dot(there, scene.center)];
+  });
+  return { width, height, fx, fy, cx, cy, camera_from_world: [...world, [0, 0, 0, 1]] };
+}
+
+// What one looks through: a view that can be moved.
+class Eye {
+  constructor(scene) {
+    this.up = turned(scene.up);
+    this.middle = turned(sub(scene.target, scene.center)).map((value) => value / scene.unit);
+  }
+
+  // Stand where a view is taken from. Orbits go about the point on its axis that is nearest to the scene's middle.
+  stand(view) {
+    this.position = view.eye;
+    this.rows = view.rows;
+    this.focal = view.fy / Math.sqrt(view.width * view.height);
+    const away = sub(this.middle, this.position);
+    const ahead = dot(away, this.rows[2]);
+    this.pace = Math.max(ahead, 0.2 * Math.hypot(...away)) || 1;
+    this.target = add(this.position, mul(this.rows[2], this.pace));
+  }
+
+  // The view in a picture of some size. A photo's picture and a window of another shape show equally large areas.
+  view(width, height) {
+    const focal = this.focal * Math.sqrt(width * height);
+    return {
+      rows: this.rows, eye: this.position, translation: this.rows.map((row) => -dot(row, this.position)),
+      width, height, fx: focal, fy: focal, cx: width / 2, cy: height / 2,
+    };
+  }
+
+  // How deep the target lies before the eye.
+  get depth() {
+    return Math.max(dot(sub(this.target, this.position), this.rows[2]), 1e-3 * this.pace);
+  }
+
+  // The point at this depth behind a place of the picture, x and y from its middle in units of the focal length.
+  point(x, y, depth = this.depth) {
+    return add(this.position, mul(add(add(mul(this.rows[0], x), mul(this.rows[1], y)), this.rows[2]), depth));
+  }
+
+  // Turn everything about a point, or only the eye: yaw about up, then pitch, short of straight up and down.
+  turn(yaw, pitch, about) {
+    const level = sub(this.rows[0], mul(this.up, dot(this.rows[0], this.up)));
+    const across = Math.hypot(...level) > 0.3 ? unit(level) : unit(cross(this.rows[2], this.up));
+    const elevation = Math.asin(Math.max(-1, Math.min(1, dot(this.rows[2], this.up))));
+    const most = 1.55;
+    pitch = Math.max(Math.min(-most, elevation), Math.min(Math.max(most, elevation), elevation + pitch)) - elevation;
+    const turn = (vector) => rotate(rotate(vector, across, pitch), this.up, yaw);
+    this.rows = this.rows.map(turn);
+    this.position = add(about, turn(sub(this.position, about)));
+    this.target = add(about, turn(sub(this.target, about)));
+  }
+
+  orbit(yaw, pitch) {
+    this.turn(yaw, pitch, this.target);
+  }
+
+  look(yaw, pitch) {
+    this.turn(yaw, pitch, this.position);
+  }
+
+  // Shift by so much along right, down and forward.
+  move(right, down, forward) {
+    const step = [right, down, forward].reduce((sum, length, r) => add(sum, mul(this.rows[r], length)), [0, 0, 0]);
+    this.position = add(this.position, step);
+    this.target = add(this.target, step);
+  }
+
+  // Shift so that what is at the target's depth follows the pointer; in units of the focal length.
+  pan(x, y) {
+    this.move(-x * this.depth, -y * this.depth, 0);
+  }
+
+  // Come nearer (factor < 1) to the point at the target's depth behind a place of the picture, which stays in place.
+  zoom(factor, x, y) {
+    const least = (1e-3 * this.pace) / this.depth;
+    const point = this.point(x, y);
+    factor = Math.max(factor, least);
+    this.position = add(point, mul(sub(this.position, point), factor));
+    this.target = add(point, mul(sub(this.target, point), factor));
+  }
+}

@@ -1,0 +1,134 @@
+#version 300 es
+// Projects splats to the picture, one splat a fragment: the mathematics of hyrfpack/ops/rasterize/reference.py.
+// Splats are as SPZ version 3 packs them.
+precision highp float;
+precision highp int;
+precision highp usampler2D;
+precision highp usampler2DArray;
+
+uniform usampler2D u_places; // x, y, z as float32; rotation
+uniform usampler2D u_looks; // 3 log scales and opacity; red, green, blue
+uniform usampler2DArray u_harmonics; // bytes, 16 a layer: coefficient after coefficient, red, green, blue of each
+uniform int u_degree;
+uniform int u_count;
+uniform bool u_antialiased;
+uniform mat3 u_rotation; // camera from page
+uniform vec3 u_translation;
+uniform vec3 u_eye;
+uniform vec4 u_intrinsics; // fx, fy, cx, cy in pixels
+uniform vec2 u_size;
+uniform float u_near;
+uniform float u_tolerance; // band around the picture in which centres may lie, as a fraction of half its size
+uniform float u_pick; // > 0: instead of a colour, z / (z + u_pick)
+
+layout(location = 0) out uvec4 o_shape; // centre x, y in pixels; covariance xx, xy
+layout(location = 1) out uvec4 o_look; // covariance yy; its determinant; halves red, green; halves blue, opacity
+
+const float LOW_PASS = 0.3;
+const float COMPENSATION_MIN = 2.5e-5;
+const float BAND_0 = 0.28209479177387814;
+
+float byte_of(uint word, int place) {
+    return float((word >> (8 * place)) & 255u);
+}
+
+// The three smallest components in 10 bits each, sign and magnitude; above them which of x, y, z, w was left out.
+vec4 quaternion(uint packed) {
+    int largest = int(packed >> 30);
+    vec4 quat = vec4(0.0);
+    for (int i = 3; i >= 0; --i) {
+        if (i == largest) continue;
+        float magnitude = float(packed & 511u) * (0.70710678118654752 / 511.0);
+        quat[i] = (packed & 512u) != 0u ? -magnitude : magnitude;
+        packed >>= 10;
+    }
+    quat[largest] = sqrt(max(0.0, 1.0 - dot(quat, quat)));
+    return normalize(quat);
+}
+
+mat3 rotation(vec4 q) {
+    float x = q.x, y = q.y, z = q.z, w = q.w;
+    return mat3(
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
+        2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
+        2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)
+    );
+}
+
+uint words[12];
+
+vec3 coefficient(int k) {
+    int i = 3 * k;
+    vec3 bytes = vec3(
+        byte_of(words[i >> 2], i & 3), byte_of(words[(i + 1) >> 2], (i + 1) & 3), byte_of(words[(i + 2) >> 2], (i + 2) & 3)
+    );
+    return (bytes - 128.0) / 128.0;
+}
+
+// Bands 1 to 3 with the Condon-Shortley phase, m = -l ... l.
+vec3 harmonics(ivec2 place, vec3 d) {
+    for (int layer = 0; layer < u_degree; ++layer) {
+        uvec4 texel = texelFetch(u_harmonics, ivec3(place, layer), 0);
+        for (int i = 0; i < 4; ++i) words[4 * layer + i] = texel[i];
+    }
+    float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
+    vec3 sum = 0.4886025119029199 * (-y * coefficient(0) + z * coefficient(1) - x * coefficient(2));
+    if (u_degree > 1) {
+        sum += 1.0925484305920792 * (x * y * coefficient(3) - y * z * coefficient(4) - x * z * coefficient(6));
+        sum += 0.31539156525252005 * (3.0 * zz - 1.0) * coefficient(5);
+        sum += 0.5462742152960396 * (xx - yy) * coefficient(7);
+    }
+    if (u_degree > 2) {
+        sum -= 0.5900435899266435 * y * (3.0 * xx - yy) * coefficient(8);
+        sum += 2.890611442640554 * x * y * z * coefficient(9);
+        sum -= 0.4570457994644658 * (5.0 * zz - 1.0) * (y * coefficient(10) + x * coefficient(12));
+        sum += 0.3731763325901154 * z * (5.0 * zz - 3.0) * coefficient(11);
+        sum += 1.445305721320277 * z * (xx - yy) * coefficient(13);
+        sum -= 0.5900435899266435 * x * (xx - 3.0 * yy) * coefficient(14);
+    }
+    return sum;
+}
+
+void main() {
+    o_shape = uvec4(0u);
+    o_look = uvec4(0u); // opacity 0: not drawn
+    ivec2 place = ivec2(gl_FragCoord.xy);
+    if (place.y * textureSize(u_places, 0).x + place.x >= u_count) return;
+
+    uvec4 packed = texelFetch(u_places, place, 0);
+    vec3 mean = uintBitsToFloat(packed.xyz);
+    vec3 p = u_rotation * mean + u_translation;
+    vec2 focal = u_intrinsics.xy, principal = u_intrinsics.zw;
+    vec2 margin = 0.5 * u_tolerance * u_size;
+    bool inside = p.z > u_near
+        && all(greaterThan(focal * p.xy, (-margin - principal) * p.z))
+        && all(lessThan(focal * p.xy, (u_size + margin - principal) * p.z));
+    if (!inside) return;
+
+    uvec2 look = texelFetch(u_looks, place, 0).xy;
+    vec3 scales = exp(vec3(byte_of(look.x, 0), byte_of(look.x, 1), byte_of(look.x, 2)) / 16.0 - 10.0);
+    float opacity = byte_of(look.x, 3) / 255.0;
+
+    vec2 slope = p.xy / p.z;
+    vec2 slack = 0.15 * u_size / focal;
+    vec2 clamped = clamp(slope, -principal / focal - slack, (u_size - principal) / focal + slack);
+    mat3 axes = u_rotation * rotation(quaternion(packed.w));
+    mat3 rows = transpose(mat3(axes[0] * scales.x, axes[1] * scales.y, axes[2] * scales.z));
+    vec3 first = focal.x / p.z * (rows[0] - clamped.x * rows[2]);
+    vec3 second = focal.y / p.z * (rows[1] - clamped.y * rows[2]);
+
+    float xx = dot(first, first), xy = dot(first, second), yy = dot(second, second);
+    vec3 normal = cross(first, second); // free of the cancellation in xx yy - xy^2
+    float determinant = dot(normal, normal);
+    float filtered = determinant + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS;
+    if (u_antialiased) opacity *= sqrt(max(determinant / filtered, COMPENSATION_MIN));
+
+    vec3 color = 0.5 + BAND_0 / 0.15 * (vec3(byte_of(look.y, 0), byte_of(look.y, 1), byte_of(look.y, 2)) / 255.0 - 0.5);
+    if (u_degree > 0) color += harmonics(place, normalize(mean - u_eye));
+    color = u_pick > 0.0 ? vec3(p.z / (p.z + u_pick)) : max(color, 0.0);
+
+    o_shape = uvec4(floatBitsToUint(focal * slope + principal), floatBitsToUint(vec2(xx + LOW_PASS, xy)));
+    o_look = uvec4(
+        floatBitsToUint(vec2(yy + LOW_PASS, filtered)), packHalf2x16(color.rg), packHalf2x16(vec2(color.b, opacity))
+    );
+}

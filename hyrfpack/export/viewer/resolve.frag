@@ -1,0 +1,31 @@
+#version 300 es
+// The blended splats over the background.
+precision highp float;
+
+uniform sampler2D u_splats; // premultiplied, row 0 on top; a part of it is in use
+uniform vec2 u_used; // its size in texels
+uniform bool u_sphere; // the background is a picture, else a colour
+uniform sampler2D u_background; // equirectangular
+uniform vec3 u_solid;
+uniform mat3 u_world; // world from camera
+uniform vec4 u_intrinsics; // fx, fy, cx, cy in pixels of the target
+uniform vec2 u_size; // of the target
+uniform bool u_upright; // row 0 of the target is at the bottom
+
+out vec4 o_color;
+
+const float PI = 3.14159265358979;
+
+vec3 background(vec3 d) {
+    float longitude = atan(d.x, d.z), latitude = asin(clamp(-d.y, -1.0, 1.0));
+    return texture(u_background, vec2(0.5 + longitude / (2.0 * PI), 0.5 - latitude / PI)).rgb;
+}
+
+void main() {
+    vec2 pixel = vec2(gl_FragCoord.x, u_upright ? u_size.y - gl_FragCoord.y : gl_FragCoord.y);
+    vec2 texel = clamp(pixel / u_size * u_used, vec2(0.5), u_used - 0.5);
+    vec4 splats = texture(u_splats, texel / vec2(textureSize(u_splats, 0)));
+    vec3 behind = u_solid;
+    if (u_sphere) behind = background(normalize(u_world * vec3((pixel - u_intrinsics.zw) / u_intrinsics.xy, 1.0)));
+    o_color = vec4(splats.rgb + (1.0 - splats.a) * behind, 1.0);
+}

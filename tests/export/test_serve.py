@@ -1,0 +1,52 @@
+"""A page is served to this machine alone, until interrupted."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import urllib.error
+import urllib.request
+
+import pytest
+
+from hyrfpack.errors import HyrfError
+from hyrfpack.export.serve import serve
+
+PAGE = b"<!DOCTYPE html><title>served</title>"
+
+
+def test_the_page_is_served_to_the_browser_until_an_interrupt_which_is_no_error(monkeypatch: pytest.MonkeyPatch):
+    said, seen = [], []
+
+    def visit(address: str) -> None:
+        try:
+            seen.append(address)
+            with urllib.request.urlopen(address + "?at=any", timeout=10) as answer:
+                seen.append((answer.headers["Content-Type"], answer.read()))
+            with urllib.request.urlopen(urllib.request.Request(address, method="HEAD"), timeout=10) as answer:
+                seen.append((answer.headers["Content-Length"], answer.read()))
+            try:
+                urllib.request.urlopen(address + "other", timeout=10)
+            except urllib.error.HTTPError as error:
+                seen.append(error.code)
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr("webbrowser.open", visit)
+    serve(PAGE, open_browser=True, say=said.append)
+
+    assert said[0].startswith("http://127.0.0.1:")
+    assert seen == [said[0], ("text/html; charset=utf-8", PAGE), (str(len(PAGE)), b""), 404]
+
+
+def test_a_port_in_use_is_one_sentence():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(HyrfError, match=rf"^port {port} of 127.0.0.1 is taken by another program; [^\n]*$"):
+            serve(PAGE, port=port, open_browser=False, say=lambda address: None)
+
+
+def test_an_address_that_is_not_ours_is_one_sentence():
+    with pytest.raises(HyrfError, match="nothing can listen at port 0 of 192.0.2.1"):
+        serve(PAGE, host="192.0.2.1", open_browser=False, say=lambda address: None)
