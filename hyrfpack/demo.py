@@ -18,6 +18,7 @@ from hyrfpack.data.demo_scene import write_demo_scene
 from hyrfpack.evaluate import evaluate
 from hyrfpack.evaluate.figures import comparison, contact_sheet
 from hyrfpack.evaluate.metrics import psnr, to_8bit
+from hyrfpack.export import ExportReport, export
 from hyrfpack.format import load, repack
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render
@@ -59,6 +60,7 @@ class DemoResult:
         frames_per_second: one over the median time to render a held-out view from the compact file.
         profiles: raw, paper, compact.
         picture: path of the picture that shows it.
+        page: what the page that shows it in a browser takes, and how like the compact file it looks.
     """
 
     steps: int
@@ -67,6 +69,7 @@ class DemoResult:
     frames_per_second: float
     profiles: list[ProfileResult]
     picture: Path
+    page: ExportReport
 
     def table(self) -> list[str]:
         """The profiles as lines of aligned text, then the speed."""
@@ -91,11 +94,11 @@ def run_demo(
     size: int = 200,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> DemoResult:
-    """Make a scene, train on it, compress, decompress, render, score, and draw one picture of it.
+    """Make a scene, train on it, compress, decompress, render, score, export, and draw one picture of it.
 
     Leaves in `folder`: `scene/` (photos and poses), `run/` (the training), `paper.hyrf`, `compact.hyrf`, `back.hyrf`
-    (compact.hyrf decompressed), `renders/` (held-out views from compact.hyrf) and `demo.png`. Earlier results are
-    replaced.
+    (compact.hyrf decompressed), `renders/` (held-out views from compact.hyrf), `demo.html` (compact.hyrf in a browser)
+    and `demo.png`. Earlier results are replaced.
 
     Args:
         folder: made if missing.
@@ -131,6 +134,8 @@ def run_demo(
     model = load(path)
     for _ in render_files(model, [(view.name, view.camera) for view in scene.test], folder / "renders"):
         pass
+    report("making a page for the browser")
+    page = export(path, folder / "demo.html", data=scene)
     result = DemoResult(
         steps=steps,
         gaussians=len(model),
@@ -138,6 +143,7 @@ def run_demo(
         frames_per_second=1 / scores.seconds_per_frame,
         profiles=profiles,
         picture=folder / "demo.png",
+        page=page,
     )
     save_picture(result.picture, _draw(model, scene, result))
     return result

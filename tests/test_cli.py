@@ -21,7 +21,7 @@ from hyrfpack.cli.train import PRESETS, train
 from hyrfpack.data.demo_scene import write_demo_scene
 from hyrfpack.format import load
 
-COMMANDS = ("train", "compress", "decompress", "render", "evaluate", "info", "bench", "demo")
+COMMANDS = ("train", "compress", "decompress", "render", "evaluate", "info", "bench", "demo", "export", "view")
 
 
 def python(code: str) -> subprocess.CompletedProcess:
@@ -214,7 +214,7 @@ def test_demo_ends_with_a_table_and_a_picture(tmp_path):
     result = run_demo(tmp_path, steps=10, views=10, size=32)
     assert Image.open(tmp_path / "demo.png").width > 900
     assert {path.name for path in tmp_path.iterdir()} == {
-        "scene", "run", "paper.hyrf", "compact.hyrf", "back.hyrf", "renders", "demo.png",
+        "scene", "run", "paper.hyrf", "compact.hyrf", "back.hyrf", "renders", "demo.html", "demo.png",
     }  # fmt: skip
     assert [profile.profile for profile in result.profiles] == ["raw", "paper", "compact"]
     assert [profile.bytes for profile in result.profiles] == [

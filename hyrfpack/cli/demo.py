@@ -14,7 +14,7 @@ from hyrfpack.cli.common import PATH, json_option, note, print_json
 @click.option("--steps", type=click.IntRange(min=1), default=3000, show_default=True, help="Optimiser steps.")
 @json_option
 def demo(output: Path, steps: int, as_json: bool) -> None:
-    """Make a scene, train on it, compress, decompress, render and measure, and draw one picture of it all.
+    """Make a scene, train on it, compress, decompress, render, measure and export, and draw one picture of it all.
 
     \b
     Example:
@@ -27,4 +27,8 @@ def demo(output: Path, steps: int, as_json: bool) -> None:
         print_json(result.to_dict())
         return
     click.echo("\n".join(result.table()))
+    page = result.page
+    click.echo(
+        f"{page.file}: the scene in a browser; {page.bytes:,} bytes, {page.photos_file:.2f} dB on the held-out photos"
+    )
     click.echo(f"{result.picture}: photos, renders and errors of held-out views")
