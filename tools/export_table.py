@@ -16,6 +16,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+
 import hyrfpack
 from hyrfpack.export.background import background_picture, background_splats
 from hyrfpack.export.bake import bake
@@ -62,7 +64,7 @@ def main() -> None:
         picture = background_picture(source.model)
         print(f", the background as {len(behind):,} more in {seconds:.1f} s", end="")
     whole = {d: splats if behind is None else concatenate((splats, behind)) for d, splats in baked.items()}
-    own = score(source, {}, None)["model"]
+    own = score(source, {})["model"]
     print(f"; the model itself: {arguments.model.stat().st_size:,} bytes, {own.photos:.2f} dB on photos\n")
     print("| format | degree | bytes | write (s) | read (s) | dB, model | dB, photos | checked by |")
     print("|---|---|---|---|---|---|---|---|")
@@ -71,17 +73,22 @@ def main() -> None:
             row(source, name, degree, baked, whole, picture)
 
 
-def row(source: Source, name: str, degree: int, baked: dict[int, Splats], whole: dict[int, Splats], picture) -> None:
+def row(
+    source: Source,
+    name: str,
+    degree: int,
+    baked: dict[int, Splats],
+    whole: dict[int, Splats],
+    picture: np.ndarray | None,
+) -> None:
     """Write, read, score and print one file."""
     if name == ".html":
         data, write = timed(lambda: page(source, baked[degree], picture, "scene"))
         back, read = timed(lambda: decode_page(data, name))
-        scores = score(source, {"file": back}, picture)
     else:
         data, write = timed(lambda: pack(source, whole[degree], name))
-        back, read = timed(lambda: decode_splats(data, name.split()[0], name))
-        scores = score(source, {"file": back}, None)
-    file = scores["file"]
+        back, read = timed(lambda: (decode_splats(data, name.split()[0], name), None))
+    file = score(source, {"file": back})["file"]
     print(
         f"| {name} | {degree} | {len(data):,} | {write:.2f} | {read:.2f} | {file.model:.2f} | {file.photos:.2f} "
         f"| {CHECKED_BY[name]} |",
@@ -97,9 +104,9 @@ def pack(source: Source, splats: Splats, name: str) -> bytes:
     return encode_splats(splats, name, up=source.up, camera=source.cameras[0][1])
 
 
-def score(source: Source, contenders: dict[str, Splats], picture) -> dict[str, Likeness]:
-    """Of splats, by name."""
-    return likeness(source.model, contenders, source.measured, behind=picture, sphere=source.model.config.background)
+def score(source: Source, contenders: dict[str, tuple[Splats, np.ndarray | None]]) -> dict[str, Likeness]:
+    """Of splats and what lies behind them, by name."""
+    return likeness(source.model, contenders, source.measured, sphere=source.model.config.background)
 
 
 def timed(action: Callable[[], Result]) -> tuple[Result, float]:

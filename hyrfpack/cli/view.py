@@ -27,7 +27,5 @@ def view(model: Path, degree: int, port: int, host: str, no_browser: bool) -> No
     from hyrfpack.export.run import page_of
     from hyrfpack.export.serve import serve
 
-    note("making the page")
-    page = page_of(model, degree)
-    note(f"{len(page):,} bytes; press Ctrl-C to end")
-    serve(page, host=host, port=port, open_browser=not no_browser, say=click.echo)
+    note("making the page; press Ctrl-C to end")
+    serve(lambda: page_of(model, degree), host=host, port=port, open_browser=not no_browser, say=click.echo)

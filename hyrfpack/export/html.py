@@ -103,8 +103,8 @@ def encode_page(
     return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], _part("page.html")).encode()
 
 
-def decode_page(data: bytes, name: str) -> Splats:
-    """The splats in a page, world units, as it draws them.
+def decode_page(data: bytes, name: str) -> tuple[Splats, np.ndarray | None]:
+    """The splats in a page, world units, and its background (H, W, 3) float32 in [0, 1] or None, as it draws them.
 
     Args:
         data: from `encode_page`.
@@ -122,8 +122,10 @@ def decode_page(data: bytes, name: str) -> Splats:
             raise ValueError("no frame")
         local = spz.decode(packed, name)
         with np.errstate(over="ignore"):  # Splats refuses what is not finite
-            return replace(local, positions=local.positions * unit + middle, scales=local.scales * np.float32(unit))
-    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
+            splats = replace(local, positions=local.positions * unit + middle, scales=local.scales * np.float32(unit))
+        picture = re.search(rb'<img id="background"[^>]*base64,([^"]*)"', data)
+        return splats, None if picture is None else _read_webp(base64.b64decode(picture[1], validate=True))
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError, OSError) as error:
         raise HyrfDataError(f"{name}: this is no page of hyrfpack's, or it is damaged; export it again") from error
 
 
@@ -147,6 +149,12 @@ def _webp(picture: np.ndarray) -> str:
     file = io.BytesIO()
     Image.fromarray((np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)).save(file, "WEBP", quality=QUALITY, method=6)
     return base64.b64encode(file.getvalue()).decode()
+
+
+def _read_webp(data: bytes) -> np.ndarray:
+    """The inverse of `_webp`, but for what WebP loses: (H, W, 3) float32 in [0, 1]."""
+    with Image.open(io.BytesIO(data), formats=("WEBP",)) as picture:
+        return np.asarray(picture.convert("RGB"), np.float32) / 255
 
 
 def _policy(style: str, script: str) -> str:

@@ -26,41 +26,41 @@ class Likeness:
     Attributes:
         model: of the splats' pictures against the model's.
         photos: of the splats' pictures against the photos; None without photos.
+        views: how many.
     """
 
     model: float
     photos: float | None
+    views: int
 
 
 @torch.no_grad()
 def likeness(
     model: HybridModel,
-    contenders: Mapping[str, Splats],
+    contenders: Mapping[str, tuple[Splats, np.ndarray | None]],
     views: Sequence[tuple[Camera, View | None]],
     *,
-    behind: np.ndarray | None,
     sphere: bool,
 ) -> dict[str, Likeness]:
     """How like a model splats look.
 
     Args:
         model: what they were made of; scored itself, too, as "model".
-        contenders: splats by name.
+        contenders: by name, splats and what lies behind them: an equirectangular picture (H, 2H, 3) as
+            `background_picture` makes it, or None for the model's solid colour.
         views: where to look from; photos are scored where all views have them.
-        behind: (H, 2H, 3) an equirectangular picture that lies behind the splats, as `background_picture` makes it;
-            the model's solid colour where None.
         sphere: whether the model shows its background sphere.
     """
     decoded, frame = model.decode(), model.config.frame
     solid = torch.tensor(model.config.solid)
-    drawables = {name: Drawable.of(splats, frame) for name, splats in contenders.items()}
+    drawables = {name: (Drawable.of(splats, frame), behind) for name, (splats, behind) in contenders.items()}
     scores: dict[str, list[tuple[float, float | None]]] = {}
     for camera, view in views:
         own = to_8bit(render(model, camera, decoded=decoded, background=sphere).rgb)
-        backdrop = solid if behind is None else _equirect_colors(torch.from_numpy(behind), camera)
         pictures = {"model": own}
-        for name, drawable in drawables.items():
+        for name, (drawable, behind) in drawables.items():
             raster = draw(drawable, camera)
+            backdrop = solid if behind is None else _equirect_colors(torch.from_numpy(behind), camera)
             pictures[name] = to_8bit(raster.rgb + raster.transmittance[..., None] * backdrop)
         photo, mask = (None, None) if view is None else _photo(view, model)
         if mask is not None and not mask.any():
@@ -95,4 +95,4 @@ def _photo(view: View, model: HybridModel) -> tuple[Tensor, Tensor | None]:
 
 def _mean(scores: Sequence[tuple[float, float | None]]) -> Likeness:
     own, photos = zip(*scores, strict=True)
-    return Likeness(fmean(own), None if None in photos else fmean(photos))
+    return Likeness(fmean(own), None if None in photos else fmean(photos), len(scores))

@@ -33,6 +33,7 @@ ENDINGS = (*POINTS, *WRITTEN, PAGE, TRANSFORMS)
 # What is imported for an ending alone, and what pip calls it.
 PACKAGES = {**dict.fromkeys(USD, ("pxr", "usd-core")), ".points.glb": ("trimesh",) * 2, COLMAP: ("pycolmap",) * 2}
 PAGE_CAMERAS = 12  # that a page can be stepped through
+COARSE = 3.0  # dB that a format's rounding may cost before something is said about it
 
 
 @dataclass(frozen=True)
@@ -129,32 +130,35 @@ def export(
     whole = {d: splats if behind is None else concatenate((splats, behind)) for d, splats in baked.items()}
     say(f"writing {len(whole[degree]):,} Gaussians")
     if kind == PAGE:
-        data = page(read, whole[degree], picture, Path(target).stem)
-        back = decode_page(data, str(target))
+        written = page(read, whole[degree], picture, Path(target).stem)
+        back = decode_page(written, str(target))
     else:
         first = read.cameras[0][1] if read.cameras else None
-        data = encode_splats(whole[degree], kind, up=read.up, camera=first)
-        back = decode_splats(data, kind, str(target))
-    write_atomic(target, data)
+        written = encode_splats(whole[degree], kind, up=read.up, camera=first)
+        back = decode_splats(written, kind, str(target)), None
+    write_atomic(target, written)
     count = 0 if behind is None else len(behind)
-    report = ExportReport(str(target), len(data), len(whole[degree]), count, degree)
+    report = ExportReport(str(target), len(written), len(whole[degree]), count, degree)
     if not measured:
         why = "no photo is held out" if crop is None else "a part of the scene was cropped"
         say(f"nothing is measured, for {why}")
         return report
     say(f"measuring at {len(measured)} views")
-    contenders = {**{str(d): splats for d, splats in whole.items()}, "file": back}
-    scores = likeness(read.model, contenders, measured, behind=picture, sphere=sphere)
+    contenders = {**{str(d): (splats, picture) for d, splats in whole.items()}, "file": back}
+    scores = likeness(read.model, contenders, measured, sphere=sphere)
     if not scores:
         say("nothing is measured, for the masks leave no pixel of the held-out photos")
         return report
+    file, before = scores["file"], scores[str(degree)].model
+    if before - file.model > COARSE:
+        say(f"{kind} is too coarse for this scene, perhaps for its unit of length: choose another format")
     return replace(
         report,
-        views=len(measured),
+        views=file.views,
         by_degree={d: scores[str(d)].model for d in whole},
-        psnr=scores["file"].model,
+        psnr=file.model,
         photos_model=scores["model"].photos,
-        photos_file=scores["file"].photos,
+        photos_file=file.photos,
     )
 
 
@@ -198,8 +202,6 @@ def kind_of(target: str | os.PathLike[str]) -> str:
         HyrfError: it is none of them.
     """
     name = Path(target).name.lower()
-    if Path(target).is_dir() or not Path(name).suffix:
-        return COLMAP
     if name.endswith(".compressed.ply"):
         raise HyrfError(
             f"{target}: compressed PLY is read, not written; .sog and .spz are small, .ply is not compressed"
@@ -207,6 +209,8 @@ def kind_of(target: str | os.PathLike[str]) -> str:
     for kind in ENDINGS:
         if name.endswith(kind):
             return kind
+    if Path(target).is_dir() or not Path(name).suffix:
+        return COLMAP
     raise HyrfError(
         f"{target}: the ending names the format; end it in one of {', '.join(ENDINGS)}, or name a folder for COLMAP"
     )

@@ -17,7 +17,7 @@ LOCAL = "127.0.0.1"
 
 
 def serve(
-    page: bytes,
+    make_page: Callable[[], bytes],
     *,
     host: str = LOCAL,
     port: int = 0,
@@ -27,7 +27,7 @@ def serve(
     """Serve a page until interrupted (Ctrl-C), which is how it ends without an error.
 
     Args:
-        page: HTML, UTF-8.
+        make_page: gives HTML, UTF-8; called once it is sure that it can be served.
         host: the address to listen at. Others than the default let other machines look.
         port: to listen at, 0 to 65535; 0 takes a free one.
         open_browser: whether to open the page in the person's browser.
@@ -36,7 +36,8 @@ def serve(
     Raises:
         HyrfError: nothing can listen there.
     """
-    with _server(page, host, port) as server:
+    with _server(host, port) as server:
+        server.page = make_page()
         name = f"[{host}]" if ":" in host else host
         address = f"http://{name}:{server.server_port}/"
         say(address)
@@ -46,7 +47,7 @@ def serve(
             server.serve_forever()
 
 
-def _server(page: bytes, host: str, port: int) -> ThreadingHTTPServer:
+def _server(host: str, port: int) -> ThreadingHTTPServer:
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
         timeout = 60  # s: a silent browser does not keep a thread for ever
@@ -63,18 +64,19 @@ def _server(page: bytes, host: str, port: int) -> ThreadingHTTPServer:
                 return
             self.send_response(HTTPStatus.OK)
             self.send_header("Content-Type", "text/html; charset=utf-8")
-            self.send_header("Content-Length", str(len(page)))
+            self.send_header("Content-Length", str(len(self.server.page)))
             self.send_header("Cache-Control", "no-store")
             self.send_header("X-Content-Type-Options", "nosniff")
             self.end_headers()
             if with_body:
                 with contextlib.suppress(ConnectionError, TimeoutError):  # the browser went away
-                    self.wfile.write(page)
+                    self.wfile.write(self.server.page)
 
         def log_message(self, format: str, *args: object) -> None:
             """Requests are nobody's news."""
 
     class Server(ThreadingHTTPServer):
+        page = b""
         address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
 
     try:

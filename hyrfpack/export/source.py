@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass, replace
 
@@ -82,8 +83,8 @@ def _up_and_center(viewpoint: dict, path: str | os.PathLike[str]) -> tuple[np.nd
     """Which way is up, unit length, and what is looked at; HyrfDataError where they make no sense."""
     try:
         up, center = (np.array(viewpoint[name], np.float64) for name in ("up", "center"))
-        length = np.linalg.norm(up)
-        if not (up.shape == center.shape == (3,) and 0 < length < np.inf and np.isfinite(center).all()):
+        length = math.hypot(*up)
+        if not (up.shape == center.shape == (3,) and 0 < length < math.inf and np.isfinite(center).all()):
             raise ValueError("'up' is no direction or 'center' no point")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise HyrfDataError(f"{path}: its viewpoint cannot be used ({error!s:.160}); train the model again") from error

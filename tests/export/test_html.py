@@ -80,7 +80,7 @@ def test_a_page_holds_its_splats_as_finely_as_spz_far_from_the_origin_and_in_any
     for factor in (1e-6, 1.0, 1e6):
         splats = cloud(300)
         splats = replace(splats, positions=splats.positions * factor, scales=splats.scales * np.float32(factor))
-        back = decode_page(page_of(splats), "page")
+        back, _ = decode_page(page_of(splats), "page")
         extent = np.ptp(splats.positions, axis=0).max()
         assert np.abs(back.positions - splats.positions).max() < extent * 2**-21
         assert np.abs(np.log(back.scales / splats.scales)).max() < 1 / 31
@@ -91,7 +91,7 @@ def test_a_page_holds_its_splats_as_finely_as_spz_far_from_the_origin_and_in_any
 def test_many_splats_come_in_blocks_that_unpack_apart(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("hyrfpack.export.html.BLOCK", 3000)
     page = page_of(cloud())
-    assert page.count(b'class="splats"') > 10 and len(decode_page(page, "page")) == 1500
+    assert page.count(b'class="splats"') > 10 and len(decode_page(page, "page")[0]) == 1500
 
 
 def test_a_page_needs_a_camera():
@@ -200,7 +200,7 @@ def test_pictures_are_those_of_our_rasterizer(browser: Chromium, tmp_path: Path)
     opened(browser, tmp_path, page)
     for case, at in CASES.items():
         picture = shown(browser, at)
-        assert psnr(picture, drawn(decode_page(page, "page"), at, sky_seen(at))) > 45, case
+        assert psnr(picture, drawn(decode_page(page, "page")[0], at, sky_seen(at))) > 45, case
         assert psnr(picture, drawn(splats, at, sky_seen(at))) > 38, case
     assert browser.complaints() == []
 
@@ -215,7 +215,7 @@ def test_a_scene_of_another_program_looks_as_our_rasterizer_draws_it(
     page = page_of(splats, cameras=[at], near=0.01 * size)
     frame = Frame(tuple(middle), size, (1.0, 1.0, 1.0))
     picture = shown(opened(browser, tmp_path, page), at)
-    assert psnr(picture, drawn(decode_page(page, "page"), at, frame=frame)) > 50
+    assert psnr(picture, drawn(decode_page(page, "page")[0], at, frame=frame)) > 50
     assert psnr(picture, drawn(splats, at, frame=frame)) > 38
 
 
@@ -223,7 +223,7 @@ def test_a_scene_of_another_program_looks_as_our_rasterizer_draws_it(
 def test_lower_degrees_and_compensated_opacities_look_right(browser: Chromium, tmp_path: Path, degree: int):
     page = page_of(replace(cloud(400, degree), antialiased=degree != 1))
     opened(browser, tmp_path, page)
-    assert psnr(shown(browser, camera(6.0)), drawn(decode_page(page, "page"), camera(6.0))) > 50
+    assert psnr(shown(browser, camera(6.0)), drawn(decode_page(page, "page")[0], camera(6.0))) > 50
 
 
 def test_where_targets_of_floats_are_missing_eight_bits_serve(browser: Chromium, tmp_path: Path):
@@ -231,7 +231,7 @@ def test_where_targets_of_floats_are_missing_eight_bits_serve(browser: Chromium,
     with before_every_page(browser, script):
         page = page_of(cloud())
         opened(browser, tmp_path, page)
-        assert psnr(shown(browser, camera()), drawn(decode_page(page, "page"), camera())) > 35
+        assert psnr(shown(browser, camera()), drawn(decode_page(page, "page")[0], camera())) > 35
 
 
 def test_a_page_without_splats_shows_its_background(browser: Chromium, tmp_path: Path):
@@ -245,7 +245,7 @@ def test_the_address_can_name_the_camera(browser: Chromium, tmp_path: Path):
     ends = time.monotonic() + 10
     while not browser.evaluate("Boolean(hyrfpack.pixels())") and time.monotonic() < ends:
         time.sleep(0.05)
-    assert psnr(pixels(browser, camera(1.0)), drawn(decode_page(page, "page"), camera(1.0))) > 50
+    assert psnr(pixels(browser, camera(1.0)), drawn(decode_page(page, "page")[0], camera(1.0))) > 50
 
 
 def eye(browser: Chromium) -> Camera:

@@ -34,7 +34,7 @@ def test_the_page_is_served_to_the_browser_until_an_interrupt_which_is_no_error(
             os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr("webbrowser.open", visit)
-    serve(PAGE, open_browser=True, say=said.append)
+    serve(lambda: PAGE, open_browser=True, say=said.append)
 
     assert said[0].startswith("http://127.0.0.1:")
     assert seen == [said[0], ("text/html; charset=utf-8", PAGE), (str(len(PAGE)), b""), 404]
@@ -44,9 +44,9 @@ def test_a_port_in_use_is_one_sentence():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(HyrfError, match=rf"^port {port} of 127.0.0.1 is taken by another program; [^\n]*$"):
-            serve(PAGE, port=port, open_browser=False, say=lambda address: None)
+            serve(lambda: PAGE, port=port, open_browser=False, say=lambda address: None)
 
 
 def test_an_address_that_is_not_ours_is_one_sentence():
     with pytest.raises(HyrfError, match="nothing can listen at port 0 of 192.0.2.1"):
-        serve(PAGE, host="192.0.2.1", open_browser=False, say=lambda address: None)
+        serve(lambda: PAGE, host="192.0.2.1", open_browser=False, say=lambda address: None)

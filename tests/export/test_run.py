@@ -1,0 +1,379 @@
+"""Export: what is written is what was asked for, reads back, and is measured honestly."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from scenes import ball_scene, ring, small_model
+
+import hyrfpack
+from hyrfpack.errors import HyrfError
+from hyrfpack.evaluate import evaluate
+from hyrfpack.export import ExportReport, export, run
+from hyrfpack.export.bake import bake
+from hyrfpack.export.files import USD, WRITTEN, decode_splats
+from hyrfpack.export.html import decode_page
+from hyrfpack.export.measure import likeness
+from hyrfpack.export.run import ENDINGS, chosen, kind_of, page_of
+from hyrfpack.export.source import Source
+from hyrfpack.format import load, save
+from hyrfpack.model import Frame
+from hyrfpack.render.capture import capture_of
+from hyrfpack.render.paths import viewpoint_hint
+from hyrfpack.scene import Camera
+
+POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
+FOUR = ring(4)
+CROP = (-0.3, -10, -10, 0.4, 10, 0.2)
+SPLATS = (*WRITTEN, ".html")
+
+
+def moved(camera: Camera, unit: float, center) -> Camera:
+    pose = camera.camera_from_world.copy()
+    pose[:3, 3] = unit * pose[:3, 3] - pose[:3, :3] @ np.asarray(center, np.float64)
+    return replace(camera, camera_from_world=pose)
+
+
+def write(path, model=None, cameras=FOUR, **options):
+    """A model, as training would leave it; returns its path."""
+    kept = {"cameras": capture_of(cameras), "viewpoint": viewpoint_hint(cameras)}
+    save(model or small_model(POSITIONS, **{"fields": 2.0, **options}), path, provenance=kept)
+    return path
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """Forty Gaussians before black."""
+    return write(tmp_path_factory.mktemp("models") / "plain.hyrf")
+
+
+@pytest.fixture(scope="module")
+def sphere(tmp_path_factory):
+    """Forty Gaussians before a background sphere."""
+    return write(tmp_path_factory.mktemp("models") / "sphere.hyrf", background=True)
+
+
+@pytest.fixture
+def no_bake(monkeypatch):
+    """Fails the test when work begins."""
+    monkeypatch.setattr(run, "bake", lambda *arguments: pytest.fail("the bake began"))
+
+
+def read_back(path):
+    data = path.read_bytes()
+    return decode_page(data, "page")[0] if path.suffix == ".html" else decode_splats(data, path.suffix, str(path))
+
+
+def nearest(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """How far each of the points is from the nearest other."""
+    return np.linalg.norm(points[:, None] - others, axis=-1).min(1)
+
+
+# -- what is written -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", SPLATS)
+@pytest.mark.parametrize("place", [((0, 0, 0), 1.0), ((-30.0, 700.0, 2.0), 0.05), ((0, 0, 0), 300.0)])
+def test_every_ending_reads_back_with_as_many_gaussians_in_the_same_place(ending, place, tmp_path):
+    center, unit = place
+    cameras = [moved(camera, unit, center) for camera in ring(2, width=8, height=8)]
+    model = small_model(POSITIONS, frame=Frame(center, unit, (1.0, 1.0, 1.0)))
+    source, target = write(tmp_path / "model.hyrf", model, cameras), tmp_path / f"out{ending}"
+    report = export(source, target)
+    back, there = read_back(target), POSITIONS * unit + center
+    assert (report.file, report.bytes) == (str(target), target.stat().st_size)
+    assert report.gaussians == len(back) == 40 and report.degree == back.degree == (0 if ending == ".splat" else 3)
+    reach = np.abs(there).max()
+    assert max(nearest(there, back.positions).max(), nearest(back.positions, there).max()) < 3e-4 * unit + 2e-7 * reach
+    assert report.psnr > 45 and report.views == 2
+
+
+@pytest.mark.parametrize("ending", SPLATS)
+def test_one_gaussian_alone_is_enough(ending, tmp_path):
+    source = write(tmp_path / "one.hyrf", small_model([[0.1, 0.2, 0.3]]), ring(1))
+    report = export(source, tmp_path / f"one{ending}")
+    assert report.gaussians == 1 and report.views == 1
+    assert np.allclose(read_back(tmp_path / f"one{ending}").positions, [[0.1, 0.2, 0.3]], atol=2e-4)
+
+
+def test_points_are_the_centres_and_the_cameras(plain, tmp_path):
+    report = export(plain, tmp_path / "a.points.ply")
+    cloud = trimesh.load(tmp_path / "a.points.ply")
+    assert np.allclose(cloud.vertices[:40], load(plain).gaussians.positions.detach(), atol=1e-6)
+    assert (report.gaussians, report.cameras) == (40, 4) and len(cloud.vertices) > 40
+    export(plain, tmp_path / "a.points.glb")
+    assert set(trimesh.load(tmp_path / "a.points.glb").geometry) == {"gaussians", "cameras"}
+
+
+def test_a_transforms_json_holds_the_cameras_and_takes_no_bake(plain, tmp_path, no_bake):
+    report = export(plain, tmp_path / "transforms.json")
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    places = [np.array(frame["transform_matrix"])[:3, 3] for frame in frames]
+    assert np.allclose(places, [camera.position for camera in ring(4)], atol=1e-6)
+    assert (report.cameras, report.gaussians, report.bytes) == (4, 0, (tmp_path / "transforms.json").stat().st_size)
+
+
+def test_a_folder_becomes_a_colmap_model_and_its_size_is_that_of_the_model(plain, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    (tmp_path / "colmap").mkdir()
+    (tmp_path / "colmap" / "mine.bin").write_bytes(bytes(1000))
+    report = export(plain, tmp_path / "colmap", crop=CROP)
+    model = pycolmap.Reconstruction(tmp_path / "colmap" / "sparse" / "0")
+    places = sorted(tuple(image.projection_center().round(5)) for image in model.images.values())
+    assert places == sorted(tuple(camera.position.round(5)) for camera in ring(4))
+    tables = (tmp_path / "colmap" / "sparse" / "0").iterdir()
+    assert report.bytes == sum(table.stat().st_size for table in tables) and report.cameras == 4
+    points = np.array([point.xyz for point in model.points3D.values()])
+    assert len(points) and ((points >= CROP[:3]) & (points <= CROP[3:])).all()
+
+
+def test_the_same_export_gives_the_same_bytes(sphere, tmp_path):
+    (tmp_path / "again").mkdir()
+    for ending in SPLATS:
+        first, second = tmp_path / f"a{ending}", tmp_path / "again" / f"a{ending}"
+        for target in (first, second):
+            export(sphere, target, degree=1, crop=(-9, -9, -9, 9, 9, 9))
+        assert first.read_bytes() == second.read_bytes(), ending
+
+
+def test_the_page_that_is_served_is_the_page_that_is_written(sphere, tmp_path):
+    export(sphere, tmp_path / "sphere.html", degree=1)
+    assert page_of(sphere, 1) == (tmp_path / "sphere.html").read_bytes()
+
+
+# -- choices ---------------------------------------------------------------------------------------------------------
+
+
+def inside(points: np.ndarray) -> np.ndarray:
+    return points[((points >= CROP[:3]) & (points <= CROP[3:])).all(1)]
+
+
+@pytest.mark.parametrize("ending", [".ply", ".sog", ".html"])
+def test_a_crop_keeps_exactly_what_is_inside_and_leaves_the_background_out(ending, sphere, tmp_path):
+    said = []
+    report = export(sphere, tmp_path / f"part{ending}", crop=CROP, say=said.append)
+    expected, back = inside(load(sphere).gaussians.positions.detach().numpy()), read_back(tmp_path / f"part{ending}")
+    assert 3 < len(expected) < 40 and len(back) == report.gaussians == len(expected) and report.background == 0
+    assert nearest(expected, back.positions).max() < 1e-3
+    assert (report.views, report.psnr, report.by_degree) == (0, None, {})
+    assert said[-1] == "nothing is measured, for a part of the scene was cropped"
+
+
+def test_a_crop_may_be_open_to_any_side_and_a_list(plain, tmp_path):
+    endless = float("inf")
+    report = export(plain, tmp_path / "a.ply", crop=[0.0, *[-endless] * 2, *[endless] * 3])
+    assert report.gaussians == (POSITIONS[:, 0] >= 0).sum()
+
+
+def test_the_faint_are_left_out(tmp_path):
+    logits = np.linspace(-5, 5, 40, dtype=np.float32)[:, None]
+    source = write(tmp_path / "model.hyrf", fields=0.0, opacity_logits=logits)
+    report = export(source, tmp_path / "a.ply", min_opacity=0.5, degree=0)
+    back = read_back(tmp_path / "a.ply")
+    assert report.gaussians == len(back) == 20 and back.opacities.min() >= 0.5
+    assert report.views == 4  # and what that costs is measured
+    assert report.psnr < export(source, tmp_path / "b.ply", degree=0).psnr
+
+
+def test_the_background_goes_along_unless_it_shall_not(sphere, tmp_path):
+    whole, alone = export(sphere, tmp_path / "a.ply"), export(sphere, tmp_path / "b.ply", background=False)
+    assert whole.background >= 384 and whole.gaussians == 40 + whole.background
+    assert (alone.background, alone.gaussians, len(read_back(tmp_path / "b.ply"))) == (0, 40, 40)
+    page = export(sphere, tmp_path / "a.html")
+    assert page.gaussians == 40 and b'<img id="background"' in (tmp_path / "a.html").read_bytes()
+    export(sphere, tmp_path / "b.html", background=False)
+    assert b'<img id="background"' not in (tmp_path / "b.html").read_bytes()
+    assert min(whole.psnr, alone.psnr, page.by_degree[3]) > 25
+    assert page.psnr > 20  # what is nearly noise suffers in WebP
+
+
+def test_models_before_a_solid_colour_have_it_behind_them(tmp_path):
+    source = write(tmp_path / "model.hyrf", solid=(1.0, 1.0, 1.0))
+    for ending in (".ply", ".html"):
+        report = export(source, tmp_path / f"a{ending}")
+        assert report.background == 0 and report.psnr > 35
+
+
+# -- what is measured ------------------------------------------------------------------------------------------------
+
+
+def test_psnr_rises_with_the_degree_where_colour_depends_on_the_direction(tmp_path):
+    source = write(tmp_path / "model.hyrf", fields=4.0, direction_encoding="sh", cameras=ring(12))
+    scores = list(export(source, tmp_path / "a.ply").by_degree.values())
+    assert len(scores) == 4 and scores == sorted(scores) and scores[3] > scores[0] + 6
+
+
+@pytest.mark.parametrize("ending", [".ply", ".spz", ".splat", ".sog"])
+def test_the_psnr_is_that_of_the_file(ending, plain, tmp_path):
+    report = export(plain, tmp_path / f"a{ending}", degree=2)
+    assert list(report.by_degree) == list(range(report.degree + 1))
+    views = [(camera, None) for camera in Source.read(plain).fitted]
+    file = likeness(load(plain), {"file": (read_back(tmp_path / f"a{ending}"), None)}, views, sphere=False)["file"]
+    assert report.psnr == pytest.approx(file.model, abs=1e-3)
+    assert (report.psnr == pytest.approx(report.by_degree[report.degree], abs=1e-3)) == (ending == ".ply")
+
+
+def test_a_file_that_lost_something_scores_less(plain, tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "decode_splats", lambda *arguments: decode_splats(*arguments)[:20])
+    report = export(plain, tmp_path / "a.ply")
+    assert report.psnr < report.by_degree[3] - 3
+
+
+def test_held_out_photos_score_the_model_and_the_file_and_are_not_fitted(plain, tmp_path, monkeypatch):
+    photos = ball_scene(8).train
+    scene = replace(ball_scene(8), train=photos[1::2], test=photos[::2])
+    fitted = []
+    monkeypatch.setattr(run, "bake", lambda model, cameras, degrees: fitted.extend(cameras) or bake(model, [], degrees))
+    report = export(plain, tmp_path / "a.ply", data=scene)
+    assert fitted == [view.camera for view in scene.train] and report.views == 4
+    assert report.photos_model == pytest.approx(evaluate(load(plain), scene.test).psnr, abs=1e-6)
+    assert report.photos_file == pytest.approx(report.photos_model, abs=0.5)
+
+
+def test_without_held_out_photos_it_says_that_nothing_is_measured(plain, tmp_path):
+    said = []
+    report = export(plain, tmp_path / "a.ply", data=ball_scene(3), say=said.append)
+    assert report.views == 0 and said[-1] == "nothing is measured, for no photo is held out"
+
+
+def test_masks_that_leave_nothing_leave_the_score_out(plain, tmp_path):
+    scene = ball_scene(2)
+    hidden = [
+        replace(view, load=lambda view=view: replace(view.load(), mask=np.zeros((32, 32), bool)))
+        for view in scene.train
+    ]
+    report = export(plain, tmp_path / "a.ply", data=replace(scene, test=hidden))
+    assert (report.views, report.psnr) == (0, None)
+
+
+# -- files that keep no cameras ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def compact(plain, tmp_path_factory):
+    path = tmp_path_factory.mktemp("compact") / "compact.hyrf"
+    hyrfpack.compress(plain, path)
+    return path
+
+
+@pytest.mark.parametrize("name", ["cameras.json", "colmap"])
+def test_cameras_that_a_file_does_not_keep_are_one_sentence_or_come_from_photos(name, compact, tmp_path, no_bake):
+    with pytest.raises(HyrfError, match=r"compact\.hyrf: it keeps no cameras; [^\n]*--data$"):
+        export(compact, tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+    if name.endswith(".json"):
+        assert export(compact, tmp_path / name, data=ball_scene(5)).cameras == 5
+
+
+def test_a_compact_file_is_baked_and_measured_around_the_scene(compact, tmp_path):
+    said = []
+    report = export(compact, tmp_path / "a.spz", degree=1, say=said.append)
+    assert "keeps no cameras" in said[0] and report.views > 0 and report.psnr > 25
+    assert export(compact, tmp_path / "a.points.ply").cameras == 0
+
+
+# -- refusals come before the work, and nothing is half done -----------------------------------------------------------
+
+
+def test_the_ending_names_the_format():
+    assert [kind_of(f"a/b{ending}") for ending in ENDINGS] == list(ENDINGS)
+    assert kind_of("A/B.PLY") == ".ply" and kind_of("a.b/c") == "" and kind_of("my.scene.spz") == ".spz"
+    for name in ("a.xyz", "model.hyrf", "a.ply.txt"):
+        with pytest.raises(HyrfError, match=rf"^{name}: the ending names the format; [^\n]*\.ply[^\n]*$"):
+            kind_of(name)
+    with pytest.raises(HyrfError, match="compressed PLY is read, not written"):
+        kind_of("a.compressed.ply")
+
+
+WRONG = [
+    {"degree": 4},
+    {"degree": -1},
+    {"crop": (0, 0, 0, 1, 1, float("nan"))},
+    {"crop": (0, 0, 1, 1)},
+    {"crop": (1, 1, 1, 0, 0, 0)},
+    {"crop": (90, 90, 90, 91, 91, 91)},
+    {"min_opacity": float("nan")},
+    {"min_opacity": 1.5},
+    {"min_opacity": 0.999},
+]
+
+
+@pytest.mark.parametrize("options", WRONG, ids=str)
+def test_options_that_cannot_be_met_are_one_sentence_before_the_bake(options, plain, tmp_path, no_bake):
+    with pytest.raises(HyrfError) as refusal:
+        export(plain, tmp_path / "a.ply", **options)
+    assert re.fullmatch(r"[^\n]+; [^\n]+[^.]", str(refusal.value))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_choosing_gaussians_for_a_file_of_cameras_is_refused(plain, tmp_path):
+    for options in ({"crop": CROP}, {"min_opacity": 0.5}):
+        with pytest.raises(HyrfError, match=r"holds cameras only[^\n]*$"):
+            export(plain, tmp_path / "a.json", **options)
+
+
+@pytest.mark.parametrize("name", ["none/a.ply", "file/a.ply", "file/colmap", "none/a.json"])
+def test_places_that_cannot_be_written_to_are_refused_before_the_bake(name, plain, tmp_path, no_bake):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(HyrfError, match=r"^[^\n]*(none|file)[^\n]*$"):
+        export(plain, tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"] and (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("ending", "module", "package"),
+    [
+        *((ending, "pxr", "usd-core") for ending in USD),
+        (".points.glb", "trimesh", "trimesh"),
+        ("", "pycolmap", "pycolmap"),
+    ],
+)
+def test_packages_that_are_not_there_are_missed_before_the_bake(
+    ending, module, package, plain, tmp_path, no_bake, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(HyrfError, match=rf"pip install {package}'$"):
+        export(plain, tmp_path / f"a{ending}")
+
+
+@pytest.mark.parametrize("failing", ["encode_splats", "decode_splats", "background_splats"])
+def test_what_goes_wrong_leaves_the_old_file_as_it_was(failing, sphere, tmp_path, monkeypatch):
+    def fail(*arguments, **options):
+        raise HyrfError("no")
+
+    monkeypatch.setattr(run, failing, fail)
+    (tmp_path / "a.ply").write_bytes(b"old")
+    with pytest.raises(HyrfError, match="^no$"):
+        export(sphere, tmp_path / "a.ply", degree=0)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"] and (tmp_path / "a.ply").read_bytes() == b"old"
+
+
+def test_a_disk_that_fails_leaves_the_old_file_as_it_was(plain, tmp_path, monkeypatch):
+    def fail(*arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("hyrfpack.atomic.os.replace", fail)
+    (tmp_path / "a.ply").write_bytes(b"old")
+    with pytest.raises(HyrfError, match=r"a\.ply: the disk is full[^\n]*$"):
+        export(plain, tmp_path / "a.ply", degree=0)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"] and (tmp_path / "a.ply").read_bytes() == b"old"
+
+
+# -- for callers -----------------------------------------------------------------------------------------------------
+
+
+def test_export_is_one_call_on_the_package(plain, tmp_path):
+    report = hyrfpack.export(plain, tmp_path / "a.ply", degree=0)
+    assert isinstance(report, hyrfpack.ExportReport) and hyrfpack.ExportReport is ExportReport
+    assert {"export", "ExportReport"} <= set(hyrfpack.__all__)
+
+
+def test_choosing_all_copies_nothing(plain):
+    splats = bake(load(plain), [], (0,))[0]
+    assert chosen(splats) is splats
