@@ -33,12 +33,12 @@ from torch import Tensor
 import hyrfpack
 from hyrfpack.evaluate.figures import blank_figure, save_figure
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
+from hyrfpack.export.harmonics import harmonics_basis
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.model import Geometry, HybridModel, viewpoint_of
 from hyrfpack.model.gaussians import logit
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
-from hyrfpack.ops.shade import spherical_harmonics
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Camera, View
 
@@ -97,30 +97,6 @@ class Row:
     drop_hybrid: float
     drop_baked: float | None
     likeness: float
-
-
-def harmonics_basis(directions: Tensor) -> Tensor:
-    """Real spherical harmonics of bands 0 to 3 with the Condon-Shortley phase, as 3DGS files have them.
-
-    Args:
-        directions: (N, 3) unit vectors.
-
-    Returns:
-        (N, 16).
-    """
-    x, y, z = directions.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
-    phase = directions.new_tensor((1, -1, 1, -1, 1, -1, 1, -1, 1))
-    third = (
-        -0.5900435899266435 * y * (3 * xx - yy),
-        2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (5 * zz - 1),
-        0.3731763325901154 * z * (5 * zz - 3),
-        -0.4570457994644658 * x * (5 * zz - 1),
-        1.445305721320277 * z * (xx - yy),
-        -0.5900435899266435 * x * (xx - 3 * yy),
-    )
-    return torch.cat((spherical_harmonics(directions) * phase, torch.stack(third, -1)), -1)
 
 
 @torch.no_grad()
