@@ -54,7 +54,7 @@ def background_splats(model: HybridModel, cameras: Sequence[Camera]) -> Splats:
 
     Args:
         model: on the CPU.
-        cameras: from where it was photographed, world units; without any, all cells are alike.
+        cameras: from where it was photographed, world units; without any, cells are divided where colours differ.
 
     Returns:
         Splats to be drawn together with the model's; none when the model has no learnt background.

@@ -66,7 +66,7 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
         HyrfDataError: there is no such file, or it is none of these, or it is damaged.
     """
     path = Path(path)
-    if path.name == "meta.json":
+    if path.name == sog.META:
         path = path.parent
     extension = path.suffix.lower()
     try:
@@ -74,16 +74,20 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
             return sog.decode(_loose_sog(path), str(path))
         if extension not in READ:
             raise HyrfDataError(f"{path}: files with this ending are not known; name one of {', '.join(READ)}")
-        if path.stat().st_size > MAX_BYTES:
-            raise HyrfDataError(f"{path}: the file is larger than {MAX_BYTES:,} bytes; split it first")
-        return decode_splats(path.read_bytes(), extension, str(path))
+        return decode_splats(_bytes_of(path), extension, str(path))
     except OSError as error:
         raise HyrfDataError(f"{path}: the file cannot be read ({error.strerror or error}); check the path") from error
 
 
 def _loose_sog(folder: Path) -> dict[str, bytes]:
     """The files of a SOG that is not bundled, by name: meta.json and the pictures that it names."""
-    files = {"meta.json": (folder / "meta.json").read_bytes()}
-    for name in sog.picture_names(files["meta.json"], str(folder)):
-        files[name] = (folder / name).read_bytes()
+    files = {sog.META: _bytes_of(folder / sog.META)}
+    for name in sog.picture_names(files[sog.META], str(folder)):
+        files[name] = _bytes_of(folder / name)
     return files
+
+
+def _bytes_of(path: Path) -> bytes:
+    if path.stat().st_size > MAX_BYTES:
+        raise HyrfDataError(f"{path}: the file is larger than {MAX_BYTES:,} bytes; split it first")
+    return path.read_bytes()

@@ -33,7 +33,8 @@ ENDINGS = (*POINTS, *WRITTEN, PAGE, TRANSFORMS)
 # What is imported for an ending alone, and what pip calls it.
 PACKAGES = {**dict.fromkeys(USD, ("pxr", "usd-core")), ".points.glb": ("trimesh",) * 2, COLMAP: ("pycolmap",) * 2}
 PAGE_CAMERAS = 12  # that a page can be stepped through
-COARSE = 3.0  # dB that a format's rounding may cost before something is said about it
+COARSE = 3.0  # dB that a format may cost before something is said about it
+INVISIBLE = 50.0  # dB from which on no difference can be seen, and none is told
 
 
 @dataclass(frozen=True)
@@ -150,8 +151,11 @@ def export(
         say("nothing is measured, for the masks leave no pixel of the held-out photos")
         return report
     file, before = scores["file"], scores[str(degree)].model
-    if before - file.model > COARSE:
-        say(f"{kind} is too coarse for this scene, perhaps for its unit of length: choose another format")
+    if min(before, INVISIBLE) - file.model > COARSE:
+        if read.model.config.antialiased and not back[0].antialiased:
+            say(f"{kind} cannot tell that the model is antialiased: say so where it is drawn, or choose .spz or .sog")
+        else:
+            say(f"{kind} is too coarse for this scene, perhaps for its unit of length: choose another format")
     return replace(
         report,
         views=file.views,
@@ -231,6 +235,8 @@ def _kept(positions: np.ndarray, opacities: np.ndarray, crop: Sequence[float] | 
     keep = opacities >= min_opacity
     if crop is not None:
         keep &= ((positions >= crop[:3]) & (positions <= crop[3:])).all(axis=1)
+    if not len(positions):
+        raise HyrfError("no Gaussian is left: no camera sees any; name the photos with --data, or train again")
     if not keep.any():
         low, high = (corner.round(4).tolist() for corner in (positions.min(0), positions.max(0)))
         raise HyrfError(
@@ -258,6 +264,8 @@ def _check(
         module, package = PACKAGES[kind]
         with needs_package(package, f"{target}: writing this format"):
             import_module(module)
+    if kind != COLMAP and Path(target).is_dir():
+        raise HyrfError(f"{target}: this is a folder; name a file in it")
     place = Path(os.path.realpath(target))
     place = place.parent if kind != COLMAP else next(path for path in (place, *place.parents) if path.exists())
     if not place.exists():

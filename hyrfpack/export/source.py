@@ -19,6 +19,8 @@ MEASURED = 12  # views at most that a loss is measured at
 HELD_OUT = 8  # every so many of the cameras that a file keeps are not fitted, but measured at
 FEW = 16  # cameras, of which none can be spared
 RING, LIFTS = 24, (-0.2, 0.0, 0.2)  # cameras around what kept none: in rings, raised by so much of their distance
+# Lengths of mean unit vectors: from where on cameras look the same way, and up to where their pictures' sides do not.
+SAME_WAY, TURNED = 0.9, 0.5
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,8 @@ class Source:
         if data is not None and data.train:
             named = [(view.name, view.camera) for view in data.train]
             measured = [(view.camera, view) for view in evenly_spaced(data.test, MEASURED)]
-            return cls(model, named, [camera for _, camera in named], measured, up, center)
+            cameras = [camera for _, camera in named]
+            return cls(model, named, cameras, measured, _up_of(cameras, up), center)
         stored = stored_cameras(facts)
         if not facts["provenance"].get("cameras"):
             between = evenly_spaced(stored[1::2], MEASURED)  # of an orbit with twice as many cameras as RING
@@ -65,7 +68,17 @@ class Source:
         named = [(f"{number:04d}.png", camera) for number, camera in enumerate(stored)]
         spare = stored[::HELD_OUT] if len(stored) >= FEW else stored
         fitted = [c for number, c in enumerate(stored) if number % HELD_OUT] if len(stored) >= FEW else stored
-        return cls(model, named, fitted, [(camera, None) for camera in evenly_spaced(spare, MEASURED)], up, center)
+        measured = [(camera, None) for camera in evenly_spaced(spare, MEASURED)]
+        return cls(model, named, fitted, measured, _up_of(stored, up), center)
+
+
+def _up_of(cameras: list[Camera], up: np.ndarray) -> np.ndarray:
+    """Which way is up, unit length: for cameras that look down on a flat scene and turn, as drones do, against them."""
+    forward = np.mean([camera.forward for camera in cameras], axis=0)
+    downward = np.mean([camera.rotation[1] for camera in cameras], axis=0)
+    if np.linalg.norm(forward) > SAME_WAY and np.linalg.norm(downward) < TURNED:
+        return -forward / np.linalg.norm(forward)
+    return up
 
 
 def _around(viewpoint: dict, center: np.ndarray, up: np.ndarray) -> list[Camera]:

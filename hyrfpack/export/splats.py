@@ -47,12 +47,13 @@ class Splats:
             values = getattr(self, name)
             if values.shape != shape:
                 raise ValueError(f"{name} has shape {values.shape}; {shape} is needed")
+            with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused; NaN may signal
+                values = np.ascontiguousarray(values, np.float64 if name == "positions" else np.float32)
             if not np.isfinite(values).all():
                 raise ValueError(f"{name} must be finite")
-            kind = np.float64 if name == "positions" else np.float32
-            object.__setattr__(self, name, np.ascontiguousarray(values, kind))
-        if self.degree > MAX_DEGREE:
-            raise ValueError(f"the harmonics have degree {self.degree}; {MAX_DEGREE} is the most")
+            object.__setattr__(self, name, values)
+        if not 0 <= self.degree <= MAX_DEGREE:
+            raise ValueError(f"the harmonics have degree {self.degree}; 0 to {MAX_DEGREE} are known")
         if (self.scales < 0).any() or not ((self.opacities >= 0) & (self.opacities <= 1)).all():
             raise ValueError("scales must not be negative, and opacities lie in [0, 1]")
 

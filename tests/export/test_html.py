@@ -302,6 +302,20 @@ def test_mouse_and_keys_move_the_eye(browser: Chromium, tmp_path: Path):
     assert browser.complaints() == []
 
 
+def test_the_scene_follows_the_pointer_where_the_camera_stands_on_its_head(browser: Chromium, tmp_path: Path):
+    opened(browser, tmp_path, page_of(cloud(), cameras=[CASES["turned upside down"]]))
+    home = eye(browser)
+    browser.drag((120, 90), (170, 90))
+    assert (eye(browser).position - home.position) @ home.rotation[0] < -0.3
+
+
+def test_a_camera_in_the_middle_of_the_scene_flies_as_fast_as_befits_its_size(browser: Chromium, tmp_path: Path):
+    opened(browser, tmp_path, page_of(cloud(), cameras=[camera(0.01), camera(2.5), camera(4.0)]))
+    home = eye(browser)
+    browser.drag((120, 90), (140, 90), button="right")
+    assert np.linalg.norm(eye(browser).position - home.position) > 0.05
+
+
 def test_the_wheel_zooms_towards_the_pointer(browser: Chromium, tmp_path: Path):
     opened(browser, tmp_path, page_of(cloud()))
     home = eye(browser)

@@ -53,6 +53,11 @@ def test_encode_writes_the_layout_that_programs_expect():
     np.testing.assert_allclose(struct.unpack("<62f", rows), expected, rtol=1e-6, atol=1e-7)
 
 
+def test_comments_hold_anything():
+    data = ply.encode(make_splats(3)).replace(b"1.0\n", "1.0\ncomment a\x0cb\u2028c\x85\n".encode(), 1)
+    assert len(ply.decode(data, "a.ply")) == 3
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("count", [0, 1, 500])
 def test_everything_comes_back_to_the_precision_of_float32(degree, count):

@@ -225,6 +225,18 @@ def test_a_file_that_lost_something_scores_less(plain, tmp_path, monkeypatch):
     assert report.psnr < report.by_degree[3] - 3
 
 
+def test_a_format_that_forgets_antialiasing_is_told_from_a_coarse_one(tmp_path):
+    source = write(tmp_path / "m.hyrf", antialiased=True, scale_logits=-5.0, fields=0.0)
+    for ending, word in ((".glb", "antialiased"), (".spz", "measuring"), (".sog", "measuring")):
+        said = []
+        export(source, tmp_path / f"a{ending}", degree=0, say=said.append)
+        assert word in said[-1]
+    tiny = small_model(POSITIONS, frame=Frame((0, 0, 0), 1e-5, (1.0, 1.0, 1.0)))
+    source = write(tmp_path / "tiny.hyrf", tiny, [moved(camera, 1e-5, (0, 0, 0)) for camera in FOUR])
+    export(source, tmp_path / "a.spz", degree=0, say=said.append)
+    assert "too coarse" in said[-1]
+
+
 def test_held_out_photos_score_the_model_and_the_file_and_are_not_fitted(plain, tmp_path, monkeypatch):
     photos = ball_scene(8).train
     scene = replace(ball_scene(8), train=photos[1::2], test=photos[::2])
@@ -318,12 +330,26 @@ def test_choosing_gaussians_for_a_file_of_cameras_is_refused(plain, tmp_path):
             export(plain, tmp_path / "a.json", **options)
 
 
+def test_a_model_that_no_camera_sees_is_one_sentence(tmp_path):
+    # So large that it would cover the pictures, and beside them.
+    source = write(tmp_path / "m.hyrf", small_model([[-4.8, 3.1, 4.1]], scale_logits=8.0), ring(4))
+    with pytest.raises(HyrfError, match=r"^no Gaussian is left: [^\n]*$"):
+        export(source, tmp_path / "a.glb", degree=0)
+    assert not (tmp_path / "a.glb").exists()
+
+
 @pytest.mark.parametrize("name", ["none/a.ply", "file/a.ply", "file/colmap", "none/a.json"])
 def test_places_that_cannot_be_written_to_are_refused_before_the_bake(name, plain, tmp_path, no_bake):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(HyrfError, match=r"^[^\n]*(none|file)[^\n]*$"):
         export(plain, tmp_path / name)
     assert [path.name for path in tmp_path.iterdir()] == ["file"] and (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_folder_with_the_ending_of_a_file_is_refused_before_the_bake(plain, tmp_path, no_bake):
+    (tmp_path / "a.ply").mkdir()
+    with pytest.raises(HyrfError, match=r"a\.ply: this is a folder; name a file in it$"):
+        export(plain, tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import struct
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -168,10 +170,17 @@ def test_a_palette_finds_separate_clusters() -> None:
         ({"count": 2}, "1 pixels for 2 Gaussians"),
         ({"count": 10**9}, "count of Gaussians"),
         ({"count": True}, "count of Gaussians"),
+        ({"count": "1" * 99999}, "^.{0,200}count of Gaussians.{0,200}$"),
         ({"scales": {"codebook": [0.0] * 255, "files": ["scales.webp"]}}, "scales.codebook"),
         ({"scales": {"codebook": [float("nan")] * 256, "files": ["scales.webp"]}}, "scales.codebook"),
-        ({"scales": {"codebook": [1e9] * 256, "files": ["scales.webp"]}}, "scales must be finite"),
-        ({"means": {"mins": [1e9] * 3, "maxs": [1e9] * 3, "files": ["low.webp", "high.webp"]}}, "must be finite"),
+        (
+            {"scales": {"codebook": [1e9] * 256, "files": ["scales.webp"]}},
+            "the scale of Gaussian 0 of 1 is not a finite number",
+        ),
+        (
+            {"means": {"mins": [1e9] * 3, "maxs": [1e9] * 3, "files": ["low.webp", "high.webp"]}},
+            "the position of Gaussian 0",
+        ),
         ({"quats": {"files": ["../quats.webp"]}}, "picture 1 of quats"),
         ({"quats": {"files": ["gone.webp"]}}, "gone.webp is missing"),
         ({"quats": {"files": ["meta.json"]}}, "no picture"),
@@ -193,9 +202,24 @@ def test_a_zip_that_unpacks_to_far_more_is_refused_unread() -> None:
         sog.unzip(bundle.getvalue(), "bomb")
 
 
-def test_a_picture_of_too_many_pixels_is_refused_undecoded() -> None:
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_zip_that_lies_about_sizes_is_refused_unread(method: int) -> None:
+    bundle = io.BytesIO()
+    with zipfile.ZipFile(bundle, "w", method) as archive:
+        archive.writestr("meta.json", bytes(10_000_000))
+    data = bytearray(bundle.getvalue())
+    struct.pack_into("<I", data, data.index(b"PK\x01\x02") + 24, 100)
+    tracemalloc.start()
+    with pytest.raises(HyrfDataError, match="stored or deflated"):
+        sog.unzip(bytes(data), "bomb")
+    assert tracemalloc.get_traced_memory()[1] < 1_000_000
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("side", [300, 16000])
+def test_a_picture_of_far_more_pixels_than_gaussians_is_refused_undecoded(side: int) -> None:
     file = io.BytesIO()
-    Image.new("1", (16000, 16000)).save(file, "PNG")
+    Image.new("RGB" if side == 300 else "1", (side, side)).save(file, "PNG")
     with pytest.raises(HyrfDataError, match=r"quats.webp .*(pixels|picture)"):
         sog.decode(packed() | {"quats.webp": file.getvalue()}, "bomb")
 

@@ -13,7 +13,7 @@ from hyrfpack.export.source import FEW, MEASURED, Source
 from hyrfpack.format import save
 from hyrfpack.render.capture import capture_of
 from hyrfpack.render.paths import viewpoint_hint
-from hyrfpack.scene import Scene
+from hyrfpack.scene import Camera, Scene
 
 POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (20, 3))
 
@@ -131,3 +131,16 @@ def test_an_empty_model_and_no_file_are_one_sentence(written, tmp_path):
         Source.read(path)
     with pytest.raises(HyrfError, match=r"none\.hyrf[^\n]*$"):
         Source.read(tmp_path / "none.hyrf")
+
+
+def test_up_is_against_cameras_that_look_down_and_turn(written):
+    # A drone that flies to and fro over the plane z = 0: half of its pictures stand on their heads.
+    poses = [np.eye(4) for _ in range(12)]
+    for number, pose in enumerate(poses):
+        pose[:3, :3] = np.diag([1.0, -1, -1]) if number % 2 else np.diag([-1.0, 1, -1])
+        pose[:3, 3] = -pose[:3, :3] @ (number - 6.0, 0.0, 3.0)
+    cameras = [Camera(32, 32, 30.0, 30.0, 16.0, 16.0, pose) for pose in poses]
+    kept = {"cameras": capture_of(cameras), "viewpoint": viewpoint_hint(cameras)}
+    assert np.allclose(Source.read(written(kept)).up, (0, 0, 1))
+    kept["cameras"] = capture_of(cameras[::2])  # all the same way up: as likely a wall as the ground
+    assert np.allclose(abs(Source.read(written(kept)).up), (0, 1, 0))

@@ -31,6 +31,8 @@ def random_splats(count: int, degree: int = 3, seed: int = 0) -> Splats:
         {"scales": -np.ones((3, 3))},
         {"opacities": np.full(3, 1.1)},
         {"positions": np.full((3, 3), np.nan)},
+        {"scales": np.full((3, 3), 1e39)},  # beyond float32
+        {"harmonics": np.zeros((3, 0, 3))},
         {"harmonics": np.zeros((3, 5, 3))},
         {"harmonics": np.zeros((3, 25, 3))},
     ],

@@ -21,6 +21,7 @@ import numpy as np
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.export.formats.checked import checked_splats
 from hyrfpack.export.formats.ply_elements import PlyHeader, columns, read_elements, read_header
+from hyrfpack.export.formats.smallest_three import with_largest
 from hyrfpack.export.harmonics import BAND_0
 from hyrfpack.export.splats import Splats
 
@@ -28,7 +29,6 @@ _CHUNK = 256
 _POSITION, _SCALE, _COLOR = ("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b")
 _11_10_11 = (21, 11, 0), (11, 10, 11)  # shifts and widths of bit fields
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # of the components 0 to 3 all but one
 
 _REST_OF = np.float32((np.arange(256) + 0.5) / 32 - 4)
 _REST_OF[[0, 255]] = -4, 4
@@ -114,8 +114,4 @@ def _between(chunk: np.ndarray, parts: Sequence[str], fractions: np.ndarray) -> 
 def _rotations(words: np.ndarray) -> np.ndarray:
     """(N, 4) wxyz."""
     others = (_fractions(words, (20, 10, 0), (10, 10, 10)) - 0.5) * np.sqrt(2)
-    largest = (words >> 30).astype(np.intp)
-    quats = np.empty((len(words), 4))
-    np.put_along_axis(quats, _OTHERS[largest], others, axis=1)
-    np.put_along_axis(quats, largest[:, None], np.sqrt(np.maximum(0, 1 - (others**2).sum(1, keepdims=True))), axis=1)
-    return quats
+    return with_largest(words >> 30, others)

@@ -105,7 +105,7 @@ def encode(splats: Splats, *, up: np.ndarray) -> bytes:
     if length > _MAX_BYTES:
         raise HyrfDataError(
             f"{len(splats):,} Gaussians of degree {splats.degree} come to {length:,} bytes and a .glb file holds "
-            f"{_MAX_BYTES:,}; lower --degree"
+            f"{_MAX_BYTES:,}; lower --sh-degree"
         )
     head = _HEADER.pack(b"glTF", 2, length) + _CHUNK.pack(len(text), _JSON) + text
     return b"".join((head, _CHUNK.pack(binary, _BIN), *parts))
@@ -133,7 +133,7 @@ def decode(data: bytes, name: str, *, upright: bool = False) -> Splats:
         if not found:
             raise HyrfDataError(f"{name}: there are no Gaussian splats in it ({EXTENSION}); name another file")
         counts = [integer(_item(content, "accessors", item["attributes"]["POSITION"])["count"]) for _, item in found]
-        if sum(counts) * _MIN_BYTES > len(data):
+        if sum(max(count, 0) for count in counts) * _MIN_BYTES > len(data):
             raise HyrfDataError(f"{name}: its nodes show the same splats many times; export each once")
         turn = np.eye(3) if upright else rotation_of(found[0][0], name)[1].T
         parts = [

@@ -59,7 +59,7 @@ def read_header(data: bytes, name: str) -> PlyHeader:
     if end is None:
         raise HyrfDataError(f"{name}: its PLY header has no end within {_LONGEST_HEADER:,} bytes; it is damaged")
     order, elements, properties = "", {}, None
-    for line in data[: end.start()].decode("utf-8", "replace").splitlines()[1:]:
+    for line in data[: end.start()].decode("utf-8", "replace").split("\n")[1:]:
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
                 pass

@@ -28,8 +28,10 @@ import numpy as np
 from PIL import Image
 
 from hyrfpack.errors import HyrfDataError
+from hyrfpack.export.formats.checked import checked_splats
 from hyrfpack.export.formats.palette import build_palette, nearest
-from hyrfpack.export.splats import Splats, normalized_quats
+from hyrfpack.export.formats.smallest_three import with_largest, without_largest
+from hyrfpack.export.splats import Splats
 from hyrfpack.quant.morton import morton_codes
 
 META = "meta.json"
@@ -43,7 +45,6 @@ _FILES = {
 }
 _ENTRIES = 256  # of a codebook
 _ABREAST = 64  # palette rows side by side
-_SMALLER = np.array(((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)))  # components beside the largest
 _LEAST_SCALE = 1e-12  # the logarithm of nothing is not a number
 
 # On baked scenes of 20,000 to 30,000 Gaussians of degree 3, a row for 4 Gaussians loses 0.06 dB and takes 29 % of the
@@ -56,7 +57,8 @@ _LARGEST_PALETTE = 65536  # that labels of 16 bits can name
 # More effort (method 4 to 6, quality 75 to 100) takes up to 30 times as long, and makes larger files of these pictures.
 _WEBP = {"lossless": True, "exact": True, "method": 2, "quality": 50}
 
-_MOST_PIXELS = 1 << 26  # of a picture, and so Gaussians; 256 MiB
+_MOST_GAUSSIANS = 1 << 26
+_PADDED, _FREE_PIXELS = 4, 1 << 16  # a picture has at most so many pixels a Gaussian, and these
 _MOST_META = 1 << 20  # bytes
 _UNEARNED = 1 << 20  # Gaussians that pictures of no size may hold; more need a byte each
 
@@ -83,9 +85,9 @@ def encode(splats: Splats) -> bytes:
 def encode_files(splats: Splats) -> dict[str, bytes]:
     """The same as `encode` as loose files by name: for a folder, opened through its meta.json."""
     count = len(splats)
-    if count > _MOST_PIXELS:
+    if count > _MOST_GAUSSIANS:
         raise HyrfDataError(
-            f"SOG: {count:,} Gaussians are too many, a file holds {_MOST_PIXELS:,}; write a PLY instead"
+            f"SOG: {count:,} Gaussians are too many, a file holds {_MOST_GAUSSIANS:,}; write a PLY instead"
         )
     drawn_in = np.sign(splats.positions) * np.log1p(np.abs(splats.positions))
     mins, maxs = (drawn_in.min(0), drawn_in.max(0)) if count else (np.zeros(3), np.zeros(3))
@@ -176,19 +178,20 @@ def decode(files: Mapping[str, bytes], name: str) -> Splats:
     meta = _parse(_get(files, META, name), name)
     count = meta.get("count")
     size = sum(map(len, files.values()))
-    if type(count) is not int or not 0 <= count <= min(_MOST_PIXELS, size + _UNEARNED):
-        raise HyrfDataError(f"{name}: {META} gives {count!r} as count of Gaussians in {size:,} bytes; it is damaged")
+    if type(count) is not int or not 0 <= count <= min(_MOST_GAUSSIANS, size + _UNEARNED):
+        raise HyrfDataError(f"{name}: {META} gives {count!r:.40} as count of Gaussians in {size:,} bytes; damaged")
 
     def pixels(group: str, number: int = 0) -> np.ndarray:
         file = _file(meta, group, number, name)
-        picture = _read_picture(_get(files, file, name), f"{name}: {file}").reshape(-1, 4)
+        picture = _read_picture(_get(files, file, name), _PADDED * count + _FREE_PIXELS, f"{name}: {file}")
+        picture = picture.reshape(-1, 4)
         if len(picture) < count:
             raise HyrfDataError(f"{name}: {file} has {len(picture):,} pixels for {count:,} Gaussians; it is damaged")
         return picture[:count]
 
     mins, maxs = (_floats(meta, "means", key, name, 3) for key in ("mins", "maxs"))
     steps = pixels("means", 0)[:, :3] + 256.0 * pixels("means", 1)[:, :3]
-    with np.errstate(over="ignore", invalid="ignore"):  # Splats refuses what comes of it
+    with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is refused
         drawn_in = mins + steps / 65535 * (maxs - mins)
         positions = np.sign(drawn_in) * np.expm1(np.abs(drawn_in))
         scales = np.exp(_from_codebook(meta, "scales", pixels("scales")[:, :3], name))
@@ -202,10 +205,7 @@ def decode(files: Mapping[str, bytes], name: str) -> Splats:
         harmonics = np.concatenate((harmonics, palette[labels]), axis=1)
     quats = _unpack_quats(pixels("quats"), name)
     opacities = colors[:, 3] / np.float32(255)
-    try:
-        return Splats(positions, scales, quats, opacities, harmonics, antialiased=meta.get("antialias") is True)
-    except ValueError as error:
-        raise HyrfDataError(f"{name}: {error}; {META} is damaged") from error
+    return checked_splats(name, positions, scales, quats, opacities, harmonics, meta.get("antialias") is True)
 
 
 def _to_codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -252,7 +252,7 @@ def _to_palette(splats: Splats) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _read_palette(meta: dict, files: Mapping[str, bytes], name: str) -> np.ndarray:
     """(K, T, 3) float32 rows of harmonics of bands 1 and up, T = 3, 8 or 15."""
     file = _file(meta, "shN", 0, name)
-    picture = _read_picture(_get(files, file, name), f"{name}: {file}")[..., :3]
+    picture = _read_picture(_get(files, file, name), _LARGEST_PALETTE * 15, f"{name}: {file}")[..., :3]
     height, width, _ = picture.shape
     if width not in (64 * 3, 64 * 8, 64 * 15) or height * _ABREAST > _LARGEST_PALETTE:
         raise HyrfDataError(f"{name}: {file} is {width} x {height}, no palette of degree 1 to 3; it is damaged")
@@ -261,24 +261,16 @@ def _read_palette(meta: dict, files: Mapping[str, bytes], name: str) -> np.ndarr
 
 def _pack_quats(quats: np.ndarray) -> np.ndarray:
     """Unit quaternions (N, 4) wxyz to bytes (N, 4)."""
-    largest = np.abs(quats).argmax(1)
-    signs = np.where(np.take_along_axis(quats, largest[:, None], 1) < 0, -1, 1)
-    smaller = np.take_along_axis(quats, _SMALLER[largest], 1) * signs
+    largest, smaller = without_largest(quats)
     return np.column_stack((np.rint(np.clip(smaller * math.sqrt(2), -1, 1) * 127.5 + 127.5), 252 + largest))
 
 
 def _unpack_quats(packed: np.ndarray, name: str) -> np.ndarray:
-    """Bytes (N, 4) to unit quaternions (N, 4) wxyz."""
+    """Bytes (N, 4) to quaternions (N, 4) wxyz."""
     tags = packed[:, 3]
     if tags.min(initial=255) < 252:
         raise HyrfDataError(f"{name}: a rotation has the tag {tags.min()}, not 252 to 255; its picture is damaged")
-    largest = tags.astype(np.intp) - 252
-    smaller = (packed[:, :3] / 127.5 - 1) * math.sqrt(0.5)
-    quats = np.empty((len(packed), 4))
-    np.put_along_axis(quats, _SMALLER[largest], smaller, 1)
-    rest = np.sqrt(np.maximum(0, 1 - (smaller**2).sum(1, keepdims=True)))
-    np.put_along_axis(quats, largest[:, None], rest, 1)
-    return normalized_quats(quats)
+    return with_largest(tags - 252, (packed[:, :3] / 127.5 - 1) * math.sqrt(0.5))
 
 
 def _webp(pixels: np.ndarray) -> bytes:
@@ -288,14 +280,14 @@ def _webp(pixels: np.ndarray) -> bytes:
     return file.getvalue()
 
 
-def _read_picture(data: bytes, name: str) -> np.ndarray:
-    """(H, W, 4) uint8."""
+def _read_picture(data: bytes, most: int, name: str) -> np.ndarray:
+    """(H, W, 4) uint8, of at most `most` pixels."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as picture:
                 # Opened, not decoded.
-                if picture.width * picture.height > _MOST_PIXELS or picture.mode not in ("RGB", "RGBA"):
+                if picture.width * picture.height > most or picture.mode not in ("RGB", "RGBA"):
                     found = f"{picture.width} x {picture.height} pixels of {picture.mode}"
                     raise HyrfDataError(f"{name} has {found}, not RGB or too many; it is damaged")
                 return np.asarray(picture.convert("RGBA"))
@@ -306,12 +298,14 @@ def _read_picture(data: bytes, name: str) -> np.ndarray:
 
 
 def _member(archive: zipfile.ZipFile, file: str, room: int, name: str) -> zipfile.ZipInfo:
-    """A file of the zip, at most `room` bytes large."""
+    """A file of the zip, at most `room` bytes large, packed in a way that is unpacked piece by piece."""
     if file not in archive.NameToInfo:
         raise HyrfDataError(f"{name}: the zip has no {file}; it is no SOG, or damaged")
     member = archive.getinfo(file)
     if member.file_size > room:
         raise HyrfDataError(f"{name}: {file} unpacks to {member.file_size:,} bytes, far too many; it is damaged")
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others pay no heed to the size
+        raise HyrfDataError(f"{name}: {file} is packed by method {member.compress_type}; zip it stored or deflated")
     return member
 
 
@@ -334,7 +328,9 @@ def _parse(data: bytes, name: str) -> dict:
         raise HyrfDataError(f"{name}: {META} holds no SOG; it is damaged")
     version = meta.get("version", 1)  # the first had none
     if version != 2:
-        raise HyrfDataError(f"{name}: this is SOG version {version!r} and 2 is read; convert it with splat-transform")
+        raise HyrfDataError(
+            f"{name}: this is SOG version {version!r:.40} and 2 is read; convert it with splat-transform"
+        )
     return meta
 
 
@@ -351,7 +347,7 @@ def _file(meta: dict, group: str, number: int, name: str) -> str:
     listed = meta[group].get("files") if isinstance(meta.get(group), dict) else None
     file = listed[number] if isinstance(listed, list) and number < len(listed) else None
     if not isinstance(file, str) or not file.isprintable() or file in ("", "..") or set(file) & set("/\\:"):
-        raise HyrfDataError(f"{name}: {META} names {file!r} as picture {number + 1} of {group}; it is damaged")
+        raise HyrfDataError(f"{name}: {META} names {file!r:.80} as picture {number + 1} of {group}; it is damaged")
     return file
 
 

@@ -27,6 +27,7 @@ import zstandard
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.export.formats.checked import checked_splats
+from hyrfpack.export.formats.smallest_three import with_largest, without_largest
 from hyrfpack.export.harmonics import MAX_DEGREE, harmonics_rotation, terms_of
 from hyrfpack.export.splats import Splats
 from hyrfpack.parallel.pool import run_tasks
@@ -56,7 +57,6 @@ _HIGHEST_RATIO = 100
 
 _FLIPS = np.array([1.0, -1.0, -1.0])  # half a turn about x: RDF <-> RUB, its own inverse
 _SQRT_2 = np.sqrt(2.0)
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # of the components 0 to 3 all but one
 
 # What each byte stands for.
 _BYTES = np.arange(256, dtype=np.float64)
@@ -308,32 +308,24 @@ def _unpack_positions(packed: np.ndarray, bits: int, version: int) -> np.ndarray
 def _pack_quats(quats: np.ndarray) -> np.ndarray:
     """Quaternions (N, 4) wxyz as (N,) uint32: in the 2 high bits which of x, y, z, w is largest, then the other three
     in this order: a sign and 9 bits of the magnitude, of which 511 is sqrt(1/2)."""
-    quats = quats[:, [1, 2, 3, 0]] * np.float32([1, -1, -1, 1])
-    largest = np.abs(quats).argmax(axis=1)
-    negative = np.take_along_axis(quats, largest[:, None], axis=1) < 0  # -q is the same rotation as q
-    others = np.take_along_axis(quats, _OTHERS[largest], axis=1)
+    largest, others = without_largest(quats[:, [1, 2, 3, 0]] * np.float32([1, -1, -1, 1]))
     sizes = np.minimum(np.rint(np.abs(others) * (511 * _SQRT_2)), 511).astype(np.uint32)
-    codes = sizes | ((others < 0) ^ negative).astype(np.uint32) << 9
+    codes = sizes | (others < 0).astype(np.uint32) << 9
     return (largest.astype(np.uint32) << 30 | codes[:, 0] << 20 | codes[:, 1] << 10 | codes[:, 2]).astype("<u4")
 
 
 def _unpack_quats(packed: np.ndarray, version: int) -> np.ndarray:
     """(N, 4) float32 wxyz."""
-    count = len(packed) // (4 if version >= 3 else 3)
-    quats = np.empty((count, 4), np.float32)  # xyzw
     if version >= 3:
         words = packed.view("<u4")
         codes = words[:, None] >> np.uint32([20, 10, 0])
         sizes = (codes & 511).astype(np.float32) * np.float32(1 / (511 * _SQRT_2))
         others = np.where(codes & 512, -sizes, sizes)
-        largest = (words >> 30).astype(np.intp)
-        np.put_along_axis(quats, _OTHERS[largest], others, axis=1)
+        quats = with_largest(words >> 30, others)
     else:
         others = _AXIS_OF[packed.reshape(-1, 3)]
-        largest = np.full(count, 3)
-        quats[:, :3] = others
-    np.put_along_axis(quats, largest[:, None], np.sqrt(np.maximum(0, 1 - (others**2).sum(1, keepdims=True))), axis=1)
-    return quats[:, [3, 0, 1, 2]] * np.float32([1, 1, -1, -1])
+        quats = with_largest(np.full(len(others), 3), others)
+    return quats[:, [3, 0, 1, 2]] * np.float32([1, 1, -1, -1])  # of xyzw
 
 
 def _pack_harmonics(harmonics: np.ndarray) -> np.ndarray:

@@ -43,9 +43,12 @@ function cameraOf({ rows, translation, width, height, fx, fy, cx, cy }, scene) {
 
 // What one looks through: a view that can be moved.
 class Eye {
-  constructor(scene) {
+  // `views` tell how large the scene is.
+  constructor(scene, views) {
     this.up = turned(scene.up);
     this.middle = turned(sub(scene.target, scene.center)).map((value) => value / scene.unit);
+    const distances = views.map((view) => Math.hypot(...sub(view.eye, this.middle))).sort((a, b) => a - b);
+    this.size = distances[distances.length >> 1];
   }
 
   // Stand where a view is taken from. Orbits go about the point on its axis that is nearest to the scene's middle.
@@ -53,9 +56,8 @@ class Eye {
     this.position = view.eye;
     this.rows = view.rows;
     this.focal = view.fy / Math.sqrt(view.width * view.height);
-    const away = sub(this.middle, this.position);
-    const ahead = dot(away, this.rows[2]);
-    this.pace = Math.max(ahead, 0.2 * Math.hypot(...away)) || 1;
+    const ahead = dot(sub(this.middle, this.position), this.rows[2]);
+    this.pace = Math.max(ahead, 0.3 * this.size) || 1; // cameras among the scene look past its middle
     this.target = add(this.position, mul(this.rows[2], this.pace));
   }
 
@@ -84,6 +86,7 @@ class Eye {
     const across = Math.hypot(...level) > 0.3 ? unit(level) : unit(cross(this.rows[2], this.up));
     const elevation = Math.asin(Math.max(-1, Math.min(1, dot(this.rows[2], this.up))));
     const most = 1.55;
+    if (dot(this.rows[1], this.up) > 0) yaw = -yaw; // upside down: what is seen still follows the pointer
     pitch = Math.max(Math.min(-most, elevation), Math.min(Math.max(most, elevation), elevation + pitch)) - elevation;
     const turn = (vector) => rotate(rotate(vector, across, pitch), this.up, yaw);
     this.rows = this.rows.map(turn);

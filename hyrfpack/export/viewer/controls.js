@@ -1,6 +1,6 @@
 // Mouse, fingers and keys move the eye.
 
-const TAP = { pixels: 8, ms: 350 };
+const TAP = { pixels: 8, apart: 30, ms: 350 }; // a finger's second tap lies near the first, not on it
 const ORBIT = 3.6; // radians across a window of the focal length's size
 const FLY = { W: [0, 0, 1], S: [0, 0, -1], A: [-1, 0, 0], D: [1, 0, 0], Q: [0, 1, 0], E: [0, -1, 0] };
 const LOOK = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }; // yaw, pitch
@@ -16,10 +16,11 @@ class Controls {
     canvas.addEventListener("pointerdown", (event) => this.down(event));
     canvas.addEventListener("pointermove", (event) => this.drag(event));
     for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => this.lift(event));
+    canvas.addEventListener("lostpointercapture", (event) => this.pointers.delete(event.pointerId));
     canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     addEventListener("keydown", (event) => this.key(event));
-    addEventListener("keyup", (event) => this.held.delete(nameOf(event)));
+    addEventListener("keyup", (event) => this.release(event));
     addEventListener("blur", () => this.held.clear());
   }
 
@@ -53,11 +54,9 @@ class Controls {
 
   down(event) {
     this.canvas.setPointerCapture(event.pointerId);
-    this.canvas.focus({ preventScroll: true });
     const { clientX: x, clientY: y, timeStamp: time } = event;
     this.pointers.set(event.pointerId, { x, y });
     this.start = this.pointers.size === 1 && event.button === 0 ? { x, y, time } : null;
-    event.preventDefault();
   }
 
   drag(event) {
@@ -81,10 +80,10 @@ class Controls {
   lift(event) {
     this.pointers.delete(event.pointerId);
     const { clientX: x, clientY: y, timeStamp: time } = event;
-    const near = (to) => to && Math.hypot(x - to.x, y - to.y) < TAP.pixels && time - to.time < TAP.ms;
-    if (event.type !== "pointerup" || !near(this.start)) {
+    const near = (to, pixels) => to && Math.hypot(x - to.x, y - to.y) < pixels && time - to.time < TAP.ms;
+    if (event.type !== "pointerup" || !near(this.start, TAP.pixels)) {
       this.tapped = null;
-    } else if (near(this.tapped)) {
+    } else if (near(this.tapped, TAP.apart)) {
       this.tapped = null;
       this.pick(x, y);
     } else {
@@ -95,18 +94,23 @@ class Controls {
   }
 
   wheel(event) {
-    const lines = event.deltaMode === 1 ? 16 : event.deltaMode === 2 ? 400 : 1;
+    const lines = event.deltaMode === 1 ? 33 : event.deltaMode === 2 ? 400 : 1;
     const much = event.ctrlKey ? 0.01 : 0.0012; // a trackpad's pinch comes as Ctrl and a wheel of small steps
-    const steps = Math.max(-400, Math.min(400, event.deltaY * lines));
-    this.eye.zoom(Math.exp(steps * much), ...this.fromMiddle(event.clientX, event.clientY));
+    const step = Math.max(-0.5, Math.min(0.5, event.deltaY * lines * much));
+    this.eye.zoom(Math.exp(step), ...this.fromMiddle(event.clientX, event.clientY));
     event.preventDefault();
     this.changed();
   }
 
+  release(event) {
+    if (event.key === "Meta") this.held.clear(); // macOS tells of no letter that was let go meanwhile
+    else this.held.delete(nameOf(event));
+  }
+
   key(event) {
-    const typing = event.target.closest?.("input, select, dialog");
-    if (event.ctrlKey || event.metaKey || event.altKey || typing) return;
     const key = nameOf(event);
+    const theirs = event.target.closest?.(LOOK[key] ? "input, select, dialog" : "select, dialog"); // not ours
+    if (event.ctrlKey || event.metaKey || event.altKey || theirs) return;
     if (FLY[key] || LOOK[key] || key === "Shift") {
       this.held.add(key);
       if (LOOK[key]) event.preventDefault();
@@ -117,10 +121,10 @@ class Controls {
   }
 }
 
-// Letters by their place on the keyboard where they fly, so that other layouts fly as well.
+// Letters by their place on the keyboard where they fly, or are not Latin, so that other layouts work as well.
 function nameOf(event) {
   const place = event.code.startsWith("Key") ? event.code.slice(3) : "";
-  return FLY[place] ? place : event.key.length === 1 ? event.key.toUpperCase() : event.key;
+  return FLY[place] || event.key > "~" ? place : event.key.length === 1 ? event.key.toUpperCase() : event.key;
 }
 
 // The middle of all pointers and how far they are from it.

@@ -9,6 +9,8 @@ const LONGEST_STEP = 0.1; // s that a held key flies in one frame
 const element = (name) => document.getElementById(name);
 const textOf = (name) => element(name).textContent;
 
+const lost = () => new Error("The graphics device was taken away from this page; reload the page to go on.");
+
 function fail(error) {
   element("loading").hidden = true;
   element("message").textContent = error.message;
@@ -22,7 +24,7 @@ class Page {
     this.renderer = new Renderer(this.canvas, this.scene);
     this.splats = new Splats(this.scene);
     this.cameras = this.scene.cameras.map((camera) => viewOf(camera, this.scene));
-    this.eye = new Eye(this.scene);
+    this.eye = new Eye(this.scene, this.cameras);
     this.frames = 0; // drawn so far
     this.moved = -Infinity; // when
     this.began = null; // when the frame that is being drawn was begun
@@ -40,17 +42,20 @@ class Page {
     this.choose(0);
     this.canvas.addEventListener("webglcontextlost", () => {
       this.loaded = false;
-      fail(new Error("The graphics device was taken away from this page; reload the page to go on."));
+      fail(lost());
     });
-    new ResizeObserver(() => this.fit()).observe(this.canvas);
+    new ResizeObserver(() => this.wake()).observe(this.canvas);
+    addEventListener("resize", () => this.wake()); // also to a screen of other density
   }
 
   async load() {
     const picture = element("background");
     const [unpacked] = await Promise.all([this.splats.unpack((part) => (element("bar").value = part)), picture?.decode()]);
+    if (this.renderer.gl.isContextLost()) throw lost();
     this.renderer.load(unpacked, picture);
     this.loaded = true;
     element("loading").hidden = true;
+    this.fit();
     this.resort();
   }
 
@@ -65,13 +70,13 @@ class Page {
     return this.controls.active || performance.now() - this.moved < SETTLED;
   }
 
+  // Give the canvas the window's size. That blanks it, so it is drawn to at once.
   fit() {
     const dense = Math.min(devicePixelRatio, DENSEST);
     const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((side) => Math.max(1, Math.round(side * dense)));
     if (this.canvas.width === width && this.canvas.height === height) return;
     [this.canvas.width, this.canvas.height] = [width, height];
     this.stale = this.unsorted = true;
-    this.wake();
   }
 
   changed() {
@@ -95,6 +100,7 @@ class Page {
     this.scheduled = false;
     if (!this.loaded) return;
     if (this.renderer.busy()) return this.wake();
+    this.fit();
     if (this.began !== null) this.measure(now - this.began);
     this.began = null;
     if (this.controls.advance(Math.min(LONGEST_STEP, (now - (this.before ?? now)) / 1000))) this.changed();
@@ -220,6 +226,7 @@ class Page {
     if (name !== "camera") return;
     try {
       await this.show(JSON.parse(decodeURIComponent(value)));
+      element("message").hidden = this.loaded; // what was said of the address before
     } catch (error) {
       throw new Error(`The address names no camera that can be used: ${error.message}.`);
     }

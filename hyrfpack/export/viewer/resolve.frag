@@ -1,6 +1,7 @@
 #version 300 es
 // The blended splats over the background.
 precision highp float;
+precision highp sampler2D; // else lowp, which phones take at its word
 
 uniform sampler2D u_splats; // premultiplied, row 0 on top; a part of it is in use
 uniform vec2 u_used; // its size in texels

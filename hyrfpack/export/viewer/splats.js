@@ -17,16 +17,20 @@ class Splats {
   async unpack(progress) {
     const { count, degree } = this.scene;
     const unpacked = new Promise((resolve, reject) => {
-      this.worker.onerror = (event) => reject(new Error(`The scene cannot be unpacked: ${event.message}.`));
+      this.worker.onerror = ({ message }) => reject(damaged(message));
       this.worker.onmessage = ({ data }) => {
         if (data.done) progress(data.done);
-        if (data.error) reject(new Error(data.error));
+        if (data.error) reject(damaged(data.error));
         if (data.splats) resolve(data.splats);
         if (data.order) this.sorted(data.order);
       };
     });
     this.worker.postMessage({ start: { count, degree, width: TEXTURE_WIDTH } });
-    for await (const bytes of payload()) this.worker.postMessage({ bytes }, [bytes.buffer]);
+    try {
+      for await (const bytes of payload()) this.worker.postMessage({ bytes }, [bytes.buffer]);
+    } catch ({ message }) {
+      throw damaged(message);
+    }
     this.worker.postMessage({ end: true });
     return unpacked;
   }
@@ -63,6 +67,8 @@ class Splats {
     this.spare = order;
   }
 }
+
+const damaged = (why) => new Error(`The scene cannot be unpacked; if this page is not whole, fetch it again (${why}).`);
 
 // The bytes in the page's blocks of base64, as they come in. Each block is dropped once it is read.
 async function* payload() {

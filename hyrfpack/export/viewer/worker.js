@@ -6,7 +6,7 @@
 // Out:  {done}                               part unpacked, 0 to 1
 //       {splats: {places, looks, harmonics, antialiased, height}}
 //       {order: {ticket, order, drawn}}
-//       {error}                              a sentence
+//       {error}                              why it cannot be unpacked
 "use strict";
 
 const MAGIC = 0x5053474e;
@@ -22,7 +22,7 @@ onmessage = ({ data }) => {
     expected = data.start;
     const gzip = new DecompressionStream("gzip");
     writer = gzip.writable.getWriter();
-    read(gzip.readable.getReader()).catch((error) => postMessage({ error: `The scene cannot be unpacked: ${error.message}.` }));
+    read(gzip.readable.getReader()).catch(({ message }) => postMessage({ error: message }));
   } else if (data.bytes) {
     writer.write(data.bytes).catch(() => {}); // the reader reports it
   } else if (data.end) {
