@@ -40,6 +40,8 @@ _PUBLIC = {
     "TrainConfig": "hyrfpack.train",
     "TrainResult": "hyrfpack.train",
     "Evaluation": "hyrfpack.evaluate",
+    "DistillConfig": "hyrfpack.distill",
+    "DistillReport": "hyrfpack.distill",
     "ExportReport": "hyrfpack.export",
     "CompressionReport": "hyrfpack.format",
     "describe": "hyrfpack.format",
@@ -47,7 +49,7 @@ _PUBLIC = {
     "save": "hyrfpack.format",
 }
 # Sub-packages that are also the one function they are about: `hyrfpack.render(...)` calls `hyrfpack.render.render`.
-_CALLABLE = ("bench", "compress", "evaluate", "export", "render", "train")
+_CALLABLE = ("bench", "compress", "distill", "evaluate", "export", "render", "train")
 
 __all__ = ["__version__", *_CALLABLE, *_PUBLIC]
 

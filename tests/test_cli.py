@@ -21,7 +21,19 @@ from hyrfpack.cli.train import PRESETS, train
 from hyrfpack.data.demo_scene import write_demo_scene
 from hyrfpack.format import load
 
-COMMANDS = ("train", "compress", "decompress", "render", "evaluate", "info", "bench", "demo", "export", "view")
+COMMANDS = (
+    "train",
+    "compress",
+    "decompress",
+    "render",
+    "evaluate",
+    "info",
+    "bench",
+    "demo",
+    "export",
+    "view",
+    "import",
+)
 
 
 def python(code: str) -> subprocess.CompletedProcess:

@@ -124,7 +124,7 @@ def test_models_that_cannot_be_read_are_one_sentence(command, model, tmp_path, m
 
 
 def test_help_names_every_ending():
-    from hyrfpack.export.run import ENDINGS
+    from hyrfpack.export.kinds import ENDINGS
 
     printed = succeeded("export", "--help").stdout
     assert all(re.search(rf"{re.escape(ending)}\b", printed) for ending in ENDINGS)

@@ -16,6 +16,7 @@ from hyrfpack.cli.bench import bench
 from hyrfpack.cli.demo import demo
 from hyrfpack.cli.export import export
 from hyrfpack.cli.files import compress, decompress, info
+from hyrfpack.cli.imports import import_
 from hyrfpack.cli.train import train
 from hyrfpack.cli.view import view
 from hyrfpack.cli.views import evaluate, render
@@ -60,5 +61,5 @@ def main() -> None:
     """
 
 
-for _command in (train, compress, decompress, render, evaluate, export, view, bench, info, demo):
+for _command in (train, compress, decompress, render, evaluate, export, view, import_, bench, info, demo):
     main.add_command(_command)

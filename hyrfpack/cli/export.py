@@ -59,6 +59,7 @@ degree_option = click.option(
 @click.option(
     "--data", type=PATH, help="Photos of the scene: for a file that keeps no cameras, and to score held-out ones."
 )
+@click.option("--spz-version", type=click.Choice(["3", "4"]), default="3", show_default=True, help="Of .spz files.")
 @scene_options
 @json_option
 def export(
@@ -68,6 +69,7 @@ def export(
     crop: tuple[float, ...] | None,
     min_opacity: float,
     background: bool,
+    spz_version: str,
     data: Path | None,
     test_every: int,
     images: str | None,
@@ -103,6 +105,7 @@ def export(
         crop=crop,
         min_opacity=min_opacity,
         background=background,
+        spz_version=int(spz_version),
         say=note,
     )
     if as_json:

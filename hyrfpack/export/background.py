@@ -16,7 +16,7 @@ from torch import Tensor
 from hyrfpack.export.bake import refuse_nonfinite, small_camera
 from hyrfpack.export.harmonics import BAND_0
 from hyrfpack.export.splats import Splats
-from hyrfpack.model import BACKGROUND_RADIUS, Geometry, HybridModel, viewpoint_of
+from hyrfpack.model import BACKGROUND_RADIUS, Frame, Geometry, HybridModel, viewpoint_of
 from hyrfpack.ops.background import pixel_directions, sphere_points
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
@@ -43,7 +43,7 @@ POINTS_AT_ONCE = 1 << 18
 
 @torch_on_one_thread()
 @torch.no_grad()
-def background_splats(model: HybridModel, cameras: Sequence[Camera]) -> Splats:
+def background_splats(model: HybridModel, cameras: Sequence[Camera], largest_scale: float = math.inf) -> Splats:
     """The background as round splats of one colour each (degree 0) around the scene, world units.
 
     They tile a sphere of `BACKGROUND_RADIUS` about the frame's centre, or somewhat larger where they are coarse, and
@@ -55,6 +55,7 @@ def background_splats(model: HybridModel, cameras: Sequence[Camera]) -> Splats:
     Args:
         model: on the CPU.
         cameras: from where it was photographed, world units; without any, cells are divided where colours differ.
+        largest_scale: that the splats may have, world units: where they would be larger, the whole sphere is smaller.
 
     Returns:
         Splats to be drawn together with the model's; none when the model has no learnt background.
@@ -69,6 +70,8 @@ def background_splats(model: HybridModel, cameras: Sequence[Camera]) -> Splats:
     directions, sides, levels, colors = _tile(sums, largest, max(LEAST_SPLATS, int(MOST_SHARE * len(model))))
     radii = BACKGROUND_RADIUS * RECEDE ** (levels.max() - levels)
     count, frame = len(colors), model.config.frame
+    shrink = min(1.0, largest_scale / (SPREAD * sides * radii * frame.scale).max())
+    radii = shrink * radii
     scales = SPREAD * sides * radii * frame.scale
     return Splats(
         frame.to_world(directions * radii[:, None]),
@@ -78,6 +81,12 @@ def background_splats(model: HybridModel, cameras: Sequence[Camera]) -> Splats:
         ((colors - 0.5) / BAND_0)[:, None],
         model.config.antialiased,
     )
+
+
+def background_reach(frame: Frame) -> float:
+    """How far from the world's origin, along an axis, splats of the background may lie: world units."""
+    farthest = BACKGROUND_RADIUS * RECEDE ** (FINEST - COARSEST)
+    return float(np.abs(frame.center).max()) + farthest * frame.scale
 
 
 @torch_on_one_thread()

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.export.harmonics import harmonics_basis, terms_of
+from hyrfpack.export.harmonics import fibonacci_sphere, harmonics_basis, terms_of
 from hyrfpack.export.splats import Splats, normalized_quats
 from hyrfpack.model import Geometry, HybridModel, viewpoint_of
 from hyrfpack.ops.rasterize import rasterize
@@ -134,7 +134,7 @@ def _fit(model: HybridModel, views: Sequence[_View], light: Tensor, degrees: Ite
     shading, positions = model.shading(), model.gaussians.positions.detach()
     fitted = {degree: positions.new_empty(len(model), terms_of(degree), 3) for degree in degrees}
     highest = max(fitted)
-    sphere = fibonacci_sphere(SPHERE_DIRECTIONS)
+    sphere = fibonacci_sphere(SPHERE_DIRECTIONS).float()
     edges = torch.arange(0, len(model) + BLOCK, BLOCK)
     ranges = [torch.searchsorted(view.index, edges) for view in views]
 
@@ -173,14 +173,6 @@ def _equations(directions: Tensor, shading: Shading, weights: Tensor, degree: in
 
 def _part(shading: Shading, index: Tensor | slice) -> Shading:
     return replace(shading, first_layer=shading.first_layer[index], color_logits=shading.color_logits[index])
-
-
-def fibonacci_sphere(count: int) -> Tensor:
-    """(count, 3) unit vectors spread evenly over the sphere: points of a Fibonacci lattice."""
-    numbers = torch.arange(count, dtype=torch.float64)
-    heights, angles = 1 - (2 * numbers + 1) / count, torch.pi * (1 + 5**0.5) * numbers
-    radii = (1 - heights**2).sqrt()
-    return torch.stack((radii * angles.cos(), radii * angles.sin(), heights), -1).float()
 
 
 def refuse_nonfinite(name: str, values: Tensor) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 
 from hyrfpack.atomic import make_folder, replacing
 from hyrfpack.errors import needs_package
-from hyrfpack.export.harmonics import BAND_0
 from hyrfpack.export.splats import Splats
 from hyrfpack.scene import Camera, evenly_spaced
 
@@ -60,7 +59,7 @@ def write_colmap(
     if points is not None:
         solid = np.flatnonzero(points.opacities >= _MIN_OPACITY)
         chosen = points[np.array(evenly_spaced(solid, max_points), np.int64)]
-        colors = np.round(255 * np.clip(0.5 + BAND_0 * chosen.harmonics[:, 0], 0, 1)).astype(np.uint8)
+        colors = np.round(255 * chosen.base_colors).astype(np.uint8)
         for position, color in zip(chosen.positions, colors, strict=True):
             model.add_point3D(position, pycolmap.Track(), color)
 

@@ -18,7 +18,9 @@ READ = (".ply", ".splat", ".spz", ".sog")  # by `read_splats`; .compressed.ply i
 MAX_BYTES = 1 << 32  # of a file to be read: 17 million Gaussians as PLY
 
 
-def encode_splats(splats: Splats, extension: str, *, up: np.ndarray, camera: Camera | None) -> bytes:
+def encode_splats(
+    splats: Splats, extension: str, *, up: np.ndarray, camera: Camera | None, spz_version: int = 3
+) -> bytes:
     """Splats as the bytes of a file.
 
     Args:
@@ -26,6 +28,7 @@ def encode_splats(splats: Splats, extension: str, *, up: np.ndarray, camera: Cam
         extension: one of WRITTEN. ".splat" holds no harmonics beyond degree 0.
         up: (3,) unit vector in the world, for the formats that know up (glTF, USD).
         camera: to look from first, for the formats that hold one (USD).
+        spz_version: 3 or 4, see `spz.encode`.
 
     Raises:
         HyrfError: the format's package is missing.
@@ -34,7 +37,9 @@ def encode_splats(splats: Splats, extension: str, *, up: np.ndarray, camera: Cam
         return usd.encode(splats, extension=extension[1:], up=up, camera=camera)
     if extension == ".glb":
         return gltf.encode(splats, up=up)
-    return {".ply": ply, ".splat": splat, ".spz": spz, ".sog": sog}[extension].encode(splats)
+    if extension == ".spz":
+        return spz.encode(splats, spz_version)
+    return {".ply": ply, ".splat": splat, ".sog": sog}[extension].encode(splats)
 
 
 def decode_splats(data: bytes, extension: str, name: str) -> Splats:

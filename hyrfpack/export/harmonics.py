@@ -60,11 +60,7 @@ def harmonics_rotation(rotation: np.ndarray, degree: int) -> np.ndarray:
     Returns:
         (K, K) float64, K = (degree + 1)^2; orthogonal, block-diagonal by bands.
     """
-    count = 64  # points of a Fibonacci lattice: well-conditioned for 16 unknowns
-    heights = 1 - (2 * np.arange(count) + 1) / count
-    angles = np.pi * (1 + 5**0.5) * np.arange(count)
-    radii = np.sqrt(1 - heights**2)
-    directions = np.stack((radii * np.cos(angles), radii * np.sin(angles), heights), axis=1)
+    directions = fibonacci_sphere(64).numpy()  # well-conditioned for 16 unknowns
     turned = directions @ np.asarray(rotation, np.float64)  # rows R^T d
     before, after = (harmonics_basis(torch.from_numpy(rows), degree).numpy() for rows in (turned, directions))
     blocks = np.zeros((terms_of(degree), terms_of(degree)))
@@ -72,3 +68,11 @@ def harmonics_rotation(rotation: np.ndarray, degree: int) -> np.ndarray:
         own = slice(band**2, terms_of(band))
         blocks[own, own] = np.linalg.lstsq(after[:, own], before[:, own], rcond=None)[0]
     return blocks
+
+
+def fibonacci_sphere(count: int) -> Tensor:
+    """(count, 3) float64 unit vectors spread evenly over the sphere: points of a Fibonacci lattice."""
+    numbers = torch.arange(count, dtype=torch.float64)
+    heights, angles = 1 - (2 * numbers + 1) / count, torch.pi * (1 + 5**0.5) * numbers
+    radii = (1 - heights.square()).sqrt()
+    return torch.stack((radii * angles.cos(), radii * angles.sin(), heights), -1)

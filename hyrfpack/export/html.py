@@ -125,7 +125,7 @@ def decode_page(data: bytes, name: str) -> tuple[Splats, np.ndarray | None]:
             splats = replace(local, positions=local.positions * unit + middle, scales=local.scales * np.float32(unit))
         picture = re.search(rb'<img id="background"[^>]*base64,([^"]*)"', data)
         return splats, None if picture is None else _read_webp(base64.b64decode(picture[1], validate=True))
-    except (KeyError, TypeError, ValueError, OverflowError, RecursionError, OSError) as error:
+    except (LookupError, TypeError, ValueError, ArithmeticError, RecursionError, OSError) as error:
         raise HyrfDataError(f"{name}: this is no page of hyrfpack's, or it is damaged; export it again") from error
 
 
@@ -153,8 +153,11 @@ def _webp(picture: np.ndarray) -> str:
 
 def _read_webp(data: bytes) -> np.ndarray:
     """The inverse of `_webp`, but for what WebP loses: (H, W, 3) float32 in [0, 1]."""
-    with Image.open(io.BytesIO(data), formats=("WEBP",)) as picture:
-        return np.asarray(picture.convert("RGB"), np.float32) / 255
+    try:
+        with Image.open(io.BytesIO(data), formats=("WEBP",)) as picture:
+            return np.asarray(picture.convert("RGB"), np.float32) / 255
+    except Image.DecompressionBombError as error:
+        raise ValueError(error) from error
 
 
 def _policy(style: str, script: str) -> str:

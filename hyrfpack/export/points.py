@@ -9,7 +9,6 @@ import numpy as np
 
 from hyrfpack.errors import HyrfDataError, needs_package
 from hyrfpack.export.formats.gltf import GLTF_UP, linear_colors
-from hyrfpack.export.harmonics import BAND_0
 from hyrfpack.export.placement import local_origin, local_positions, upright_rotation
 from hyrfpack.export.splats import Splats
 from hyrfpack.scene import Camera
@@ -77,8 +76,7 @@ def _ply(splats: Splats, frusta: np.ndarray, origin: np.ndarray) -> bytes:
     kind = [("position", "<f8" if origin.any() else "<f4", 3), ("color", "u1", 4)]
     vertices = np.empty(len(splats) + len(dots), kind)
     vertices["position"] = np.concatenate((splats.positions, dots))
-    srgb = np.clip(0.5 + BAND_0 * splats.harmonics[:, 0], 0, 1)
-    vertices["color"][: len(splats)] = np.round(255 * np.column_stack((srgb, splats.opacities)))
+    vertices["color"][: len(splats)] = np.round(255 * np.column_stack((splats.base_colors, splats.opacities)))
     vertices["color"][len(splats) :] = _CAMERA_COLOR
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     header += [f"property {number} {axis}" for axis in "xyz"]

@@ -2,39 +2,40 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from hyrfpack.atomic import check_writable, write_atomic
-from hyrfpack.errors import HyrfError, needs_package
-from hyrfpack.export.background import background_picture, background_splats
+from hyrfpack.atomic import write_atomic
+from hyrfpack.errors import HyrfError
+from hyrfpack.export.background import background_picture, background_reach, background_splats
 from hyrfpack.export.bake import bake
 from hyrfpack.export.cameras import encode_transforms, write_colmap
-from hyrfpack.export.files import USD, WRITTEN, decode_splats, encode_splats
+from hyrfpack.export.choice import chosen, kept_of
+from hyrfpack.export.files import decode_splats, encode_splats
+from hyrfpack.export.formats import spz
 from hyrfpack.export.harmonics import MAX_DEGREE
 from hyrfpack.export.html import decode_page, encode_page
+from hyrfpack.export.kinds import COLMAP, PAGE, POINTS, TRANSFORMS, check_reach, check_request, kind_of
 from hyrfpack.export.measure import likeness
 from hyrfpack.export.points import encode_points
 from hyrfpack.export.source import Source
 from hyrfpack.export.splats import Splats, concatenate
-from hyrfpack.model import HybridModel
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Scene, evenly_spaced
 
-PAGE, TRANSFORMS, COLMAP = ".html", ".json", ""
-POINTS = (".points.ply", ".points.glb")
-ENDINGS = (*POINTS, *WRITTEN, PAGE, TRANSFORMS)
-# What is imported for an ending alone, and what pip calls it.
-PACKAGES = {**dict.fromkeys(USD, ("pxr", "usd-core")), ".points.glb": ("trimesh",) * 2, COLMAP: ("pycolmap",) * 2}
 PAGE_CAMERAS = 12  # that a page can be stepped through
 COARSE = 3.0  # dB that a format may cost before something is said about it
 INVISIBLE = 50.0  # dB from which on no difference can be seen, and none is told
+
+NO_CAMERAS = "places around the scene, for the file keeps no cameras (--data names photos)"
+
+Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,8 @@ def export(
     crop: Sequence[float] | None = None,
     min_opacity: float = 0.0,
     background: bool = True,
-    say: Callable[[str], None] = lambda sentence: None,
+    spz_version: int = 3,
+    say: Say = lambda sentence: None,
 ) -> ExportReport:
     """Write a `.hyrf` model as what other programs read, in its own axes and units, and measure what was lost.
 
@@ -100,70 +102,144 @@ def export(
             background, are left out. Infinite numbers leave a side open.
         min_opacity: fainter Gaussians are left out.
         background: whether the model's background goes along.
+        spz_version: of ".spz", 3 (which all programs read) or 4.
         say: told what is going on.
 
     Raises:
         HyrfError: a file cannot be read or written, or the options do not go together.
     """
     kind = kind_of(target)
-    _check(kind, target, degree, crop, min_opacity)
+    check_request(kind, target, degree, crop, min_opacity)
     read = Source.read(source, data)
     if kind in (TRANSFORMS, COLMAP) and not read.cameras:
         raise HyrfError(f"{source}: it keeps no cameras; export them from the file that training wrote, or name --data")
     if kind == TRANSFORMS:
-        frames = encode_transforms(read.cameras)
-        write_atomic(target, frames)
-        return ExportReport(str(target), len(frames), cameras=len(read.cameras))
-    _check_choice(read.model, crop, min_opacity)
+        return _export_cameras(read, target)
+    sphere = background and crop is None and read.model.config.background and kind not in (COLMAP, *POINTS)
+    _check_model(read, kind, crop, min_opacity, sphere)
     degree = 0 if kind in (".splat", COLMAP, *POINTS) else degree
-    where = (
+    places = (
         "cameras" if read.cameras else "places around the scene, for the file keeps no cameras (--data names photos)"
     )
-    say(f"fitting colours of degree {degree} at {len(read.fitted)} {where}")
+    say(f"fitting colours of degree {degree} at {len(read.fitted)} {places}")
     if kind in (COLMAP, *POINTS):
         return _export_points(read, kind, target, chosen(bake(read.model, read.fitted, (0,))[0], crop, min_opacity))
-    measured = read.measured if crop is None else []
-    degrees = range(degree + 1) if measured else (degree,)
+    degrees = (degree,) if crop is not None else range(degree + 1)
     baked = {d: chosen(splats, crop, min_opacity) for d, splats in bake(read.model, read.fitted, degrees).items()}
-    sphere = background and crop is None and read.model.config.background
-    picture = background_picture(read.model) if sphere and kind == PAGE else None
-    behind = background_splats(read.model, read.fitted) if sphere and kind != PAGE else None
-    whole = {d: splats if behind is None else concatenate((splats, behind)) for d, splats in baked.items()}
-    say(f"writing {len(whole[degree]):,} Gaussians")
-    if kind == PAGE:
-        written = page(read, whole[degree], picture, Path(target).stem)
-        back = decode_page(written, str(target))
-    else:
-        first = read.cameras[0][1] if read.cameras else None
-        written = encode_splats(whole[degree], kind, up=read.up, camera=first)
-        back = decode_splats(written, kind, str(target)), None
-    write_atomic(target, written)
-    count = 0 if behind is None else len(behind)
-    report = ExportReport(str(target), len(written), len(whole[degree]), count, degree)
-    if not measured:
-        why = "no photo is held out" if crop is None else "a part of the scene was cropped"
-        say(f"nothing is measured, for {why}")
+    say(f"writing {len(baked[degree]):,} Gaussians{' and the background' if sphere else ''}")
+    pack = _pack_page if kind == PAGE else _pack_splats
+    packed = pack(read, kind, target, baked, degree, sphere, spz_version)
+    write_atomic(target, packed.data)
+    report = ExportReport(str(target), len(packed.data), len(packed.before[degree][0]), packed.background, degree)
+    if crop is not None:
+        say("nothing is measured, for a part of the scene was cropped")
         return report
-    say(f"measuring at {len(measured)} views")
-    contenders = {**{str(d): (splats, picture) for d, splats in whole.items()}, "file": back}
-    scores = likeness(read.model, contenders, measured, sphere=sphere)
+    return _measured(report, read, packed, kind, sphere, say)
+
+
+@dataclass(frozen=True)
+class _Packed:
+    """A file's bytes, and what it shows: splats and the picture behind them.
+
+    Attributes:
+        data: the bytes.
+        before: what was to be written, by degree.
+        after: what is read back.
+        background: how many of the splats make the background.
+    """
+
+    data: bytes
+    before: dict[int, tuple[Splats, np.ndarray | None]]
+    after: tuple[Splats, np.ndarray | None]
+    background: int = 0
+
+
+def _pack_page(
+    read: Source,
+    kind: str,
+    target: str | os.PathLike[str],
+    baked: dict[int, Splats],
+    degree: int,
+    sphere: bool,
+    spz_version: int,
+) -> _Packed:
+    picture = background_picture(read.model) if sphere else None
+    data = page(read, baked[degree], picture, Path(target).stem)
+    before = {d: (splats, picture) for d, splats in baked.items()}
+    return _Packed(data, before, decode_page(data, str(target)))
+
+
+def _pack_splats(
+    read: Source,
+    kind: str,
+    target: str | os.PathLike[str],
+    baked: dict[int, Splats],
+    degree: int,
+    sphere: bool,
+    spz_version: int,
+) -> _Packed:
+    largest = spz.LARGEST_SCALE if kind == ".spz" else math.inf
+    behind = [background_splats(read.model, read.fitted, largest)] if sphere else []
+    whole = {d: concatenate((splats, *behind)) for d, splats in baked.items()}
+    first = read.cameras[0][1] if read.cameras else None
+    data = encode_splats(whole[degree], kind, up=read.up, camera=first, spz_version=spz_version)
+    after = decode_splats(data, kind, str(target)), None
+    return _Packed(data, {d: (splats, None) for d, splats in whole.items()}, after, sum(map(len, behind)))
+
+
+def _measured(report: ExportReport, read: Source, packed: _Packed, kind: str, sphere: bool, say: Say) -> ExportReport:
+    """The report with all PSNR filled in."""
+    if not read.measured:
+        say("nothing is measured, for no photo is held out")
+        return report
+    say(f"measuring at {len(read.measured)} views")
+    contenders = {**{str(d): shown for d, shown in packed.before.items()}, "file": packed.after}
+    scores = likeness(read.model, contenders, read.measured, sphere=sphere)
     if not scores:
         say("nothing is measured, for the masks leave no pixel of the held-out photos")
         return report
-    file, before = scores["file"], scores[str(degree)].model
+    file, before = scores["file"], scores[str(report.degree)].model
     if min(before, INVISIBLE) - file.model > COARSE:
-        if read.model.config.antialiased and not back[0].antialiased:
+        if read.model.config.antialiased and not packed.after[0].antialiased:
             say(f"{kind} cannot tell that the model is antialiased: say so where it is drawn, or choose .spz or .sog")
         else:
             say(f"{kind} is too coarse for this scene, perhaps for its unit of length: choose another format")
     return replace(
         report,
         views=file.views,
-        by_degree={d: scores[str(d)].model for d in whole},
+        by_degree={d: scores[str(d)].model for d in packed.before},
         psnr=file.model,
         photos_model=scores["model"].photos,
         photos_file=file.photos,
     )
+
+
+@torch.no_grad()
+def _check_model(read: Source, kind: str, crop: Sequence[float] | None, min_opacity: float, sphere: bool) -> None:
+    """Refuse a choice that leaves nothing, and a scene too far away, before the bake."""
+    model, frame = read.model, read.model.config.frame
+    positions = frame.to_world(model.gaussians.positions.numpy())
+    if crop is not None or min_opacity > 0:  # the bake makes no Gaussian less faint
+        positions = positions[kept_of(positions, model.decode_geometry().opacities.numpy(), crop, min_opacity)]
+    reach = float(np.abs(positions).max())
+    check_reach(kind, max(reach, background_reach(frame)) if sphere else reach)
+
+
+def _export_cameras(read: Source, target: str | os.PathLike[str]) -> ExportReport:
+    data = encode_transforms(read.cameras)
+    write_atomic(target, data)
+    return ExportReport(str(target), len(data), cameras=len(read.cameras))
+
+
+def _export_points(read: Source, kind: str, target: str | os.PathLike[str], splats: Splats) -> ExportReport:
+    """Centres of splats, and cameras."""
+    if kind == COLMAP:
+        write_colmap(read.cameras, target, splats)
+        size = sum(table.stat().st_size for table in Path(target, "sparse", "0").glob("*.bin"))
+        return ExportReport(str(target), size, cameras=len(read.cameras))
+    data = encode_points(splats, [camera for _, camera in read.cameras], Path(kind).suffix[1:], read.up)
+    write_atomic(target, data)
+    return ExportReport(str(target), len(data), len(splats), cameras=len(read.cameras))
 
 
 def page_of(source: str | os.PathLike[str], degree: int = MAX_DEGREE) -> bytes:
@@ -197,96 +273,3 @@ def page(read: Source, splats: Splats, picture: np.ndarray | None, title: str) -
         solid=read.model.config.solid,
         near=RenderSettings().near * read.model.config.frame.scale,
     )
-
-
-def kind_of(target: str | os.PathLike[str]) -> str:
-    """The ending that decides the format, one of ENDINGS; COLMAP for a folder or a name without ending.
-
-    Raises:
-        HyrfError: it is none of them.
-    """
-    name = Path(target).name.lower()
-    if name.endswith(".compressed.ply"):
-        raise HyrfError(
-            f"{target}: compressed PLY is read, not written; .sog and .spz are small, .ply is not compressed"
-        )
-    for kind in ENDINGS:
-        if name.endswith(kind):
-            return kind
-    if Path(target).is_dir() or not Path(name).suffix:
-        return COLMAP
-    raise HyrfError(
-        f"{target}: the ending names the format; end it in one of {', '.join(ENDINGS)}, or name a folder for COLMAP"
-    )
-
-
-def chosen(splats: Splats, crop: Sequence[float] | None = None, min_opacity: float = 0.0) -> Splats:
-    """Those with centres in the box `crop` and not fainter than `min_opacity`; see `export`.
-
-    Raises:
-        HyrfError: none is left.
-    """
-    keep = _kept(splats.positions, splats.opacities, crop, min_opacity)
-    return splats if keep.all() else splats[keep]
-
-
-def _kept(positions: np.ndarray, opacities: np.ndarray, crop: Sequence[float] | None, min_opacity: float) -> np.ndarray:
-    """(N,) bool: which Gaussians with positions (N, 3) and opacities (N,) `chosen` keeps. HyrfError when none."""
-    keep = opacities >= min_opacity
-    if crop is not None:
-        keep &= ((positions >= crop[:3]) & (positions <= crop[3:])).all(axis=1)
-    if not len(positions):
-        raise HyrfError("no Gaussian is left: no camera sees any; name the photos with --data, or train again")
-    if not keep.any():
-        low, high = (corner.round(4).tolist() for corner in (positions.min(0), positions.max(0)))
-        raise HyrfError(
-            f"no Gaussian is left: centres lie between {low} and {high}, opacities reach {opacities.max():.3f}; "
-            "widen --crop or lower --min-opacity"
-        )
-    return keep
-
-
-def _check(
-    kind: str, target: str | os.PathLike[str], degree: int, crop: Sequence[float] | None, min_opacity: float
-) -> None:
-    """Refuse, before minutes of work, what would fail after them: see `export`."""
-    if degree not in range(MAX_DEGREE + 1):
-        raise HyrfError(f"spherical harmonics of degree {degree} are not known; name 0 to {MAX_DEGREE}")
-    if crop is not None and (np.shape(crop) != (6,) or np.isnan(crop).any()):
-        raise HyrfError(f"the crop {crop} is no box; name the least x, y, z, then the greatest, in world units")
-    if not 0 <= min_opacity <= 1:
-        raise HyrfError(f"an opacity of {min_opacity} cannot be asked for; name 0 to 1")
-    if kind == TRANSFORMS and (crop is not None or min_opacity > 0):
-        raise HyrfError(
-            f"{target}: this holds cameras only, and --crop and --min-opacity choose Gaussians; leave them out"
-        )
-    if kind in PACKAGES:
-        module, package = PACKAGES[kind]
-        with needs_package(package, f"{target}: writing this format"):
-            import_module(module)
-    if kind != COLMAP and Path(target).is_dir():
-        raise HyrfError(f"{target}: this is a folder; name a file in it")
-    place = Path(os.path.realpath(target))
-    place = place.parent if kind != COLMAP else next(path for path in (place, *place.parents) if path.exists())
-    if not place.exists():
-        raise HyrfError(f"{target}: there is no folder '{Path(target).parent}'; make it first")
-    check_writable(place)
-
-
-@torch.no_grad()
-def _check_choice(model: HybridModel, crop: Sequence[float] | None, min_opacity: float) -> None:
-    """Refuse a choice that leaves nothing, before the bake, which makes no Gaussian less faint."""
-    if crop is not None or min_opacity > 0:
-        positions = model.config.frame.to_world(model.gaussians.positions.numpy())
-        _kept(positions, model.decode_geometry().opacities.numpy(), crop, min_opacity)
-
-
-def _export_points(read: Source, kind: str, target: str | os.PathLike[str], splats: Splats) -> ExportReport:
-    """Centres of splats, and cameras."""
-    if kind == COLMAP:
-        write_colmap(read.cameras, target, splats)
-        size = sum(table.stat().st_size for table in Path(target, "sparse", "0").glob("*.bin"))
-        return ExportReport(str(target), size, cameras=len(read.cameras))
-    data = encode_points(splats, [camera for _, camera in read.cameras], Path(kind).suffix[1:], read.up)
-    write_atomic(target, data)
-    return ExportReport(str(target), len(data), len(splats), cameras=len(read.cameras))

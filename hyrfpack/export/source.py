@@ -15,6 +15,7 @@ from hyrfpack.render.capture import stored_cameras
 from hyrfpack.render.paths import look_at, orbit, stored_viewpoint
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 
+FITTED = 256  # cameras at most that colours are fitted at: each takes memory and time
 MEASURED = 12  # views at most that a loss is measured at
 HELD_OUT = 8  # every so many of the cameras that a file keeps are not fitted, but measured at
 FEW = 16  # cameras, of which none can be spared
@@ -59,7 +60,8 @@ class Source:
             named = [(view.name, view.camera) for view in data.train]
             measured = [(view.camera, view) for view in evenly_spaced(data.test, MEASURED)]
             cameras = [camera for _, camera in named]
-            return cls(model, named, cameras, measured, _up_of(cameras, up), center)
+            fitted = evenly_spaced(cameras, FITTED)
+            return cls(model, named, fitted, measured, _up_of(cameras, up), center)
         stored = stored_cameras(facts)
         if not facts["provenance"].get("cameras"):
             between = evenly_spaced(stored[1::2], MEASURED)  # of an orbit with twice as many cameras as RING

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hyrfpack.export.harmonics import MAX_DEGREE, harmonics_rotation, terms_of
+from hyrfpack.export.harmonics import BAND_0, MAX_DEGREE, harmonics_rotation, terms_of
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,11 @@ class Splats:
     def degree(self) -> int:
         """Of the spherical harmonics."""
         return round(self.harmonics.shape[1] ** 0.5) - 1
+
+    @property
+    def base_colors(self) -> np.ndarray:
+        """(N, 3) float32 colours of degree 0, what directions have in common, cut to [0, 1]."""
+        return np.clip(0.5 + np.float32(BAND_0) * self.harmonics[:, 0], 0, 1)
 
     def with_degree(self, degree: int) -> Splats:
         """The same with harmonics cut, or filled up with zeros, to another degree."""

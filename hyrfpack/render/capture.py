@@ -18,9 +18,14 @@ ORBIT = 48  # cameras around a model that kept none
 def capture_of(cameras: Sequence[Camera]) -> list[list[float]]:
     """Up to KEPT of the cameras, evenly spread, as JSON: [width, height, fx, fy, cx, cy, 3 x 4 camera_from_world]."""
     return [
-        [c.width, c.height, *(float(f"{x:.9g}") for x in (*c.intrinsics, *c.camera_from_world[:3].ravel()))]
+        [c.width, c.height, *map(_rounded, (*c.intrinsics, *c.camera_from_world[:3].ravel()))]
         for c in evenly_spaced(cameras, KEPT)
     ]
+
+
+def _rounded(number: float) -> float:
+    """To nine digits, or where these are not six behind the point, as with map coordinates, to six."""
+    return float(f"{number:.9g}") if abs(number) < 1000 else round(float(number), 6)
 
 
 def stored_cameras(facts: dict) -> list[Camera]:

@@ -45,12 +45,18 @@ class Trainer:
         config: TrainConfig,
         cache: PictureCache | None = None,
         device: torch.device = torch.device("cpu"),  # noqa: B008 - a constant
+        model: HybridModel | None = None,
     ) -> None:
+        """Args: model: to go on with, changed in place; None builds an untrained one that fits the scene."""
         self.scene = scene
         self.config = config
         self.cache = cache or PictureCache()
         self.device = device
-        model, self.budget, self.choices = build_model(scene, config)
+        self.choices: dict[str, str] = {}  # what was chosen for the run, each with its reason
+        if model is None:
+            model, self.budget, self.choices = build_model(scene, config)
+        else:
+            self.budget = config.max_gaussians or len(model)
         self._take(model)
         self.density = DensityControl(config.density, config.steps, self.budget, len(self.model), config.seed, device)
         self.step = 0

@@ -17,10 +17,12 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
 from hyrfpack.export import ExportReport, export, run
 from hyrfpack.export.bake import bake
+from hyrfpack.export.choice import chosen
 from hyrfpack.export.files import USD, WRITTEN, decode_splats
 from hyrfpack.export.html import decode_page
+from hyrfpack.export.kinds import ENDINGS, kind_of
 from hyrfpack.export.measure import likeness
-from hyrfpack.export.run import ENDINGS, chosen, kind_of, page_of
+from hyrfpack.export.run import page_of
 from hyrfpack.export.source import Source
 from hyrfpack.format import load, save
 from hyrfpack.model import Frame

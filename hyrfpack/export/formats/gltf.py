@@ -26,7 +26,7 @@ import numpy as np
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.export.formats.checked import checked_splats
-from hyrfpack.export.harmonics import BAND_0, MAX_DEGREE, terms_of
+from hyrfpack.export.harmonics import MAX_DEGREE, terms_of
 from hyrfpack.export.placement import local_origin, local_positions, matrices_of, placed, rotation_of, upright_rotation
 from hyrfpack.export.splats import Splats, concatenate, quaternion_of
 
@@ -166,7 +166,7 @@ def _harmonics_semantics(degree: int) -> list[str]:
 
 def linear_colors(splats: Splats) -> np.ndarray:
     """(N, 4) uint8: colours of degree 0 as linear RGB, for that is what glTF's COLOR_0 means, and opacities."""
-    srgb = np.clip(0.5 + BAND_0 * splats.harmonics[:, 0], 0, 1)
+    srgb = splats.base_colors
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     return np.round(255 * np.column_stack((linear, splats.opacities))).astype(np.uint8)
 

@@ -32,7 +32,7 @@ def encode(splats: Splats) -> bytes:
     if np.abs(splats.positions).max(initial=0) > np.finfo(np.float32).max:
         raise HyrfDataError("a Gaussian lies farther from the origin than .splat's numbers reach; move the scene there")
     order = np.argsort(-splats.opacities * np.prod(splats.scales, axis=1, dtype=np.float64), kind="stable")
-    colors = 0.5 + BAND_0 * splats.harmonics[:, 0]
+    colors = splats.base_colors
     records = np.empty(len(splats), _RECORD)
     records["position"] = splats.positions[order]
     records["scale"] = splats.scales[order]

@@ -42,6 +42,7 @@ _STREAM = struct.Struct("<QQ")
 _ANTIALIASED, _EXTENDED, _TREE = 0x01, 0x02, 0x80  # flags
 
 _FRACTIONAL_BITS = range(1, 24)  # that every reader we know accepts
+FARTHEST = (1 << 22) - 1  # units from the origin along an axis that a position may lie
 
 # Kept of each byte of harmonics. Pictures of two models then lie 48 and 51 dB from those before. With all 8 bits it is
 # 51 and 53 dB, in files larger by 33 and 16 %; with the usual choice, 5 for degree 1 and 4 above, 38 and 45 dB, in
@@ -63,6 +64,7 @@ _BYTES = np.arange(256, dtype=np.float64)
 _OPACITY_OF = np.float32(_BYTES / 255)
 _COLOR_OF = np.float32((_BYTES / 255 - 0.5) / 0.15)
 _SCALE_OF = np.float32(np.exp(_BYTES / 16 - 10))
+LARGEST_SCALE = float(_SCALE_OF[-1])  # of what is stored, units
 _HARMONICS_OF = np.float32((_BYTES - 128) / 128)
 _AXIS_OF = np.float32(_BYTES / 127.5 - 1)
 
@@ -286,7 +288,7 @@ def _fractional_bits(positions: np.ndarray) -> int:
         if np.rint(farthest * 2**bits) < 1 << 23:
             return bits
     raise HyrfDataError(
-        f"a Gaussian lies {farthest:,.0f} units from the origin, and SPZ reaches {(1 << 23 - bits) - 1:,}; "
+        f"a Gaussian lies {farthest:,.0f} units from the origin, and SPZ reaches {FARTHEST:,}; "
         "export another format (PLY)"
     )
 

@@ -1,0 +1,88 @@
+"""`hyrfpack import`."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from hyrfpack.cli.common import PATH, json_option, note, print_json, table
+from hyrfpack.errors import HyrfError
+
+if TYPE_CHECKING:
+    from hyrfpack.distill import DistillReport
+
+
+def _finite(ctx: click.Context, param: click.Parameter, value: float) -> float:
+    """Refuse NaN, which no range does."""
+    if math.isnan(value):
+        raise click.BadParameter("NaN is no number", ctx, param)
+    return value
+
+
+@click.command("import", short_help="Make a small model of 3D Gaussians from elsewhere.")
+@click.argument("source", type=PATH)
+@click.option("-o", "--output", type=PATH, required=True, metavar="FILE", help="The .hyrf file to write.")
+@click.option("--steps", type=click.IntRange(min=1), default=500, show_default=True, help="Optimiser steps.")
+@click.option(
+    "--psnr",
+    type=click.FloatRange(10, 60),
+    callback=_finite,
+    default=37.0,
+    show_default=True,
+    metavar="DB",
+    help="How like SOURCE's pictures those of FILE shall be: more dB take more bytes.",
+)
+@click.option(
+    "--size",
+    type=click.IntRange(min=16, max=4096),
+    default=400,
+    show_default=True,
+    metavar="PIXELS",
+    help="Longer side of the pictures that it learns from.",
+)
+@click.option("--cameras", type=PATH, metavar="FILE", help="Where it will be looked at from, as JSON; or nerfstudio's.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same bytes.")
+@json_option
+def import_(
+    source: Path, output: Path, steps: int, psnr: float, size: int, cameras: Path | None, seed: int, as_json: bool
+) -> None:
+    """Turn SOURCE, 3D Gaussians as .ply (plain or compressed), .splat, .spz or .sog, into a small .hyrf file.
+
+    No photos are needed: the model learns from pictures of SOURCE itself, from all around or, where its Gaussians
+    surround, from inside. With --cameras, which reads what `hyrfpack render --cameras` reads, it learns what is seen
+    from there. The dB told are of viewpoints that were held out.
+
+    \b
+    Examples:
+      hyrfpack import scene.ply -o scene.hyrf
+      hyrfpack import scene.spz -o scene.hyrf --steps 1500 --psnr 40
+      hyrfpack import room.ply -o room.hyrf --cameras transforms.json --size 800
+    """
+    if output.exists() and source.exists() and output.samefile(source):
+        raise HyrfError(f"{output}: this is what shall be read; name another file with -o")
+    from hyrfpack.distill import DistillConfig, distill
+    from hyrfpack.render.camera_files import cameras_from_json
+
+    given = None if cameras is None else [camera for _, camera in cameras_from_json(cameras)]
+    config = DistillConfig(steps=steps, psnr=psnr, size=size, seed=seed)
+    report = distill(source, output, config, cameras=given, say=note, quiet=False)
+    if as_json:
+        print_json(report.to_dict())
+        return
+    rows = [
+        [source.name, f"{report.gaussians_before:,}", f"{report.bytes_source:,}", _times(report, report.bytes_source)],
+        ["as PLY", f"{report.gaussians_before:,}", f"{report.bytes_ply:,}", _times(report, report.bytes_ply)],
+        [output.name, f"{report.gaussians_after:,}", f"{report.bytes_after:,}", ""],
+    ]
+    click.echo(table(["file", "Gaussians", "bytes", "smaller by"], rows))
+    click.echo(
+        f"{report.views} held-out views: {report.psnr:.2f} dB against the original, the worst {report.psnr_worst:.2f}; "
+        f"{report.seconds:.0f} s"
+    )
+
+
+def _times(report: DistillReport, size: int) -> str:
+    return f"{size / report.bytes_after:.1f}x"

@@ -1,0 +1,286 @@
+"""Distillation: a file of 3D Gaussians becomes a hybrid model, taught by the file's own pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from hyrfpack import format as hyrf_format
+from hyrfpack.atomic import check_writable
+from hyrfpack.compress import compress
+from hyrfpack.distill.start import initial_model
+from hyrfpack.distill.teacher import light_of, likeness, teaching_scene
+from hyrfpack.distill.views import Weighted, viewpoints
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.export.draw import Drawable
+from hyrfpack.export.files import read_splats
+from hyrfpack.export.splats import Splats
+from hyrfpack.model import HybridModel
+from hyrfpack.render.capture import capture_of
+from hyrfpack.render.paths import viewpoint_hint
+from hyrfpack.scene import Camera, Scene, evenly_spaced
+from hyrfpack.train.config import DensityConfig, LearningRates, TrainConfig
+from hyrfpack.train.progress import ProgressLine
+from hyrfpack.train.trainer import Trainer
+
+TEST_EVERY = 8  # of given cameras, one in so many is held out
+LIT_FROM = 64  # views at which it is measured what each Gaussian gives to pictures
+UNSEEN = 0.01  # of all light, what the faintest Gaussians together may send: they are left out
+FINETUNE = 0.5  # steps of fitting what is packed, for each step before
+ESTIMATED = 0.5  # of what packing may add, to ask for: Gaussians that are left out together are missed more
+LEAST_NOISE = 0.5  # of the error before packing, or of the one allowed, that packing may add in any case
+TOLERATED, TRIES = 1.1, 4  # times as much as it may add, and how many files are made, finer ones where it is more
+FINER = 0.7  # times what would do if errors went with the noise: they fall more slowly
+# Warm: small steps from a model that is nearly right.
+RATES = LearningRates(
+    positions=(2e-6, 2e-7),
+    fields=(3e-4, 3e-5),
+    color_logits=(3e-3, 3e-4),
+    scale_logits=(3e-3, 3e-4),
+    opacity_logits=(6e-3, 6e-4),
+)
+
+
+@dataclass(frozen=True)
+class DistillConfig:
+    """What decides the outcome of a distillation, besides the splats.
+
+    Attributes:
+        steps: optimiser steps of fitting to the original's pictures, one each; half as many follow while packing.
+        psnr: dB of held-out pictures against the original's that the file is made for: higher takes more bytes.
+        size: pixels of the longer side of pictures.
+        train_views, test_views: how many viewpoints are made up, to teach and to score.
+        seed: of viewpoints, first weights and order.
+    """
+
+    steps: int = 500
+    psnr: float = 37.0
+    size: int = 400
+    train_views: int = 240
+    test_views: int = 16
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "size", "train_views", "test_views"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
+        if not 10 <= self.psnr <= 60:
+            raise ValueError(f"psnr is {self.psnr}; it must lie in [10, 60]")
+        if self.seed < 0:
+            raise ValueError(f"seed is {self.seed}; it must not be negative")
+
+
+@dataclass(frozen=True)
+class DistillReport:
+    """What a distillation came to.
+
+    Attributes:
+        gaussians_before, gaussians_after: of the original and of the file.
+        degree: of the original's spherical harmonics.
+        views: held-out viewpoints that the scores are of.
+        psnr: dB, mean over these views, of the decoded file's pictures against the original's, over black.
+        psnr_worst: of the view with the least.
+        psnr_unpacked: mean, of the model before it was packed.
+        bytes_source: of the original as it was given; None when it was no file.
+        bytes_ply: of the original as PLY in INRIA's layout, without the header: 4 (17 + 3 (K - 1)) for each Gaussian.
+        bytes_after: of the `.hyrf` file.
+        seconds: that it took.
+    """
+
+    gaussians_before: int
+    gaussians_after: int
+    degree: int
+    views: int
+    psnr: float
+    psnr_worst: float
+    psnr_unpacked: float
+    bytes_source: int | None
+    bytes_ply: int
+    bytes_after: int
+    seconds: float
+
+    def to_dict(self) -> dict:
+        """Plain numbers, ready for JSON."""
+        return asdict(self)
+
+
+def distill(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    config: DistillConfig = DistillConfig(),
+    *,
+    cameras: Sequence[Camera] | None = None,
+    say: Callable[[str], None] = lambda sentence: None,
+    quiet: bool = True,
+) -> DistillReport:
+    """Make a `.hyrf` file from a file of 3D Gaussians; see `distill_splats`, and `read_splats` for what is read.
+
+    Raises:
+        HyrfDataError: the source cannot be read, or there is nothing to be seen in it.
+        HyrfError: the target cannot be written.
+    """
+    splats = read_splats(source)
+    report = distill_splats(splats, target, config, name=str(source), cameras=cameras, say=say, quiet=quiet)
+    return dataclasses.replace(report, bytes_source=_bytes_at(Path(source)))
+
+
+def distill_splats(
+    splats: Splats,
+    target: str | os.PathLike[str],
+    config: DistillConfig = DistillConfig(),
+    *,
+    name: str = "the splats",
+    cameras: Sequence[Camera] | None = None,
+    say: Callable[[str], None] = lambda sentence: None,
+    quiet: bool = True,
+) -> DistillReport:
+    """Turn splats into a hybrid model that looks like them, and pack it (profile compact).
+
+    Without cameras viewpoints are made up (`viewpoints`). The faintest Gaussians, as seen from there, are left out;
+    the fields are fitted to the others' shapes and colours (`initial_model`), the whole is fitted to pictures of the
+    original, and what is packed is fitted again. Same splats and settings, same bytes.
+
+    Args:
+        splats: in any units, anywhere.
+        target: the `.hyrf` file.
+        name: what messages call the splats.
+        cameras: that pictures shall hold at, made smaller where larger than `config.size`; one in TEST_EVERY is held
+            out.
+        say: told what is going on.
+        quiet: show no progress line.
+
+    Raises:
+        HyrfDataError: no view shows any of the splats.
+        HyrfError: the file cannot be written.
+    """
+    started = time.perf_counter()
+    check_writable(Path(target).parent)
+    weighted = Weighted.of(splats, name)
+    original = Drawable.of(splats, weighted.frame)
+    train, test = _cameras(weighted, original, config, cameras)
+    say(
+        f"{len(splats):,} Gaussians, harmonics of degree {splats.degree}; {len(train)} viewpoints "
+        f"{'made up' if cameras is None else 'given'} to teach with, {len(test)} held out"
+    )
+
+    light = light_of(original, evenly_spaced(train, LIT_FROM)).numpy()
+    kept = _lit(light)
+    if not len(kept):
+        raise HyrfDataError(f"{name}: no view shows anything of the Gaussians; give others with --cameras")
+    say(f"{len(splats) - len(kept):,} Gaussians are hardly seen and left out; fitting the fields to the others")
+    model = initial_model(Drawable.of(splats[kept], weighted.frame), torch.from_numpy(light[kept]), train, config.seed)
+    scene = teaching_scene(name, original, train, test)
+    _fit_to_pictures(model, scene, config, quiet)
+
+    unpacked = _mean(likeness(model, original, test))
+    say(f"{unpacked:.2f} dB before packing")
+    provenance = {"steps": config.steps, "seed": config.seed, "viewpoint": viewpoint_hint(train), "psnr": unpacked}
+    _pack(model, target, scene, original, provenance, config, say)
+    decoded = hyrf_format.load(target)
+    scores = likeness(decoded, original, test)
+    return DistillReport(
+        gaussians_before=len(splats),
+        gaussians_after=len(decoded),
+        degree=splats.degree,
+        views=len(test),
+        psnr=_mean(scores),
+        psnr_worst=min(scores),
+        psnr_unpacked=unpacked,
+        bytes_source=None,
+        bytes_ply=4 * len(splats) * (17 + 3 * (splats.harmonics.shape[1] - 1)),
+        bytes_after=Path(target).stat().st_size,
+        seconds=time.perf_counter() - started,
+    )
+
+
+def _cameras(
+    weighted: Weighted, drawable: Drawable, config: DistillConfig, cameras: Sequence[Camera] | None
+) -> tuple[list[Camera], list[Camera]]:
+    """To teach with, and held out; of fewer than two given ones, the same."""
+    if cameras is None:
+        counts = config.train_views, config.test_views
+        train, test = (
+            viewpoints(weighted, drawable, count, config.size, 2 * config.seed + held_out)
+            for held_out, count in enumerate(counts)
+        )
+        return train, test
+    fitting = [_at_most(camera, config.size) for camera in cameras]
+    test = fitting[::TEST_EVERY]
+    return [camera for number, camera in enumerate(fitting) if number % TEST_EVERY] or test, test
+
+
+def _at_most(camera: Camera, size: int) -> Camera:
+    """A camera with no side longer than `size` pixels, the same view."""
+    factor = min(1.0, size / max(camera.width, camera.height))
+    width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
+    across, down = width / camera.width, height / camera.height
+    fx, fy, cx, cy = camera.intrinsics
+    return Camera(width, height, fx * across, fy * down, cx * across, cy * down, camera.camera_from_world)
+
+
+def _lit(light: np.ndarray) -> np.ndarray:
+    """Indices (n,), ascending, of the Gaussians without the faintest that together send UNSEEN of the light (N,)."""
+    order = np.argsort(light, kind="stable")
+    sums = np.cumsum(light[order].astype(np.float64))
+    return np.sort(order[(sums > UNSEEN * sums[-1]) & (light[order] > 0)]) if len(order) else order
+
+
+def _fit_to_pictures(model: HybridModel, scene: Scene, config: DistillConfig, quiet: bool) -> None:
+    # No density control: every Gaussian has its place, and packing leaves out those that pictures do not miss.
+    settings = TrainConfig(steps=config.steps, seed=config.seed, learning_rates=RATES, density=DensityConfig(stop=0.0))
+    trainer = Trainer(scene, settings, model=model)
+    with ProgressLine(config.steps, 0, quiet) as line:
+        trainer.run(report=lambda t, loss, mse: line.update(t.step, loss, mse, len(t.model)))
+
+
+def _pack(
+    model: HybridModel,
+    target: str | os.PathLike[str],
+    scene: Scene,
+    original: Drawable,
+    provenance: dict,
+    config: DistillConfig,
+    say: Callable[[str], None],
+) -> None:
+    """Write a model as small as the quality asked for allows, as training views tell."""
+    views = [view.camera for view in evenly_spaced(scene.train, config.test_views)]
+    allowed, error = _mse(config.psnr), _mse(_mean(likeness(model, original, views)))
+    room = max(allowed - error, LEAST_NOISE * min(allowed, error))
+    with tempfile.TemporaryDirectory() as folder:
+        raw = Path(folder) / "model.hyrf"
+        provenance = {**provenance, "cameras": capture_of([view.camera for view in scene.train])}
+        hyrf_format.save(model, raw, profile="raw", provenance=provenance)
+        # Fine-tuning saves bytes, but its steps are too large for models that are very near already.
+        finetune_steps, noise = max(1, round(FINETUNE * config.steps)), ESTIMATED * room
+        for attempt in range(1, TRIES + 1):
+            compress(raw, target, data=scene, finetune_steps=finetune_steps, noise=noise, say=say)
+            added = _mse(_mean(likeness(hyrf_format.load(target), original, views))) - error
+            if added <= TOLERATED * room or attempt == TRIES:
+                break
+            noise = room if finetune_steps else noise * FINER * max(room / added, 1 / 8)
+            finetune_steps = 0
+            say("packing cost more than it may: once more, finer")
+
+
+def _mse(psnr: float) -> float:
+    return 10 ** (-psnr / 10)
+
+
+def _bytes_at(path: Path) -> int:
+    """Of a file, or of all files in a folder (that of a loose SOG's meta.json, too)."""
+    folder = path.parent if path.name == "meta.json" else path
+    if folder.is_dir():
+        return sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
+    return path.stat().st_size
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values))

@@ -1,0 +1,154 @@
+"""The model that distillation starts from: the original's Gaussians, and fields fitted to their shapes and colours.
+
+What a model stores of a Gaussian (place, one size, opacity, colour) is taken over as it is. How it is stretched and
+turned, and how its colour changes with the direction, only the fields can say: they are fitted, before anything is
+rendered, by regression over the Gaussians.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from hyrfpack.export.draw import Drawable
+from hyrfpack.export.harmonics import BAND_0, harmonics_basis
+from hyrfpack.model import HashGridConfig, HybridModel, ModelConfig, viewpoint_of
+from hyrfpack.model.gaussians import Gaussians, logit
+from hyrfpack.model.hybrid import scale_bounds
+from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
+from hyrfpack.scene import Camera
+from hyrfpack.train.config import LearningRates
+from hyrfpack.train.optimizer import Optimizer
+
+# Gaussians for each row and level of the tables. A source with harmonics is 2 to 4 times as large, and so may its
+# model be: it has colours to learn, too.
+PER_ROW, PER_ROW_HARMONICS = 8, 2
+FINEST = 1024  # vertices of the finest level along an axis
+SILENT = HashGridConfig(4, levels=1, base=2, finest=2)  # of a field that has nothing to say
+SMALLEST = 2e-4  # local units that scales are told apart down to: half a pixel, at 1000 across the box
+BATCH = 16_384  # Gaussians a step
+EPOCHS, LEAST_STEPS = 80, 600
+RATES = LearningRates(fields=(4e-3, 1e-4), color_logits=(1e-2, 1e-3))
+SIZE_WEIGHT = 0.1  # of the squared error of a size that the field may guess, against those of shapes that it must know
+MOST_WEIGHT = 10.0  # of a Gaussian, in means
+COLOR_WEIGHT = 10.0  # of squared errors of colours
+OPAQUE = 0.99  # where the rasteriser cuts alpha: beyond, gradients die
+COLORS = 0.005, 0.995  # that logits are taken of
+
+
+@dataclass(frozen=True)
+class _Shapes:
+    """What ellipsoids are, without saying which of their axes is the first: the matrices R diag(logits) R^T.
+
+    Attributes:
+        sizes: (N,) the mean of the three scale logits.
+        matrices: (N, 3, 3) the rest of it, symmetric and traceless.
+    """
+
+    sizes: Tensor
+    matrices: Tensor
+
+    @classmethod
+    def of(cls, scale_logits: Tensor, quats: Tensor) -> _Shapes:
+        sizes = scale_logits.mean(1)
+        turns = rotations(quats)
+        return cls(sizes, (turns * (scale_logits - sizes[:, None])[:, None]) @ turns.transpose(1, 2))
+
+
+def rotations(quats: Tensor) -> Tensor:
+    """(N, 3, 3) of quaternions (N, 4) wxyz of any length."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, -1) for row in rows], 1)
+
+
+def model_shape(drawable: Drawable, degree: int) -> ModelConfig:
+    """Sizes that hold so many Gaussians, and a radiance field only where colours change with the direction."""
+    rows = len(drawable.positions) / (PER_ROW_HARMONICS if degree else PER_ROW)
+    grid = HashGridConfig(min(21, max(8, round(math.log2(max(1, rows))))), finest=FINEST)
+    return ModelConfig(
+        frame=drawable.frame,
+        geometry=grid,
+        radiance=grid if degree else SILENT,
+        background=False,
+        direction_encoding="sh",
+        antialiased=drawable.antialiased,
+    )
+
+
+def initial_model(drawable: Drawable, light: Tensor, cameras: Sequence[Camera], seed: int) -> HybridModel:
+    """A model of splats, as like them as regression makes it.
+
+    Args:
+        drawable: the splats; at least one.
+        light: (N,) what each sends to pictures; errors count by its square root.
+        cameras: that the splats' colours are looked at from.
+        seed: of the first weights, and of the order.
+    """
+    degree = degree_of(drawable)
+    config = model_shape(drawable, degree)
+    scales = drawable.scales.clamp_min(SMALLEST)
+    shapes = _Shapes.of(logit(scales / scale_bounds(drawable.positions, config)), drawable.quats)
+    opacity_logits = logit(drawable.opacities[:, None].clamp_max(OPAQUE))
+    colors = (0.5 + BAND_0 * drawable.harmonics[:, 0]).clamp(*COLORS)
+    gaussians = Gaussians(drawable.positions, logit(colors), shapes.sizes[:, None], opacity_logits)
+    model = HybridModel(config, gaussians, torch.Generator().manual_seed(seed))
+    with torch.no_grad():
+        for values in (model.radiance.weights[-1], model.radiance.biases[-1]):
+            values.zero_()
+    _fit(model, drawable, shapes, light, cameras if degree else (), seed)
+    with torch.no_grad():  # what the field says of sizes and opacities comes off what Gaussians store
+        raw = model.geometry(model.cube_coords(gaussians.positions))
+        gaussians.scale_logits.copy_(shapes.sizes[:, None] - raw[:, 1:4].mean(1, keepdim=True))
+        gaussians.opacity_logits.copy_(opacity_logits - raw[:, :1])
+    return model
+
+
+def _fit(
+    model: HybridModel, drawable: Drawable, shapes: _Shapes, light: Tensor, cameras: Sequence[Camera], seed: int
+) -> None:
+    """Fit the fields: the geometry to shapes, and the radiance, with the explicit colours, to colours at cameras."""
+    count = len(model)
+    generator = torch.Generator().manual_seed(seed)
+    weights = (light / light.mean().clamp_min(1e-30)).clamp(0, MOST_WEIGHT).sqrt()
+    typical = (weights * shapes.sizes).sum() / weights.sum().clamp_min(1e-30)
+    coords = model.cube_coords(drawable.positions)
+    poses = [torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32) for camera in cameras]
+    no_turn = torch.eye(1, 4)
+    optimizer = Optimizer(model, RATES)
+    steps = max(LEAST_STEPS, EPOCHS * count // BATCH)
+    keep_freed_memory()
+    with torch_on_one_thread():
+        for step in range(steps):
+            some = torch.randperm(count, generator=generator)[:BATCH]  # no row twice: see `take_rows`
+            raw = model.geometry(coords[some])
+            made = _Shapes.of(raw[:, 1:4], raw[:, 4:] + no_turn)
+            errors = (made.matrices - shapes.matrices[some]).square().sum((1, 2))
+            errors = errors + SIZE_WEIGHT * (made.sizes + typical - shapes.sizes[some]).square()
+            errors = errors + SIZE_WEIGHT * raw[:, 0].square()
+            if poses:
+                viewpoint = viewpoint_of(poses[int(torch.randint(0, len(poses), (1,), generator=generator))])
+                wanted = colors_from(drawable, viewpoint, some).clamp(0, 1)
+                errors = errors + COLOR_WEIGHT * (model.decode_colors(viewpoint, some) - wanted).square().sum(1)
+            (weights[some] * errors).mean().backward()
+            optimizer.step(step, steps)
+
+
+def degree_of(drawable: Drawable) -> int:
+    """Of its harmonics."""
+    return round(drawable.harmonics.shape[1] ** 0.5) - 1
+
+
+def colors_from(drawable: Drawable, viewpoint: Tensor, index: Tensor) -> Tensor:
+    """Colours (n, 3), not cut, of the splats at `index` seen from `viewpoint` (3,) local units."""
+    directions = torch.nn.functional.normalize(drawable.positions[index] - viewpoint, dim=-1, eps=1e-12)
+    basis = harmonics_basis(directions, degree_of(drawable))
+    return torch.einsum("nk,nkc->nc", basis, drawable.harmonics[index]) + 0.5

@@ -1,0 +1,74 @@
+"""The original as a teacher: its pictures as a scene of photos, and what each of its Gaussians gives to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyrfpack.export.draw import Drawable, draw
+from hyrfpack.model import HybridModel
+from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.rasterize.cull import frustum_cull
+from hyrfpack.parallel.pool import torch_on_one_thread
+from hyrfpack.render import RenderSettings, render
+from hyrfpack.scene import Camera, Picture, Scene, View
+
+LEAST_ALPHA = 1e-6  # below it a pixel has no colour of its own
+MOST_DB = 100.0  # what equal pictures score
+
+
+def teaching_scene(name: str, drawable: Drawable, train: Sequence[Camera], test: Sequence[Camera]) -> Scene:
+    """The original seen by cameras, as a scene of photos with coverage; drawn when they are asked for."""
+    count = len(str(len(train) + len(test)))
+    views = [
+        [View(f"{kind}/{number:0{count}d}", camera, partial(photograph, drawable, camera)) for number, camera in parts]
+        for kind, parts in (("train", enumerate(train)), ("test", enumerate(test)))
+    ]
+    return Scene(name, "splats", *views, np.zeros((0, 3)), np.zeros((0, 3), np.float32), has_alpha=True)
+
+
+def photograph(drawable: Drawable, camera: Camera) -> Picture:
+    """The original as a camera sees it, 8 bits, straight alpha."""
+    drawn = draw(drawable, camera)
+    alpha = 1 - drawn.transmittance
+    rgb = drawn.rgb / alpha.clamp_min(LEAST_ALPHA)[..., None]
+    rgb, alpha = ((values.clamp(0, 1) * 255).round().to(torch.uint8).numpy() for values in (rgb, alpha))
+    return Picture(rgb, alpha)
+
+
+@torch_on_one_thread()
+def light_of(drawable: Drawable, cameras: Sequence[Camera]) -> Tensor:
+    """(N,) the light that each Gaussian sends to a picture, in pixels: the sum of T alpha, mean over cameras."""
+    total = torch.zeros(len(drawable.positions))
+    near, tolerance = RenderSettings().near, RenderSettings().cull_tolerance
+    for camera in cameras:
+        pose = torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32)
+        size = camera.intrinsics, camera.width, camera.height
+        index = frustum_cull(drawable.positions, pose, *size, near, tolerance)
+        # rgb = sum T alpha color is linear in the colours: their gradient is the light.
+        colors = torch.ones(len(index), 3, requires_grad=True)
+        explicit = (drawable.quats[index], drawable.scales[index], drawable.opacities[index])
+        raster = rasterize(
+            drawable.positions[index], *explicit, colors, pose, *size, near=near, antialiased=drawable.antialiased
+        )
+        if raster.rgb.requires_grad:
+            (gradient,) = torch.autograd.grad(raster.rgb[..., 0].sum(), colors)
+            total.index_add_(0, index, gradient[:, 0])
+    return total / max(1, len(cameras))
+
+
+@torch.no_grad()
+def likeness(model: HybridModel, drawable: Drawable, cameras: Sequence[Camera]) -> list[float]:
+    """PSNR in dB of a model's pictures against the original's, both over black and cut to [0, 1], by camera."""
+    decoded = model.decode()
+    scores = []
+    for camera in cameras:
+        wanted = draw(drawable, camera).rgb.clamp(0, 1)
+        given = render(model, camera, decoded=decoded).rgb.clamp(0, 1)
+        mse = float((given - wanted).square().mean())
+        scores.append(min(MOST_DB, -10 * float(np.log10(max(mse, 1e-30)))))
+    return scores

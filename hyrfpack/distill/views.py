@@ -1,0 +1,162 @@
+"""Where splats are looked at from when nobody says: cameras that see much of them and stand in nobody's way."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.export.draw import Drawable, draw
+from hyrfpack.export.splats import Splats
+from hyrfpack.model import Frame
+from hyrfpack.render.paths import look_at
+from hyrfpack.scene import Camera
+
+INSIDE = 0.01, 0.99  # of what is there, along each axis, the part that the frame's box spans
+LARGEST = 0.99  # of the splats' areas: what is larger counts as no larger
+DISTANCES = 0.5, 2.2  # of outside views from what they look at, in half diagonals of the box; evenly in their logarithm
+FIELD_OF_VIEW = 50.0, 75.0  # degrees across, of views from outside and from inside
+CLEAR, ROOMY = 0.12, 0.25  # half diagonals around cameras that are free of splats, and around those in a room
+CLUTTER = 0.1  # the most of the sphere around a camera that splats so near may cover, about
+COVERED = 0.3  # the least of a picture that splats cover
+ENCLOSED = 0.75  # of all directions from the clearest places: where so many end at splats, views stand inside
+MIDDLE = 0.55  # of the box, along each axis, that views from inside stand in
+PLACES, CLEAREST = 256, 8  # that are looked at to tell
+TRIED = 6  # cameras for each that is wanted
+THUMBNAIL = 24  # pixels a side, to see how much a picture shows
+
+
+@dataclass(frozen=True)
+class Weighted:
+    """Splats with what they matter by.
+
+    Attributes:
+        areas: (N,) float64 opacity times the product of the two larger scales, squared world units.
+        frame: the box around nearly all of it.
+    """
+
+    splats: Splats
+    areas: np.ndarray
+    frame: Frame
+
+    @classmethod
+    def of(cls, splats: Splats, name: str) -> Weighted:
+        """Weigh splats.
+
+        Raises:
+            HyrfDataError: none of them can be seen.
+        """
+        sides = np.sort(splats.scales.astype(np.float64), axis=1)
+        areas = splats.opacities * sides[:, 1] * sides[:, 2]
+        if not (areas > 0).any():
+            raise HyrfDataError(
+                f"{name}: there is no Gaussian in it that could be seen (of some size and opacity); name another file"
+            )
+        seen = areas > 0
+        areas = np.minimum(areas, np.quantile(areas[seen], LARGEST))
+        return cls(splats, areas, Frame.from_box(*_box(splats.positions[seen], sides[seen, 2], areas[seen])))
+
+    @property
+    def radius(self) -> float:
+        """Half the diagonal of the box, world units."""
+        return float(np.linalg.norm(self.frame.half_extent)) * self.frame.scale
+
+    def clutter(self, place: np.ndarray, reach: float = CLEAR) -> float:
+        """About how much of the sphere around a place (3,) splats within `reach` half diagonals cover."""
+        squares = ((self.splats.positions - place) ** 2).sum(axis=1)
+        near = squares < (reach * self.radius) ** 2
+        # A disc of standard deviations a and b lets 2 pi a b o of light from far behind it disappear.
+        return float((self.areas[near] / (2 * squares[near] + self.areas[near])).sum())
+
+
+def _box(positions: np.ndarray, sizes: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The corners between the quantiles INSIDE, by weight, of each axis; each splat lies at its two ends."""
+    ends = np.concatenate((positions - sizes[:, None], positions + sizes[:, None]))
+    order = np.argsort(ends, axis=0, kind="stable")
+    shares = np.cumsum(np.tile(weights, 2)[order], axis=0)
+    rows = [[np.searchsorted(column / column[-1], share) for column in shares.T] for share in INSIDE]
+    low, high = (np.array([ends[order[row, axis], axis] for axis, row in enumerate(part)]) for part in rows)
+    return low, high
+
+
+def viewpoints(weighted: Weighted, drawable: Drawable, count: int, size: int, seed: int) -> list[Camera]:
+    """Cameras all around, near and far, or inside where splats surround.
+
+    Views from outside look at places of the splats, drawn by area, from all directions. Where the clearest places of
+    the box have splats all around, as in a room, views stand there instead and look anywhere. Either kind keeps clear
+    of splats right before the camera and has some of them in the picture, as long as such views are found.
+
+    Args:
+        drawable: the splats in the frame's units.
+        count: how many.
+        size: pixels a side.
+        seed: of what is drawn; other seeds give other cameras of the same kind.
+    """
+    rng = np.random.default_rng(seed)
+    inside = _surrounds(weighted, drawable)
+    found: list[Camera] = []
+    others: list[tuple[float, Camera]] = []
+    for _ in range(TRIED * count):
+        place, target = _inside(weighted, rng) if inside else _outside(weighted, rng)
+        camera = _camera(place, target, size, FIELD_OF_VIEW[inside])
+        covered = -1.0 if weighted.clutter(place) > CLUTTER else coverage(drawable, camera)
+        if covered >= COVERED:
+            found.append(camera)
+            if len(found) == count:
+                return found
+        else:
+            others.append((covered, camera))
+    others.sort(key=lambda pair: -pair[0])
+    return found + [camera for _, camera in others[: count - len(found)]]
+
+
+def coverage(drawable: Drawable, camera: Camera) -> float:
+    """How much of a camera's picture splats cover, 0 to 1, from a picture of THUMBNAIL pixels."""
+    factor = THUMBNAIL / max(camera.width, camera.height)
+    width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
+    intrinsics = (value * factor for value in camera.intrinsics)
+    return 1 - float(draw(drawable, Camera(width, height, *intrinsics, camera.camera_from_world)).transmittance.mean())
+
+
+def _surrounds(weighted: Weighted, drawable: Drawable) -> bool:
+    """Whether there are places in the box with room around them and splats all around."""
+    rng = np.random.default_rng(0)  # the same answer for training views and held-out ones
+    places = [_inside(weighted, rng)[0] for _ in range(PLACES)]
+    clutter = np.array([weighted.clutter(place, ROOMY) for place in places])
+    seen = []
+    for index in np.argsort(clutter, kind="stable")[:CLEAREST]:
+        if clutter[index] <= CLUTTER:
+            axes = np.concatenate((np.eye(3), -np.eye(3)))
+            cameras = [_camera(places[index], places[index] + axis * weighted.radius, THUMBNAIL, 90.0) for axis in axes]
+            seen.append(np.mean([coverage(drawable, camera) for camera in cameras]))
+    return len(seen) > 0 and float(np.median(seen)) >= ENCLOSED
+
+
+def _inside(weighted: Weighted, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A place in the middle of the box, and one to look at in any direction."""
+    frame = weighted.frame
+    place = np.array(frame.center) + rng.uniform(-MIDDLE, MIDDLE, 3) * np.array(frame.half_extent) * frame.scale
+    return place, place + weighted.radius * _direction(rng)
+
+
+def _outside(weighted: Weighted, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A place some way off, and the splat that it looks at."""
+    shares = np.cumsum(weighted.areas)
+    target = weighted.splats.positions[np.searchsorted(shares, rng.random() * shares[-1])]
+    near, far = np.log(DISTANCES)
+    return target + weighted.radius * math.exp(rng.uniform(near, far)) * _direction(rng), target
+
+
+def _direction(rng: np.random.Generator) -> np.ndarray:
+    """(3,) a unit vector, all directions alike."""
+    height, angle = rng.uniform(-1, 1), rng.uniform(0, 2 * math.pi)
+    side = math.sqrt(1 - height * height)
+    return np.array([side * math.cos(angle), height, side * math.sin(angle)])
+
+
+def _camera(place: np.ndarray, target: np.ndarray, size: int, degrees: float) -> Camera:
+    focal = size / 2 / math.tan(math.radians(degrees / 2))
+    pose = look_at(place, target, np.array([0.0, -1.0, 0.0]))
+    return Camera(size, size, focal, focal, size / 2, size / 2, pose)

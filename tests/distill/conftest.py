@@ -1,0 +1,12 @@
+from __future__ import annotations
+
+import pytest
+
+from hyrfpack.distill import run, start
+
+
+@pytest.fixture(autouse=True)
+def short_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As little of everything as still makes a model."""
+    monkeypatch.setattr(start, "LEAST_STEPS", 20)
+    monkeypatch.setattr(run, "TRIES", 1)

@@ -1,0 +1,122 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from explicit_balls import LITTLE, ball
+
+import hyrfpack
+from hyrfpack.distill import DistillConfig, distill_splats
+from hyrfpack.distill.teacher import likeness, teaching_scene
+from hyrfpack.distill.views import Weighted, viewpoints
+from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.export.draw import Drawable, draw
+from hyrfpack.scene import Camera
+
+
+def test_report_says_what_is_in_the_file(tmp_path: Path) -> None:
+    splats, target = ball(200), tmp_path / "ball.hyrf"
+    report = distill_splats(splats, target, LITTLE)
+    model = hyrfpack.load(target)
+    weighted = Weighted.of(splats, "ball")
+    original = Drawable.of(splats, weighted.frame)
+    held_out = viewpoints(weighted, original, LITTLE.test_views, LITTLE.size, 1)
+    scores = likeness(model, original, held_out)
+    assert (report.psnr, report.psnr_worst) == (np.mean(scores), min(scores))
+    assert (report.gaussians_before, report.gaussians_after) == (200, len(model))
+    assert report.bytes_after == target.stat().st_size
+    assert report.bytes_ply == 200 * 4 * (3 + 3 + 3 + 9 + 1 + 3 + 4)
+    assert hyrfpack.describe(target)["profile"] == "compact"
+
+
+def test_more_steps_bring_the_pictures_nearer(tmp_path: Path) -> None:
+    splats = ball(200)
+    few, many = (
+        distill_splats(splats, tmp_path / "ball.hyrf", replace(LITTLE, steps=steps)).psnr_unpacked for steps in (1, 40)
+    )
+    assert many > few + 0.2
+
+
+def test_same_splats_and_seed_give_the_same_bytes(tmp_path: Path) -> None:
+    for name in "ab":
+        distill_splats(ball(60), tmp_path / name, LITTLE)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+@pytest.mark.parametrize("unit, offset", [(1, 1e6), (1e-6, 0)])
+def test_neither_origin_nor_unit_matters(tmp_path: Path, unit: float, offset: float) -> None:
+    splats = ball(100)
+    moved = replace(splats, positions=splats.positions * unit + offset, scales=splats.scales * np.float32(unit))
+    here, there = (distill_splats(some, tmp_path / "x.hyrf", LITTLE) for some in (splats, moved))
+    assert abs(here.psnr_unpacked - there.psnr_unpacked) < 0.05
+    frame = hyrfpack.load(tmp_path / "x.hyrf").config.frame
+    np.testing.assert_allclose(
+        frame.to_local(moved.positions), Weighted.of(splats, "").frame.to_local(splats.positions), atol=1e-5
+    )
+
+
+def test_model_of_degree_0_has_no_colours_by_direction(tmp_path: Path) -> None:
+    distill_splats(ball(100, degree=0), tmp_path / "x.hyrf", LITTLE)
+    assert {s["type"]: s["after"] for s in hyrfpack.describe(tmp_path / "x.hyrf")["sections"]}["RTAB"] < 32
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda s: s[:1],
+        lambda s: s[:2],
+        lambda s: replace(s, positions=s.positions * 0),
+        lambda s: replace(s, scales=s.scales * np.float32((1, 1, 0))),
+        lambda s: replace(s, opacities=np.ones(len(s))),
+        lambda s: replace(s, opacities=np.where(np.arange(len(s)) % 2, s.opacities, 0)),
+        lambda s: replace(s, positions=np.concatenate((np.full((1, 3), 1e12), s.positions[1:]))),
+        lambda s: replace(s, antialiased=True),
+    ],
+    ids=["one", "two", "coincident", "flat", "opaque", "clear", "outlier", "antialiased"],
+)
+def test_odd_splats_make_a_model(tmp_path: Path, change) -> None:
+    report = distill_splats(change(ball(30)), tmp_path / "x.hyrf", LITTLE)
+    assert report.gaussians_after >= 1
+    assert report.psnr > 15
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda s: s[:0], lambda s: replace(s, opacities=np.zeros(len(s))), lambda s: replace(s, scales=s.scales * 0)],
+    ids=["none", "clear", "points"],
+)
+def test_splats_that_cannot_be_seen_are_one_sentence(tmp_path: Path, change) -> None:
+    with pytest.raises(HyrfDataError, match="^ball.ply: there is no Gaussian in it that could be seen"):
+        distill_splats(change(ball(20)), tmp_path / "x.hyrf", LITTLE, name="ball.ply")
+
+
+def test_cameras_that_look_away_are_one_sentence(tmp_path: Path) -> None:
+    pose = np.eye(4)
+    pose[2, 3] = -100  # all splats are behind
+    with pytest.raises(HyrfDataError, match="no view shows anything"):
+        distill_splats(ball(20), tmp_path / "x.hyrf", LITTLE, cameras=[Camera(32, 32, 32, 32, 16, 16, pose)])
+
+
+def test_folder_that_is_missing_is_told_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(HyrfError, match="no file can be made in this folder"):
+        distill_splats(ball(20), tmp_path / "missing" / "x.hyrf", LITTLE)
+
+
+def test_settings_out_of_range_are_refused() -> None:
+    for wrong in ({"steps": 0}, {"psnr": float("nan")}, {"seed": -1}, {"size": 0}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            DistillConfig(**wrong)
+
+
+def test_teacher_shows_what_is_drawn() -> None:
+    splats = ball(40)
+    weighted = Weighted.of(splats, "ball")
+    original = Drawable.of(splats, weighted.frame)
+    (camera,) = viewpoints(weighted, original, 1, 32, 0)
+    scene = teaching_scene("ball", original, [camera], [])
+    picture = scene.train[0].load()
+    drawn = draw(original, camera)
+    np.testing.assert_allclose(picture.alpha / 255, 1 - drawn.transmittance, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(picture.composite(), drawn.rgb.clamp(0, 1), atol=1.5 / 255)

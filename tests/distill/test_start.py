@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from explicit_balls import ball
+from scipy.spatial.transform import Rotation
+
+from hyrfpack.distill import start
+from hyrfpack.distill.start import initial_model, rotations
+from hyrfpack.distill.teacher import teaching_scene
+from hyrfpack.distill.views import Weighted, viewpoints
+from hyrfpack.export.draw import Drawable
+from hyrfpack.export.splats import Splats
+from hyrfpack.train import DensityConfig, TrainConfig, Trainer
+
+
+def drawable_of(splats: Splats) -> tuple[Drawable, list]:
+    weighted = Weighted.of(splats, "x")
+    drawable = Drawable.of(splats, weighted.frame)
+    return drawable, viewpoints(weighted, drawable, 6, 32, 0)
+
+
+def covariances(scales, quats) -> np.ndarray:
+    turns = Rotation.from_quat(np.asarray(quats), scalar_first=True).as_matrix()
+    return turns * np.asarray(scales, np.float64)[:, None] ** 2 @ turns.transpose(0, 2, 1)
+
+
+def test_rotations_are_those_of_scipy() -> None:
+    quats = torch.randn(20, 4, generator=torch.Generator().manual_seed(0))
+    np.testing.assert_allclose(
+        rotations(quats), Rotation.from_quat(quats.numpy(), scalar_first=True).as_matrix(), atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_fields_learn_shapes_and_colours(degree: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(start, "LEAST_STEPS", 200)
+    splats = ball(100, degree)
+    drawable, cameras = drawable_of(splats)
+    model = initial_model(drawable, torch.ones(100), cameras, 0)
+    with torch.no_grad():
+        made = model.decode_geometry()
+        place = torch.tensor((3.0, 1.0, 0.0))
+        colors = model.decode_colors(place)
+        wanted = start.colors_from(drawable, place, torch.arange(100)).clamp(0, 1)
+    # Ellipsoids agree whatever their axes are called; sizes and opacities are stored, and exact.
+    expected = covariances(drawable.scales, drawable.quats)
+    error = np.linalg.norm(covariances(made.scales, made.quats) - expected, axis=(1, 2))
+    assert np.median(error / np.linalg.norm(expected, axis=(1, 2))) < 0.1
+    np.testing.assert_allclose(made.opacities, drawable.opacities, rtol=1e-4)
+    np.testing.assert_allclose(made.scales.log().mean(1), drawable.scales.log().mean(1), atol=0.05)
+    assert float((colors - wanted).abs().mean()) < (0.01 if degree == 0 else 0.1)
+
+
+def test_trainer_goes_on_with_a_model_that_is_given() -> None:
+    splats = ball(50)
+    drawable, cameras = drawable_of(splats)
+    model = initial_model(drawable, torch.ones(50), cameras, 0)
+    before = model.gaussians.color_logits.detach().clone()
+    scene = teaching_scene("ball", drawable, cameras, [])
+    trainer = Trainer(scene, TrainConfig(steps=2, density=DensityConfig(stop=0.0)), model=model)
+    assert trainer.run()
+    assert trainer.model is model
+    assert len(model) == 50
+    assert not torch.equal(model.gaussians.color_logits, before)

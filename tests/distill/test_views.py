@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from explicit_balls import ball
+
+from hyrfpack.distill.views import CLUTTER, COVERED, DISTANCES, Weighted, coverage, viewpoints
+from hyrfpack.export.draw import Drawable
+from hyrfpack.export.splats import Splats
+
+
+def seen(splats: Splats, count: int = 12, seed: int = 0):
+    weighted = Weighted.of(splats, "x")
+    drawable = Drawable.of(splats, weighted.frame)
+    return weighted, drawable, viewpoints(weighted, drawable, count, 32, seed)
+
+
+def solid_ball() -> Splats:
+    """Splats all through the unit ball."""
+    splats, depths = ball(400), np.random.default_rng(1).random((400, 1)) ** (1 / 3)
+    return replace(splats, positions=splats.positions * depths)
+
+
+def room() -> Splats:
+    """Large splats on a sphere of radius 5 that is empty inside."""
+    splats = ball(600)
+    return replace(splats, positions=5 * splats.positions, scales=np.full((600, 3), 0.5), opacities=np.full(600, 0.9))
+
+
+def test_objects_are_seen_from_outside_and_rooms_from_inside() -> None:
+    weighted, _, outside = seen(solid_ball())
+    assert all(np.linalg.norm(camera.position) > 0.9 for camera in outside)
+    _, _, inside = seen(room())
+    assert all(np.linalg.norm(camera.position) < 5 for camera in inside)
+
+
+def test_views_show_something_and_stand_clear() -> None:
+    weighted, drawable, cameras = seen(solid_ball())
+    assert min(coverage(drawable, camera) for camera in cameras) >= COVERED
+    assert max(weighted.clutter(camera.position) for camera in cameras) <= CLUTTER
+    reach = weighted.radius * DISTANCES[1] + 1
+    assert max(np.linalg.norm(camera.position) for camera in cameras) <= reach
+
+
+def test_another_seed_gives_other_views_and_the_same_seed_the_same() -> None:
+    first, again, other = (
+        np.array([camera.position for camera in seen(solid_ball(), seed=seed)[2]]) for seed in (0, 0, 1)
+    )
+    assert np.array_equal(first, again)
+    assert np.abs(first - other).max(1).min() > 0.01
+
+
+def test_far_away_splat_does_not_stretch_the_frame() -> None:
+    splats = solid_ball()
+    positions = splats.positions.copy()
+    positions[0] = 1e5
+    assert Weighted.of(replace(splats, positions=positions), "x").frame.scale < 2

@@ -1,0 +1,23 @@
+"""Made-up explicit Gaussians for tests of distillation."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hyrfpack.distill import DistillConfig
+from hyrfpack.export.splats import Splats, normalized_quats
+
+LITTLE = DistillConfig(steps=6, size=24, train_views=6, test_views=2)
+
+
+def ball(count: int, degree: int = 1, seed: int = 0) -> Splats:
+    """Coloured splats on the unit sphere, of random shapes and turns."""
+    rng = np.random.default_rng(seed)
+    positions = rng.normal(size=(count, 3))
+    return Splats(
+        positions / np.linalg.norm(positions, axis=1, keepdims=True),
+        rng.uniform(0.03, 0.2, (count, 3)),
+        normalized_quats(rng.normal(size=(count, 4))),
+        rng.uniform(0.3, 0.95, count),
+        0.4 * rng.normal(size=(count, (degree + 1) ** 2, 3)),
+    )
