@@ -24,7 +24,14 @@ def _finite(ctx: click.Context, param: click.Parameter, value: float) -> float:
 
 @click.command("import", short_help="Make a small model of 3D Gaussians from elsewhere.")
 @click.argument("source", type=PATH)
-@click.option("-o", "--output", type=PATH, required=True, metavar="FILE", help="The .hyrf file to write.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    required=True,
+    metavar="FILE",
+    help="The .hyrf file to write.",
+)
 @click.option("--steps", type=click.IntRange(min=1), default=500, show_default=True, help="Optimiser steps.")
 @click.option(
     "--psnr",

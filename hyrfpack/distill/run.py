@@ -14,12 +14,13 @@ import numpy as np
 import torch
 
 from hyrfpack import format as hyrf_format
-from hyrfpack.atomic import check_writable
+from hyrfpack.atomic import check_writable, write_atomic
 from hyrfpack.compress import compress
 from hyrfpack.distill.start import initial_model
 from hyrfpack.distill.teacher import light_of, likeness, teaching_scene
 from hyrfpack.distill.views import Weighted, viewpoints
 from hyrfpack.errors import HyrfDataError
+from hyrfpack.export.bake import small_camera
 from hyrfpack.export.draw import Drawable
 from hyrfpack.export.files import read_splats
 from hyrfpack.export.splats import Splats
@@ -182,7 +183,9 @@ def distill_splats(
 
     unpacked = _mean(likeness(model, original, test))
     say(f"{unpacked:.2f} dB before packing")
+    imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
     provenance = {"steps": config.steps, "seed": config.seed, "viewpoint": viewpoint_hint(train), "psnr": unpacked}
+    provenance["choices"] = {"imported": imported}
     _pack(model, target, scene, original, provenance, config, say)
     decoded = hyrf_format.load(target)
     scores = likeness(decoded, original, test)
@@ -212,18 +215,9 @@ def _cameras(
             for held_out, count in enumerate(counts)
         )
         return train, test
-    fitting = [_at_most(camera, config.size) for camera in cameras]
+    fitting = [small_camera(camera, config.size) for camera in cameras]
     test = fitting[::TEST_EVERY]
     return [camera for number, camera in enumerate(fitting) if number % TEST_EVERY] or test, test
-
-
-def _at_most(camera: Camera, size: int) -> Camera:
-    """A camera with no side longer than `size` pixels, the same view."""
-    factor = min(1.0, size / max(camera.width, camera.height))
-    width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
-    across, down = width / camera.width, height / camera.height
-    fx, fy, cx, cy = camera.intrinsics
-    return Camera(width, height, fx * across, fy * down, cx * across, cy * down, camera.camera_from_world)
 
 
 def _lit(light: np.ndarray) -> np.ndarray:
@@ -255,19 +249,20 @@ def _pack(
     allowed, error = _mse(config.psnr), _mse(_mean(likeness(model, original, views)))
     room = max(allowed - error, LEAST_NOISE * min(allowed, error))
     with tempfile.TemporaryDirectory() as folder:
-        raw = Path(folder) / "model.hyrf"
+        raw, packed = Path(folder) / "model.hyrf", Path(folder) / "packed.hyrf"
         provenance = {**provenance, "cameras": capture_of([view.camera for view in scene.train])}
         hyrf_format.save(model, raw, profile="raw", provenance=provenance)
         # Fine-tuning saves bytes, but its steps are too large for models that are very near already.
         finetune_steps, noise = max(1, round(FINETUNE * config.steps)), ESTIMATED * room
         for attempt in range(1, TRIES + 1):
-            compress(raw, target, data=scene, finetune_steps=finetune_steps, noise=noise, say=say)
-            added = _mse(_mean(likeness(hyrf_format.load(target), original, views))) - error
+            compress(raw, packed, data=scene, finetune_steps=finetune_steps, noise=noise, say=say)
+            added = _mse(_mean(likeness(hyrf_format.load(packed), original, views))) - error
             if added <= TOLERATED * room or attempt == TRIES:
                 break
             noise = room if finetune_steps else noise * FINER * max(room / added, 1 / 8)
             finetune_steps = 0
             say("packing cost more than it may: once more, finer")
+        write_atomic(target, packed.read_bytes())  # only now: an interrupt leaves what was there before
 
 
 def _mse(psnr: float) -> float:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError
+from hyrfpack.export.bake import small_camera
 from hyrfpack.export.draw import Drawable, draw
 from hyrfpack.export.splats import Splats
 from hyrfpack.model import Frame
@@ -34,12 +35,17 @@ class Weighted:
 
     Attributes:
         areas: (N,) float64 opacity times the product of the two larger scales, squared world units.
-        frame: the box around nearly all of it.
+        details: (N,) float64 opacity, times the typical area over the splat's own where that is larger: what is far
+            from all cameras, as a sky, is made of few large splats.
+        frame: the box around nearly all details.
+        targets: (N,) float64 areas, beyond the box by the fourth power less: a sky is large and far away.
     """
 
     splats: Splats
     areas: np.ndarray
+    details: np.ndarray
     frame: Frame
+    targets: np.ndarray
 
     @classmethod
     def of(cls, splats: Splats, name: str) -> Weighted:
@@ -49,14 +55,19 @@ class Weighted:
             HyrfDataError: none of them can be seen.
         """
         sides = np.sort(splats.scales.astype(np.float64), axis=1)
-        areas = splats.opacities * sides[:, 1] * sides[:, 2]
+        discs = sides[:, 1] * sides[:, 2]
+        areas = splats.opacities * discs
         if not (areas > 0).any():
             raise HyrfDataError(
                 f"{name}: there is no Gaussian in it that could be seen (of some size and opacity); name another file"
             )
         seen = areas > 0
+        typical = np.median(discs[seen])
+        details = np.where(seen, splats.opacities * (typical / np.maximum(discs, typical)), 0.0)
         areas = np.minimum(areas, np.quantile(areas[seen], LARGEST))
-        return cls(splats, areas, Frame.from_box(*_box(splats.positions[seen], sides[seen, 2], areas[seen])))
+        frame = Frame.from_box(*_box(splats.positions[seen], sides[seen, 2], details[seen]))
+        boxes_away = np.abs(frame.to_local(splats.positions) / frame.half_extent).max(axis=1)
+        return cls(splats, areas, details, frame, areas / np.maximum(boxes_away, 1) ** 4)
 
     @property
     def radius(self) -> float:
@@ -84,9 +95,10 @@ def _box(positions: np.ndarray, sizes: np.ndarray, weights: np.ndarray) -> tuple
 def viewpoints(weighted: Weighted, drawable: Drawable, count: int, size: int, seed: int) -> list[Camera]:
     """Cameras all around, near and far, or inside where splats surround.
 
-    Views from outside look at places of the splats, drawn by area, from all directions. Where the clearest places of
-    the box have splats all around, as in a room, views stand there instead and look anywhere. Either kind keeps clear
-    of splats right before the camera and has some of them in the picture, as long as such views are found.
+    Views from outside look at splats, drawn as `Weighted.targets`, from all directions. Where the clearest places of
+    the box have splats all around, as in a room, views stand there instead and look at splats drawn by details, for
+    walls and skies would take most of the pictures. Either kind keeps clear of splats right before the camera and has
+    some of them in the picture, as long as such views are found.
 
     Args:
         drawable: the splats in the frame's units.
@@ -114,10 +126,7 @@ def viewpoints(weighted: Weighted, drawable: Drawable, count: int, size: int, se
 
 def coverage(drawable: Drawable, camera: Camera) -> float:
     """How much of a camera's picture splats cover, 0 to 1, from a picture of THUMBNAIL pixels."""
-    factor = THUMBNAIL / max(camera.width, camera.height)
-    width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
-    intrinsics = (value * factor for value in camera.intrinsics)
-    return 1 - float(draw(drawable, Camera(width, height, *intrinsics, camera.camera_from_world)).transmittance.mean())
+    return 1 - float(draw(drawable, small_camera(camera, THUMBNAIL)).transmittance.mean())
 
 
 def _surrounds(weighted: Weighted, drawable: Drawable) -> bool:
@@ -135,18 +144,23 @@ def _surrounds(weighted: Weighted, drawable: Drawable) -> bool:
 
 
 def _inside(weighted: Weighted, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """A place in the middle of the box, and one to look at in any direction."""
+    """A place in the middle of the box, and the splat that it looks at."""
     frame = weighted.frame
     place = np.array(frame.center) + rng.uniform(-MIDDLE, MIDDLE, 3) * np.array(frame.half_extent) * frame.scale
-    return place, place + weighted.radius * _direction(rng)
+    return place, _drawn(weighted, weighted.details, rng)
 
 
 def _outside(weighted: Weighted, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """A place some way off, and the splat that it looks at."""
-    shares = np.cumsum(weighted.areas)
-    target = weighted.splats.positions[np.searchsorted(shares, rng.random() * shares[-1])]
+    target = _drawn(weighted, weighted.targets, rng)
     near, far = np.log(DISTANCES)
     return target + weighted.radius * math.exp(rng.uniform(near, far)) * _direction(rng), target
+
+
+def _drawn(weighted: Weighted, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The place (3,) of a splat, drawn by weights (N,)."""
+    shares = np.cumsum(weights)
+    return weighted.splats.positions[np.searchsorted(shares, rng.random() * shares[-1])]
 
 
 def _direction(rng: np.random.Generator) -> np.ndarray:

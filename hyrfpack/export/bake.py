@@ -119,9 +119,9 @@ def _view(model: HybridModel, geometry: Geometry, camera: Camera) -> _View:
     return _View(viewpoint_of(pose), drawn[lit], received[lit], left_out, all_drawn[left_out])
 
 
-def small_camera(camera: Camera) -> Camera:
-    """The same view in a picture of at most LONGEST_SIDE pixels: enough to learn what can be seen from there."""
-    shrink = min(1.0, LONGEST_SIDE / max(camera.width, camera.height))
+def small_camera(camera: Camera, longest: int = LONGEST_SIDE) -> Camera:
+    """The same view in a picture of at most `longest` pixels a side: enough to learn what can be seen from there."""
+    shrink = min(1.0, longest / max(camera.width, camera.height))
     width, height = max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink))
     x, y = width / camera.width, height / camera.height
     return replace(

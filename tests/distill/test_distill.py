@@ -8,7 +8,7 @@ import pytest
 from explicit_balls import LITTLE, ball
 
 import hyrfpack
-from hyrfpack.distill import DistillConfig, distill_splats
+from hyrfpack.distill import DistillConfig, distill_splats, run
 from hyrfpack.distill.teacher import likeness, teaching_scene
 from hyrfpack.distill.views import Weighted, viewpoints
 from hyrfpack.errors import HyrfDataError, HyrfError
@@ -102,6 +102,32 @@ def test_cameras_that_look_away_are_one_sentence(tmp_path: Path) -> None:
 def test_folder_that_is_missing_is_told_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(HyrfError, match="no file can be made in this folder"):
         distill_splats(ball(20), tmp_path / "missing" / "x.hyrf", LITTLE)
+
+
+def test_interrupt_while_packing_leaves_the_file_that_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "x.hyrf"
+    target.write_bytes(b"before")
+    monkeypatch.setattr(run, "TRIES", 2)
+    monkeypatch.setattr(run, "TOLERATED", -np.inf)  # the first try will not do
+    monkeypatch.setattr(run, "compress", _interrupted_at_the_second(run.compress))
+    with pytest.raises(KeyboardInterrupt):
+        distill_splats(ball(20), target, LITTLE)
+    assert [path.name for path in tmp_path.iterdir()] == ["x.hyrf"]
+    assert target.read_bytes() == b"before"
+
+
+def _interrupted_at_the_second(compress):
+    calls = []
+
+    def wrapped(*args, **options):
+        calls.append(args)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return compress(*args, **options)
+
+    return wrapped
 
 
 def test_settings_out_of_range_are_refused() -> None:

@@ -18,7 +18,7 @@ from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 def drawable_of(splats: Splats) -> tuple[Drawable, list]:
     weighted = Weighted.of(splats, "x")
     drawable = Drawable.of(splats, weighted.frame)
-    return drawable, viewpoints(weighted, drawable, 6, 32, 0)
+    return drawable, viewpoints(weighted, drawable, 24, 32, 0)
 
 
 def covariances(scales, quats) -> np.ndarray:

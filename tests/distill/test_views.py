@@ -7,7 +7,7 @@ from explicit_balls import ball
 
 from hyrfpack.distill.views import CLUTTER, COVERED, DISTANCES, Weighted, coverage, viewpoints
 from hyrfpack.export.draw import Drawable
-from hyrfpack.export.splats import Splats
+from hyrfpack.export.splats import Splats, concatenate
 
 
 def seen(splats: Splats, count: int = 12, seed: int = 0):
@@ -56,3 +56,11 @@ def test_far_away_splat_does_not_stretch_the_frame() -> None:
     positions = splats.positions.copy()
     positions[0] = 1e5
     assert Weighted.of(replace(splats, positions=positions), "x").frame.scale < 2
+
+
+def test_sky_does_not_stretch_the_frame() -> None:
+    ground, sky = solid_ball(), room()
+    sky = replace(sky, positions=100 * sky.positions, scales=100 * sky.scales)
+    weighted, drawable, cameras = seen(concatenate((replace(ground, scales=ground.scales / 2), sky[::10])))
+    assert weighted.frame.scale < 2
+    assert np.abs([camera.position for camera in cameras]).max() < 10
