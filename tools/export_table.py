@@ -32,15 +32,15 @@ from hyrfpack.export.splats import Splats, concatenate
 Result = TypeVar("Result")
 
 CHECKED_BY = {
-    ".ply": "splat-transform, gsply",
-    ".splat": "splat-transform",
-    ".spz": "splat-transform, three.js",
-    ".spz v4": "splat-transform",
+    ".ply": "splat-transform, gsply, three.js",
+    ".splat": "splat-transform, three.js",
+    ".spz": "splat-transform, gsply, three.js",
+    ".spz v4": "splat-transform, gsply",
     ".sog": "splat-transform, gsply",
     ".glb": "three.js, gltf-validator",
-    ".usda": "omniverse-asset-validator",
-    ".usdc": "omniverse-asset-validator",
-    ".usdz": "omniverse-asset-validator",
+    ".usda": "omniverse-asset-validator, OpenUSD",
+    ".usdc": "omniverse-asset-validator, OpenUSD",
+    ".usdz": "omniverse-asset-validator, OpenUSD",
     ".html": "Chromium",
 }
 
