@@ -127,8 +127,8 @@ def export(
     degrees = (degree,) if crop is not None else range(degree + 1)
     baked = {d: chosen(splats, crop, min_opacity) for d, splats in bake(read.model, read.fitted, degrees).items()}
     say(f"writing {len(baked[degree]):,} Gaussians{' and the background' if sphere else ''}")
-    pack = _pack_page if kind == PAGE else _pack_splats
-    packed = pack(read, kind, target, baked, degree, sphere, spz_version)
+    what = read, baked, degree, sphere, Path(target)
+    packed = _pack_page(*what) if kind == PAGE else _pack_splats(*what, kind, spz_version)
     write_atomic(target, packed.data)
     report = ExportReport(str(target), len(packed.data), len(packed.before[degree][0]), packed.background, degree)
     if crop is not None:
@@ -154,29 +154,15 @@ class _Packed:
     background: int = 0
 
 
-def _pack_page(
-    read: Source,
-    kind: str,
-    target: str | os.PathLike[str],
-    baked: dict[int, Splats],
-    degree: int,
-    sphere: bool,
-    spz_version: int,
-) -> _Packed:
+def _pack_page(read: Source, baked: dict[int, Splats], degree: int, sphere: bool, target: Path) -> _Packed:
     picture = background_picture(read.model) if sphere else None
-    data = page(read, baked[degree], picture, Path(target).stem)
+    data = page(read, baked[degree], picture, target.stem)
     before = {d: (splats, picture) for d, splats in baked.items()}
     return _Packed(data, before, decode_page(data, str(target)))
 
 
 def _pack_splats(
-    read: Source,
-    kind: str,
-    target: str | os.PathLike[str],
-    baked: dict[int, Splats],
-    degree: int,
-    sphere: bool,
-    spz_version: int,
+    read: Source, baked: dict[int, Splats], degree: int, sphere: bool, target: Path, kind: str, spz_version: int
 ) -> _Packed:
     largest = spz.LARGEST_SCALE if kind == ".spz" else math.inf
     behind = [background_splats(read.model, read.fitted, largest)] if sphere else []
