@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import socket
+import sys
 import threading
 import webbrowser
 from collections.abc import Callable
@@ -69,8 +70,7 @@ def _server(host: str, port: int) -> ThreadingHTTPServer:
             self.send_header("X-Content-Type-Options", "nosniff")
             self.end_headers()
             if with_body:
-                with contextlib.suppress(ConnectionError, TimeoutError):  # the browser went away
-                    self.wfile.write(self.server.page)
+                self.wfile.write(self.server.page)
 
         def log_message(self, format: str, *args: object) -> None:
             """Requests are nobody's news."""
@@ -78,6 +78,10 @@ def _server(host: str, port: int) -> ThreadingHTTPServer:
     class Server(ThreadingHTTPServer):
         page = b""
         address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+
+        def handle_error(self, request: object, client_address: object) -> None:
+            if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):  # the browser went away
+                super().handle_error(request, client_address)
 
     try:
         return Server((host, port), Handler)

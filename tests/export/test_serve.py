@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import threading
+import time
 import urllib.error
 import urllib.request
 
@@ -50,3 +52,21 @@ def test_a_port_in_use_is_one_sentence():
 def test_an_address_that_is_not_ours_is_one_sentence():
     with pytest.raises(HyrfError, match="nothing can listen at port 0 of 192.0.2.1"):
         serve(lambda: PAGE, host="192.0.2.1", open_browser=False, say=lambda address: None)
+
+
+def test_a_browser_that_goes_away_is_nobodys_news(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    def visit_in_a_hurry(address: str) -> None:
+        try:
+            for request in (b"GET / HTTP/1.1\r\n\r\n", b"GET"):
+                with socket.create_connection(("127.0.0.1", int(address.rsplit(":")[-1].strip("/")))) as client:
+                    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # reset at the end
+                    client.sendall(request)
+            time.sleep(0.3)
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(
+        "webbrowser.open", lambda address: threading.Thread(target=visit_in_a_hurry, args=[address]).start()
+    )
+    serve(lambda: bytes(20_000_000), open_browser=True, say=lambda address: None)
+    assert capsys.readouterr().err == ""
