@@ -203,16 +203,17 @@ def test_disk_that_fills_in_training_keeps_the_checkpoint_and_resumes_to_the_sam
     whole.run()
     out = disk / "run"
 
-    def fill_at_the_30th(count: int) -> None:
-        if count == 30:
-            with suppress(OSError):  # a checkpoint that is being written took the room first
-                fill(disk, leave=0)
+    def fill_from_the_30th(count: int) -> None:
+        # Again and again: a checkpoint that was being written gives its forerunner's room back when it is done.
+        if count >= 30:
+            with suppress(OSError), open(disk / "ballast", "ab", buffering=0) as ballast:
+                ballast.write(bytes(shutil.disk_usage(disk).free))
 
     out.mkdir()
     (out / "model.hyrf").write_bytes(b"old")
 
     with pytest.raises(HyrfError, match=r"model.hyrf: the disk is full.*checkpoint of step \d+ is kept, --resume") as e:
-        train(balls(fill_at_the_30th), out, CONFIG, overwrite=True, cache=PictureCache(0), quiet=True)
+        train(balls(fill_from_the_30th), out, CONFIG, overwrite=True, cache=PictureCache(0), quiet=True)
 
     assert files_in(out).keys() == {"model.hyrf", "checkpoint.pt"} and (out / "model.hyrf").read_bytes() == b"old"
     assert 10 <= int(re.search(r"checkpoint of step (\d+)", str(e.value))[1]) <= 30
