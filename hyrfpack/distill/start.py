@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.export.draw import Drawable
-from hyrfpack.export.harmonics import BAND_0, harmonics_basis
+from hyrfpack.export.harmonics import BAND_0
 from hyrfpack.model import HashGridConfig, HybridModel, ModelConfig, viewpoint_of
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.hybrid import scale_bounds
@@ -93,7 +93,7 @@ def initial_model(drawable: Drawable, light: Tensor, cameras: Sequence[Camera], 
         cameras: that the splats' colours are looked at from.
         seed: of the first weights, and of the order.
     """
-    degree = degree_of(drawable)
+    degree = drawable.degree
     config = model_shape(drawable, degree)
     scales = drawable.scales.clamp_min(SMALLEST)
     shapes = _Shapes.of(logit(scales / scale_bounds(drawable.positions, config)), drawable.quats)
@@ -136,19 +136,7 @@ def _fit(
             errors = errors + SIZE_WEIGHT * raw[:, 0].square()
             if poses:
                 viewpoint = viewpoint_of(poses[int(torch.randint(0, len(poses), (1,), generator=generator))])
-                wanted = colors_from(drawable, viewpoint, some).clamp(0, 1)
+                wanted = drawable.colors_from(viewpoint, some).clamp(0, 1)
                 errors = errors + COLOR_WEIGHT * (model.decode_colors(viewpoint, some) - wanted).square().sum(1)
             (weights[some] * errors).mean().backward()
             optimizer.step(step, steps)
-
-
-def degree_of(drawable: Drawable) -> int:
-    """Of its harmonics."""
-    return round(drawable.harmonics.shape[1] ** 0.5) - 1
-
-
-def colors_from(drawable: Drawable, viewpoint: Tensor, index: Tensor) -> Tensor:
-    """Colours (n, 3), not cut, of the splats at `index` seen from `viewpoint` (3,) local units."""
-    directions = torch.nn.functional.normalize(drawable.positions[index] - viewpoint, dim=-1, eps=1e-12)
-    basis = harmonics_basis(directions, degree_of(drawable))
-    return torch.einsum("nk,nkc->nc", basis, drawable.harmonics[index]) + 0.5

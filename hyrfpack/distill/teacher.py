@@ -9,16 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.export.draw import Drawable, draw
+from hyrfpack.evaluate.metrics import psnr
+from hyrfpack.export.draw import Drawable, draw, sent_light
 from hyrfpack.model import HybridModel
-from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Camera, Picture, Scene, View
 
 LEAST_ALPHA = 1e-6  # below it a pixel has no colour of its own
-MOST_DB = 100.0  # what equal pictures score
 
 
 def teaching_scene(name: str, drawable: Drawable, train: Sequence[Camera], test: Sequence[Camera]) -> Scene:
@@ -44,20 +43,14 @@ def photograph(drawable: Drawable, camera: Camera) -> Picture:
 def light_of(drawable: Drawable, cameras: Sequence[Camera]) -> Tensor:
     """(N,) the light that each Gaussian sends to a picture, in pixels: the sum of T alpha, mean over cameras."""
     total = torch.zeros(len(drawable.positions))
-    near, tolerance = RenderSettings().near, RenderSettings().cull_tolerance
+    settings = RenderSettings()
     for camera in cameras:
         pose = torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32)
         size = camera.intrinsics, camera.width, camera.height
-        index = frustum_cull(drawable.positions, pose, *size, near, tolerance)
-        # rgb = sum T alpha color is linear in the colours: their gradient is the light.
-        colors = torch.ones(len(index), 3, requires_grad=True)
-        explicit = (drawable.quats[index], drawable.scales[index], drawable.opacities[index])
-        raster = rasterize(
-            drawable.positions[index], *explicit, colors, pose, *size, near=near, antialiased=drawable.antialiased
-        )
-        if raster.rgb.requires_grad:
-            (gradient,) = torch.autograd.grad(raster.rgb[..., 0].sum(), colors)
-            total.index_add_(0, index, gradient[:, 0])
+        index = frustum_cull(drawable.positions, pose, *size, settings.near, settings.cull_tolerance)
+        parts = (drawable.positions, drawable.quats, drawable.scales, drawable.opacities)
+        light = sent_light(*(part[index] for part in parts), camera, pose, drawable.antialiased)
+        total.index_add_(0, index, light)
     return total / max(1, len(cameras))
 
 
@@ -69,6 +62,5 @@ def likeness(model: HybridModel, drawable: Drawable, cameras: Sequence[Camera]) 
     for camera in cameras:
         wanted = draw(drawable, camera).rgb.clamp(0, 1)
         given = render(model, camera, decoded=decoded).rgb.clamp(0, 1)
-        mse = float((given - wanted).square().mean())
-        scores.append(min(MOST_DB, -10 * float(np.log10(max(mse, 1e-30)))))
+        scores.append(psnr(given, wanted))
     return scores

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from hyrfpack.errors import HyrfError
+from hyrfpack.export.draw import sent_light
 from hyrfpack.export.harmonics import fibonacci_sphere, harmonics_basis, terms_of
 from hyrfpack.export.splats import Splats, normalized_quats
 from hyrfpack.model import Geometry, HybridModel, viewpoint_of
-from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import ALPHA_MIN
 from hyrfpack.ops.shade import Shading, shade
@@ -107,11 +107,8 @@ def _view(model: HybridModel, geometry: Geometry, camera: Camera) -> _View:
     drawn = frustum_cull(positions, pose, *size, settings.near, settings.cull_tolerance)
 
     def light(means: Tensor, some: Geometry) -> Tensor:
-        with torch.enable_grad():  # T alpha, summed over pixels, is the derivative of summed pixels by the colour
-            colors = torch.zeros_like(means, requires_grad=True)
-            how = {"near": settings.near, "antialiased": model.config.antialiased}
-            raster = rasterize(means, some.quats, some.scales, some.opacities, colors, pose, *size, **how)
-            return torch.autograd.grad(raster.rgb[..., 0].sum(), colors)[0][:, 0]
+        shape = some.quats, some.scales, some.opacities
+        return sent_light(means, *shape, camera, pose, model.config.antialiased)
 
     received, all_drawn = light(positions[drawn], geometry[drawn]), light(positions, geometry)
     all_drawn[drawn] = 0

@@ -49,6 +49,16 @@ class Drawable:
             splats.antialiased,
         )
 
+    @property
+    def degree(self) -> int:
+        """Of the spherical harmonics."""
+        return round(self.harmonics.shape[1] ** 0.5) - 1
+
+    def colors_from(self, viewpoint: Tensor, index: Tensor) -> Tensor:
+        """Colours (n, 3), not cut, of the splats at `index` (n,), seen from `viewpoint` (3,) local units."""
+        directions = torch.nn.functional.normalize(self.positions[index] - viewpoint, dim=-1, eps=1e-12)
+        return torch.einsum("nk,nkc->nc", harmonics_basis(directions, self.degree), self.harmonics[index]) + 0.5
+
 
 @torch_on_one_thread()
 @torch.no_grad()
@@ -67,18 +77,44 @@ def draw(
     pose = torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32)
     size = camera.intrinsics, camera.width, camera.height
     index = frustum_cull(drawable.positions, pose, *size, settings.near, settings.cull_tolerance)
-    positions, harmonics = drawable.positions[index], drawable.harmonics[index]
-    directions = torch.nn.functional.normalize(positions - viewpoint_of(pose), dim=-1, eps=1e-12)
-    basis = harmonics_basis(directions, round(harmonics.shape[1] ** 0.5) - 1)
     return rasterize(
-        positions,
+        drawable.positions[index],
         drawable.quats[index],
         drawable.scales[index],
         drawable.opacities[index],
-        (torch.einsum("nk,nkc->nc", basis, harmonics) + 0.5).clamp_min(0),
+        drawable.colors_from(viewpoint_of(pose), index).clamp_min(0),
         pose,
         *size,
         near=settings.near,
         antialiased=drawable.antialiased,
         transmittance_min=settings.transmittance_min,
     )
+
+
+def sent_light(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    camera: Camera,
+    pose: Tensor,
+    antialiased: bool,
+) -> Tensor:
+    """The light (N,) that each Gaussian sends to a picture, in pixels: the sum of T alpha.
+
+    A picture is the sum of T alpha color, so this is the derivative of its summed pixels by the Gaussians' colours.
+
+    Args:
+        means, quats, scales, opacities: as in `rasterize`, local units; all are drawn.
+        camera: its size and intrinsics count.
+        pose: (4, 4) its camera_from_local.
+        antialiased: as in `rasterize`.
+    """
+    size = camera.intrinsics, camera.width, camera.height
+    with torch.enable_grad():
+        colors = torch.zeros_like(means, requires_grad=True)
+        how = {"near": RenderSettings().near, "antialiased": antialiased}
+        raster = rasterize(means, quats, scales, opacities, colors, pose, *size, **how)
+        if not raster.rgb.requires_grad:  # nothing is drawn
+            return means.new_zeros(len(means))
+        return torch.autograd.grad(raster.rgb[..., 0].sum(), colors)[0][:, 0]

@@ -43,7 +43,7 @@ def test_fields_learn_shapes_and_colours(degree: int, monkeypatch: pytest.Monkey
         made = model.decode_geometry()
         place = torch.tensor((3.0, 1.0, 0.0))
         colors = model.decode_colors(place)
-        wanted = start.colors_from(drawable, place, torch.arange(100)).clamp(0, 1)
+        wanted = drawable.colors_from(place, torch.arange(100)).clamp(0, 1)
     # Ellipsoids agree whatever their axes are called; sizes and opacities are stored, and exact.
     expected = covariances(drawable.scales, drawable.quats)
     error = np.linalg.norm(covariances(made.scales, made.quats) - expected, axis=(1, 2))

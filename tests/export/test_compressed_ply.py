@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
+from made_up_splats import EDITS, LENGTHS, damaged
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.export.formats import compressed_ply, ply
@@ -105,17 +105,13 @@ def test_decode_refuses_with_a_sentence(data, words):
 
 @settings(max_examples=40, deadline=None, derandomize=True, database=None)
 @given(
-    edits=st.lists(st.tuples(st.floats(0, 0.999), st.binary(min_size=0, max_size=3)), min_size=1, max_size=4),
-    length=st.sampled_from([1.0, 1.0, 0.9, 0.3]),
+    edits=EDITS,
+    length=LENGTHS,
 )
 def test_damaged_files_become_splats_or_a_sentence(edits, length):
     data = file_of(5, WORDS, colored=True, rest=9)
-    data = data[: int(length * len(data))]
-    for place, piece in edits:
-        at = int(place * len(data))
-        data = data[:at] + piece + data[at + 1 :]
     try:
-        splats = ply.read_ply(data, "a.ply")
+        splats = ply.read_ply(damaged(data, edits, length), "a.ply")
     except HyrfDataError as error:
         assert str(error).startswith("a.ply: ")
     else:

@@ -9,25 +9,15 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_up_splats import made_up
 from scipy.spatial.transform import Rotation
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.export.formats import gltf
 from hyrfpack.export.placement import local_origin, upright_rotation
-from hyrfpack.export.splats import Splats, normalized_quats
+from hyrfpack.export.splats import Splats
 
 Y_DOWN, Z_UP = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
-
-
-def made_up(count: int = 40, degree: int = 3, shift=(0.0, 0.0, 0.0)) -> Splats:
-    rng = np.random.default_rng(count)
-    return Splats(
-        rng.normal(size=(count, 3)) + shift,
-        np.exp(rng.normal(size=(count, 3)) - 3),
-        normalized_quats(rng.normal(size=(count, 4))),
-        rng.random(count),
-        rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.3,
-    )
 
 
 def same(first: Splats, second: Splats) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_up_splats import EDITS, LENGTHS, damaged
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.export.formats import ply
@@ -198,8 +199,8 @@ def test_read_ply_refuses_with_a_sentence(data, words):
 @settings(max_examples=50, deadline=None, derandomize=True, database=None)
 @given(
     text=st.booleans(),
-    edits=st.lists(st.tuples(st.floats(0, 0.999), st.binary(min_size=0, max_size=3)), min_size=1, max_size=4),
-    length=st.sampled_from([1.0, 1.0, 0.9, 0.3]),
+    edits=EDITS,
+    length=LENGTHS,
 )
 def test_damaged_files_become_splats_or_a_sentence(text, edits, length):
     data = ply.encode(make_splats(5, 0))
@@ -207,12 +208,8 @@ def test_damaged_files_become_splats_or_a_sentence(text, edits, length):
         values = np.frombuffer(data.split(b"end_header\n")[1], "<f4").reshape(5, -1)
         names = ["x", "y", "z", "nx", "ny", "nz", *NAMES[3:]]
         data = file_of(names, "float", "\n".join(" ".join(map(str, row)) for row in values).encode(), 5, "ascii")
-    data = data[: int(length * len(data))]
-    for place, piece in edits:
-        at = int(place * len(data))
-        data = data[:at] + piece + data[at + 1 :]
     try:
-        splats = ply.read_ply(data, "a.ply")
+        splats = ply.read_ply(damaged(data, edits, length), "a.ply")
     except HyrfDataError as error:
         assert str(error).startswith("a.ply: ")
     else:

@@ -7,12 +7,13 @@ from io import BytesIO
 
 import numpy as np
 import pytest
+from made_up_splats import made_up
 from scenes import look_at
 from scipy.spatial.transform import Rotation
 
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.export.formats import usd
-from hyrfpack.export.splats import Splats, normalized_quats
+from hyrfpack.export.splats import Splats
 from hyrfpack.scene import Camera
 
 EXTENSIONS = ("usda", "usdc", "usdz")
@@ -25,17 +26,6 @@ def pxr():
     """usd-core's modules by name: pxr("Gf")."""
     pytest.importorskip("pxr")
     return lambda name: importlib.import_module(f"pxr.{name}")
-
-
-def made_up(count: int = 40, degree: int = 3, shift=(0.0, 0.0, 0.0)) -> Splats:
-    rng = np.random.default_rng(count)
-    return Splats(
-        rng.normal(size=(count, 3)) + shift,
-        np.exp(rng.normal(size=(count, 3)) - 3),
-        normalized_quats(rng.normal(size=(count, 4))),
-        rng.random(count),
-        rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.3,
-    )
 
 
 def opened(pxr, tmp_path, splats: Splats, extension: str = "usdc", **options):

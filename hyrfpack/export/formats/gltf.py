@@ -17,6 +17,7 @@ which are most of it, have to be float32.
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections.abc import Iterator
 from operator import index as integer
@@ -225,7 +226,7 @@ def _local_transform(node: dict[str, Any]) -> np.ndarray:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
     quat = np.array([[w, x, y, z]])
-    rotation = matrices_of(quat / (np.linalg.norm(quat) or 1))[0]
+    rotation = matrices_of(quat / (math.hypot(*quat[0]) or 1))[0]  # as the norm, but its squares cannot overflow
     matrix = np.eye(4)
     matrix[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)), np.float64)
     matrix[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64)
