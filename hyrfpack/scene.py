@@ -132,6 +132,7 @@ class Scene:
         point_colors: (P, 3) float32 RGB in [0, 1].
         has_alpha: photos have transparent pixels (object-centred captures without a background).
         notes: sentences for the user about what the reader skipped or assumed.
+        files: every file it was read from or will be: tables of poses, points, photos, masks.
 
     Raises:
         ValueError: a point or its colour is not finite.
@@ -145,6 +146,7 @@ class Scene:
     point_colors: np.ndarray
     has_alpha: bool = False
     notes: list[str] = field(default_factory=list)
+    files: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.points).all() and np.isfinite(self.point_colors).all()):

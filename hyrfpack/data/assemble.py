@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Set
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -47,6 +47,7 @@ def make_scene(
     test_names: Set[str] | None = None,
     points: np.ndarray | None = None,
     point_colors: np.ndarray | None = None,
+    tables: Sequence[Path],
     notes: list[str],
 ) -> Scene:
     """Check every photo and split them.
@@ -59,6 +60,7 @@ def make_scene(
         test_names: the set's own split, which then counts instead of `test_every`.
         points: (P, 3) world positions, none when None.
         point_colors: (P, 3) RGB in [0, 1].
+        tables: the files that poses and points were read from.
         notes: sentences for the user; more are added.
 
     Raises:
@@ -87,7 +89,9 @@ def make_scene(
     if bent:
         notes.append(f"{bent} of {len(photos)} photos are undistorted as they are loaded")
     points, point_colors = _finite_points(points, point_colors, notes)
-    return Scene(str(path), layout, train, test, points, point_colors, _see_through(photos), notes)
+    masks = [photo.mask for photo in photos if photo.mask is not None]
+    files = tuple(str(file) for file in (*tables, *(photo.path for photo in photos), *masks))
+    return Scene(str(path), layout, train, test, points, point_colors, _see_through(photos), notes, files)
 
 
 def safe_name(text: str) -> str:

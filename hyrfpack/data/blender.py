@@ -32,7 +32,8 @@ def read_blender(path: Path, *, test_every: int) -> Scene:
         photos += test
         if held_out == "val":
             notes.append("the set has no test split; val is used")
-    return make_scene(path, "blender", photos, test_every=test_every, test_names=test_names, notes=notes)
+    tables = [path / f"transforms_{split}.json" for split in ("train", held_out) if split is not None]
+    return make_scene(path, "blender", photos, test_every=test_every, test_names=test_names, tables=tables, notes=notes)
 
 
 def _read_split(path: Path, split: str, notes: list[str]) -> list[Photo]:

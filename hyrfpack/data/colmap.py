@@ -65,7 +65,16 @@ def read_colmap(path: Path, *, test_every: int, images: str | None) -> Scene:
         mask = find_mask(path, picture_folder.name, name)
         photos.append(Photo(name, file, read_header(file), cameras[camera_id], pose, mask))
     notes += skipped_note(missing, len(posed), str(model))
-    return make_scene(path, "colmap", photos, test_every=test_every, points=points, point_colors=colors, notes=notes)
+    return make_scene(
+        path,
+        "colmap",
+        photos,
+        test_every=test_every,
+        points=points,
+        point_colors=colors,
+        tables=sorted(file for file in model.iterdir() if file.is_file()),
+        notes=notes,
+    )
 
 
 def lens_from_colmap(model: str, width: int, height: int, params: np.ndarray) -> Lens:

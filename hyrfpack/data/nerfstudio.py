@@ -61,6 +61,7 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None) -> Scene
         photos.append(Photo(name, picture, header, lens, pose_from_opengl(frame, file), mask))
     notes = skipped_note(missing, len(frames), file.name)
     points, colors = _read_ply(path, content, file)
+    tables = [file] if points is None else [file, path / content["ply_file_path"]]
     return make_scene(
         path,
         "nerfstudio",
@@ -69,6 +70,7 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None) -> Scene
         test_names=None if keep is None else test,
         points=points,
         point_colors=colors,
+        tables=tables,
         notes=notes,
     )
 

@@ -51,6 +51,9 @@ def test_val_stands_in_for_a_missing_test_split(tmp_path, opengl_frames):
 
     assert [view.name for view in scene.test] == ["val/r_0.png", "val/r_1.png", "val/r_2.png"]
     assert any("val is used" in note for note in scene.notes)
+    tables = [f"transforms_{split}.json" for split in ("train", "val")]
+    photos = [f"{split}/r_{index}.png" for split in ("train", "val") for index in range(3)]
+    assert sorted(scene.files) == sorted(str(tmp_path / name) for name in tables + photos)
 
 
 def test_set_without_a_split_holds_out_every_nth(tmp_path, opengl_frames):

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 
 import pytest
+import trimesh
 
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfDataError
@@ -65,3 +67,20 @@ def test_importing_the_readers_loads_no_heavy_library():
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
 
     assert printed.strip() == "[]"
+
+
+def test_scene_lists_every_file_it_is_read_from(tmp_path, colmap_folder, nerfstudio_folder):
+    colmap_folder(tmp_path, count=3)
+    (tmp_path / "masks").mkdir()
+    shutil.copy(tmp_path / "images" / "001.png", tmp_path / "masks" / "001.png")
+    (tmp_path / "stray.txt").write_text("not read")
+    pictures = {"images/000.png", "images/001.png", "images/002.png", "masks/001.png"}
+    nerfstudio_folder(3, ply_file_path="points.ply")
+    trimesh.PointCloud([[0.0, 0.0, 1.0]]).export(tmp_path / "points.ply")
+
+    colmap = load_scene(tmp_path, layout="colmap").files
+    nerfstudio = load_scene(tmp_path, layout="nerfstudio").files
+
+    tables = {f"sparse/0/{table}.bin" for table in ("cameras", "images", "points3D")}
+    assert sorted(colmap) == sorted(str(tmp_path / name) for name in tables | pictures)
+    assert sorted(nerfstudio) == sorted(str(tmp_path / name) for name in {"transforms.json", "points.ply"} | pictures)
