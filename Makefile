@@ -33,7 +33,7 @@ $(PEERS): tests/node/package.json tests/node/package-lock.json
 	else echo "npm could not install: the tests with programs under node will skip"; test -z "$${CI:-}"; fi
 
 demo: $(READY) ## train, compress and render a small made-up scene; results in demo/
-	$(BIN)/hyrfpack demo -o demo
+	$(BIN)/hyrfpack demo -o demo --overwrite
 
 test: lint $(PEERS) ## check style, then run all tests
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal

@@ -38,14 +38,15 @@ def replacing(path: str | os.PathLike[str], length: int | None = None) -> Iterat
     process left behind is removed by the next one that writes into the same folder (but on Windows).
 
     Args:
-        path: of the file, in a folder that exists.
+        path: of the file; its folder is made if missing.
         length: bytes that will be written, for the message when the disk is full.
 
     Raises:
-        HyrfError: the folder is missing, not writable or full, or what is at `path` is no file. An OSError in the
-            block counts as one of writing.
+        HyrfError: the folder cannot be made, is not writable or full, or what is at `path` is no file. An OSError in
+            the block counts as one of writing.
     """
     try:
+        make_folder(Path(os.path.realpath(path)).parent)
         if os.path.exists(path) and not os.path.isfile(path):
             kind = "folder; name a file in it" if os.path.isdir(path) else "device or a pipe; name a file"
             raise HyrfError(f"{path}: this is a {kind}")
@@ -148,7 +149,4 @@ def _explain(path: str | os.PathLike[str], length: int | None, error: OSError) -
         return f"{path}: your quota is used up and this file was not written; free {size} and try again"
     if error.errno == errno.EFBIG:
         return f"{path}: so large a file is not allowed here (see 'ulimit -f'); choose another place"
-    folder = os.path.dirname(path) or "."
-    if isinstance(error, (FileNotFoundError, NotADirectoryError)) and not os.path.isdir(folder):
-        return f"{path}: there is no folder '{folder}'; make it first"
     return f"{path}: the file cannot be written ({error.strerror or error}); choose another place or mend this one"

@@ -27,6 +27,18 @@ from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train import TrainConfig, train
 
 DRAWN_VIEWS = 4
+SCENE, RUN, RENDERS, PAGE, PICTURE, BACK = "scene", "run", "renders", "demo.html", "demo.png", "back.hyrf"
+PACKED = {profile: f"{profile}.hyrf" for profile in ("paper", "compact")}
+FILES = (  # what a demo leaves, one of each kind
+    PICTURE,
+    PAGE,
+    BACK,
+    *PACKED.values(),
+    f"{SCENE}/transforms.json",
+    f"{SCENE}/images/0000.png",
+    f"{RUN}/model.hyrf",
+    f"{RENDERS}/0000.png",
+)
 
 
 @dataclass(frozen=True)
@@ -111,19 +123,19 @@ def run_demo(
     """
     folder = Path(folder)
     report(f"making a scene of {views} photos")
-    write_demo_scene(folder / "scene", views=views, size=size)
-    scene = load_scene(folder / "scene")
+    write_demo_scene(folder / SCENE, views=views, size=size)
+    scene = load_scene(folder / SCENE)
     report(f"training {steps:,} steps on {len(scene.train)} photos, {len(scene.test)} held out")
-    trained = train(scene, folder / "run", TrainConfig(steps=steps), overwrite=True)
+    trained = train(scene, folder / RUN, TrainConfig(steps=steps), overwrite=True)
     if trained.model is None:
         raise KeyboardInterrupt
 
     report("compressing, decompressing and scoring")
-    back, profiles = folder / "back.hyrf", []
-    for profile in ("raw", "paper", "compact"):
+    back, profiles = folder / BACK, []
+    for profile in ("raw", *PACKED):
         path, compress_seconds = trained.model, None
         if profile != "raw":
-            path = folder / f"{profile}.hyrf"
+            path = folder / PACKED[profile]
             compress_seconds = _seconds(lambda path=path, profile=profile: compress(trained.model, path, profile))
         decompress_seconds = _seconds(lambda path=path: repack(path, back))
         scores = evaluate(load(back), scene.test)
@@ -132,17 +144,17 @@ def run_demo(
 
     report("rendering held-out views")
     model = load(path)
-    for _ in render_files(model, [(view.name, view.camera) for view in scene.test], folder / "renders"):
+    for _ in render_files(model, [(view.name, view.camera) for view in scene.test], folder / RENDERS):
         pass
     report("making a page for the browser")
-    page = export(path, folder / "demo.html", data=scene)
+    page = export(path, folder / PAGE, data=scene)
     result = DemoResult(
         steps=steps,
         gaussians=len(model),
         train_seconds=trained.metrics["seconds"],
         frames_per_second=1 / scores.seconds_per_frame,
         profiles=profiles,
-        picture=folder / "demo.png",
+        picture=folder / PICTURE,
         page=page,
     )
     save_picture(result.picture, _draw(model, scene, result))

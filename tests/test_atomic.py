@@ -255,9 +255,17 @@ def test_working_folder_that_was_removed_is_one_sentence(tmp_path, monkeypatch):
         write_atomic("model.hyrf", b"new")
 
 
-def test_missing_folder_is_named(tmp_path):
-    with pytest.raises(HyrfError, match="there is no folder '.*absent'; make it first"):
-        write_atomic(tmp_path / "absent" / "model.hyrf", b"new")
+def test_missing_folders_are_made(tmp_path):
+    write_atomic(tmp_path / "absent" / "too" / "model.hyrf", b"new")
+
+    assert (tmp_path / "absent" / "too" / "model.hyrf").read_bytes() == b"new"
+
+
+def test_file_in_place_of_a_folder_is_named(tmp_path):
+    (tmp_path / "photos").write_bytes(b"")
+
+    with pytest.raises(HyrfError, match="photos: the folder cannot be made"):
+        write_atomic(tmp_path / "photos" / "model.hyrf", b"new")
 
 
 def test_folder_in_the_way_is_named(tmp_path):

@@ -92,7 +92,7 @@ def test_compress_prints_every_section_and_what_it_costs(run, tmp_path):
 
 
 def test_compress_with_photos_says_what_was_lost_on_those_held_out(run, data, tmp_path):
-    arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--data", data)
+    arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--overwrite", "--data", data)
     scores = [
         json.loads(succeeded("evaluate", path, "--data", data, "--json").stdout)
         for path in (run / "model.hyrf", tmp_path / "p.hyrf")
@@ -122,7 +122,9 @@ def test_compress_fits_the_quantised_model_to_the_photos_and_keeps_every_gaussia
 
 def test_the_last_line_says_what_became_of_the_numbers(run, tmp_path):
     raw, paper = (
-        succeeded("compress", run / "model.hyrf", "-o", tmp_path / "x.hyrf", "--profile", profile).stdout.splitlines()
+        succeeded(
+            "compress", run / "model.hyrf", "-o", tmp_path / f"{profile}.hyrf", "--profile", profile
+        ).stdout.splitlines()
         for profile in ("raw", "paper")
     )
     assert re.search("bytes, [0-9,]+ Gaussians, every number as float32$", raw[-1])
@@ -316,7 +318,7 @@ def test_options_of_compress_that_cannot_be_met_are_one_sentence(case, run, data
     options, words = REFUSED_OPTIONS[case]
     (tmp_path / "old.hyrf").write_bytes(b"old")
     options = [data if option == "DATA" else option for option in options]
-    assert words in refused("compress", run / "model.hyrf", "-o", tmp_path / "old.hyrf", *options)
+    assert words in refused("compress", run / "model.hyrf", "-o", tmp_path / "old.hyrf", "--overwrite", *options)
     assert (tmp_path / "old.hyrf").read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 1
 
 
@@ -332,6 +334,7 @@ def test_the_output_may_not_be_the_input(command, packed, tmp_path):
     (tmp_path / "link.hyrf").symlink_to(packed)
     for target in (packed, packed.parent / ".." / packed.parent.name / packed.name, tmp_path / "link.hyrf"):
         assert "input itself" in refused(command, packed, "-o", target)
+        assert "input itself" in refused(command, packed, "-o", target, "--overwrite")
     assert packed.read_bytes() == before
 
 
@@ -340,13 +343,14 @@ def test_a_failed_command_leaves_the_old_file_alone(packed, tmp_path):
     damaged[len(damaged) // 2] ^= 1
     (tmp_path / "damaged.hyrf").write_bytes(damaged)
     (tmp_path / "old.hyrf").write_bytes(b"old")
-    assert "damaged" in refused("decompress", tmp_path / "damaged.hyrf", "-o", tmp_path / "old.hyrf")
+    assert "damaged" in refused("decompress", tmp_path / "damaged.hyrf", "-o", tmp_path / "old.hyrf", "--overwrite")
     assert (tmp_path / "old.hyrf").read_bytes() == b"old"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["damaged.hyrf", "old.hyrf"]
 
 
-def test_an_output_folder_that_is_missing_is_named(packed, tmp_path):
-    assert "no folder" in refused("decompress", packed, "-o", tmp_path / "not" / "there.hyrf")
+def test_an_output_folder_that_is_missing_is_made(packed, tmp_path):
+    succeeded("decompress", packed, "-o", tmp_path / "not" / "yet" / "there.hyrf")
+    assert (tmp_path / "not" / "yet" / "there.hyrf").is_file()
 
 
 def test_pictures_cannot_go_into_a_file(packed, tmp_path):

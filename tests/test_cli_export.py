@@ -63,7 +63,7 @@ def test_identical_pictures_are_json_too(tmp_path):
 
 
 def test_photos_are_scored_if_given(model, data, tmp_path):
-    arguments = ("export", model, "-o", tmp_path / "a.ply", "--sh-degree", 0, "--data", data)
+    arguments = ("export", model, "-o", tmp_path / "a.ply", "--overwrite", "--sh-degree", 0, "--data", data)
     last = succeeded(*arguments).stdout.splitlines()[-1]
     assert re.fullmatch(r"held-out photos: PSNR \d+\.\d{3} to \d+\.\d{3} dB", last)
     assert json.loads(succeeded(*arguments, "--test-every", 0, "--json").stdout)["photos_model"] is None
@@ -86,7 +86,9 @@ def test_cameras_and_points_are_counted(model, tmp_path):
 WRONG = {
     "no output": ((), "Missing option '-o'"),
     "ending": (("-o", "a.xyz"), "the ending names the format"),
-    "no folder": (("-o", "none/a.ply"), "no folder"),
+    "no name": (("-o", ""), "names no file"),
+    "standard output": (("-o", "-"), "names no file"),
+    "too long a name": (("-o", "a" * 260 + ".ply"), "longer than 255 bytes"),
     "degree": (("-o", "a.ply", "--sh-degree", "4"), "'--sh-degree'"),
     "NaN": (("-o", "a.ply", "--crop", "0,0,0,1,nan,1"), "is no box"),
     "few numbers": (("-o", "a.ply", "--crop", "0,0,0,1"), "is no box"),

@@ -143,7 +143,7 @@ def attempts(path: Path, data: Path, output: Path, *, part: bool) -> list[tuple]
     """Every command that reads a model, told to take a part of it or not."""
     take = ["--allow-partial"] if part else []
     return [
-        ("decompress", path, "-o", output, *(["--fraction", 1] if part else [])),
+        ("decompress", path, "-o", output / "x.hyrf", *(["--fraction", 1] if part else [])),
         ("render", path, "-o", output, "--orbit", 1, *take),
         ("render", path, "-o", output, "--data", data, *take),
         ("evaluate", path, "--data", data, "--pictures", output, *take),
@@ -153,7 +153,7 @@ def attempts(path: Path, data: Path, output: Path, *, part: bool) -> list[tuple]
 def test_a_file_cut_short_is_refused_unless_asked_for(cut, data, tmp_path):
     for arguments in attempts(cut, data, tmp_path / "out", part=False):
         assert f"{cut}: " in (sentence := refused(*arguments)) and "truncated" in sentence
-    assert "truncated" in refused("compress", cut, "-o", tmp_path / "out")
+    assert "truncated" in refused("compress", cut, "-o", tmp_path / "out.hyrf")
     assert "truncated" in refused("info", cut)
     assert not (tmp_path / "out").exists()
 
@@ -163,7 +163,7 @@ def test_too_little_of_a_file_is_refused_in_a_sentence_that_says_how_much_it_tak
     for arguments in attempts(stump, data, tmp_path / "out", part=True):
         assert f"{stump}: the first {needed:,} of {size:,} bytes make a model" in refused(*arguments)
     for fraction in (0.0, 0.01, (needed - 1) / size):
-        arguments = ("decompress", whole, "-o", tmp_path / "out", "--fraction", fraction)
+        arguments = ("decompress", whole, "-o", tmp_path / "out.hyrf", "--fraction", fraction)
         assert "take more of the file" in refused(*arguments)
     assert not (tmp_path / "out").exists()
 
@@ -177,7 +177,7 @@ def test_files_without_layers_are_refused_in_part(profile, whole, data, tmp_path
 
     for arguments in attempts(part, data, tmp_path / "out", part=True):
         assert f"{part}: the first {size:,} of {size:,} bytes make a model" in refused(*arguments)
-    assert "take more of the file" in refused("decompress", full, "-o", tmp_path / "out", "--fraction", 0.99)
+    assert "take more of the file" in refused("decompress", full, "-o", tmp_path / "out.hyrf", "--fraction", 0.99)
     assert not (tmp_path / "out").exists()
 
 

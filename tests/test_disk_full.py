@@ -89,12 +89,21 @@ def packed(run, tmp_path_factory) -> Path:
 # Command -> what it is asked, given data, the trained model, the packed one, and its output folder.
 WRITERS = {
     "train": lambda data, model, packed, out: ("train", data, "-o", out, "--overwrite", *STEPS),
-    "compress": lambda data, model, packed, out: ("compress", model, "-o", out / "model.hyrf"),
-    "decompress": lambda data, model, packed, out: ("decompress", packed, "-o", out / "model.hyrf"),
-    "render": lambda data, model, packed, out: ("render", packed, "-o", out, "--orbit", 2),
-    "render depth": lambda data, model, packed, out: ("render", packed, "-o", out, "--orbit", 2, "--depth"),
-    "evaluate": lambda data, model, packed, out: ("evaluate", packed, "--data", data, "--pictures", out),
-    "demo": lambda data, model, packed, out: ("demo", "-o", out, "--steps", 2),
+    "compress": lambda data, model, packed, out: ("compress", model, "-o", out / "model.hyrf", "--overwrite"),
+    "decompress": lambda data, model, packed, out: ("decompress", packed, "-o", out / "model.hyrf", "--overwrite"),
+    "render": lambda data, model, packed, out: ("render", packed, "-o", out, "--orbit", 2, "--overwrite"),
+    "render depth": lambda data, model, packed, out: (
+        "render",
+        packed,
+        "-o",
+        out,
+        "--orbit",
+        2,
+        "--depth",
+        "--overwrite",
+    ),
+    "evaluate": lambda data, model, packed, out: ("evaluate", packed, "--data", data, "--pictures", out, "--overwrite"),
+    "demo": lambda data, model, packed, out: ("demo", "-o", out, "--overwrite", "--steps", 2),
 }
 
 
@@ -239,8 +248,10 @@ def test_stop_without_room_for_the_checkpoint_says_which_one_is_kept(tmp_path):
 def test_trainer_warns_of_a_checkpoint_that_cannot_be_written(tmp_path):
     trainer = Trainer(balls(), dataclasses.replace(CONFIG, steps=2))
 
-    with pytest.warns(UserWarning, match="there is no folder.*training goes on, without the checkpoint of step 1"):
-        assert trainer.run(checkpoint=tmp_path / "gone" / "checkpoint.pt")
+    (tmp_path / "file").write_bytes(b"")
+
+    with pytest.warns(UserWarning, match="cannot be made.*training goes on, without the checkpoint of step 1"):
+        assert trainer.run(checkpoint=tmp_path / "file" / "checkpoint.pt")
 
 
 def test_folder_removed_while_training_is_made_again_for_the_model(tmp_path):

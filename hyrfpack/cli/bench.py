@@ -8,8 +8,9 @@ from pathlib import Path
 
 import click
 
-from hyrfpack.cli.common import PATH, note, print_json, read_scene, scene_options, table
+from hyrfpack.cli.common import OUTPUT, PATH, note, overwrite_option, print_json, read_scene, scene_options, table
 from hyrfpack.errors import HyrfError
+from hyrfpack.outputs import Outputs
 
 GROUPS = ("rasterize", "hash_encode", "mlp", "render", "codec")  # hyrfpack.bench.GROUPS, without loading torch
 
@@ -20,9 +21,12 @@ GROUPS = ("rasterize", "hash_encode", "mlp", "render", "codec")  # hyrfpack.benc
 @scene_options
 @click.option("--repeats", type=click.IntRange(min=1), default=7, show_default=True, help="Turns of each contender.")
 @click.option("--only", type=click.Choice(GROUPS), multiple=True, help="Measure this group; may be given again.")
-@click.option("-o", "--output", type=PATH, default=Path("bench.png"), show_default=True, help="The plot to write.")
-@click.option("--markdown", type=PATH, metavar="FILE", help="Also write the tables, into the places FILE has for them.")
+@click.option("-o", "--output", type=OUTPUT, default=Path("bench.png"), show_default=True, help="The plot to write.")
+@click.option(
+    "--markdown", type=OUTPUT, metavar="FILE", help="Also write the tables, into the places FILE has for them."
+)
 @click.option("--json", "json_file", type=click.Path(allow_dash=True), metavar="FILE", help="Also write all numbers.")
+@overwrite_option
 def bench(
     model: Path | None,
     data: Path | None,
@@ -34,6 +38,7 @@ def bench(
     output: Path,
     markdown: Path | None,
     json_file: str | None,
+    overwrite: bool,
 ) -> None:
     """Measure each operation and each setting that trades accuracy for time, and print time beside error.
 
@@ -58,10 +63,16 @@ def bench(
     from hyrfpack.bench.machine import machine_line
 
     picture_format(output)
+    scene = None if data is None else read_scene(data, test_every, images, layout)
+    outputs = Outputs(model, scene=scene, overwrite=overwrite)
+    outputs.file(output)
+    if json_file not in (None, "-"):
+        outputs.file(json_file)
     page = _read_page(markdown)
     if page:  # does it have all places? Better asked now than after minutes
         words.fill(page, dict.fromkeys(("machine", *(only or GROUPS)), ""), str(markdown))
-    scene = None if data is None else read_scene(data, test_every, images, layout)
+    if markdown is not None:  # a page with the places is not replaced, they are filled
+        Outputs(model, scene=scene, overwrite=overwrite or bool(page)).file(markdown)
     result = measure(model, scene, repeats=repeats, only=only or None, report=note)
     if json_file == "-":
         print_json(result.to_dict())

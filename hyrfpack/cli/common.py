@@ -22,6 +22,23 @@ PATH = click.Path(path_type=Path)
 PRECISIONS = ("mixed", "float32")  # hyrfpack.train.PRECISIONS, without loading torch
 LAYOUTS = ("colmap", "blender", "nerfstudio")
 
+
+class _OutputPath(click.ParamType):
+    """Where to write. Unlike a path to read it has a name of its own."""
+
+    name = "path"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        if str(value) in ("", "-"):
+            self.fail(f"'{value}' names no file; results are written to files, so give one", param, ctx)
+        return Path(str(value))
+
+
+OUTPUT = _OutputPath()
+
+overwrite_option = click.option(
+    "--overwrite", is_flag=True, help="Replace files that are there; what the command reads is never replaced."
+)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
 
 

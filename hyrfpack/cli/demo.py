@@ -6,22 +6,25 @@ from pathlib import Path
 
 import click
 
-from hyrfpack.cli.common import PATH, json_option, note, print_json
+from hyrfpack.cli.common import OUTPUT, json_option, note, overwrite_option, print_json
+from hyrfpack.outputs import Outputs
 
 
 @click.command(short_help="See all of it on a scene made on the spot.")
-@click.option("-o", "--output", type=PATH, default=Path("demo"), show_default=True, metavar="DIR", help="Folder.")
+@click.option("-o", "--output", type=OUTPUT, default=Path("demo"), show_default=True, metavar="DIR", help="Folder.")
 @click.option("--steps", type=click.IntRange(min=1), default=3000, show_default=True, help="Optimiser steps.")
+@overwrite_option
 @json_option
-def demo(output: Path, steps: int, as_json: bool) -> None:
+def demo(output: Path, steps: int, overwrite: bool, as_json: bool) -> None:
     """Make a scene, train on it, compress, decompress, render, measure and export, and draw one picture of it all.
 
     \b
     Example:
       hyrfpack demo -o demo
     """
-    from hyrfpack.demo import run_demo
+    from hyrfpack.demo import FILES, run_demo
 
+    Outputs(overwrite=overwrite).folder(output, FILES)
     result = run_demo(output, steps=steps, report=note)
     if as_json:
         print_json(result.to_dict())

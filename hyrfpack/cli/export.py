@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hyrfpack.cli.common import PATH, json_option, note, print_json, read_scene, scene_options, table
+from hyrfpack.cli.common import (
+    OUTPUT,
+    PATH,
+    json_option,
+    note,
+    overwrite_option,
+    print_json,
+    read_scene,
+    scene_options,
+    table,
+)
+from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
     from hyrfpack.export import ExportReport
@@ -44,7 +55,7 @@ degree_option = click.option(
 
 @click.command(short_help="Write a model for other programs.")
 @click.argument("model", type=PATH)
-@click.option("-o", "--output", type=PATH, required=True, metavar="FILE", help="What to write; its ending says how.")
+@click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="What to write; its ending says how.")
 @degree_option
 @click.option(
     "--crop",
@@ -60,6 +71,7 @@ degree_option = click.option(
     "--data", type=PATH, help="Photos of the scene: for a file that keeps no cameras, and to score held-out ones."
 )
 @click.option("--spz-version", type=click.Choice(["3", "4"]), default="3", show_default=True, help="Of .spz files.")
+@overwrite_option
 @scene_options
 @json_option
 def export(
@@ -71,6 +83,7 @@ def export(
     background: bool,
     spz_version: str,
     data: Path | None,
+    overwrite: bool,
     test_every: int,
     images: str | None,
     layout: str | None,
@@ -95,8 +108,10 @@ def export(
       hyrfpack export bonsai.hyrf -o table.glb --crop -1,-1,-1,1,1,1
     """
     from hyrfpack.export import export as write
+    from hyrfpack.export.kinds import check_place
 
     scene = None if data is None else read_scene(data, test_every, images, layout)
+    check_place(output, Outputs(model, scene=scene, overwrite=overwrite))
     report = write(
         model,
         output,

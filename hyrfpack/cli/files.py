@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 import shlex
 from dataclasses import asdict
@@ -12,9 +11,19 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hyrfpack.atomic import check_writable, make_folder
-from hyrfpack.cli.common import PATH, json_option, note, print_json, read_scene, scene_options, table
-from hyrfpack.errors import HyrfError, printable
+from hyrfpack.cli.common import (
+    OUTPUT,
+    PATH,
+    json_option,
+    note,
+    overwrite_option,
+    print_json,
+    read_scene,
+    scene_options,
+    table,
+)
+from hyrfpack.errors import printable
+from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
     from hyrfpack.format import CompressionReport
@@ -50,7 +59,7 @@ def _number(ctx: click.Context, param: click.Parameter, value: float | None) -> 
 
 @click.command(short_help="Pack a model into a small file.")
 @click.argument("model", type=PATH)
-@click.option("-o", "--output", type=PATH, required=True, metavar="FILE", help="The .hyrf file to write.")
+@click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The .hyrf file to write.")
 @click.option(
     "--profile",
     type=click.Choice(PROFILES),
@@ -75,7 +84,10 @@ def _number(ctx: click.Context, param: click.Parameter, value: float | None) -> 
     metavar="DB",
     help="As small as can be for so many dB lost on the held-out photos of --data.",
 )
-@click.option("--report", type=PATH, metavar="DIR", help="Write a page there: size against loss, pictures, error maps.")
+@click.option(
+    "--report", type=OUTPUT, metavar="DIR", help="Write a page there: size against loss, pictures, error maps."
+)
+@overwrite_option
 @scene_options
 @json_option
 def compress(
@@ -88,6 +100,7 @@ def compress(
     target_size: int | None,
     max_psnr_drop: float | None,
     report: Path | None,
+    overwrite: bool,
     test_every: int,
     images: str | None,
     layout: str | None,
@@ -105,13 +118,14 @@ def compress(
       hyrfpack compress runs/bonsai/model.hyrf -o bonsai.hyrf --target-size 150kB
       hyrfpack compress runs/bonsai/model.hyrf -o bonsai.hyrf --data photos/bonsai --max-psnr-drop 0.05 --report page
     """
-    _refuse_same(model, output)
     from hyrfpack.compress import compress as pack
+    from hyrfpack.compress.report_page import FILES
 
-    if report is not None:
-        make_folder(report)
-        check_writable(report)
     scene = None if data is None else read_scene(data, test_every, images, layout)
+    outputs = Outputs(model, scene=scene, overwrite=overwrite)
+    outputs.file(output, ".hyrf")
+    if report is not None:
+        outputs.folder(report, FILES)
     result = pack(
         model,
         output,
@@ -134,7 +148,7 @@ def compress(
 
 @click.command(short_help="Unpack a file to exact float32.")
 @click.argument("file", type=PATH)
-@click.option("-o", "--output", type=PATH, required=True, metavar="FILE", help="The .hyrf file to write.")
+@click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The .hyrf file to write.")
 @click.option(
     "--fraction",
     type=click.FloatRange(0, 1),
@@ -142,8 +156,9 @@ def compress(
     metavar="F",
     help="Use only so much of the file, from its start, such as 0.6: a coarser model.",
 )
+@overwrite_option
 @json_option
-def decompress(file: Path, output: Path, fraction: float | None, as_json: bool) -> None:
+def decompress(file: Path, output: Path, fraction: float | None, overwrite: bool, as_json: bool) -> None:
     """Unpack FILE into a .hyrf file of profile raw: the numbers that FILE decodes to, bit for bit.
 
     A large file of profile compact comes in layers, the most important Gaussians first, so that its start is a model,
@@ -154,7 +169,7 @@ def decompress(file: Path, output: Path, fraction: float | None, as_json: bool) 
       hyrfpack decompress bonsai.hyrf -o back.hyrf
       hyrfpack decompress bonsai.hyrf -o coarse.hyrf --fraction 0.6
     """
-    _refuse_same(file, output)
+    Outputs(file, overwrite=overwrite).file(output, ".hyrf")
     from hyrfpack.format import repack
 
     _print_report(output, repack(file, output, fraction=fraction), {}, as_json)
@@ -217,11 +232,6 @@ def _typed(context: click.Context) -> str:
         else:
             words += [parameter.opts[-1], str(value)]
     return shlex.join(words)
-
-
-def _refuse_same(source: Path, target: Path) -> None:
-    if os.path.realpath(source) == os.path.realpath(target):
-        raise HyrfError(f"{target}: the output is the input itself; name another file with -o")
 
 
 def _scores(before: Path, after: Path, scene: Scene | None) -> dict[str, float]:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hyrfpack.cli.common import PATH, json_option, note, print_json, table
-from hyrfpack.errors import HyrfError
+from hyrfpack.cli.common import OUTPUT, PATH, json_option, note, overwrite_option, print_json, table
+from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
     from hyrfpack.distill import DistillReport
@@ -24,14 +24,7 @@ def _finite(ctx: click.Context, param: click.Parameter, value: float) -> float:
 
 @click.command("import", short_help="Make a small model of 3D Gaussians from elsewhere.")
 @click.argument("source", type=PATH)
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path, dir_okay=False),
-    required=True,
-    metavar="FILE",
-    help="The .hyrf file to write.",
-)
+@click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The .hyrf file to write.")
 @click.option("--steps", type=click.IntRange(min=1), default=500, show_default=True, help="Optimiser steps.")
 @click.option(
     "--psnr",
@@ -52,9 +45,18 @@ def _finite(ctx: click.Context, param: click.Parameter, value: float) -> float:
 )
 @click.option("--cameras", type=PATH, metavar="FILE", help="Where it will be looked at from, as JSON; or nerfstudio's.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same bytes.")
+@overwrite_option
 @json_option
 def import_(
-    source: Path, output: Path, steps: int, psnr: float, size: int, cameras: Path | None, seed: int, as_json: bool
+    source: Path,
+    output: Path,
+    steps: int,
+    psnr: float,
+    size: int,
+    cameras: Path | None,
+    seed: int,
+    overwrite: bool,
+    as_json: bool,
 ) -> None:
     """Turn SOURCE, 3D Gaussians as .ply (plain or compressed), .splat, .spz or .sog, into a small .hyrf file.
 
@@ -68,8 +70,8 @@ def import_(
       hyrfpack import scene.spz -o scene.hyrf --steps 1500 --psnr 40
       hyrfpack import room.ply -o room.hyrf --cameras transforms.json --size 800
     """
-    if output.exists() and source.exists() and output.samefile(source):
-        raise HyrfError(f"{output}: this is what shall be read; name another file with -o")
+    loose = source.parent if source.name == "meta.json" else source  # a SOG is a folder, or a file
+    Outputs(source, cameras, folder=loose, overwrite=overwrite).file(output, ".hyrf")
     from hyrfpack.distill import DistillConfig, distill
     from hyrfpack.render.camera_files import cameras_from_json
 

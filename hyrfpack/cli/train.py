@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from hyrfpack.cli.common import (
+    OUTPUT,
     PATH,
     chosen_device,
     device_options,
@@ -24,7 +25,7 @@ BACKGROUND_COLORS = ("black", "white", "random")
 
 @click.command(short_help="Train a model from posed photos.")
 @click.argument("data", type=PATH)
-@click.option("-o", "--output", "out", type=PATH, required=True, metavar="RUN", help="Folder of the run.")
+@click.option("-o", "--output", "out", type=OUTPUT, required=True, metavar="RUN", help="Folder of the run.")
 @click.option("--steps", type=click.IntRange(min=1), default=3000, show_default=True, help="Optimiser steps.")
 @click.option("--max-gaussians", type=click.IntRange(min=1), metavar="N", help="Budget.  [default: from the photos]")
 @click.option("--preset", type=click.Choice(PRESETS), default="auto", show_default=True, help="The kind of scene.")

@@ -9,17 +9,20 @@ from pathlib import Path
 import click
 
 from hyrfpack.cli.common import (
+    OUTPUT,
     PATH,
     chosen_device,
     device_options,
     json_option,
     note,
+    overwrite_option,
     print_json,
     read_scene,
     scene_options,
     split_views,
     table,
 )
+from hyrfpack.outputs import Outputs
 
 SPLITS = ("test", "train", "all")
 DEFAULT_ORBIT = 60  # frames
@@ -27,7 +30,7 @@ DEFAULT_ORBIT = 60  # frames
 
 @click.command(short_help="Render views to pictures.")
 @click.argument("model", type=PATH)
-@click.option("-o", "--output", type=PATH, required=True, metavar="OUT", help="Folder for the pictures.")
+@click.option("-o", "--output", type=OUTPUT, required=True, metavar="OUT", help="Folder for the pictures.")
 @click.option("--data", type=PATH, help="Render the views of this data folder, named as its photos.")
 @click.option("--split", type=click.Choice(SPLITS), default="test", show_default=True, help="Which views of --data.")
 @scene_options
@@ -38,6 +41,7 @@ DEFAULT_ORBIT = 60  # frames
 @click.option(
     "--allow-partial", is_flag=True, help="Take a file that is cut short: a coarser model, if enough is there."
 )
+@overwrite_option
 @device_options
 @json_option
 def render(
@@ -53,6 +57,7 @@ def render(
     depth: bool,
     video: bool,
     allow_partial: bool,
+    overwrite: bool,
     device: str,
     precision: str,
     as_json: bool,
@@ -72,21 +77,25 @@ def render(
         raise click.UsageError("--data, --cameras and --orbit each say what to render; give one of them")
     from hyrfpack.format import describe, load
     from hyrfpack.render.camera_files import cameras_from_json
-    from hyrfpack.render.files import render_files
+    from hyrfpack.render.files import render_files, rendered_names
     from hyrfpack.render.paths import orbit as orbit_around
     from hyrfpack.render.paths import stored_viewpoint
     from hyrfpack.render.video import has_ffmpeg, write_video
 
     place = chosen_device(device)
-    part = 1.0 if allow_partial else None
+    part, scene = 1.0 if allow_partial else None, None
     if data is not None:
-        views = split_views(read_scene(data, test_every, images, layout), split)
+        scene = read_scene(data, test_every, images, layout)
+        views = split_views(scene, split)
         named = [(view.name, view.camera) for view in views]
     elif cameras is not None:
         named = cameras_from_json(cameras)
     else:
         path = orbit_around(stored_viewpoint(describe(model, part)), orbit or DEFAULT_ORBIT)
         named = [(f"{number:04d}", camera) for number, camera in enumerate(path)]
+    film = output / "video.mp4" if video and has_ffmpeg() else None
+    names = rendered_names([name for name, _ in named], depth)
+    Outputs(model, cameras, scene=scene, overwrite=overwrite).folder(output, [*names, *([film.name] if film else [])])
 
     loaded = load(model, place, part)
     loaded.precision = precision
@@ -99,7 +108,6 @@ def render(
     ) as frames:
         for path in frames:
             written.append(path)
-    film = output / "video.mp4" if video and has_ffmpeg() else None
     if film:
         write_video(written, film)
     elif video:
@@ -116,10 +124,11 @@ def render(
 @click.option("--split", type=click.Choice(SPLITS), default="test", show_default=True, help="Which of its photos.")
 @scene_options
 @click.option("--lpips-weights", type=PATH, metavar="FILE", help="Weights of the lpips package, to score LPIPS too.")
-@click.option("--pictures", type=PATH, metavar="DIR", help="Write photo | render | error pictures here.")
+@click.option("--pictures", type=OUTPUT, metavar="DIR", help="Write photo | render | error pictures here.")
 @click.option(
     "--allow-partial", is_flag=True, help="Take a file that is cut short: a coarser model, if enough is there."
 )
+@overwrite_option
 @device_options
 @json_option
 def evaluate(
@@ -132,6 +141,7 @@ def evaluate(
     lpips_weights: Path | None,
     pictures: Path | None,
     allow_partial: bool,
+    overwrite: bool,
     device: str,
     precision: str,
     as_json: bool,
@@ -147,11 +157,15 @@ def evaluate(
       hyrfpack evaluate bonsai.hyrf --data photos/bonsai --pictures compare --json
     """
     from hyrfpack.evaluate import evaluate as score
+    from hyrfpack.evaluate import picture_names
     from hyrfpack.format import load
 
     loaded = load(model, chosen_device(device), 1.0 if allow_partial else None)
     loaded.precision = precision
-    views = split_views(read_scene(data, test_every, images, layout), split)
+    scene = read_scene(data, test_every, images, layout)
+    views = split_views(scene, split)
+    if pictures is not None:
+        Outputs(model, lpips_weights, scene=scene, overwrite=overwrite).folder(pictures, picture_names(views).values())
     scores = score(loaded, views, lpips_weights=lpips_weights, pictures=pictures)
     size = os.path.getsize(model)
     if scores.skipped:

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.atomic import check_writable, make_folder, write_atomic
+from hyrfpack.atomic import write_atomic
 from hyrfpack.bench.machine import machine, machine_line
 from hyrfpack.bench.timing import take_turns
-from hyrfpack.compress.report_page import PLOT, Findings, Point, ShownView, page
+from hyrfpack.compress.report_page import FILES, PAGE, PLOT, SHOWN, Findings, Point, ShownView, page, picture_names
 from hyrfpack.compress.report_plot import draw
 from hyrfpack.compress.run import NOISE, default_noise
 from hyrfpack.compress.sensitivity import measure_sensitivity
@@ -34,6 +34,7 @@ from hyrfpack.format.codec import (
 from hyrfpack.format.compact import make_plan
 from hyrfpack.format.info import describe
 from hyrfpack.model import HybridModel
+from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
 from hyrfpack.render.capture import stored_cameras
 from hyrfpack.render.files import save_picture, to_image
@@ -42,7 +43,6 @@ from hyrfpack.scene import Camera, Picture, Scene, View, evenly_spaced
 FACTORS = (1 / 16, 1 / 4, 1, 4, 16)  # of the file's noise, for the curve
 LARGE = 200_000  # Gaussians from which on the curve takes the middle three alone
 PHOTOS, VIEWPOINTS = 24, 12  # scored at most
-SHOWN = 4  # views whose pictures stand on the page
 VISIBLE = 0.4  # rms difference that the worst shown view is amplified to, at most
 MOST_AMPLIFIED = 64
 TURNS = 3  # of timing each file
@@ -80,8 +80,7 @@ def write_report(
         HyrfError: a file cannot be read, or the folder cannot be written.
     """
     folder, source, packed = Path(folder), Path(source), Path(packed)
-    make_folder(folder)
-    check_writable(folder)
+    Outputs(source, packed, scene=scene, overwrite=True).folder(folder, FILES)
     model, provenance = load_with_provenance(source)
     views, words = _views(model, source, scene)
     say(f"comparing pictures with {words}, for the page")
@@ -113,7 +112,7 @@ def write_report(
         writer=facts["writer"],
     )
     draw(findings, folder / PLOT)
-    path = folder / "index.html"
+    path = folder / PAGE
     write_atomic(path, page(source, packed, report, findings, command).encode())
     return path
 
@@ -205,14 +204,10 @@ def _write_pictures(
     amplified = amplification(min(between))
     shown = []
     for number, ((view, old, new), pair, distance) in enumerate(zip(chosen, pairs, between, strict=True), 1):
-        pictures = {
-            f"view{number}_before.png": pair[0],
-            f"view{number}_after.png": pair[1],
-            f"view{number}_difference.png": amplified * (pair[1] - pair[0]).abs(),
-        }
-        for name, picture in pictures.items():
+        names = picture_names(number)
+        for name, picture in zip(names, (*pair, amplified * (pair[1] - pair[0]).abs()), strict=True):
             save_picture(folder / name, to_image(picture))
-        shown.append(ShownView(view.name, old.psnr, new.psnr, distance, tuple(pictures)))
+        shown.append(ShownView(view.name, old.psnr, new.psnr, distance, names))
     return shown, amplified
 
 

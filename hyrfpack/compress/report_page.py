@@ -15,6 +15,8 @@ from hyrfpack.format import CompressionReport
 from hyrfpack.format.info import SECTIONS_OF_LAYERS
 
 PLOT = "size_against_loss.png"
+SHOWN = 4  # views whose pictures stand on the page, at most
+KINDS = ("before", "after", "difference")  # of pictures, for each of them
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #202124; max-width: 68rem; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 2rem; margin-bottom: 0; }
@@ -31,6 +33,15 @@ pre { background: #f1f3f4; padding: .8rem; white-space: pre-wrap; overflow-wrap:
 .views { display: grid; grid-template-columns: repeat(3, 1fr); gap: .5rem; text-align: center; }
 .views img { width: 100%; }
 """
+
+
+def picture_names(number: int) -> tuple[str, ...]:
+    """The pictures of a shown view, counted from 1, one of each of KINDS."""
+    return tuple(f"view{number}_{kind}.png" for kind in KINDS)
+
+
+PAGE = "index.html"
+FILES = (PAGE, PLOT, *(name for number in range(1, SHOWN + 1) for name in picture_names(number)))
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ from hyrfpack.format.compact import Plan, Quantized, Sensitivity, make_plan, qua
 from hyrfpack.format.compact.sections import opacity_error
 from hyrfpack.format.info import describe
 from hyrfpack.model import HybridModel
+from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
 from hyrfpack.render.capture import stored_cameras
 from hyrfpack.scene import Camera, Scene, evenly_spaced
@@ -88,9 +89,10 @@ def compress(
         settings: of "paper", see `hyrfpack.format.paper`.
 
     Raises:
-        HyrfError: a file cannot be read or written, the options do not go together, or what is asked for cannot be
-            had.
+        HyrfError: a file cannot be read or written, the target is what is read, the options do not go together, or
+            what is asked for cannot be had.
     """
+    Outputs(source, scene=data, overwrite=True).file(target)
     if profile != "compact":
         if data is not None or finetune_steps or target_bytes or max_psnr_drop is not None or noise:
             raise HyrfError(f"profile '{profile}' has no settings to fit to photos, sizes or losses; use 'compact'")

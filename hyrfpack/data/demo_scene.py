@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hyrfpack.atomic import make_folder, write_atomic
+from hyrfpack.atomic import write_atomic
 from hyrfpack.errors import needs_package
 
 _FAR = np.float32(1e9)
@@ -73,7 +73,6 @@ def write_demo_scene(folder: str | os.PathLike[str], *, views: int = 60, size: i
     if views < 2 or size < 8:
         raise ValueError(f"a scene needs 2 views of 8 pixels or more, not {views} of {size}")
     folder = Path(folder)
-    make_folder(folder / "images")
     rng = np.random.default_rng(seed)
     noise = _noise_tile(rng)
     frames, points, colors = [], [], []

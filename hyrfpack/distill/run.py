@@ -25,6 +25,7 @@ from hyrfpack.export.draw import Drawable
 from hyrfpack.export.files import read_splats
 from hyrfpack.export.splats import Splats
 from hyrfpack.model import HybridModel
+from hyrfpack.outputs import Outputs
 from hyrfpack.render.capture import capture_of
 from hyrfpack.render.paths import viewpoint_hint
 from hyrfpack.scene import Camera, Scene, evenly_spaced
@@ -128,6 +129,7 @@ def distill(
         HyrfDataError: the source cannot be read, or there is nothing to be seen in it.
         HyrfError: the target cannot be written.
     """
+    Outputs(source, overwrite=True).file(target)
     splats = read_splats(source)
     report = distill_splats(splats, target, config, name=str(source), cameras=cameras, say=say, quiet=quiet)
     return dataclasses.replace(report, bytes_source=_bytes_at(Path(source)))

@@ -22,6 +22,7 @@ from hyrfpack.render import RenderSettings, render
 from hyrfpack.render.files import file_names, save_picture
 from hyrfpack.scene import View, evenly_spaced
 
+PICTURES = 6  # of photo, render and error beside each other that are written, unless told otherwise
 NO_LPIPS = (
     "no weights: LPIPS needs the trained network of the lpips package; "
     'pass a file made by torch.save(lpips.LPIPS(net="alex").state_dict(), FILE)'
@@ -76,7 +77,7 @@ def evaluate(
     lpips_weights: str | os.PathLike[str] | None = None,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     pictures: str | os.PathLike[str] | None = None,
-    picture_count: int = 6,
+    picture_count: int = PICTURES,
 ) -> Evaluation:
     """Render held-out views and score them against their photos.
 
@@ -99,8 +100,7 @@ def evaluate(
     decoded = model.decode()
     solid = np.array(model.config.solid, dtype=np.float32)
     device = model.gaussians.positions.device
-    names = file_names([view.name for view in views])
-    drawn = evenly_spaced(range(len(views)), picture_count) if pictures is not None else []
+    drawn = picture_names(views, picture_count) if pictures is not None else {}
 
     render(model, views[0].camera, settings, decoded=decoded)  # compiles kernels and fills caches
     scores: list[ViewScore] = []
@@ -124,7 +124,7 @@ def evaluate(
         scores.append(score)
         if number in drawn:
             sheet = comparison(reference, image, mask, _caption(score))
-            save_picture(Path(pictures) / f"{names[number]}.png", sheet)
+            save_picture(Path(pictures, drawn[number]), sheet)
     if not scores:
         raise HyrfError("the masks of all views leave no pixel to score; check that white means 'use this pixel'")
     return Evaluation(
@@ -137,6 +137,12 @@ def evaluate(
         views=scores,
         skipped=skipped,
     )
+
+
+def picture_names(views: Sequence[View], count: int = PICTURES) -> dict[int, str]:
+    """What `evaluate` writes into its folder of pictures: the views' places in the list, and names of files."""
+    names = file_names([view.name for view in views])
+    return {place: f"{names[place]}.png" for place in evenly_spaced(range(len(views)), count)}
 
 
 def _caption(score: ViewScore) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from hyrfpack.atomic import make_folder, write_atomic
+from hyrfpack.atomic import write_atomic
 from hyrfpack.errors import needs_package
 
 if TYPE_CHECKING:
@@ -132,7 +132,6 @@ def save_figure(path: str | os.PathLike[str], figure: Figure, **options: object)
     """
     data = io.BytesIO()
     figure.savefig(data, dpi=120, **options)
-    make_folder(Path(path).parent)
     write_atomic(path, data.getbuffer())
 
 

@@ -11,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hyrfpack.atomic import make_folder, replacing
+from hyrfpack.atomic import replacing
 from hyrfpack.errors import needs_package
 from hyrfpack.export.splats import Splats
 from hyrfpack.scene import Camera, evenly_spaced
 
+COLMAP_FILES = tuple(f"sparse/0/{table}.bin" for table in ("cameras", "frames", "images", "points3D", "rigs"))
 MAX_POINTS = 100_000  # in a COLMAP model: as many as a large reconstruction has
 _MIN_OPACITY = 0.1  # of a Gaussian whose centre is a point: fainter ones lie anywhere
 
@@ -64,7 +65,6 @@ def write_colmap(
             model.add_point3D(position, pycolmap.Track(), color)
 
     target = Path(folder, "sparse", "0")
-    make_folder(target)
     with tempfile.TemporaryDirectory() as temporary, ExitStack() as tables:
         model.write_binary(temporary)
         for table in sorted(Path(temporary).iterdir()):

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hyrfpack.atomic import check_writable
 from hyrfpack.errors import HyrfError, needs_package
+from hyrfpack.export.cameras import COLMAP_FILES
 from hyrfpack.export.files import USD, WRITTEN
 from hyrfpack.export.formats import spz
 from hyrfpack.export.harmonics import MAX_DEGREE
+from hyrfpack.outputs import Outputs
 
 PAGE, TRANSFORMS, COLMAP = ".html", ".json", ""
 POINTS = (".points.ply", ".points.glb")
@@ -36,7 +37,7 @@ def kind_of(target: str | os.PathLike[str]) -> str:
     for kind in ENDINGS:
         if name.endswith(kind):
             return kind
-    if Path(target).is_dir() or not Path(name).suffix:
+    if os.path.isdir(target) or not Path(name).suffix:
         return COLMAP
     raise HyrfError(
         f"{target}: the ending names the format; end it in one of {', '.join(ENDINGS)}, or name a folder for COLMAP"
@@ -61,13 +62,14 @@ def check_request(
         module, package = PACKAGES[kind]
         with needs_package(package, f"{target}: writing this format"):
             import_module(module)
-    if kind != COLMAP and Path(target).is_dir():
-        raise HyrfError(f"{target}: this is a folder; name a file in it")
-    place = Path(os.path.realpath(target))
-    place = place.parent if kind != COLMAP else next(path for path in (place, *place.parents) if path.exists())
-    if not place.exists():
-        raise HyrfError(f"{target}: there is no folder '{Path(target).parent}'; make it first")
-    check_writable(place)
+
+
+def check_place(target: str | os.PathLike[str], outputs: Outputs) -> None:
+    """Refuse a target that may not or cannot be written. Raises HyrfError."""
+    if kind_of(target) == COLMAP:
+        outputs.folder(target, COLMAP_FILES)
+    else:
+        outputs.file(target)
 
 
 def check_reach(kind: str, reach: float) -> None:

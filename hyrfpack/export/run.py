@@ -21,11 +21,12 @@ from hyrfpack.export.files import decode_splats, encode_splats
 from hyrfpack.export.formats import spz
 from hyrfpack.export.harmonics import MAX_DEGREE
 from hyrfpack.export.html import decode_page, encode_page
-from hyrfpack.export.kinds import COLMAP, PAGE, POINTS, TRANSFORMS, check_reach, check_request, kind_of
+from hyrfpack.export.kinds import COLMAP, PAGE, POINTS, TRANSFORMS, check_place, check_reach, check_request, kind_of
 from hyrfpack.export.measure import likeness
 from hyrfpack.export.points import encode_points
 from hyrfpack.export.source import Source
 from hyrfpack.export.splats import Splats, concatenate
+from hyrfpack.outputs import Outputs
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Scene, evenly_spaced
 
@@ -110,6 +111,7 @@ def export(
     """
     kind = kind_of(target)
     check_request(kind, target, degree, crop, min_opacity)
+    check_place(target, Outputs(source, scene=data, overwrite=True))
     read = Source.read(source, data)
     if kind in (TRANSFORMS, COLMAP) and not read.cameras:
         raise HyrfError(f"{source}: it keeps no cameras; export them from the file that training wrote, or name --data")

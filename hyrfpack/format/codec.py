@@ -18,6 +18,7 @@ from hyrfpack.format.container import Container, read_container, write_container
 from hyrfpack.format.info import LAYERED, SECTIONS, SECTIONS_OF_LAYERS, SectionSize, layer_section, section_sizes
 from hyrfpack.format.metadata import Metadata, read_metadata
 from hyrfpack.model.hybrid import HybridModel
+from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.quant import DamagedDataError
 
@@ -141,6 +142,7 @@ def repack(
 
     Arguments and errors as `encode_model`, `load` and `save`.
     """
+    Outputs(source, overwrite=True).file(target)
     model, provenance = load_with_provenance(source, fraction)
     return save(model, target, profile, provenance if profile == "raw" else without_cameras(provenance), **settings)
 

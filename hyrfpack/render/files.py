@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from hyrfpack.atomic import make_folder, write_atomic
+from hyrfpack.atomic import write_atomic
 from hyrfpack.model import HybridModel
 from hyrfpack.render.renderer import RenderSettings, render
 from hyrfpack.scene import Camera
@@ -52,6 +52,12 @@ def render_files(
         yield path
 
 
+def rendered_names(names: Sequence[str], depth: bool = False) -> list[str]:
+    """What `render_files` writes for cameras of these names, relative to its folder."""
+    kinds = (".png", ".depth.tiff") if depth else (".png",)
+    return [f"{name}{kind}" for name in file_names(names) for kind in kinds]
+
+
 def to_image(rgb: Tensor) -> Image.Image:
     """(H, W, 3) colours, clamped to [0, 1] and rounded to 8 bits."""
     return Image.fromarray((rgb.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
@@ -87,5 +93,4 @@ def save_picture(path: str | os.PathLike[str], image: Image.Image) -> None:
     """
     data = io.BytesIO()
     image.save(data, format=Image.registered_extensions()[Path(path).suffix.lower()])
-    make_folder(Path(path).parent)
     write_atomic(path, data.getbuffer())

@@ -15,13 +15,14 @@ from pathlib import Path
 import torch
 
 from hyrfpack import format as hyrf_format
-from hyrfpack.atomic import check_writable, make_folder, write_atomic
+from hyrfpack.atomic import write_atomic
 from hyrfpack.data import PictureCache
 from hyrfpack.device import choose_device, describe_device
 from hyrfpack.errors import HyrfError, HyrfTrainingError
-from hyrfpack.evaluate import Evaluation, evaluate
+from hyrfpack.evaluate import Evaluation, evaluate, picture_names
 from hyrfpack.evaluate.figures import training_curve
 from hyrfpack.model import HybridModel
+from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
 from hyrfpack.render.capture import capture_of
 from hyrfpack.render.paths import viewpoint_hint
@@ -30,7 +31,7 @@ from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.progress import ProgressLine
 from hyrfpack.train.trainer import Trainer
 
-MODEL, CHECKPOINT, METRICS = "model.hyrf", "checkpoint.pt", "metrics.json"
+MODEL, CHECKPOINT, METRICS, CURVE, VIEWS = "model.hyrf", "checkpoint.pt", "metrics.json", "curve.png", "views"
 BACKGROUND_SEEN = 1e-3  # a background that gets less than this share of the light is not there
 
 
@@ -81,13 +82,14 @@ def train(
 
     Raises:
         HyrfError: the folder holds another run, training cannot start or go on, no photo has a pixel to train on, or
-            the results cannot be written (a checkpoint that cannot, while training, is a line on standard error).
+            the results would replace photos or other files, or cannot be written (a checkpoint that cannot, while
+            training, is a line on standard error).
     """
     out = Path(out)
     config = config or TrainConfig()
     checkpoint = out / CHECKPOINT
     device = device if isinstance(device, torch.device) else choose_device(device)
-    _prepare(out, resume, overwrite)
+    _prepare(out, scene, resume, overwrite)
     trainer = Trainer(scene, config, cache, device)
     if resume:
         trainer.load(checkpoint)
@@ -115,7 +117,6 @@ def _finish(trainer: Trainer, out: Path) -> dict:
         )
 
     model = _drop_unseen_background(trainer)
-    make_folder(out)  # should it have been removed meanwhile
     path = out / MODEL
     provenance = {
         "steps": config.steps,
@@ -143,9 +144,9 @@ def _finish(trainer: Trainer, out: Path) -> dict:
         # Scored on the file as it was written, not on what is in memory.
         written = hyrf_format.load(path, trainer.device)
         written.precision = config.precision
-        scores: Evaluation = evaluate(written, scene.test, pictures=out / "views")
+        scores: Evaluation = evaluate(written, scene.test, pictures=out / VIEWS)
         metrics["evaluation"] = scores.to_dict()
-    training_curve(trainer.records, out / "curve.png")
+    training_curve(trainer.records, out / CURVE)
     write_atomic(out / METRICS, json.dumps(metrics, indent=1).encode())
     return metrics
 
@@ -163,15 +164,16 @@ def _naming_the_checkpoint(trainer: Trainer) -> Iterator[None]:
         ) from error
 
 
-def _prepare(out: Path, resume: bool, overwrite: bool) -> None:
+def _prepare(out: Path, scene: Scene, resume: bool, overwrite: bool) -> None:
     if resume and not (out / CHECKPOINT).is_file():
         raise HyrfError(f"{out}: there is no checkpoint to resume; leave out --resume to start a run")
-    make_folder(out)
-    check_writable(out)
     left = [name for name in (MODEL, CHECKPOINT) if (out / name).exists()]
     if left and not (resume or overwrite):
         hint = "--resume goes on with it, " if CHECKPOINT in left else ""
         raise HyrfError(f"{out}: the folder holds an earlier run ({left[-1]}); {hint}--overwrite replaces it")
+    views = [f"{VIEWS}/{name}" for name in picture_names(scene.test).values()]
+    outputs = Outputs(scene=scene, overwrite=resume or overwrite)
+    outputs.folder(out, [MODEL, CHECKPOINT, METRICS, CURVE, *views])
 
 
 @torch.no_grad()

@@ -132,7 +132,7 @@ def test_words_of_files_are_never_markup(with_photos):
 
 def test_folder_that_cannot_be_made_is_refused_before_the_work(source, tmp_path):
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(HyrfError, match="cannot be made"):
+    with pytest.raises(HyrfError, match="file is a file, no folder"):
         write_report(tmp_path / "file" / "page", source, source, CompressionReport("raw", 1, 1, 1, []))
 
 
@@ -143,7 +143,7 @@ def test_page_appears_only_after_its_pictures(source, tmp_path, monkeypatch):
     monkeypatch.setattr("hyrfpack.compress.report.save_picture", full)
     with pytest.raises(HyrfError, match="full"):
         reported(source, tmp_path, "raw")
-    assert list((tmp_path / "page").iterdir()) == []
+    assert not (tmp_path / "page").exists()
 
 
 # -- its numbers -----------------------------------------------------------------------------------------------------

@@ -38,7 +38,7 @@ def test_import_learns_what_cameras_see_and_tells_numbers(source: Path, cameras:
     assert numbers["views"] == 2  # of 9, the first and the ninth
     assert numbers["bytes_after"] == target.stat().st_size
     assert numbers["bytes_source"] == source.stat().st_size
-    words = succeeded("import", source, "-o", target, *QUICK, "--cameras", cameras).stdout
+    words = succeeded("import", source, "-o", target, *QUICK, "--cameras", cameras, "--overwrite").stdout
     assert f"{numbers['bytes_after']:,}" in words
     assert f"{numbers['psnr']:.2f} dB against the original" in words
 

@@ -1,0 +1,188 @@
+"""What may be written where: the one rule that keeps what a person has.
+
+1. What is read is never replaced, and nothing is put into a folder that photos or poses are read from.
+2. Nothing is put among other photos or poses, and no file that is there is replaced, unless `overwrite` says so.
+
+It is asked before any work, so that nothing is found out after minutes that was known at once.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hyrfpack.atomic import check_writable
+from hyrfpack.errors import HyrfError
+
+if TYPE_CHECKING:
+    from hyrfpack.scene import Scene
+
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif", ".dng")
+TABLES = tuple(f"{table}{kind}" for table in ("cameras", "images", "points3D") for kind in (".bin", ".txt"))
+POSES = ("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json")
+MODELS = ("sparse", "colmap")  # folders of COLMAP models
+LONGEST_NAME, LONGEST_PATH = 255, 4095  # bytes, of common systems
+
+StrPath = str | os.PathLike[str]
+
+
+class Outputs:
+    """Checks what a command is going to write against what it reads and what is there.
+
+    Every method raises HyrfError at what may not or cannot be written, and writes nothing itself.
+
+    Example:
+        >>> outputs = Outputs("run/model.hyrf", scene=scene)
+        >>> outputs.file("bonsai.hyrf", ".hyrf")
+        >>> outputs.folder("compare", ["0001.png", "0009.png"])
+    """
+
+    def __init__(
+        self,
+        *files: StrPath | None,
+        folder: StrPath | None = None,
+        scene: Scene | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        """
+        Args:
+            files: that are read; None and what is not there count for nothing.
+            folder: whose files are read.
+            scene: photos and poses that are read.
+            overwrite: files that are there may be replaced, but for those that are read.
+        """
+        self.overwrite = overwrite
+        self._files = _identities(filter(None, files))
+        self._folders: set[tuple[int, int]] = set()
+        if folder is not None and os.path.isdir(folder):
+            self._files |= _identities(Path(folder, name) for name in _names(folder))
+            self._folders |= _identities([folder])
+        if scene is not None:
+            self._files |= _identities(scene.files)
+            self._folders |= _identities({scene.path, *map(os.path.dirname, map(os.path.realpath, scene.files))})
+
+    def file(self, path: StrPath, *endings: str) -> None:
+        """Check one file to be written, whose name must have one of the endings, if any are given."""
+        path = Path(path)
+        if os.path.isdir(path):
+            raise HyrfError(f"{path}: this is a folder; name a file in it")
+        self._check(path)
+        if endings and not str(path).lower().endswith(endings):
+            raise HyrfError(f"{path}: what is written here ends in {' or '.join(endings)}; name the file so")
+        if os.path.lexists(path):
+            if not self.overwrite:
+                raise HyrfError(f"{path}: there is a file of this name; name another, or replace it with --overwrite")
+        elif not self.overwrite and _of_a_set(_folder_of(path)):
+            raise HyrfError(
+                f"{path}: photos or poses lie in this folder; name another, or write there with --overwrite"
+            )
+        _check_place(path)
+
+    def folder(self, folder: StrPath, names: Iterable[str]) -> None:
+        """Check files to be written into a folder and folders in it, by their names relative to it."""
+        if os.path.lexists(folder) and not os.path.isdir(folder):
+            raise HyrfError(f"{folder}: this is a file; name a folder")
+        paths = [Path(folder, name) for name in names]
+        for place in dict.fromkeys((Path(folder), *(path.parent for path in paths))):
+            self._refuse_folder_read(place)
+        for path in paths:
+            self._check(path)
+        if not self.overwrite:
+            there = [path for path in paths if os.path.lexists(path)]
+            if there:
+                more = f" and {len(there) - 1} more" if len(there) > 1 else ""
+                raise HyrfError(
+                    f"{folder}: {there[0].relative_to(folder)}{more} of the files to be written "
+                    f"{'are' if more else 'is'} there; name another folder, or replace them with --overwrite"
+                )
+            for place in dict.fromkeys((Path(folder), *(path.parent for path in paths))):
+                if _has_poses(place) or _has_pictures(place):
+                    raise HyrfError(
+                        f"{place}: photos or poses lie in this folder; name another, or write there with --overwrite"
+                    )
+        for path in paths or [Path(folder, "file")]:
+            _check_place(path)
+
+    def _check(self, path: StrPath) -> None:
+        """Refuse what is read, under whatever name, and what is no file."""
+        if _identities([path]) & self._files:
+            raise HyrfError(f"{path}: the output is an input itself; name another file")
+        if os.path.exists(path) and not os.path.isfile(path):
+            kind = "folder" if os.path.isdir(path) else "device or a pipe"
+            raise HyrfError(f"{path}: this is a {kind}; name a file")
+        self._refuse_folder_read(_folder_of(path))
+
+    def _refuse_folder_read(self, folder: StrPath) -> None:
+        if _identities([folder]) & self._folders:
+            raise HyrfError(f"{folder}: the same command reads what lies in this folder; name another to write into")
+
+
+def _identities(paths: Iterable[StrPath]) -> set[tuple[int, int]]:
+    """Device and number of each path that is there: the same for all its names and links."""
+    found = set()
+    for path in paths:
+        try:
+            status = os.stat(path)
+        except OSError:
+            continue
+        found.add((status.st_dev, status.st_ino))
+    return found
+
+
+def _folder_of(path: StrPath) -> Path:
+    """The folder that a file lies in, links followed, for that is where it will be replaced."""
+    return _real(path).parent
+
+
+def _real(path: StrPath) -> Path:
+    try:
+        return Path(os.path.realpath(path))
+    except OSError as error:  # the working folder was removed
+        raise HyrfError(f"{path}: the place cannot be found ({error.strerror}); name a whole path") from error
+
+
+def _check_place(path: StrPath) -> None:
+    """Refuse a name that cannot be, and a place where no file can be made."""
+    place = _real(path)
+    for part in place.parts:
+        if len(os.fsencode(part)) > LONGEST_NAME:
+            raise HyrfError(f"{part[:40]}...: the name is longer than {LONGEST_NAME} bytes; shorten it")
+    if len(os.fsencode(place)) > LONGEST_PATH:
+        raise HyrfError(f"{str(place)[:40]}...: the path is longer than {LONGEST_PATH} bytes; shorten it")
+    above = next(folder for folder in place.parents if os.path.lexists(folder))
+    if not above.is_dir():
+        raise HyrfError(f"{path}: {above} is a file, no folder; name another place")
+    check_writable(above)
+
+
+def _of_a_set(folder: Path) -> bool:
+    """Whether photos or poses are kept here: a folder with both, one of its folders of photos, or a COLMAP model.
+
+    Pictures alone say nothing, for there are some in many a folder that people write other files to.
+    """
+    names = _names(folder)
+    if not names.isdisjoint(TABLES):
+        return True
+    photos = _has_pictures(folder)
+    if _has_poses(folder) and (photos or any(_has_pictures(folder / name) for name in names)):
+        return True
+    results = any(name.endswith(".hyrf") for name in names)
+    return photos and not results and _has_poses(folder.parent)
+
+
+def _has_poses(folder: Path) -> bool:
+    return not _names(folder).isdisjoint((*TABLES, *POSES, *MODELS))
+
+
+def _has_pictures(folder: Path) -> bool:
+    return any(name.lower().endswith(PICTURES) for name in _names(folder))
+
+
+def _names(folder: StrPath) -> set[str]:
+    """Names of what lies in a folder; none where it is none or cannot be read."""
+    try:
+        return set(os.listdir(folder))
+    except OSError:
+        return set()

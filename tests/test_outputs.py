@@ -1,0 +1,178 @@
+"""The rule that keeps what a person has, asked directly; `test_every_command` holds each command to it."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+
+import pytest
+
+from hyrfpack.data import load_scene
+from hyrfpack.data.demo_scene import write_demo_scene
+from hyrfpack.errors import HyrfError
+from hyrfpack.outputs import Outputs
+from hyrfpack.train import TrainConfig, train
+
+CONFIG = TrainConfig(steps=2, max_gaussians=50)
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    """A set of three photos, read as one of nerfstudio's."""
+    return write_demo_scene(tmp_path / "photos", views=3, size=16)
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    path = tmp_path / "model.hyrf"
+    path.write_bytes(b"a model")
+    return path
+
+
+def test_new_files_and_folders_are_allowed_and_nothing_is_made(tmp_path, model):
+    Outputs(model).file(tmp_path / "new" / "small.hyrf", ".hyrf")
+    Outputs(model).folder(tmp_path / "pictures", ["0000.png", "left/0001.png"])
+
+    assert list(tmp_path.iterdir()) == [model]
+
+
+@pytest.mark.parametrize("name", ["model.hyrf", "soft.hyrf", "hard.hyrf", "sub/../model.hyrf"])
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_an_input_is_never_replaced_by_whatever_name(name, overwrite, tmp_path, model):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "soft.hyrf").symlink_to(model)
+    os.link(model, tmp_path / "hard.hyrf")
+
+    with pytest.raises(HyrfError, match="the output is an input itself"):
+        Outputs(model, overwrite=overwrite).file(tmp_path / name)
+    with pytest.raises(HyrfError, match="the output is an input itself"):
+        Outputs(model, overwrite=overwrite).folder(tmp_path, [name])
+
+
+@pytest.mark.parametrize("place", [".", "images", "elsewhere/.."])
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_nothing_is_put_beside_the_photos_and_poses_that_are_read(place, overwrite, photos):
+    outputs = Outputs(scene=load_scene(photos), overwrite=overwrite)
+    (photos / "elsewhere").mkdir()
+
+    with pytest.raises(HyrfError, match="the same command reads what lies in this folder"):
+        outputs.file(photos / place / "new.hyrf")
+    with pytest.raises(HyrfError, match="the same command reads what lies in this folder"):
+        outputs.folder(photos / place, ["new.png"])
+    outputs.folder(photos / "run", ["new.png"])
+
+
+def test_files_that_are_there_are_replaced_only_when_told(tmp_path, model):
+    (tmp_path / "old.spz").write_bytes(b"of another program")
+    (tmp_path / "dangling.spz").symlink_to(tmp_path / "nowhere")
+
+    for name in ("old.spz", "dangling.spz"):
+        with pytest.raises(HyrfError, match="there is a file of this name; .* --overwrite"):
+            Outputs(model).file(tmp_path / name)
+        with pytest.raises(HyrfError, match=f"{name} of the files to be written is there; .* --overwrite"):
+            Outputs(model).folder(tmp_path, ["new.spz", name])
+    Outputs(model, overwrite=True).file(tmp_path / "old.spz")
+    Outputs(model, overwrite=True).folder(tmp_path, ["old.spz"])
+
+
+@pytest.mark.parametrize("place", ["", "images"])
+def test_sets_of_photos_that_are_not_read_are_left_alone_too(place, photos, model):
+    with pytest.raises(HyrfError, match="photos or poses lie in this folder"):
+        Outputs(model).file(photos / place / "new.hyrf")
+    with pytest.raises(HyrfError, match="photos or poses lie in this folder"):
+        Outputs(model).folder(photos / place, ["new.png"])
+    Outputs(model, overwrite=True).file(photos / place / "new.hyrf")
+
+
+def test_tables_of_a_reconstruction_are_poses(tmp_path, model):
+    table = tmp_path / "sparse" / "0" / "cameras.bin"
+    table.parent.mkdir(parents=True)
+    table.write_bytes(b"")
+
+    for refused in (table.parent, tmp_path):
+        with pytest.raises(HyrfError, match="photos or poses lie in this folder"):
+            Outputs(model).folder(refused, ["new.png"])
+
+
+def test_pictures_beside_a_single_new_file_do_not_matter(tmp_path, model):
+    """A desktop with screenshots is no set of photos, and a run that lies in one has pictures of its own."""
+    (tmp_path / "screenshot.png").write_bytes(b"")
+    (tmp_path / "photos").mkdir()
+    run = write_demo_scene(tmp_path / "photos", views=2, size=16) / "run"
+    run.mkdir()
+    (run / "model.hyrf").write_bytes(b"")
+    (run / "curve.png").write_bytes(b"")
+
+    Outputs(model).file(tmp_path / "scene.html")
+    Outputs(model).file(run / "small.hyrf")
+
+
+@pytest.mark.parametrize(
+    "name, words",
+    [
+        ("small.ply", "ends in .hyrf"),
+        ("small", "ends in .hyrf"),
+        ("folder", "this is a folder"),
+        ("file/small.hyrf", "is a file, no folder"),
+        ("a" * 300 + ".hyrf", "longer than 255 bytes"),
+        ("a" * 300 + "/small.hyrf", "longer than 255 bytes"),
+        ("aaaa/" * 1000 + "small.hyrf", "longer than 4095 bytes"),
+        ("\N{CJK UNIFIED IDEOGRAPH-6F22}" * 90 + ".hyrf", "longer than 255 bytes"),
+    ],
+)
+def test_what_cannot_be_written_is_told_before_the_work(name, words, tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_bytes(b"")
+
+    with pytest.raises(HyrfError, match=words):
+        Outputs().file(tmp_path / name, ".hyrf")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/null"), reason="there is no /dev/null")
+def test_devices_are_no_files():
+    with pytest.raises(HyrfError, match="device or a pipe"):
+        Outputs(overwrite=True).file("/dev/null")
+
+
+def test_a_file_is_no_folder_for_pictures(model):
+    with pytest.raises(HyrfError, match="this is a file; name a folder"):
+        Outputs().folder(model, ["0000.png"])
+
+
+# -- training, which a library call guards as the command line does ---------------------------------------------------
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_training_never_writes_among_its_photos(overwrite, photos):
+    before = {path: path.read_bytes() for path in photos.rglob("*") if path.is_file()}
+    scene = load_scene(photos, test_every=2)
+
+    for place in (photos, photos / "images"):
+        with pytest.raises(HyrfError, match="the same command reads"):
+            train(scene, place, CONFIG, overwrite=overwrite, quiet=True)
+
+    assert {path: path.read_bytes() for path in photos.rglob("*") if path.is_file()} == before
+
+
+def test_training_never_replaces_photos_that_lie_where_its_pictures_go(photos):
+    (photos / "images").rename(photos / "views")
+    poses = photos / "transforms.json"
+    poses.write_text(poses.read_text().replace("images/", "views/"))
+
+    with pytest.raises(HyrfError, match="the same command reads"):
+        train(load_scene(photos, test_every=2), photos, CONFIG, overwrite=True, quiet=True)
+
+
+def test_training_keeps_a_foreign_metrics_json_unless_told(photos, tmp_path):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "metrics.json").write_text("mine")
+    scene = dataclasses.replace(load_scene(photos), test=[])
+
+    with pytest.raises(HyrfError, match="metrics.json of the files to be written is there"):
+        train(scene, out, CONFIG, quiet=True)
+    assert (out / "metrics.json").read_text() == "mine"
+
+    train(scene, out, CONFIG, overwrite=True, quiet=True)
+    assert (out / "metrics.json").read_text() != "mine"
