@@ -283,6 +283,8 @@ def test_a_wrong_input_is_one_sentence_that_names_it(arguments, tmp_path, monkey
         ("train", "data"),
         ("train", "data", "-o", "run", "--steps", "0"),
         ("train", "data", "-o", "run", "--preset", "huge"),
+        ("train", "data", "-o", "run", "--seed", str(2**64)),
+        ("import", "a.ply", "-o", "b.hyrf", "--seed", str(2**64)),
         ("train", "data", "-o", "run", "--resume", "--overwrite"),
         ("compress", "a.hyrf", "-o", "b.hyrf", "--profile", "zip"),
         ("render", "a.hyrf", "-o", "out", "--orbit", "3", "--data", "d"),

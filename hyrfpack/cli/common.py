@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 Command = TypeVar("Command", bound=Callable)
 
 PATH = click.Path(path_type=Path)
+SEED = click.IntRange(0, 2**64 - 1)  # hyrfpack.train.config.LARGEST_SEED, without loading torch
 PRECISIONS = ("mixed", "float32")  # hyrfpack.train.PRECISIONS, without loading torch
 LAYOUTS = ("colmap", "blender", "nerfstudio")
 

@@ -10,6 +10,7 @@ import click
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
+    SEED,
     chosen_device,
     device_options,
     json_option,
@@ -29,7 +30,7 @@ BACKGROUND_COLORS = ("black", "white", "random")
 @click.option("--steps", type=click.IntRange(min=1), default=3000, show_default=True, help="Optimiser steps.")
 @click.option("--max-gaussians", type=click.IntRange(min=1), metavar="N", help="Budget.  [default: from the photos]")
 @click.option("--preset", type=click.Choice(PRESETS), default="auto", show_default=True, help="The kind of scene.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same bytes.")
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Same seed, same bytes.")
 @scene_options
 @click.option("--background/--no-background", default=None, help="Train a background sphere.  [default: preset]")
 @click.option(
