@@ -65,7 +65,8 @@ def train(
     """Train a model on DATA, a folder of photos and poses (COLMAP, NeRF-synthetic, instant-ngp or nerfstudio).
 
     RUN gets model.hyrf, metrics.json, the training curve and pictures of held-out views. Ctrl-C saves a checkpoint
-    and exits with code 1; --resume goes on with it and ends with the same model as an uninterrupted run.
+    and exits with code 1; --resume goes on with it and ends with the same model as an uninterrupted run. So do SIGTERM
+    and a terminal that is closed.
 
     \b
     Examples:
@@ -80,6 +81,7 @@ def train(
     from hyrfpack.device import describe_device
     from hyrfpack.train import TrainConfig
     from hyrfpack.train import train as run
+    from hyrfpack.train.run import resuming
 
     place = chosen_device(device)
     scene = read_scene(data, test_every, images, layout)
@@ -88,7 +90,7 @@ def train(
     cache = None if cache_mb is None else PictureCache(cache_mb * 2**20)
     result = run(scene, out, TrainConfig(**settings), resume=resume, overwrite=overwrite, cache=cache, device=place)
     if not result.complete:
-        note(f"stopped after step {result.step:,}; the same command with --resume goes on from there")
+        note(f"stopped after step {result.step:,}; {resuming(overwrite)} goes on from there")
     if as_json:
         print_json({"complete": result.complete, "step": result.step, **result.metrics})
     elif result.complete:
