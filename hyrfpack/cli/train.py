@@ -12,6 +12,7 @@ from hyrfpack.cli.common import (
     PATH,
     SEED,
     chosen_device,
+    detail,
     device_options,
     json_option,
     note,
@@ -89,6 +90,7 @@ def train(
     note(f"{scene.layout} scene: {len(scene.train)} photos to train on, {len(scene.test)} held out; on {where}")
     cache = None if cache_mb is None else PictureCache(cache_mb * 2**20)
     result = run(scene, out, TrainConfig(**settings), resume=resume, overwrite=overwrite, cache=cache, device=place)
+    detail("seconds: " + ", ".join(f"{part} {t:.1f}" for part, t in result.metrics.get("stage_seconds", {}).items()))
     if not result.complete:
         note(f"stopped after step {result.step:,}; {resuming(overwrite)} goes on from there")
     if as_json:
