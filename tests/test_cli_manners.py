@@ -62,7 +62,7 @@ def test_quiet_training_and_rendering_say_their_results_alone(before, data, tmp_
     ):
         result = succeeded(*(("--quiet", command) if before else (command, "--quiet")), *arguments)
         assert result.stderr == "" and str(tmp_path) in result.stdout
-    assert succeeded(command, *arguments).stderr != ""
+    assert succeeded(command, *arguments, "--overwrite").stderr != ""
 
 
 def test_quiet_holds_for_whatever_speaks_and_only_as_long_as_the_command_runs(model, monkeypatch):
