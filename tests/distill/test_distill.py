@@ -45,6 +45,11 @@ def test_same_splats_and_seed_give_the_same_bytes(tmp_path: Path) -> None:
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
+def test_the_largest_seed_is_as_good_as_any(tmp_path: Path) -> None:
+    report = distill_splats(ball(40), tmp_path / "x.hyrf", replace(LITTLE, seed=2**64 - 1, steps=2))
+    assert hyrfpack.describe(tmp_path / "x.hyrf")["provenance"]["seed"] == 2**64 - 1 and report.psnr > 10
+
+
 @pytest.mark.parametrize("unit, offset", [(1, 1e6), (1e-6, 0)])
 def test_neither_origin_nor_unit_matters(tmp_path: Path, unit: float, offset: float) -> None:
     splats = ball(100)
