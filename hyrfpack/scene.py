@@ -13,6 +13,7 @@ from typing import TypeVar
 import numpy as np
 
 Item = TypeVar("Item")
+DEFAULT_MAX_SIZE = 1600  # pixels of the longer side that larger photos are shrunk to, as 3DGS does
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,8 @@ class Scene:
         has_alpha: photos have transparent pixels (object-centred captures without a background).
         notes: sentences for the user about what the reader skipped or assumed.
         files: every file it was read from or will be: tables of poses, points, photos, masks.
+        max_size: pixels of the longer side that larger photos are shrunk to; 0 for photos as they are stored, None for
+            a scene that was not read from files.
 
     Raises:
         ValueError: a point or its colour is not finite.
@@ -147,6 +150,7 @@ class Scene:
     has_alpha: bool = False
     notes: list[str] = field(default_factory=list)
     files: tuple[str, ...] = ()
+    max_size: int | None = None
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.points).all() and np.isfinite(self.point_colors).all()):

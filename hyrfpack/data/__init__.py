@@ -7,13 +7,18 @@ from pathlib import Path
 
 from hyrfpack.data.cache import PictureCache
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.scene import Scene
+from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 
 __all__ = ["PictureCache", "load_scene"]
 
 
 def load_scene(
-    path: str | os.PathLike[str], *, test_every: int = 8, images: str | None = None, layout: str | None = None
+    path: str | os.PathLike[str],
+    *,
+    test_every: int = 8,
+    images: str | None = None,
+    layout: str | None = None,
+    max_size: int = DEFAULT_MAX_SIZE,
 ) -> Scene:
     """Read a folder of posed photos; pictures are decoded later, one by one, by `View.load`.
 
@@ -26,16 +31,20 @@ def load_scene(
         images: take the photos from this folder ("images_2"); intrinsics follow the size of its files.
         layout: "colmap", "blender" or "nerfstudio"; None takes the first of these that is there and says so in
             `Scene.notes` when there was a choice.
+        max_size: shrink photos with more pixels than this on the longer side to so many, as they are decoded; cameras
+            and masks follow. 0 keeps them as they are. `Scene.notes` says how many are shrunk.
 
     Returns:
         The scene in the frame and units of its files.
 
     Raises:
         HyrfDataError: the folder cannot be used; one sentence says what, where, and what to do.
-        ValueError: an unknown `layout` or a negative `test_every`.
+        ValueError: an unknown `layout`, a negative `test_every` or `max_size`.
     """
     if test_every < 0:
         raise ValueError(f"test_every must be 0 or more, not {test_every}")
+    if max_size < 0:
+        raise ValueError(f"max_size must be 0 (photos as they are) or more, not {max_size}")
     if layout not in (None, "colmap", "blender", "nerfstudio"):
         raise ValueError(f"no layout '{layout}'; there are colmap, blender, nerfstudio")
     folder = Path(path)
@@ -63,11 +72,11 @@ def load_scene(
     if chosen == "blender" and images is not None:
         raise HyrfDataError(f"{folder}: a Blender-style set names its own pictures; leave out the folder '{images}'")
     if chosen == "colmap":
-        scene = read_colmap(folder, test_every=test_every, images=images)
+        scene = read_colmap(folder, test_every=test_every, images=images, max_size=max_size)
     elif chosen == "blender":
-        scene = read_blender(folder, test_every=test_every)
+        scene = read_blender(folder, test_every=test_every, max_size=max_size)
     else:
-        scene = read_nerfstudio(folder, test_every=test_every, images=images)
+        scene = read_nerfstudio(folder, test_every=test_every, images=images, max_size=max_size)
     if len(found) > 1:
         scene.notes.insert(0, f"poses are there as {' and '.join(found)}; {chosen} was taken")
     return scene

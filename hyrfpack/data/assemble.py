@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from hyrfpack.data.pictures import Header, PhotoFile, read_header, read_pixels, same_aspect
+from hyrfpack.data.pictures import Header, PhotoFile, read_header, read_pixels, same_aspect, shrunk_size
 from hyrfpack.data.undistort import Lens
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
@@ -44,6 +44,7 @@ def make_scene(
     photos: list[Photo],
     *,
     test_every: int,
+    max_size: int,
     test_names: Set[str] | None = None,
     points: np.ndarray | None = None,
     point_colors: np.ndarray | None = None,
@@ -57,6 +58,7 @@ def make_scene(
         layout: the format's name.
         photos: found on disk, in any order.
         test_every: every n-th of the sorted names, from the first on, is held out; 0 holds out none.
+        max_size: shrink photos to so many pixels on the longer side; 0 keeps them.
         test_names: the set's own split, which then counts instead of `test_every`.
         points: (P, 3) world positions, none when None.
         point_colors: (P, 3) RGB in [0, 1].
@@ -74,7 +76,7 @@ def make_scene(
             raise HyrfDataError(f"{path}: photo {first.name} is listed twice; remove one of the entries")
     if test_names is None:
         test_names = {photo.name for photo in photos[::test_every]} if test_every else set()
-    views = [_make_view(photo) for photo in photos]
+    views = [_make_view(photo, max_size) for photo in photos]
     train = [view for view in views if view.name not in test_names]
     test = [view for view in views if view.name in test_names]
     if not train:
@@ -88,10 +90,18 @@ def make_scene(
     bent = sum(photo.lens.distorted for photo in photos)
     if bent:
         notes.append(f"{bent} of {len(photos)} photos are undistorted as they are loaded")
+    shrunk = [photo.header.size for photo in photos if max(photo.header.size) > max_size > 0]
+    if shrunk:
+        width, height = max(shrunk)
+        notes.append(
+            f"{len(shrunk)} of {len(photos)} photos are shrunk from up to {width} x {height} to {max_size} pixels on "
+            "the longer side; --max-size 0 keeps them"
+        )
     points, point_colors = _finite_points(points, point_colors, notes)
     masks = [photo.mask for photo in photos if photo.mask is not None]
     files = tuple(str(file) for file in (*tables, *(photo.path for photo in photos), *masks))
-    return Scene(str(path), layout, train, test, points, point_colors, _see_through(photos), notes, files)
+    see_through = _see_through(photos, max_size)
+    return Scene(str(path), layout, train, test, points, point_colors, see_through, notes, files, max_size)
 
 
 def safe_name(text: str) -> str:
@@ -105,7 +115,7 @@ def skipped_note(missing: int, listed: int, where: str) -> list[str]:
     return [f"{missing} of {listed} photos listed in {where} are not on disk and were skipped"] if missing else []
 
 
-def _make_view(photo: Photo) -> View:
+def _make_view(photo: Photo, max_size: int) -> View:
     lens, header = photo.lens, photo.header
     if not _is_sane(lens):
         raise HyrfDataError(
@@ -117,8 +127,9 @@ def _make_view(photo: Photo) -> View:
             f"{photo.path}: the picture is {header.width} x {header.height} but its camera says {lens.width} x "
             f"{lens.height}, which is no uniform rescaling; use the pictures that were calibrated (unrotated)"
         )
-    if (header.width, header.height) != (lens.width, lens.height):
-        lens = lens.scaled(header.width, header.height)
+    size = shrunk_size(*header.size, max_size)
+    if size != (lens.width, lens.height):
+        lens = lens.scaled(*size)
     if photo.mask is not None:
         mask = read_header(photo.mask)
         if not same_aspect(mask.width, mask.height, header.width, header.height):
@@ -127,8 +138,8 @@ def _make_view(photo: Photo) -> View:
                 f"{header.height}; make it the photo's size"
             )
     pose = _rigid(photo.camera_from_world, photo.path)
-    camera = Camera(header.width, header.height, lens.fx, lens.fy, lens.cx, lens.cy, pose)
-    return View(photo.name, camera, PhotoFile(photo.path, lens, photo.mask))
+    camera = Camera(*size, lens.fx, lens.fy, lens.cx, lens.cy, pose)
+    return View(photo.name, camera, PhotoFile(photo.path, header.size, lens, photo.mask))
 
 
 def _is_sane(lens: Lens) -> bool:
@@ -160,10 +171,15 @@ def _rigid(pose: np.ndarray, path: Path) -> np.ndarray:
     return rigid
 
 
-def _see_through(photos: list[Photo]) -> bool:
+def _see_through(photos: list[Photo], max_size: int) -> bool:
     """Whether a photo has a transparent pixel: an alpha channel alone says little, many are opaque throughout."""
+
+    def alpha(photo: Photo) -> np.ndarray:
+        size = shrunk_size(*photo.header.size, max_size)
+        return read_pixels(photo.path, None if size == photo.header.size else size)[1]
+
     candidates = [photo for photo in photos if photo.header.has_alpha]
-    return any(read_pixels(photo.path)[1].min() < 255 for photo in evenly_spaced(candidates, _ALPHA_LOOKED_AT))
+    return any(alpha(photo).min() < 255 for photo in evenly_spaced(candidates, _ALPHA_LOOKED_AT))
 
 
 def _finite_points(

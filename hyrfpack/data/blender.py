@@ -12,10 +12,11 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Scene
 
 
-def read_blender(path: Path, *, test_every: int) -> Scene:
+def read_blender(path: Path, *, test_every: int, max_size: int) -> Scene:
     """Read a Blender-style set; the world is the file's (z up), pictures keep straight alpha.
 
     The set's own split counts: train, and test (val where there is no test). `test_every` is for sets with neither.
+    `max_size` is `load_scene`'s.
 
     Raises:
         HyrfDataError: a file is missing or cannot be used.
@@ -33,7 +34,16 @@ def read_blender(path: Path, *, test_every: int) -> Scene:
         if held_out == "val":
             notes.append("the set has no test split; val is used")
     tables = [path / f"transforms_{split}.json" for split in ("train", held_out) if split is not None]
-    return make_scene(path, "blender", photos, test_every=test_every, test_names=test_names, tables=tables, notes=notes)
+    return make_scene(
+        path,
+        "blender",
+        photos,
+        test_every=test_every,
+        max_size=max_size,
+        test_names=test_names,
+        tables=tables,
+        notes=notes,
+    )
 
 
 def _read_split(path: Path, split: str, notes: list[str]) -> list[Photo]:

@@ -26,12 +26,12 @@ def find_model(path: Path) -> Path | None:
     return None
 
 
-def read_colmap(path: Path, *, test_every: int, images: str | None) -> Scene:
+def read_colmap(path: Path, *, test_every: int, images: str | None, max_size: int) -> Scene:
     """Read a folder with a COLMAP model and its photos.
 
     Args:
         path: the scene folder.
-        test_every: see `load_scene`.
+        test_every, max_size: see `load_scene`.
         images: the folder of photos; "images" when None. Intrinsics follow the size of the files in it.
 
     Returns:
@@ -70,6 +70,7 @@ def read_colmap(path: Path, *, test_every: int, images: str | None) -> Scene:
         "colmap",
         photos,
         test_every=test_every,
+        max_size=max_size,
         points=points,
         point_colors=colors,
         tables=sorted(file for file in model.iterdir() if file.is_file()),

@@ -20,7 +20,7 @@ _PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RA
 _DENOMINATOR = ("k4", "k5", "k6")
 
 
-def read_nerfstudio(path: Path, *, test_every: int, images: str | None) -> Scene:
+def read_nerfstudio(path: Path, *, test_every: int, images: str | None, max_size: int) -> Scene:
     """Read a folder with a transforms.json.
 
     The world is that of the file's matrices. `applied_transform` says how it was turned from the reconstruction's
@@ -30,6 +30,7 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None) -> Scene
         path: the scene folder.
         test_every: see `load_scene`; `train_filenames`, `val_filenames`, `test_filenames` come first.
         images: a folder to take the photos from instead of the one the frames name.
+        max_size: see `load_scene`.
 
     Raises:
         HyrfDataError: a file is missing or cannot be used.
@@ -67,6 +68,7 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None) -> Scene
         "nerfstudio",
         photos,
         test_every=test_every,
+        max_size=max_size,
         test_names=None if keep is None else test,
         points=points,
         point_colors=colors,

@@ -24,7 +24,7 @@ from hyrfpack.evaluate.figures import training_curve
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
-from hyrfpack.render.capture import capture_of
+from hyrfpack.render.capture import capture_of, max_size_of
 from hyrfpack.render.paths import viewpoint_hint
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train.config import TrainConfig
@@ -126,11 +126,20 @@ def _finish(trainer: Trainer, out: Path) -> dict:
         "cameras": capture_of([view.camera for view in scene.train]),
         "psnr": statistics.median(record["psnr"] for record in trainer.records[-len(trainer.records) // 10 :]),
     }
+    max_size = max_size_of(scene)
+    if max_size is not None:
+        provenance["max_size"] = max_size
     report = hyrf_format.save(model, path, profile="raw", provenance=provenance)
     metrics = {
         "settings": config.to_dict(),
         "device": describe_device(trainer.device),
-        "scene": {"path": scene.path, "layout": scene.layout, "train": len(scene.train), "test": len(scene.test)},
+        "scene": {
+            "path": scene.path,
+            "layout": scene.layout,
+            "train": len(scene.train),
+            "test": len(scene.test),
+            "max_size": scene.max_size,
+        },
         "choices": trainer.choices,
         "notes": scene.notes,
         "gaussians": len(model),
