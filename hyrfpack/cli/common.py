@@ -46,18 +46,30 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print one JS
 def scene_options(command: Command) -> Command:
     """Options that say how a data folder is read, which the command gets as one argument, `reading`, for `read_scene`.
 
-    --test-every, --images, --max-size, --layout.
+    --test-every, --images, --max-size, --layout, --model.
     """
 
     @functools.wraps(command)
     def with_reading(
-        *args: Any, test_every: int, images: str | None, max_size: int | None, layout: str | None, **others: Any
+        *args: Any,
+        test_every: int,
+        images: str | None,
+        max_size: int | None,
+        layout: str | None,
+        colmap_model: str | None,
+        **others: Any,
     ) -> Any:
         reading = {"test_every": test_every, "images": images, "max_size": max_size, "layout": layout}
-        return command(*args, reading=reading, **others)
+        return command(*args, reading={**reading, "model": colmap_model}, **others)
 
     with_options = with_reading
     for option in (
+        click.option(
+            "--model",
+            "colmap_model",
+            metavar="NAME",
+            help="COLMAP model to take, such as 1 for sparse/1.  [default: the largest]",
+        ),
         click.option("--layout", type=click.Choice(LAYOUTS), help="How the folder is laid out.  [default: detected]"),
         click.option(
             "--max-size",

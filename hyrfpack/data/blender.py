@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
-from hyrfpack.data.assemble import Photo, make_scene, safe_name, skipped_note
+from hyrfpack.data.assemble import Photo, check_found, make_scene, safe_name
 from hyrfpack.data.pictures import find_picture, read_header
 from hyrfpack.data.transforms import focal_from_angle, number, pose_from_opengl, read_json
 from hyrfpack.data.undistort import Lens
@@ -52,11 +52,12 @@ def _read_split(path: Path, split: str, notes: list[str]) -> list[Photo]:
     angle = number(content, "camera_angle_x", file)
     if angle is None:
         raise HyrfDataError(f"{file}: has no 'camera_angle_x', so the focal length is unknown; add it")
-    photos, missing = [], 0
+    photos: list[Photo] = []
+    missing: list[str] = []
     for frame in content["frames"]:
         picture = find_picture(path / frame["file_path"])
         if picture is None:
-            missing += 1
+            missing.append(str(PurePosixPath(frame["file_path"])))
             continue
         header = read_header(picture)
         focal = focal_from_angle(angle, header.width, file)
@@ -65,7 +66,5 @@ def _read_split(path: Path, split: str, notes: list[str]) -> list[Photo]:
         if not name.endswith(picture.suffix):
             name += picture.suffix
         photos.append(Photo(name, picture, header, lens, pose_from_opengl(frame, file)))
-    if not photos:
-        raise HyrfDataError(f"{file}: none of its {missing} pictures is on disk; put them where 'file_path' says")
-    notes += skipped_note(missing, len(content["frames"]), file.name)
+    notes += check_found(path, photos, missing, file.name)
     return photos

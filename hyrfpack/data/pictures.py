@@ -75,11 +75,19 @@ def find_picture(path: Path) -> Path | None:
     return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
 
 
-def find_mask(root: Path, picture_folder: str, name: str) -> Path | None:
-    """The mask of photo `name`: in `masks/` (or "masks_2" for "images_2", if there is one) below `root`, under
-    the same name, the name + ".png", or its stem + ".png"."""
+def is_picture_name(name: str) -> bool:
+    """Whether a file is called like a picture."""
+    return name.lower().endswith(_SUFFIXES) and not name.startswith(".")
+
+
+def mask_folder(root: Path, picture_folder: str) -> Path:
+    """Where the masks of photos in a folder are: `masks/`, or "masks_2" for "images_2" if there is one."""
     suffix = picture_folder.removeprefix("images")
-    folder = root / f"masks{suffix}" if suffix and (root / f"masks{suffix}").is_dir() else root / "masks"
+    return root / f"masks{suffix}" if suffix and (root / f"masks{suffix}").is_dir() else root / "masks"
+
+
+def find_mask(folder: Path, name: str) -> Path | None:
+    """The mask of photo `name` in a folder: under the same name, the name + ".png", or its stem + ".png"."""
     candidates = (folder / name, folder / f"{name}.png", (folder / name).with_suffix(".png"))
     return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
 
