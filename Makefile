@@ -9,10 +9,10 @@ BIN := .venv/bin
 READY := .venv/.ready
 PEERS := tests/node/node_modules/.ready
 
-.PHONY: help demo test bench gpu speed sets choices ablations precision kill fuzz lint format clean
+.PHONY: help demo test test-newest test-oldest bench gpu speed sets choices ablations precision kill fuzz lint format clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z.]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z.-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo "  PYTHON=python3.12 and the like choose the interpreter of a new .venv"
 
 .venv: $(READY) ## make or refresh the environment
@@ -37,6 +37,12 @@ demo: $(READY) ## train, compress and render a small made-up scene; results in d
 
 test: lint $(PEERS) ## check style, then run all tests
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
+
+test-newest: ## run the tests with the newest versions, on each Python that is here (6 GB and ten minutes each)
+	$(PYTHON) tools/versions.py newest
+
+test-oldest: ## run the tests with the oldest versions that pyproject.toml allows, on Python 3.10
+	$(PYTHON) tools/versions.py oldest
 
 bench: $(READY) ## time each hot operation at several sizes against its references
 	$(BIN)/python tools/bench.py

@@ -6,9 +6,10 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,21 @@ if os.environ["TRITON_INTERPRET"] == "1" and find_spec("triton"):
     from interpreter import patch_once
 
     patch_once()
+
+
+@pytest.fixture
+def signals() -> Iterator[None]:
+    """Signals do what they do in a terminal, here and in programs started from here.
+
+    Whoever started the tests may have had some ignored, as nohup and the background of a script do.
+    """
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    if hasattr(signal, "SIGHUP"):
+        usual[signal.SIGHUP] = signal.SIG_DFL
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session")

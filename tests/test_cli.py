@@ -205,7 +205,16 @@ def test_video_without_ffmpeg_is_a_note_beside_the_pictures(packed, tmp_path, mo
     assert len(list((tmp_path / "out").iterdir())) == 2
 
 
-def test_an_interrupted_training_saves_and_exits_with_1(data, tmp_path):
+@pytest.mark.usefixtures("signals")
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ((), "the same command with --resume goes on"),
+        (("--overwrite",), "with --resume instead of --overwrite goes on"),
+    ],
+    ids=["new", "overwriting"],
+)
+def test_an_interrupted_training_saves_exits_with_1_and_says_how_to_go_on(options, told, data, tmp_path):
     before = signal.getsignal(signal.SIGINT)
 
     def interrupt_once_training_listens():
@@ -214,10 +223,10 @@ def test_an_interrupted_training_saves_and_exits_with_1(data, tmp_path):
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt_once_training_listens, daemon=True).start()
-    result = hyrfpack("train", data, "-o", tmp_path, "--steps", 1_000_000, "--max-gaussians", 200, "--json")
+    result = hyrfpack("train", data, "-o", tmp_path, "--steps", 1_000_000, "--max-gaussians", 200, "--json", *options)
     assert result.exit_code == 1 and isinstance(result.exception, SystemExit)
     assert json.loads(result.stdout)["complete"] is False
-    assert "--resume" in result.stderr
+    assert told in result.stderr
     assert (tmp_path / "checkpoint.pt").is_file() and not (tmp_path / "model.hyrf").exists()
     assert signal.getsignal(signal.SIGINT) is before
 
@@ -283,6 +292,8 @@ def test_a_wrong_input_is_one_sentence_that_names_it(arguments, tmp_path, monkey
         ("train", "data"),
         ("train", "data", "-o", "run", "--steps", "0"),
         ("train", "data", "-o", "run", "--preset", "huge"),
+        ("train", "data", "-o", "run", "--seed", str(2**64)),
+        ("import", "a.ply", "-o", "b.hyrf", "--seed", str(2**64)),
         ("train", "data", "-o", "run", "--resume", "--overwrite"),
         ("compress", "a.hyrf", "-o", "b.hyrf", "--profile", "zip"),
         ("render", "a.hyrf", "-o", "out", "--orbit", "3", "--data", "d"),

@@ -136,12 +136,9 @@ def test_help_names_every_ending():
 # -- view ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("signals")
 def test_view_serves_the_page_at_a_free_port_until_ctrl_c(model):
-    # Whoever started the tests may have had interrupts ignored, and children inherit that.
-    code = (
-        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from hyrfpack.cli import main; main()"
-    )
-    command = [sys.executable, "-c", code, "view", str(model), "--sh-degree", "0", "--no-browser"]
+    command = [sys.executable, "-m", "hyrfpack", "view", str(model), "--sh-degree", "0", "--no-browser"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             address = process.stdout.readline().strip()
@@ -160,6 +157,10 @@ def test_view_refuses_a_port_in_use_and_no_port(model):
         port = taken.getsockname()[1]
         assert f"port {port} of 127.0.0.1 is taken" in refused("view", model, "--port", port, "--no-browser")
     assert hyrfpack("view", model, "--port", 70000).exit_code == 2
+
+
+def test_view_refuses_an_address_that_is_none(model):
+    assert "no address to listen at" in refused("view", model, "--host", "", "--no-browser")
 
 
 def test_view_opens_the_browser_where_it_says(model, monkeypatch):

@@ -7,6 +7,7 @@ Nothing here imports torch or numpy before a command needs it, so that `hyrfpack
 from __future__ import annotations
 
 import errno
+import traceback
 from typing import Any
 
 import click
@@ -17,6 +18,7 @@ from hyrfpack.cli.demo import demo
 from hyrfpack.cli.export import export
 from hyrfpack.cli.files import compress, decompress, info
 from hyrfpack.cli.imports import import_
+from hyrfpack.cli.manners import add_manners, is_verbose, mend_streams
 from hyrfpack.cli.train import train
 from hyrfpack.cli.view import view
 from hyrfpack.cli.views import evaluate, render
@@ -26,10 +28,16 @@ from hyrfpack.errors import HyrfError
 class _Commands(click.Group):
     """A group of commands that turns errors of the user's into one sentence and exit code 2."""
 
+    def main(self, *args: Any, **options: Any) -> Any:
+        mend_streams()
+        return super().main(*args, **options)
+
     def invoke(self, ctx: click.Context) -> Any:
         try:
             return super().invoke(ctx)
         except HyrfError as error:
+            if is_verbose():
+                traceback.print_exc()
             raise _failure(str(error)) from error
         except OSError as error:
             # Files are written by functions that raise HyrfError: what is left is printing onto a full disk.
@@ -63,3 +71,5 @@ def main() -> None:
 
 for _command in (train, compress, decompress, render, evaluate, export, view, import_, bench, info, demo):
     main.add_command(_command)
+    add_manners(_command)
+add_manners(main)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from hyrfpack.cli.manners import detail, note
 from hyrfpack.errors import HyrfError
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 Command = TypeVar("Command", bound=Callable)
 
 PATH = click.Path(path_type=Path)
+SEED = click.IntRange(0, 2**64 - 1)  # hyrfpack.train.config.LARGEST_SEED, without loading torch
 PRECISIONS = ("mixed", "float32")  # hyrfpack.train.PRECISIONS, without loading torch
 LAYOUTS = ("colmap", "blender", "nerfstudio")
 
@@ -117,9 +119,11 @@ def device_options(command: Command) -> Command:
 
 def chosen_device(name: str) -> torch.device:
     """The device of --device, with a word about it where it is slow."""
-    from hyrfpack.device import choose_device
+    from hyrfpack.device import choose_device, describe_device
 
-    return choose_device(name, note)
+    device = choose_device(name, note)
+    detail(f"device: {describe_device(device)}")
+    return device
 
 
 def read_scene(path: Path, reading: dict[str, Any], model: dict | None = None) -> Scene:
@@ -165,11 +169,6 @@ def largest_picture(cameras: Iterable[Camera]) -> tuple[int, int]:
     return max(((camera.width, camera.height) for camera in cameras), key=lambda size: size[0] * size[1])
 
 
-def note(sentence: str) -> None:
-    """Tell the person something on standard error."""
-    click.echo(sentence, err=True)
-
-
 def print_json(values: dict) -> None:
     """Print one JSON object, the only thing a command puts on standard output under --json."""
     click.echo(json.dumps(values, indent=1, allow_nan=False))
@@ -178,18 +177,21 @@ def print_json(values: dict) -> None:
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Rows of words and numbers as aligned text: the first column to the left, the others to the right."""
     lines = [list(header), *map(list, rows)]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(header))]
+    widths = [max(_columns(line[column]) for line in lines) for column in range(len(header))]
 
     def align(line: Sequence[str]) -> str:
-        cells = [
-            line[0].ljust(widths[0]),
-            *(cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True)),
-        ]
+        gaps = [" " * (width - _columns(cell)) for cell, width in zip(line, widths, strict=True)]
+        cells = [line[0] + gaps[0], *(gap + cell for cell, gap in zip(line[1:], gaps[1:], strict=True))]
         return "  ".join(cells).rstrip()
 
-    return "\n".join(
-        [
-            "  ".join(["-" * width for width in widths]) if line is None else align(line)
-            for line in (lines[0], None, *lines[1:])
-        ]
-    )
+    first, *others = map(align, lines)
+    return "\n".join([first, "  ".join("-" * width for width in widths), *others])
+
+
+def _columns(text: str) -> int:
+    """How many columns of a terminal a text takes: wide characters (CJK) take two."""
+    if text.isascii():
+        return len(text)
+    from rich.cells import cell_len
+
+    return cell_len(text)

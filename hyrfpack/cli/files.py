@@ -221,7 +221,8 @@ def _typed(context: click.Context) -> str:
     """The command as it was given, from its parameters."""
     words = ["hyrfpack", context.info_name]
     for parameter in context.command.params:
-        if context.get_parameter_source(parameter.name) is not click.core.ParameterSource.COMMANDLINE:
+        given = context.get_parameter_source(parameter.name) is click.core.ParameterSource.COMMANDLINE
+        if not given or not parameter.expose_value:
             continue
         value = context.params[parameter.name]
         if isinstance(parameter, click.Argument):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hyrfpack.cli.common import OUTPUT, PATH, json_option, note, overwrite_option, print_json, table
+from hyrfpack.cli.common import OUTPUT, PATH, SEED, json_option, note, overwrite_option, print_json, table
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def _finite(ctx: click.Context, param: click.Parameter, value: float) -> float:
     help="Longer side of the pictures that it learns from.",
 )
 @click.option("--cameras", type=PATH, metavar="FILE", help="Where it will be looked at from, as JSON; or nerfstudio's.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same bytes.")
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Same seed, same bytes.")
 @overwrite_option
 @json_option
 def import_(

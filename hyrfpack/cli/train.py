@@ -10,7 +10,9 @@ import click
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
+    SEED,
     chosen_device,
+    detail,
     device_options,
     json_option,
     note,
@@ -29,7 +31,7 @@ BACKGROUND_COLORS = ("black", "white", "random")
 @click.option("--steps", type=click.IntRange(min=1), default=3000, show_default=True, help="Optimiser steps.")
 @click.option("--max-gaussians", type=click.IntRange(min=1), metavar="N", help="Budget.  [default: from the photos]")
 @click.option("--preset", type=click.Choice(PRESETS), default="auto", show_default=True, help="The kind of scene.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same bytes.")
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Same seed, same bytes.")
 @scene_options
 @click.option("--background/--no-background", default=None, help="Train a background sphere.  [default: preset]")
 @click.option(
@@ -62,7 +64,8 @@ def train(
     """Train a model on DATA, a folder of photos and poses (COLMAP, NeRF-synthetic, instant-ngp or nerfstudio).
 
     RUN gets model.hyrf, metrics.json, the training curve and pictures of held-out views. Ctrl-C saves a checkpoint
-    and exits with code 1; --resume goes on with it and ends with the same model as an uninterrupted run.
+    and exits with code 1; --resume goes on with it and ends with the same model as an uninterrupted run. So do SIGTERM
+    and a terminal that is closed.
 
     \b
     Examples:
@@ -77,6 +80,7 @@ def train(
     from hyrfpack.device import describe_device
     from hyrfpack.train import TrainConfig
     from hyrfpack.train import train as run
+    from hyrfpack.train.run import resuming
 
     place = chosen_device(device)
     scene = read_scene(data, reading)
@@ -84,8 +88,9 @@ def train(
     note(f"{scene.layout} scene: {len(scene.train)} photos to train on, {len(scene.test)} held out; on {where}")
     cache = None if cache_mb is None else PictureCache(cache_mb * 2**20)
     result = run(scene, out, TrainConfig(**settings), resume=resume, overwrite=overwrite, cache=cache, device=place)
+    detail("seconds: " + ", ".join(f"{part} {t:.1f}" for part, t in result.metrics.get("stage_seconds", {}).items()))
     if not result.complete:
-        note(f"stopped after step {result.step:,}; the same command with --resume goes on from there")
+        note(f"stopped after step {result.step:,}; {resuming(overwrite)} goes on from there")
     if as_json:
         print_json({"complete": result.complete, "step": result.step, **result.metrics})
     elif result.complete:

@@ -15,6 +15,7 @@ import torch
 
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import check_writable, write_atomic
+from hyrfpack.checks import check_float, check_int
 from hyrfpack.compress import compress
 from hyrfpack.distill.start import initial_model
 from hyrfpack.distill.teacher import light_of, likeness, teaching_scene
@@ -29,7 +30,7 @@ from hyrfpack.outputs import Outputs
 from hyrfpack.render.capture import capture_of
 from hyrfpack.render.paths import viewpoint_hint
 from hyrfpack.scene import Camera, Scene, evenly_spaced
-from hyrfpack.train.config import DensityConfig, LearningRates, TrainConfig
+from hyrfpack.train.config import LARGEST_SEED, DensityConfig, LearningRates, TrainConfig
 from hyrfpack.train.progress import ProgressLine
 from hyrfpack.train.trainer import Trainer
 
@@ -60,7 +61,7 @@ class DistillConfig:
         psnr: dB of held-out pictures against the original's that the file is made for: higher takes more bytes.
         size: pixels of the longer side of pictures.
         train_views, test_views: how many viewpoints are made up, to teach and to score.
-        seed: of viewpoints, first weights and order.
+        seed: of viewpoints, first weights and order; 0 to LARGEST_SEED.
     """
 
     steps: int = 500
@@ -72,12 +73,9 @@ class DistillConfig:
 
     def __post_init__(self) -> None:
         for name in ("steps", "size", "train_views", "test_views"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        if not 10 <= self.psnr <= 60:
-            raise ValueError(f"psnr is {self.psnr}; it must lie in [10, 60]")
-        if self.seed < 0:
-            raise ValueError(f"seed is {self.seed}; it must not be negative")
+            check_int(name, getattr(self, name), 1)
+        check_float("psnr", self.psnr, 10, 60)
+        check_int("seed", self.seed, 0, LARGEST_SEED)
 
 
 @dataclass(frozen=True)

@@ -83,13 +83,14 @@ def _server(host: str, port: int) -> ThreadingHTTPServer:
             if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):  # the browser went away
                 super().handle_error(request, client_address)
 
+    if not host.strip():  # to the socket, this is every address
+        raise HyrfError(f"'{host}' is no address to listen at; name {LOCAL}, or 0.0.0.0 to let others look")
     try:
         return Server((host, port), Handler)
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
+    except (OSError, UnicodeError) as error:  # the latter of a name that can be none
+        if getattr(error, "errno", None) == errno.EADDRINUSE:
             raise HyrfError(
                 f"port {port} of {host} is taken by another program; name another, or 0 for any free one"
             ) from error
-        raise HyrfError(
-            f"nothing can listen at port {port} of {host} ({error.strerror or error}); name another port or host"
-        ) from error
+        reason = getattr(error, "strerror", None) or error
+        raise HyrfError(f"nothing can listen at port {port} of {host} ({reason}); name another port or host") from error

@@ -11,6 +11,7 @@ from math import isfinite
 import torch
 from torch import Tensor
 
+from hyrfpack.checks import check_float, check_int
 from hyrfpack.errors import HyrfError
 from hyrfpack.model import Decoded, HybridModel, viewpoint_of
 from hyrfpack.model.gaussians import take_rows
@@ -43,12 +44,12 @@ class RenderSettings:
     transmittance_min: float = TRANSMITTANCE_MIN
 
     def __post_init__(self) -> None:
-        if not (self.near >= 0 and self.cull_tolerance >= 0 and self.background_threshold >= 0):
-            raise ValueError("near, cull_tolerance and background_threshold must not be negative")
-        if self.background_stride < 1:
-            raise ValueError(f"background_stride is {self.background_stride}; it must be at least 1")
-        if not 0 <= self.transmittance_min < 1:
-            raise ValueError(f"transmittance_min is {self.transmittance_min}; it must lie in [0, 1)")
+        for name in ("near", "cull_tolerance", "background_threshold"):
+            check_float(name, getattr(self, name))
+        check_int("background_stride", self.background_stride, 1)
+        check_float("transmittance_min", self.transmittance_min, 0, 1)
+        if self.transmittance_min == 1:
+            raise ValueError("transmittance_min is 1; it must lie in [0, 1), for at 1 nothing is drawn")
 
 
 @dataclass(frozen=True)

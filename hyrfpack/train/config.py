@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
+
+from hyrfpack.checks import check_bool, check_choice, check_float, check_int, check_pair
 
 PRECISIONS = ("mixed", "float32")
 PRESETS = ("auto", "synthetic", "standard", "large", "street")
+BACKGROUND_COLORS = ("black", "white", "random")
+LARGEST_SEED = 2**64 - 1  # torch's generators take 64 bits
 FULL_STEPS = 30_000  # the length of a run that the paper's schedule is written for
 SHORT_STEPS = 1_000  # rates grow no further in runs shorter than this
+SMALLEST_RATE = 1e-30  # next to nothing; their ratio is taken, so 0 is none
 
 
 @dataclass(frozen=True)
@@ -17,6 +22,7 @@ class LearningRates:
 
     A shorter run has fewer steps to go the same way: its rates are sqrt(FULL_STEPS / steps) times these.
     Positions are in local units (the frame's longest half-axis is 1), the rest are logits and field weights.
+    All are positive.
     """
 
     positions: tuple[float, float] = (2e-4, 2e-6)
@@ -24,6 +30,12 @@ class LearningRates:
     color_logits: tuple[float, float] = (6e-3, 6e-4)
     scale_logits: tuple[float, float] = (1.2e-2, 1.2e-3)
     opacity_logits: tuple[float, float] = (3e-2, 3e-3)
+
+    def __post_init__(self) -> None:
+        for group in fields(self):
+            check_pair(group.name, getattr(self, group.name))
+            for rate in getattr(self, group.name):
+                check_float(f"a rate of {group.name}", rate, SMALLEST_RATE)
 
     def at(self, name: str, step: int, steps: int) -> float:
         """The rate of one group for `step` (from 0) of a run of `steps`."""
@@ -58,6 +70,15 @@ class DensityConfig:
     resets: int = 0
     reset_opacity: float = 0.01
 
+    def __post_init__(self) -> None:
+        for name in ("start", "stop", "prune_opacity"):
+            check_float(name, getattr(self, name), 0, 1)
+        for name in ("gradient", "split_scale", "prune_scale"):
+            check_float(name, getattr(self, name))
+        check_int("rounds", self.rounds, 1)
+        check_int("resets", self.resets, 0)
+        check_float("reset_opacity", self.reset_opacity, 1e-6, 1 - 1e-6)  # its logit is finite
+
 
 @dataclass(frozen=True)
 class TrainConfig:
@@ -65,11 +86,11 @@ class TrainConfig:
 
     Attributes:
         steps: optimiser steps, one view each; every schedule scales with it.
-        seed: of view order, initialisation and density control.
+        seed: of view order, initialisation and density control; 0 to LARGEST_SEED.
         preset: the paper's regime, one of PRESETS; "auto" looks at the scene.
         max_gaussians: budget; None chooses from the pictures' pixels and the steps.
         log2_table_size: rows per level of the radiance grid as a power of two (the geometry grid has half);
-            None follows the budget.
+            None follows the budget. 4 to 24.
         background: whether a background sphere is trained; None lets the preset decide.
         background_color: what transparent pictures are laid over: "black", "white" or "random" (a new colour
             every step; the model then has black behind it).
@@ -101,21 +122,30 @@ class TrainConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
 
     def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise ValueError(f"steps is {self.steps}; it must be at least 1")
-        if self.preset not in PRESETS:
-            raise ValueError(f"preset is '{self.preset}'; it must be one of {', '.join(PRESETS)}")
-        if self.precision not in PRECISIONS:
-            raise ValueError(f"precision is '{self.precision}'; it must be one of {', '.join(PRECISIONS)}")
-        if self.background_color not in ("black", "white", "random"):
-            raise ValueError(f"background_color is '{self.background_color}'; it must be black, white or random")
+        check_int("steps", self.steps, 1)
+        check_int("seed", self.seed, 0, LARGEST_SEED)
         for name in ("max_gaussians", "checkpoint_every"):
-            if getattr(self, name) is not None and getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        if self.seed < 0:
-            raise ValueError(f"seed is {self.seed}; it must not be negative")
-        if not 0 <= self.ssim_weight <= 1:
-            raise ValueError(f"ssim_weight is {self.ssim_weight}; it must lie in [0, 1]")
+            if getattr(self, name) is not None:
+                check_int(name, getattr(self, name), 1)
+        if self.log2_table_size is not None:
+            check_int("log2_table_size", self.log2_table_size, 4, 24)
+        check_choice("preset", self.preset, PRESETS)
+        check_choice("precision", self.precision, PRECISIONS)
+        check_choice("background_color", self.background_color, BACKGROUND_COLORS)
+        check_choice("scale_rule", self.scale_rule, ("sum", "product"))
+        check_choice("direction_encoding", self.direction_encoding, ("frequency", "sh"))
+        if self.background is not None:
+            check_bool("background", self.background)
+        for name in ("antialiased", "scale_grows", "position_gradients"):
+            check_bool(name, getattr(self, name))
+        check_float("ssim_weight", self.ssim_weight, 0, 1)
+        check_pair("grid_resolutions", self.grid_resolutions)
+        coarsest, finest = self.grid_resolutions
+        check_int("the finest of grid_resolutions", finest, 2, 65536)
+        check_int("the coarsest of grid_resolutions", coarsest, 2, finest)
+        for name, kind in (("learning_rates", LearningRates), ("density", DensityConfig)):
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(f"{name} is {getattr(self, name)!r}; it must be a {kind.__name__}")
 
     def to_dict(self) -> dict:
         """Plain numbers, strings, lists and dictionaries, ready for JSON."""

@@ -113,7 +113,7 @@ class DensityControl:
     ) -> dict[str, Tensor]:
         """Two children for each Gaussian at `split`, drawn from it, 1.6 times smaller on every axis as decoded."""
         explicit = model.gaussians
-        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + step)
+        generator = torch.Generator().manual_seed((self.seed * 1_000_003 + step) % 2**64)
         twice = split.repeat(2)
         scales, quats = geometry.scales[twice], geometry.quats[twice]
         # Drawn on the CPU: the same numbers on every device.

@@ -4,56 +4,62 @@ from __future__ import annotations
 
 import math
 import sys
-import time
 from contextlib import suppress
+from time import monotonic
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.live import Live
+from rich.text import Text
 
 SMOOTHING = 0.05  # weight of the newest step in the running means
 LOG_EVERY = 15.0  # seconds between lines when standard error is not a terminal
+COLD_STEPS = 2  # in which kernels are compiled: they say nothing of the speed
+FAIR_STEPS, FAIR_SECONDS = 3, 10.0  # from which on the speed is known well enough to speak of hours
+LONG = 3600.0  # seconds left, from which on it is told what would make them fewer
+BAR = 8, 24  # columns, at least and at most
+DROPPED = ("gaussians", "loss", "gone", "speed", "psnr", "left")  # where a terminal is narrow, the first ones first
 
 
 class ProgressLine:
     """Shows step, steps/s, loss, PSNR, Gaussians and time left on standard error.
 
-    On a terminal one line that is redrawn; elsewhere (a log file) a plain line every few seconds. `quiet` shows
-    nothing.
+    On a terminal one line that is redrawn and always fits; elsewhere (a log file) a plain line every few seconds.
+    Where there is no standard error, nothing; and one that goes away does not end the training.
     """
 
-    def __init__(self, steps: int, done: int, quiet: bool = False) -> None:
+    def __init__(self, steps: int, done: int, quiet: bool = False, advice: str = "") -> None:
+        """Args: quiet: show nothing; advice: what would shorten the run ("fewer --steps or a GPU"), told once where
+        more than an hour is left; without it, nothing is."""
         self.steps = steps
         self.first = done
-        self.start = self.last_log = time.monotonic()
+        self.start = self.last_log = self.warm = monotonic()
+        self.warm_step = done
         self.loss = self.mse = None
-        self.quiet = quiet
-        self.bar: Progress | None = None
-        if not quiet and sys.stderr.isatty():
-            self.bar = Progress(
-                TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
-                BarColumn(bar_width=24),
-                TextColumn("{task.fields[line]}"),
-                TimeElapsedColumn(),
-                TextColumn("left"),
-                TimeRemainingColumn(),
-                console=Console(stderr=True),
-                refresh_per_second=4,
-            )
-            self.task = self.bar.add_task("train", total=steps, completed=done, line="")
+        self.quiet = quiet or sys.stderr is None
+        self.advice = advice
+        self.line = _Line({"steps": f"{done:,}/{steps:,}"}, done / steps)
+        self.live: Live | None = None
+        if not self.quiet and sys.stderr.isatty():
+            console = Console(stderr=True)
+            if not console.is_dumb_terminal:
+                self.live = Live(self.line, console=console, refresh_per_second=4)
 
     def __enter__(self) -> ProgressLine:
-        if self.bar:
-            self.bar.start()
+        if self.live:
+            with suppress(OSError, ValueError):
+                self.live.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self.bar:
-            self.bar.stop()
+        if self.live:
+            with suppress(OSError, ValueError):
+                self.live.stop()
 
     def note(self, sentence: str) -> None:
         """Tell the person something between the steps."""
-        if self.bar:
-            self.bar.console.print(sentence, markup=False, highlight=False)
+        if self.live:
+            with suppress(OSError, ValueError):
+                self.live.console.print(sentence, markup=False, highlight=False)
         elif not self.quiet:
             _print(sentence)
 
@@ -63,23 +69,77 @@ class ProgressLine:
             weight = SMOOTHING if self.loss is not None else 1.0
             self.loss = loss * weight + (self.loss or 0) * (1 - weight)
             self.mse = mse * weight + (self.mse or 0) * (1 - weight)
+        now = monotonic()
+        speed, left = self._pace(step, now)
         if self.quiet or self.loss is None:
             return
-        now = time.monotonic()
-        due = self.bar is not None or now - self.last_log >= LOG_EVERY or step == self.steps
+        self._advise(step, now, left)
+        due = self.live is not None or now - self.last_log >= LOG_EVERY or step == self.steps
         if not due:
             return
-        rate = (step - self.first) / max(now - self.start, 1e-9)
-        psnr = -10 * math.log10(max(self.mse, 1e-10))
-        line = f"{rate:5.1f} steps/s  loss {self.loss:.4f}  PSNR {psnr:5.2f}  {gaussians:,} Gaussians"
-        if self.bar:
-            self.bar.update(self.task, completed=step, line=line)
+        parts = {
+            "steps": f"{step:,}/{self.steps:,}",
+            "speed": f"{speed:.1f} steps/s" if speed >= 1 else f"{1 / speed:.1f} s/step",
+            "loss": f"loss {self.loss:.4f}",
+            "psnr": f"PSNR {-10 * math.log10(max(self.mse, 1e-10)):.2f}",
+            "gaussians": f"{gaussians:,} Gaussians",
+            "gone": f"{duration(now - self.start)} gone",
+            "left": f"{duration(left)} left",
+        }
+        if self.live:
+            self.line.parts, self.line.share = parts, step / self.steps
         else:
             self.last_log = now
-            left = (self.steps - step) / max(rate, 1e-9)
-            _print(f"step {step:,}/{self.steps:,}  {line}  {left:.0f} s left")
+            _print("step " + "  ".join(parts.values()))
+
+    def _pace(self, step: int, now: float) -> tuple[float, float]:
+        """Steps a second and seconds left, by what was measured since the kernels are compiled."""
+        since, at = (self.warm, self.warm_step) if step > self.warm_step else (self.start, self.first)
+        speed = max(step - at, 1) / max(now - since, 1e-9)
+        if step - self.first <= COLD_STEPS:
+            self.warm, self.warm_step = now, step
+        return speed, (self.steps - step) / speed
+
+    def _advise(self, step: int, now: float, left: float) -> None:
+        fair = step - self.warm_step >= FAIR_STEPS and now - self.warm >= FAIR_SECONDS
+        if self.advice and fair and left > LONG:
+            self.note(f"this takes {left / 3600:.1f} more hours; {self.advice} would shorten it")
+            self.advice = ""
+
+
+def duration(seconds: float) -> str:
+    """Of 120 seconds and less as "60 s", of more as hours, minutes and seconds: "1:04:09"."""
+    whole = round(seconds)
+    if whole <= 120:
+        return f"{whole} s"
+    return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}"
+
+
+class _Line:
+    """What is known of a run, as one line of any terminal's width.
+
+    Attributes:
+        parts: by name, in the order of reading; those that have no room are left out in the order of DROPPED.
+        share: of the run that is done, drawn as a bar where there is room for one.
+    """
+
+    def __init__(self, parts: dict[str, str], share: float) -> None:
+        self.parts, self.share = parts, share
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        words, width = dict(self.parts), options.max_width
+        for name in DROPPED:
+            if len("  ".join(words.values())) > width:
+                words.pop(name, None)
+        steps, *others = words.values()
+        line = Text(steps, no_wrap=True, overflow="crop")
+        room = min(width - len("  ".join(words.values())) - 2, BAR[1])
+        if room >= BAR[0]:
+            done, mark = round(self.share * room), "-" if options.ascii_only else "\u2501"
+            line.append("  ").append(mark * done, "bar.complete").append(mark * (room - done), "bar.back")
+        yield line.append("".join(f"  {word}" for word in others))
 
 
 def _print(line: str) -> None:
-    with suppress(OSError):  # a log file on a full disk does not end the training
+    with suppress(OSError, ValueError):  # a log file on a full disk or a closed one does not end the training
         print(line, file=sys.stderr, flush=True)

@@ -32,6 +32,8 @@ from hyrfpack.train.progress import ProgressLine
 from hyrfpack.train.trainer import Trainer
 
 MODEL, CHECKPOINT, METRICS, CURVE, VIEWS = "model.hyrf", "checkpoint.pt", "metrics.json", "curve.png", "views"
+# What ends a run early; Windows has no SIGHUP.
+STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 BACKGROUND_SEEN = 1e-3  # a background that gets less than this share of the light is not there
 
 
@@ -66,8 +68,8 @@ def train(
     """Train a model on a scene and leave everything about the run in a folder.
 
     The folder gets `model.hyrf` (profile raw), `metrics.json`, `curve.png`, `views/` (held-out photos beside their
-    renders and error maps) and, while running, `checkpoint.pt`. The first Ctrl-C (or SIGTERM) saves the checkpoint
-    and returns.
+    renders and error maps) and, while running, `checkpoint.pt`. The first Ctrl-C (or SIGTERM, or SIGHUP as when the
+    terminal is closed) saves the checkpoint and returns, unless whoever started the program has it ignored.
 
     Args:
         scene: from `hyrfpack.load_scene`.
@@ -93,8 +95,8 @@ def train(
     trainer = Trainer(scene, config, cache, device)
     if resume:
         trainer.load(checkpoint)
-    with _naming_the_checkpoint(trainer):
-        with ProgressLine(config.steps, trainer.step, quiet) as line, _stop_requests() as stop:
+    with _naming_the_checkpoint(trainer, overwrite):
+        with ProgressLine(config.steps, trainer.step, quiet, _shorter(device)) as line, _stop_requests() as stop:
             complete = trainer.run(
                 checkpoint=checkpoint,
                 report=lambda t, loss, mse: line.update(t.step, loss, mse, len(t.model)),
@@ -160,8 +162,21 @@ def _finish(trainer: Trainer, out: Path) -> dict:
     return metrics
 
 
+def resuming(overwrite: bool) -> str:
+    """The command that goes on with a run which was started with or without --overwrite."""
+    return f"the same command with --resume{' instead of --overwrite' if overwrite else ''}"
+
+
+def _shorter(device: torch.device) -> str:
+    """What makes a run take less time."""
+    ways = ["fewer --steps", "smaller photos (--max-size, or --images with smaller copies)", "fewer --max-gaussians"]
+    if device.type == "cpu":
+        ways.append("a GPU")
+    return f"{', '.join(ways[:-1])} or {ways[-1]}"
+
+
 @contextmanager
-def _naming_the_checkpoint(trainer: Trainer) -> Iterator[None]:
+def _naming_the_checkpoint(trainer: Trainer, overwrite: bool) -> Iterator[None]:
     """Add to an error of reading or writing what is there to go on from."""
     try:
         yield
@@ -169,7 +184,7 @@ def _naming_the_checkpoint(trainer: Trainer) -> Iterator[None]:
         if isinstance(error, HyrfTrainingError) or trainer.saved is None:
             raise
         raise type(error)(
-            f"{error}; the checkpoint of step {trainer.saved:,} is kept, --resume goes on from there"
+            f"{error}; the checkpoint of step {trainer.saved:,} is kept, {resuming(overwrite)} goes on from there"
         ) from error
 
 
@@ -203,18 +218,26 @@ def _drop_unseen_background(trainer: Trainer) -> HybridModel:
 
 @contextmanager
 def _stop_requests() -> Iterator:
-    """Turns the first Ctrl-C or SIGTERM into a request to stop; a second one interrupts at once."""
+    """Turns the first Ctrl-C, SIGTERM or SIGHUP into a request to stop; a second one interrupts at once.
+
+    What whoever started us has ignored stays ignored: SIGHUP under nohup, Ctrl-C in the background of a script. A
+    second SIGHUP is no news: a terminal that closes sends it by way of the shell and once more itself.
+    """
     requested = threading.Event()
     if threading.current_thread() is not threading.main_thread():  # signals belong to the main thread
         yield requested.is_set
         return
+    found = {number: signal.getsignal(number) for number in STOPPING}
+    previous = {number: handler for number, handler in found.items() if handler not in (signal.SIG_IGN, None)}
 
     def handle(number: int, _frame: object) -> None:
         requested.set()
-        signal.signal(number, previous[number])
+        if number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, previous[number])
 
-    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
+        for number in previous:
+            signal.signal(number, handle)
         yield requested.is_set
     finally:
         for number, handler in previous.items():

@@ -131,7 +131,10 @@ def _interrupted_at_the_second(compress):
 
 
 def test_settings_out_of_range_are_refused() -> None:
-    for wrong in ({"steps": 0}, {"psnr": float("nan")}, {"seed": -1}, {"size": 0}):
+    for wrong in (
+        *({"steps": 0}, {"steps": 2.5}, {"size": 0}, {"train_views": True}, {"test_views": "3"}),
+        *({"psnr": float("nan")}, {"psnr": 61}, {"psnr": "high"}, {"seed": -1}, {"seed": 2**64}),
+    ):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             DistillConfig(**wrong)
 

@@ -18,6 +18,7 @@ from hyrfpack.export.serve import serve
 PAGE = b"<!DOCTYPE html><title>served</title>"
 
 
+@pytest.mark.usefixtures("signals")
 def test_the_page_is_served_to_the_browser_until_an_interrupt_which_is_no_error(monkeypatch: pytest.MonkeyPatch):
     said, seen = [], []
 
@@ -49,11 +50,19 @@ def test_a_port_in_use_is_one_sentence():
             serve(lambda: PAGE, port=port, open_browser=False, say=lambda address: None)
 
 
-def test_an_address_that_is_not_ours_is_one_sentence():
-    with pytest.raises(HyrfError, match="nothing can listen at port 0 of 192.0.2.1"):
-        serve(lambda: PAGE, host="192.0.2.1", open_browser=False, say=lambda address: None)
+@pytest.mark.parametrize("host", ["192.0.2.1", "no such name", "a" * 70])
+def test_an_address_that_is_not_ours_is_one_sentence(host):
+    with pytest.raises(HyrfError, match=rf"^nothing can listen at port 0 of {host} [^\n]*$"):
+        serve(lambda: PAGE, host=host, open_browser=False, say=lambda address: None)
 
 
+@pytest.mark.parametrize("host", ["", " "])
+def test_no_address_is_one_sentence_and_does_not_mean_all(host):
+    with pytest.raises(HyrfError, match="no address to listen at.*127.0.0.1.*0.0.0.0"):
+        serve(lambda: PAGE, host=host, open_browser=False, say=lambda address: None)
+
+
+@pytest.mark.usefixtures("signals")
 def test_a_browser_that_goes_away_is_nobodys_news(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     def visit_in_a_hurry(address: str) -> None:
         try:

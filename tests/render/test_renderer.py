@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from contextlib import nullcontext
 
 import numpy as np
@@ -282,7 +283,13 @@ def test_antialiasing_dims_small_gaussians_by_what_the_low_pass_adds():
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"near": -0.1}, {"cull_tolerance": -0.1}, {"background_threshold": -0.1}, {"background_stride": 0}],
+    [
+        {name: value}
+        for name in ("near", "cull_tolerance", "background_threshold", "background_stride", "transmittance_min")
+        for value in (-0.1, math.nan, math.inf, True, "2", None)
+    ]
+    + [{"background_stride": 0}, {"background_stride": 1.5}, {"transmittance_min": 1.0}],
+    ids=str,
 )
 def test_impossible_settings_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):

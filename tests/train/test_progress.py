@@ -1,11 +1,15 @@
 from __future__ import annotations
 
+import io
 import math
+import re
+import sys
 
 import pytest
+from rich.console import Console
 
 from hyrfpack.train import progress
-from hyrfpack.train.progress import ProgressLine
+from hyrfpack.train.progress import ProgressLine, duration
 
 
 def test_a_log_file_gets_plain_lines_with_all_that_matters(capsys, monkeypatch):
@@ -17,7 +21,7 @@ def test_a_log_file_gets_plain_lines_with_all_that_matters(capsys, monkeypatch):
     assert out == ""
     assert len(err.splitlines()) == 20
     last = err.splitlines()[-1]
-    for part in ("step 20/20", "loss 0.2500", "PSNR 20.00", "1,234 Gaussians", "steps/s", "0 s left"):
+    for part in ("step 20/20  ", "loss 0.2500", "PSNR 20.00", "1,234 Gaussians", "steps/s", "0 s left"):
         assert part in last
 
 
@@ -59,3 +63,181 @@ def test_a_perfect_picture_does_not_break_the_line(capsys):
     with ProgressLine(1, 0) as line:
         line.update(1, 0.0, 0.0, 5)
     assert "PSNR 100.00" in capsys.readouterr().err and math.isfinite(line.mse)
+
+
+# -- what fits on a terminal -----------------------------------------------------------------------------------------
+
+PARTS = {
+    "steps": "604/3,000",
+    "speed": "40.2 steps/s",
+    "loss": "loss 0.0381",
+    "psnr": "PSNR 29.40",
+    "gaussians": "4,850 Gaussians",
+    "gone": "15 s gone",
+    "left": "60 s left",
+}
+LONG_PARTS = {
+    "steps": "29,604/30,000",
+    "speed": "125.5 s/step",
+    "loss": "loss 0.0381",
+    "psnr": "PSNR 29.40",
+    "gaussians": "1,234,850 Gaussians",
+    "gone": "120:15:22 gone",
+    "left": "11:15:22 left",
+}
+FITTING = {
+    40: "604/3,000  PSNR 29.40  60 s left",
+    60: "604/3,000  40.2 steps/s  PSNR 29.40  15 s gone  60 s left",
+    80: "604/3,000  ━━━━━━━━  40.2 steps/s  loss 0.0381  PSNR 29.40  15 s gone  60 s left",
+    120: "604/3,000  " + 24 * "━" + "  40.2 steps/s  loss 0.0381  PSNR 29.40  4,850 Gaussians  15 s gone  60 s left",
+}
+
+
+class Terminal(io.StringIO):
+    encoding = "utf-8"
+
+    def isatty(self) -> bool:
+        return True
+
+
+def drawn(parts: dict[str, str], width: int, encoding: str = "utf-8") -> str:
+    """The line as a terminal shows it."""
+    file = Terminal()
+    file.encoding = encoding
+    Console(width=width, file=file, force_terminal=True, color_system=None).print(progress._Line(parts, 604 / 3000))
+    (line,) = file.getvalue().splitlines()
+    return line
+
+
+@pytest.mark.parametrize("width", FITTING)
+def test_line_fits_the_terminal_and_leaves_out_the_least_important_first(width):
+    assert drawn(PARTS, width) == FITTING[width]
+
+
+@pytest.mark.parametrize("parts", [PARTS, LONG_PARTS], ids=["short", "long"])
+def test_line_never_is_wider_than_the_terminal(parts):
+    for width in range(1, 200):
+        line = drawn(parts, width)
+        assert len(line) <= width
+        assert width < 14 or line.startswith(parts["steps"])
+        assert width < 40 or (parts["psnr"] in line and parts["left"] in line)
+
+
+def test_bar_of_a_terminal_without_unicode_is_ascii():
+    assert drawn(PARTS, 120, encoding="ascii").isascii()
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 120])
+def test_a_terminal_gets_one_line_that_is_redrawn(width, monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    for name, value in (("COLUMNS", str(width)), ("TERM", "xterm"), ("NO_COLOR", "1")):
+        monkeypatch.setenv(name, value)
+    with ProgressLine(3000, 0) as line:
+        for step in range(1, 605):
+            line.update(step, 0.05, 0.001, 4850)
+        line.note("a sentence")
+    shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
+    lines = [part for part in re.split(r"[\r\n]+", shown) if part.strip()]
+    assert all(len(part) <= width for part in lines)
+    assert "a sentence" in [part.strip() for part in lines]
+    assert lines[-1].startswith("604/3,000  ") and "PSNR 30.00" in lines[-1] and lines[-1].endswith(" left")
+
+
+def test_a_terminal_that_cannot_redraw_gets_plain_lines(monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "dumb")
+    with ProgressLine(3, 0) as line:
+        line.update(3, 0.05, 0.001, 4850)
+    assert terminal.getvalue().startswith("step 3/3  ") and "\x1b" not in terminal.getvalue()
+
+
+# -- time ------------------------------------------------------------------------------------------------------------
+
+
+class Clock:
+    """Time that passes when told so."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 1000.0
+        monkeypatch.setattr(progress, "monotonic", lambda: self.now)
+
+
+def trained(clock: Clock, steps: int, seconds: float, count: int, **options) -> None:
+    """`count` steps of a run of `steps`, so many seconds each, the first one ten times as many."""
+    with ProgressLine(steps, 0, **options) as line:
+        for step in range(1, count + 1):
+            clock.now += seconds * (10 if step == 1 else 1)
+            line.update(step, 0.05, 0.001, 4850)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [
+        (0, "0 s"),
+        (0.4, "0 s"),
+        (59.6, "60 s"),
+        (120, "120 s"),
+        (121, "0:02:01"),
+        (3600, "1:00:00"),
+        (45e3, "12:30:00"),
+    ],
+)
+def test_more_than_two_minutes_are_said_as_hours_minutes_and_seconds(seconds, said):
+    assert duration(seconds) == said
+
+
+def test_times_of_a_log_file_are_readable(capsys, monkeypatch):
+    trained(Clock(monkeypatch), steps=3000, seconds=0.5, count=600)
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert re.search(r"  0:0[45]:\d\d gone  0:20:\d\d left$", last)
+
+
+def test_compiling_in_the_first_steps_does_not_count_as_slowness(capsys, monkeypatch):
+    trained(Clock(monkeypatch), steps=1000, seconds=2.0, count=20)
+    assert "2.0 s/step" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_more_than_an_hour_is_told_once_with_what_would_shorten_it(capsys, monkeypatch):
+    trained(Clock(monkeypatch), steps=3000, seconds=12.0, count=40, advice="fewer --steps")
+    told = [line for line in capsys.readouterr().err.splitlines() if "hours" in line]
+    assert told == ["this takes 10.0 more hours; fewer --steps would shorten it"]
+
+
+@pytest.mark.parametrize(
+    ("steps", "seconds", "count"),
+    [(3000, 1.0, 200), (3000, 12.0, 4), (30_000, 1.0, 11)],
+    ids=["less than an hour", "too few steps", "too few seconds"],
+)
+def test_hours_are_not_told_where_there_are_none_or_too_early(steps, seconds, count, capsys, monkeypatch):
+    trained(Clock(monkeypatch), steps=steps, seconds=seconds, count=count, advice="fewer --steps")
+    assert "hours" not in capsys.readouterr().err
+
+
+def test_quiet_is_not_told_of_hours(capsys, monkeypatch):
+    trained(Clock(monkeypatch), steps=3000, seconds=12.0, count=40, quiet=True, advice="fewer --steps")
+    assert capsys.readouterr() == ("", "")
+
+
+# -- standard error that is not there --------------------------------------------------------------------------------
+
+
+def test_without_standard_error_nothing_is_shown_and_training_goes_on(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "stderr", None)
+    with ProgressLine(3, 0) as line:
+        line.update(3, 1.0, 0.1, 5)
+        line.note("a sentence")
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("terminal", [False, True], ids=["a file", "a terminal"])
+def test_standard_error_that_goes_away_does_not_end_the_training(terminal, monkeypatch):
+    gone = Terminal() if terminal else io.StringIO()
+    monkeypatch.setattr(sys, "stderr", gone)
+    monkeypatch.setenv("TERM", "xterm")
+    with ProgressLine(3, 0) as line:
+        line.update(2, 1.0, 0.1, 5)
+        gone.close()
+        line.note("a sentence")
+        line.update(3, 1.0, 0.1, 5)

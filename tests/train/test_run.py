@@ -21,8 +21,8 @@ from hyrfpack import format as hyrf_format
 from hyrfpack.errors import HyrfError
 from hyrfpack.render import render
 from hyrfpack.scene import Scene
-from hyrfpack.train import DensityConfig, TrainConfig, Trainer, train
-from hyrfpack.train.run import _stop_requests
+from hyrfpack.train import DensityConfig, TrainConfig, Trainer, progress, train
+from hyrfpack.train.run import STOPPING, _stop_requests
 
 CONFIG = TrainConfig(
     steps=60,
@@ -187,9 +187,18 @@ def test_speed_is_told_of_all_parts_of_a_resumed_run(finished, tmp_path):
     assert metrics["steps_per_second"] == pytest.approx(60 / metrics["seconds"])
 
 
+def test_a_long_run_says_once_what_would_shorten_it(tmp_path, capsys, monkeypatch):
+    for name in ("FAIR_STEPS", "FAIR_SECONDS", "LONG"):
+        monkeypatch.setattr(progress, name, 0)
+    train(a_scene(), tmp_path, dataclasses.replace(CONFIG, steps=8))
+    (told,) = [line for line in capsys.readouterr().err.splitlines() if "more hours" in line]
+    assert all(way in told for way in ("--steps", "--max-size", "--images", "--max-gaussians", "a GPU"))
+
+
 # -- stopping and going on -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("signals")
 def test_the_first_interrupt_asks_and_the_second_interrupts():
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt), _stop_requests() as stop:
@@ -200,20 +209,45 @@ def test_the_first_interrupt_asks_and_the_second_interrupts():
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_a_request_to_terminate_asks_too():
-    before = signal.getsignal(signal.SIGTERM)
+@pytest.mark.usefixtures("signals")
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_request_to_terminate_and_a_terminal_that_closes_ask_too(name):
+    number = getattr(signal, name, None) or pytest.skip(f"there is no {name} here")
+    before = signal.getsignal(number)
     with _stop_requests() as stop:
-        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(number)
         assert stop()
-    assert signal.getsignal(signal.SIGTERM) is before
+    assert signal.getsignal(number) is before
 
 
-def test_an_interrupt_saves_exits_cleanly_and_resumes_to_the_same_model(whole, tmp_path):
+@pytest.mark.usefixtures("signals")
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="there is no SIGHUP here")
+def test_a_terminal_that_closes_may_say_so_twice():
+    with _stop_requests() as stop:
+        signal.raise_signal(signal.SIGHUP)
+        signal.raise_signal(signal.SIGHUP)
+        assert stop()
+
+
+@pytest.mark.usefixtures("signals")
+@pytest.mark.parametrize("number", STOPPING)
+def test_a_signal_that_is_ignored_stays_ignored(number):
+    """SIGHUP under nohup, Ctrl-C in the background of a script."""
+    signal.signal(number, signal.SIG_IGN)
+    with _stop_requests() as stop:
+        signal.raise_signal(number)
+        assert not stop()
+    assert signal.getsignal(number) is signal.SIG_IGN
+
+
+@pytest.mark.usefixtures("signals")
+@pytest.mark.parametrize("number", STOPPING)
+def test_an_interrupt_saves_exits_cleanly_and_resumes_to_the_same_model(number, whole, tmp_path):
     child = start_child(tmp_path, "train")
     checkpoint = tmp_path / "checkpoint.pt"
     while child.poll() is None and not checkpoint.exists():
         time.sleep(0.002)
-    child.send_signal(signal.SIGINT)
+    child.send_signal(number)
     out, errors = child.communicate(timeout=120)
 
     assert child.returncode == 0, errors

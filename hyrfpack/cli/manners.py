@@ -1,0 +1,98 @@
+"""How all commands speak: --quiet, --verbose, and what is done where there is nobody to speak to."""
+
+from __future__ import annotations
+
+import errno
+import os
+import platform
+import sys
+import time
+from contextlib import redirect_stderr, suppress
+from typing import TextIO
+
+import click
+
+import hyrfpack
+
+_MANNER, _STARTED = "hyrfpack.manner", "hyrfpack.started"  # in click's context, where all commands see them
+_PACKAGES = ("torch", "numpy", "numba", "triton", "pycolmap")
+
+
+def add_manners(command: click.Command) -> None:
+    """Give a command, or all of a group, --quiet and --verbose."""
+    for flag, help in (
+        ("--quiet", "Say nothing on standard error but errors."),
+        ("--verbose", "Say what a bug report needs: versions, device, times, tracebacks."),
+    ):
+        command.params.append(click.Option([flag], is_flag=True, expose_value=False, callback=_choose, help=help))
+
+
+def _choose(ctx: click.Context, option: click.Parameter, given: bool) -> None:
+    if not given or ctx.resilient_parsing or ctx.meta.get(_MANNER) == option.name:
+        return
+    root = ctx.find_root()
+    if _MANNER in ctx.meta:
+        root.close()  # standard error is needed
+        raise click.UsageError("--quiet and --verbose contradict each other; give one of them", ctx)
+    ctx.meta[_MANNER] = option.name
+    if option.name == "quiet":  # of progress and libraries too; errors are printed once the root is closed
+        root.with_resource(redirect_stderr(root.with_resource(open(os.devnull, "w", encoding="utf-8"))))
+        return
+    ctx.meta[_STARTED] = time.perf_counter()
+    note(f"{_versions()}; on {platform.platform()} with {os.cpu_count()} cores")
+    root.call_on_close(lambda: note(f"the end, after {time.process_time():.1f} s of processors"))
+
+
+def _versions() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    known = [f"hyrfpack {hyrfpack.__version__}", f"Python {platform.python_version()}"]
+    for package in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            known.append(f"{package} {version(package)}")
+    return ", ".join(known)
+
+
+def is_verbose() -> bool:
+    """Whether the command that runs was given --verbose."""
+    ctx = click.get_current_context(silent=True)
+    return ctx is not None and ctx.meta.get(_MANNER) == "verbose"
+
+
+def note(sentence: str) -> None:
+    """Tell the person something on standard error; with --verbose, with the seconds since the start before it."""
+    if is_verbose():
+        sentence = f"[{time.perf_counter() - click.get_current_context().meta[_STARTED]:7.2f} s] {sentence}"
+    with suppress(OSError):  # a full disk or a terminal that is gone does not end the work
+        click.echo(sentence, err=True)
+
+
+def detail(sentence: str) -> None:
+    """`note` what only --verbose wants to know."""
+    if is_verbose():
+        note(sentence)
+
+
+def mend_streams() -> None:
+    """Make standard streams that can be written to.
+
+    The null device stands in for a closed one (`2>&-`): the next file to be opened would get its number, and what a
+    library prints there. File names that the terminal's encoding lacks are printed with escapes.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if _is_closed(getattr(sys, name), mode):
+            number = os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(number, True)
+            setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))
+    if hasattr(sys.stdout, "reconfigure"):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def _is_closed(stream: TextIO | None, mode: str) -> bool:
+    if stream is None or mode == "r":
+        return stream is None
+    try:
+        os.write(stream.fileno(), b"")
+    except OSError as error:  # a stream of a test or a notebook has no number, and no EBADF
+        return error.errno == errno.EBADF
+    return False

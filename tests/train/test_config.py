@@ -1,0 +1,81 @@
+"""Settings that make no sense are refused where they are made, in one sentence that names them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from scenes import ball_scene
+
+from hyrfpack.train import DensityConfig, LearningRates, TrainConfig, Trainer
+from hyrfpack.train.config import LARGEST_SEED
+
+NO_INT = (2.5, math.nan, math.inf, True, "3", (3,), np.int64(3))
+NO_FLOAT = (math.nan, math.inf, -math.inf, True, "0.1", None, np.float32(0.1))
+WRONG = {
+    "steps": (0, -1, None, *NO_INT),
+    "seed": (-1, LARGEST_SEED + 1, None, *NO_INT),
+    "max_gaussians": (0, -1, *NO_INT),
+    "checkpoint_every": (0, -1, *NO_INT),
+    "log2_table_size": (3, 25, 40, -1, *NO_INT),
+    "preset": ("indoor", None, 1),
+    "precision": ("float16", None),
+    "background": (1, "no", math.nan),
+    "background_color": ("grey", None),
+    "antialiased": (None, 1, "yes"),
+    "ssim_weight": (1.1, -0.1, *NO_FLOAT),
+    "scale_rule": ("max", None),
+    "scale_grows": (None, 0),
+    "direction_encoding": ("none", None),
+    "position_gradients": (None, 2),
+    "grid_resolutions": ((64, 32), (1, 32), (8, 65537), (8,), (8, 16, 32), (8.5, 32), (8, math.nan), 8, None, "ab"),
+    "learning_rates": (None, {}, 1e-3),
+    "density": (None, {}, DensityConfig),
+}
+WRONG_DENSITY = {
+    **dict.fromkeys(("start", "stop", "prune_opacity"), (-0.1, 1.1, *NO_FLOAT)),
+    **dict.fromkeys(("gradient", "split_scale", "prune_scale"), (-1e-9, *NO_FLOAT)),
+    "rounds": (0, -1, None, *NO_INT),
+    "resets": (-1, None, *NO_INT),
+    "reset_opacity": (0, 1, *NO_FLOAT),
+}
+WRONG_RATES = ((0.0, 1e-3), (1e-3, 0.0), (-1e-3, 1e-3), (1e-3,), (1e-3, 1e-3, 1e-3), 1e-3, None, (1e-3, math.nan))
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong"), [(TrainConfig, WRONG), (DensityConfig, WRONG_DENSITY)], ids=["TrainConfig", "DensityConfig"]
+)
+def test_each_setting_out_of_range_or_of_another_type_is_one_sentence_that_names_it(kind, wrong):
+    assert set(wrong) == {field.name for field in dataclasses.fields(kind)}
+    for name, values in wrong.items():
+        for value in values:
+            with pytest.raises(ValueError, match=rf"^[^\n]*\b{name} is [^\n]*; it must be [^\n]*$"):
+                kind(**{name: value})
+
+
+@pytest.mark.parametrize("group", [field.name for field in dataclasses.fields(LearningRates)])
+@pytest.mark.parametrize("rates", WRONG_RATES, ids=str)
+def test_learning_rates_are_two_positive_numbers(group, rates):
+    with pytest.raises(ValueError, match=f"{group} is "):
+        LearningRates(**{group: rates})
+
+
+def test_what_lies_at_the_ends_of_the_ranges_is_taken():
+    for taken in ({"seed": LARGEST_SEED}, {"log2_table_size": 4}, {"log2_table_size": 24}, {"ssim_weight": 1}):
+        json.dumps(TrainConfig(**taken).to_dict(), allow_nan=False)
+    DensityConfig(start=1, stop=0, gradient=0, split_scale=0, prune_opacity=0, resets=0, rounds=1)
+
+
+@pytest.mark.parametrize("seed", [2**32, 18_446_744_073_710, 2**63, LARGEST_SEED])
+def test_training_with_any_seed_of_64_bits_splits_gaussians_and_ends(seed):
+    """Splitting draws from a generator of the seed and the step."""
+    density = DensityConfig(start=0.2, stop=1.0, rounds=2, gradient=0.0, split_scale=0.0)
+    trainer = Trainer(ball_scene(views=2, side=24), TrainConfig(steps=4, seed=seed, max_gaussians=200, density=density))
+    before = len(trainer.model)
+
+    assert trainer.run() and len(trainer.model) > before
+    assert all(torch.isfinite(values).all() for values in trainer.model.parameters())
