@@ -20,9 +20,8 @@ from hyrfpack.data.pictures import (
 )
 from hyrfpack.data.undistort import Lens
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.scene import Camera, Scene, View, evenly_spaced
+from hyrfpack.scene import Camera, Scene, View, evenly_spaced, rigid_pose
 
-_RIGID_TOLERANCE = 1e-3
 _ALPHA_LOOKED_AT = 4  # photos, spread over the set; the first with transparency ends the search
 
 
@@ -231,16 +230,11 @@ def _is_sane(lens: Lens) -> bool:
 
 def _rigid(pose: np.ndarray, path: Path) -> np.ndarray:
     """The pose with its rotation made exactly orthonormal (text files round it)."""
-    with np.errstate(over="ignore"):
-        finite = np.isfinite(pose.astype(np.float32)).all()
-    if not finite:
-        raise HyrfDataError(f"{path}: the pose of this photo is not finite (NaN or Inf); remove or re-register it")
-    rotation = pose[:3, :3]
-    if np.abs(rotation).max() > 2 or np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID_TOLERANCE:
-        raise HyrfDataError(f"{path}: the pose of this photo is not rigid (its axes are scaled or skewed); mend it")
-    if np.linalg.det(rotation) < 0:
-        raise HyrfDataError(f"{path}: the pose of this photo mirrors the world; mend its rotation")
-    u, _, vt = np.linalg.svd(rotation)
+    try:
+        pose = rigid_pose(pose)
+    except ValueError as error:
+        raise HyrfDataError(f"{path}: {error}; mend it, or register this photo again") from error
+    u, _, vt = np.linalg.svd(pose[:3, :3])
     rigid = np.eye(4)
     rigid[:3, :3] = u @ vt
     rigid[:3, 3] = pose[:3, 3]

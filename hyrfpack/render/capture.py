@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.render.camera_files import focal_length, rigid_pose, side_length
+from hyrfpack.render.camera_files import focal_length, side_length
 from hyrfpack.render.paths import orbit, stored_viewpoint
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 
@@ -49,7 +49,7 @@ def stored_cameras(facts: dict) -> list[Camera]:
                 focal_length(fy),
                 float(cx),
                 float(cy),
-                rigid_pose(np.reshape(pose, (3, 4))),
+                np.reshape(pose, (3, 4)),
             )
             for width, height, fx, fy, cx, cy, *pose in capture
         ]
