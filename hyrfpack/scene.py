@@ -13,21 +13,55 @@ from typing import TypeVar
 import numpy as np
 
 Item = TypeVar("Item")
+RIGID_TOLERANCE = 1e-3  # how far a rotation times its transpose may be from one: text files round poses
+DEFAULT_MAX_SIZE = 1600  # pixels of the longer side that larger photos are shrunk to, as 3DGS does
 
 
-@dataclass(frozen=True)
+def rigid_pose(values: object) -> np.ndarray:
+    """A rigid transform as a (4, 4) float64 array of its own.
+
+    Args:
+        values: (4, 4) or (3, 4) numbers, an array or nested lists.
+
+    Raises:
+        ValueError: it is of another shape, not finite (in float32, too), or no rotation and translation to within
+            RIGID_TOLERANCE.
+    """
+    try:
+        pose = np.array(values, np.float64)
+    except TypeError as error:
+        raise ValueError(f"the pose is not made of numbers ({error})") from error
+    if pose.shape == (3, 4):
+        pose = np.vstack((pose, (0, 0, 0, 1)))
+    if pose.shape != (4, 4):
+        raise ValueError(f"the pose has the shape {pose.shape} instead of (4, 4)")
+    with np.errstate(over="ignore"):
+        if not np.isfinite(pose.astype(np.float32)).all():
+            raise ValueError("the pose is not finite (NaN, Inf or beyond float32)")
+    rotation = pose[:3, :3]
+    off = np.abs(rotation).max() > 2 or np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID_TOLERANCE
+    if off or np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID_TOLERANCE:
+        raise ValueError("the pose is not rigid (its axes are scaled or skewed)")
+    if np.linalg.det(rotation) < 0:
+        raise ValueError("the pose mirrors the world")
+    return pose
+
+
+@dataclass(frozen=True, eq=False)
 class Camera:
-    """An undistorted pinhole camera.
+    """An undistorted pinhole camera. Two are equal if all their numbers are.
 
     Attributes:
         width, height: picture size in pixels.
         fx, fy: focal lengths in pixels.
         cx, cy: principal point in pixels; the top-left corner of the picture is (0, 0), the centre of its first
             pixel (0.5, 0.5).
-        camera_from_world: (4, 4) float64 rigid transform, row-major, last row (0, 0, 0, 1).
+        camera_from_world: (4, 4) float64 rigid transform, row-major, last row (0, 0, 0, 1). Nested lists will do, and
+            the last row may be left out; the camera keeps an array of its own.
 
     Raises:
-        ValueError: no pixels, a focal length that is not positive, or a number that is not finite.
+        ValueError: no pixels, a focal length that is not positive, a number that is not finite, or a pose that is not
+            rigid, see `rigid_pose`.
     """
 
     width: int
@@ -43,8 +77,19 @@ class Camera:
             raise ValueError(f"a camera of {self.width} x {self.height} pixels; each side needs at least one")
         if not (np.isfinite(self.intrinsics).all() and self.fx > 0 and self.fy > 0):
             raise ValueError(f"the intrinsics {self.intrinsics} must be finite, the focal lengths positive")
-        if np.shape(self.camera_from_world) != (4, 4) or not np.isfinite(self.camera_from_world).all():
-            raise ValueError("camera_from_world must be 4 x 4 finite numbers")
+        try:
+            object.__setattr__(self, "camera_from_world", rigid_pose(self.camera_from_world))
+        except ValueError as error:
+            raise ValueError(f"camera_from_world: {error}") from error
+
+    def __eq__(self, other: object) -> bool:
+        return self._numbers() == other._numbers() if isinstance(other, Camera) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self._numbers())
+
+    def _numbers(self) -> tuple[float, ...]:
+        return self.width, self.height, *self.intrinsics, *self.camera_from_world.ravel().tolist()
 
     @property
     def rotation(self) -> np.ndarray:
@@ -67,9 +112,9 @@ class Camera:
         return self.fx, self.fy, self.cx, self.cy
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Picture:
-    """A decoded photo, straight (not premultiplied) as it was stored.
+    """A decoded photo, straight (not premultiplied) as it was stored. Equal to itself alone: compare its arrays.
 
     Attributes:
         rgb: (H, W, 3) uint8, display-referred sRGB.
@@ -109,6 +154,8 @@ class Picture:
 class View:
     """One photo with its camera. `load` decodes the photo; nothing is read before it is called.
 
+    Views are equal if they show the same photo: name, camera and `load` are the same.
+
     Attributes:
         name: the photo's path below the picture folder, with its extension ("DSCF5565.jpg", "left/0001.png").
         camera: the camera after undistortion; its size is the size of the loaded picture.
@@ -120,9 +167,9 @@ class View:
     load: Callable[[], Picture]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
-    """Posed photos and what is known of the geometry.
+    """Posed photos and what is known of the geometry. Equal to itself alone: compare its views and points.
 
     Attributes:
         path: the folder it was read from.
@@ -133,6 +180,8 @@ class Scene:
         has_alpha: photos have transparent pixels (object-centred captures without a background).
         notes: sentences for the user about what the reader skipped or assumed.
         files: every file it was read from or will be: tables of poses, points, photos, masks.
+        max_size: pixels of the longer side that larger photos are shrunk to; 0 for photos as they are stored, None for
+            a scene that was not read from files.
 
     Raises:
         ValueError: a point or its colour is not finite.
@@ -147,10 +196,17 @@ class Scene:
     has_alpha: bool = False
     notes: list[str] = field(default_factory=list)
     files: tuple[str, ...] = ()
+    max_size: int | None = None
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.points).all() and np.isfinite(self.point_colors).all()):
             raise ValueError("points and their colours must be finite; leave out those that are not")
+
+    def __repr__(self) -> str:
+        return (
+            f"Scene({self.path!r}, {self.layout!r}: {len(self.train)} views to train on, {len(self.test)} held out, "
+            f"{len(self.points)} points)"
+        )
 
     @property
     def views(self) -> list[View]:

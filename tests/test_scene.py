@@ -1,9 +1,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scenes import camera_at, look_at, view_of
+import pytest
+from scenes import ball_scene, camera_at, look_at, view_of
 
-from hyrfpack.scene import Camera, Picture, Scene
+from hyrfpack.scene import Camera, Picture, Scene, View
 
 
 def test_camera_position_is_the_centre_of_projection():
@@ -71,3 +72,82 @@ def test_scene_views_are_both_splits_sorted_by_name():
 
     scene = Scene("x", "colmap", [named("b"), named("d")], [named("a"), named("c")], np.zeros((0, 3)), np.zeros((0, 3)))
     assert [view.name for view in scene.views] == ["a", "b", "c", "d"]
+
+
+# -- poses -----------------------------------------------------------------------------------------------------------
+
+
+def posed(pose) -> Camera:
+    return Camera(8, 6, 1.0, 2.0, 3.0, 4.0, pose)
+
+
+@pytest.mark.parametrize(
+    ("pose", "says"),
+    [
+        (np.diag([2.0, 2, 2, 1]), "not rigid"),
+        (np.diag([1.0, 1, 1, 2]), "not rigid"),
+        (np.diag([1.0, 1, 1, 1]) + np.eye(4, k=1), "not rigid"),
+        (np.diag([1.0, 1, 1.002, 1]), "not rigid"),
+        (np.diag([1e200, 1, 1, 1]), "not finite"),
+        (np.diag([1.0, 1, -1, 1]), "mirrors"),
+        (np.full((4, 4), np.nan), "not finite"),
+        (np.eye(3), r"shape \(3, 3\)"),
+        ([[1, 2], [3]], "camera_from_world"),
+        ("pose", "camera_from_world"),
+        (None, "camera_from_world"),
+        ([[object()] * 4] * 4, "camera_from_world"),
+    ],
+    ids=str,
+)
+def test_a_pose_that_is_not_rigid_is_refused(pose, says):
+    with pytest.raises(ValueError, match=says):
+        posed(pose)
+
+
+def test_a_pose_that_was_rounded_is_taken():
+    pose = look_at((4.0, 1.0, 2.0), (0, 0, 0)).round(4)
+    np.testing.assert_array_equal(posed(pose).camera_from_world, pose)
+
+
+@pytest.mark.parametrize("rows", [3, 4])
+def test_nested_lists_become_an_array_of_the_cameras_own(rows):
+    pose = look_at((4.0, 1.0, 2.0), (0, 0, 0))
+    camera = posed(pose[:rows].tolist())
+    assert camera.camera_from_world.dtype == np.float64
+    np.testing.assert_array_equal(camera.camera_from_world, pose)
+    np.testing.assert_allclose(camera.position, (4, 1, 2), atol=1e-12)
+    kept = posed(pose)
+    pose[0, 3] += 1
+    assert kept == camera
+
+
+# -- equality and what is printed ------------------------------------------------------------------------------------
+
+
+def test_cameras_are_equal_if_all_their_numbers_are():
+    camera, other = posed(np.eye(4)), posed(np.where(np.eye(4) == 0, -0.0, 1.0))
+    assert camera == other and hash(camera) == hash(other) and len({camera, other}) == 1
+    moved = np.eye(4)
+    moved[0, 3] = 1e-9
+    assert camera != posed(moved) and camera != Camera(8, 6, 1.0, 2.0, 3.0, 5.0, np.eye(4)) and camera != "camera"
+
+
+def test_views_of_one_photo_are_equal_and_can_be_looked_up():
+    def load():
+        return Picture(np.zeros((6, 8, 3), np.uint8))
+
+    view, same = (View("a.png", posed(np.eye(4)), load) for _ in range(2))
+    others = [View("b.png", posed(np.eye(4)), load), View("a.png", posed(np.eye(4)), lambda: None)]
+    assert view == same and hash(view) == hash(same) and others.count(view) == 0
+    assert [*others, same].index(view) == 2
+
+
+def test_pictures_and_scenes_are_equal_to_themselves_alone():
+    scene, other = ball_scene(3), ball_scene(3)
+    picture = scene.train[0].load()
+    assert scene == scene and scene != other and len({scene, other}) == 2
+    assert picture == picture and picture != Picture(picture.rgb) and hash(picture)
+
+
+def test_a_scene_prints_in_a_line():
+    assert repr(ball_scene(3)) == "Scene('balls', 'colmap': 3 views to train on, 0 held out, 100 points)"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -30,9 +31,7 @@ GROUPS = ("rasterize", "hash_encode", "mlp", "render", "codec")  # hyrfpack.benc
 def bench(
     model: Path | None,
     data: Path | None,
-    test_every: int,
-    images: str | None,
-    layout: str | None,
+    reading: dict[str, Any],
     repeats: int,
     only: tuple[str, ...],
     output: Path,
@@ -61,9 +60,10 @@ def bench(
     from hyrfpack.bench import tables as words
     from hyrfpack.bench.figure import picture_format, plot
     from hyrfpack.bench.machine import machine_line
+    from hyrfpack.format import describe
 
     picture_format(output)
-    scene = None if data is None else read_scene(data, test_every, images, layout)
+    scene = None if data is None else read_scene(data, reading, describe(model))
     outputs = Outputs(model, scene=scene, overwrite=overwrite)
     outputs.file(output)
     if json_file not in (None, "-"):

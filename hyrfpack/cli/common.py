@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -15,7 +16,7 @@ from hyrfpack.errors import HyrfError
 if TYPE_CHECKING:
     import torch
 
-    from hyrfpack.scene import Scene, View
+    from hyrfpack.scene import Camera, Scene, View
 
 Command = TypeVar("Command", bound=Callable)
 
@@ -45,9 +46,40 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print one JS
 
 
 def scene_options(command: Command) -> Command:
-    """Options that say how a data folder is read: --test-every, --images, --layout."""
+    """Options that say how a data folder is read, which the command gets as one argument, `reading`, for `read_scene`.
+
+    --test-every, --images, --max-size, --layout, --model.
+    """
+
+    @functools.wraps(command)
+    def with_reading(
+        *args: Any,
+        test_every: int,
+        images: str | None,
+        max_size: int | None,
+        layout: str | None,
+        colmap_model: str | None,
+        **others: Any,
+    ) -> Any:
+        reading = {"test_every": test_every, "images": images, "max_size": max_size, "layout": layout}
+        return command(*args, reading={**reading, "model": colmap_model}, **others)
+
+    with_options = with_reading
     for option in (
+        click.option(
+            "--model",
+            "colmap_model",
+            metavar="NAME",
+            help="COLMAP model to take, such as 1 for sparse/1.  [default: the largest]",
+        ),
         click.option("--layout", type=click.Choice(LAYOUTS), help="How the folder is laid out.  [default: detected]"),
+        click.option(
+            "--max-size",
+            type=click.IntRange(min=0),
+            metavar="PIXELS",
+            help="Shrink photos that are larger than this on the longer side; 0 keeps them.  "
+            "[default: 1600, or what MODEL was trained at]",
+        ),
         click.option("--images", metavar="NAME", help="Folder of pictures to use, such as images_4."),
         click.option(
             "--test-every",
@@ -59,8 +91,8 @@ def scene_options(command: Command) -> Command:
             "keep it.",
         ),
     ):
-        command = option(command)
-    return command
+        with_options = option(with_options)
+    return with_options
 
 
 def device_options(command: Command) -> Command:
@@ -94,11 +126,27 @@ def chosen_device(name: str) -> torch.device:
     return device
 
 
-def read_scene(path: Path, test_every: int, images: str | None, layout: str | None) -> Scene:
-    """Read a data folder and tell what the reader has to say about it."""
-    from hyrfpack.data import load_scene
+def read_scene(path: Path, reading: dict[str, Any], model: dict | None = None) -> Scene:
+    """Read a data folder and tell what the reader has to say about it.
 
-    scene = load_scene(path, test_every=test_every, images=images, layout=layout)
+    Args:
+        path: the folder.
+        reading: from `scene_options`.
+        model: facts of the model file (`hyrfpack.describe`) that the photos are of, if any: it says how large they
+            are wanted where --max-size does not.
+    """
+    from hyrfpack.data import load_scene
+    from hyrfpack.scene import DEFAULT_MAX_SIZE
+
+    if reading["max_size"] is None:
+        if model is None:
+            max_size = DEFAULT_MAX_SIZE
+        else:
+            from hyrfpack.render.capture import stored_max_size
+
+            max_size = stored_max_size(model)
+        reading = {**reading, "max_size": max_size}
+    scene = load_scene(path, **reading)
     for sentence in scene.notes:
         note(sentence)
     return scene
@@ -114,6 +162,11 @@ def split_views(scene: Scene, split: str) -> list[View]:
     if not views:
         raise HyrfError(f"{scene.path}: no photo is in the split '{split}'; name another --split or --test-every")
     return views
+
+
+def largest_picture(cameras: Iterable[Camera]) -> tuple[int, int]:
+    """(width, height) in pixels of the largest picture that cameras make."""
+    return max(((camera.width, camera.height) for camera in cameras), key=lambda size: size[0] * size[1])
 
 
 def print_json(values: dict) -> None:

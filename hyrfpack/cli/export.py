@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -84,9 +84,7 @@ def export(
     spz_version: str,
     data: Path | None,
     overwrite: bool,
-    test_every: int,
-    images: str | None,
-    layout: str | None,
+    reading: dict[str, Any],
     as_json: bool,
 ) -> None:
     """Write MODEL, a .hyrf file, as what other programs read, and say what was lost on the way.
@@ -109,8 +107,9 @@ def export(
     """
     from hyrfpack.export import export as write
     from hyrfpack.export.kinds import check_place
+    from hyrfpack.format import describe
 
-    scene = None if data is None else read_scene(data, test_every, images, layout)
+    scene = None if data is None else read_scene(data, reading, describe(model))
     check_place(output, Outputs(model, scene=scene, overwrite=overwrite))
     report = write(
         model,

@@ -7,7 +7,7 @@ import re
 import shlex
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -101,9 +101,7 @@ def compress(
     max_psnr_drop: float | None,
     report: Path | None,
     overwrite: bool,
-    test_every: int,
-    images: str | None,
-    layout: str | None,
+    reading: dict[str, Any],
     as_json: bool,
 ) -> None:
     """Pack MODEL, a .hyrf file, into a smaller one and show what each part takes.
@@ -120,8 +118,9 @@ def compress(
     """
     from hyrfpack.compress import compress as pack
     from hyrfpack.compress.report_page import FILES
+    from hyrfpack.format import describe
 
-    scene = None if data is None else read_scene(data, test_every, images, layout)
+    scene = None if data is None else read_scene(data, reading, describe(model))
     outputs = Outputs(model, scene=scene, overwrite=overwrite)
     outputs.file(output, ".hyrf")
     if report is not None:

@@ -53,9 +53,7 @@ BACKGROUND_COLORS = ("black", "white", "random")
 def train(
     data: Path,
     out: Path,
-    test_every: int,
-    images: str | None,
-    layout: str | None,
+    reading: dict[str, Any],
     cache_mb: int | None,
     resume: bool,
     overwrite: bool,
@@ -85,7 +83,7 @@ def train(
     from hyrfpack.train.run import resuming
 
     place = chosen_device(device)
-    scene = read_scene(data, test_every, images, layout)
+    scene = read_scene(data, reading)
     where = describe_device(place)
     note(f"{scene.layout} scene: {len(scene.train)} photos to train on, {len(scene.test)} held out; on {where}")
     cache = None if cache_mb is None else PictureCache(cache_mb * 2**20)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -14,6 +15,7 @@ from hyrfpack.cli.common import (
     chosen_device,
     device_options,
     json_option,
+    largest_picture,
     note,
     overwrite_option,
     print_json,
@@ -49,9 +51,7 @@ def render(
     output: Path,
     data: Path | None,
     split: str,
-    test_every: int,
-    images: str | None,
-    layout: str | None,
+    reading: dict[str, Any],
     cameras: Path | None,
     orbit: int | None,
     depth: bool,
@@ -85,7 +85,7 @@ def render(
     place = chosen_device(device)
     part, scene = 1.0 if allow_partial else None, None
     if data is not None:
-        scene = read_scene(data, test_every, images, layout)
+        scene = read_scene(data, reading, describe(model, part))
         views = split_views(scene, split)
         named = [(view.name, view.camera) for view in views]
     elif cameras is not None:
@@ -115,7 +115,8 @@ def render(
     if as_json:
         print_json({"pictures": [str(path) for path in written], "video": str(film) if film else None})
     else:
-        click.echo(f"{output}: {len(written)} pictures{' and video.mp4' if film else ''}")
+        width, height = largest_picture(camera for _, camera in named)
+        click.echo(f"{output}: {len(written)} pictures{' and video.mp4' if film else ''}, {width} x {height} pixels")
 
 
 @click.command(short_help="Score a model against photos.")
@@ -135,9 +136,7 @@ def evaluate(
     model: Path,
     data: Path,
     split: str,
-    test_every: int,
-    images: str | None,
-    layout: str | None,
+    reading: dict[str, Any],
     lpips_weights: Path | None,
     pictures: Path | None,
     allow_partial: bool,
@@ -158,24 +157,28 @@ def evaluate(
     """
     from hyrfpack.evaluate import evaluate as score
     from hyrfpack.evaluate import picture_names
-    from hyrfpack.format import load
+    from hyrfpack.format import describe, load
 
-    loaded = load(model, chosen_device(device), 1.0 if allow_partial else None)
+    part = 1.0 if allow_partial else None
+    loaded = load(model, chosen_device(device), part)
     loaded.precision = precision
-    scene = read_scene(data, test_every, images, layout)
+    scene = read_scene(data, reading, describe(model, part))
     views = split_views(scene, split)
     if pictures is not None:
         Outputs(model, lpips_weights, scene=scene, overwrite=overwrite).folder(pictures, picture_names(views).values())
     scores = score(loaded, views, lpips_weights=lpips_weights, pictures=pictures)
     size = os.path.getsize(model)
+    width, height = largest_picture(view.camera for view in views)
     if scores.skipped:
         note(f"{len(scores.skipped)} photos were not scored because their masks leave no pixel")
     if as_json:
-        print_json({"bytes": size, **scores.to_dict()})
+        print_json({"bytes": size, "max_size": scene.max_size, "picture_size": [width, height], **scores.to_dict()})
         return
     rows = [[view.name, f"{view.psnr:.2f}", f"{view.ssim:.4f}", _optional(view.lpips)] for view in scores.views]
     rows.append(["mean", f"{scores.psnr:.2f}", f"{scores.ssim:.4f}", _optional(scores.lpips)])
     click.echo(table(["view", "PSNR (dB)", "SSIM", "LPIPS"], rows))
+    limit = f"--max-size {scene.max_size}" if scene.max_size else "as they are stored"
+    click.echo(f"{len(scores.views)} photos of up to {width} x {height} pixels ({limit})")
     click.echo(f"{model}: {size:,} bytes, {scores.gaussians:,} Gaussians, {scores.seconds_per_frame:.4f} s a frame")
     if scores.lpips is None:
         click.echo(f"LPIPS: {scores.lpips_reason}")

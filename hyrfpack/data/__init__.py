@@ -7,13 +7,19 @@ from pathlib import Path
 
 from hyrfpack.data.cache import PictureCache
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.scene import Scene
+from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 
 __all__ = ["PictureCache", "load_scene"]
 
 
 def load_scene(
-    path: str | os.PathLike[str], *, test_every: int = 8, images: str | None = None, layout: str | None = None
+    path: str | os.PathLike[str],
+    *,
+    test_every: int = 8,
+    images: str | None = None,
+    layout: str | None = None,
+    model: str | None = None,
+    max_size: int = DEFAULT_MAX_SIZE,
 ) -> Scene:
     """Read a folder of posed photos; pictures are decoded later, one by one, by `View.load`.
 
@@ -26,32 +32,38 @@ def load_scene(
         images: take the photos from this folder ("images_2"); intrinsics follow the size of its files.
         layout: "colmap", "blender" or "nerfstudio"; None takes the first of these that is there and says so in
             `Scene.notes` when there was a choice.
+        model: name of the folder of a COLMAP model ("1" for `sparse/1`); None takes the one with the most photos and
+            says so in `Scene.notes` when there was a choice.
+        max_size: shrink photos with more pixels than this on the longer side to so many, as they are decoded; cameras
+            and masks follow. 0 keeps them as they are. `Scene.notes` says how many are shrunk.
 
     Returns:
         The scene in the frame and units of its files.
 
     Raises:
         HyrfDataError: the folder cannot be used; one sentence says what, where, and what to do.
-        ValueError: an unknown `layout` or a negative `test_every`.
+        ValueError: an unknown `layout`, a negative `test_every` or `max_size`.
     """
     if test_every < 0:
         raise ValueError(f"test_every must be 0 or more, not {test_every}")
+    if max_size < 0:
+        raise ValueError(f"max_size must be 0 (photos as they are) or more, not {max_size}")
     if layout not in (None, "colmap", "blender", "nerfstudio"):
         raise ValueError(f"no layout '{layout}'; there are colmap, blender, nerfstudio")
     folder = Path(path)
-    if not folder.exists():
+    if not os.path.exists(folder):  # methods of Path raise where a name is too long
         raise HyrfDataError(f"{folder}: no such folder; check the path")
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         raise HyrfDataError(f"{folder}: a file, not a folder; give the folder that holds photos and poses")
 
     from hyrfpack.data.blender import read_blender
-    from hyrfpack.data.colmap import find_model, read_colmap
+    from hyrfpack.data.colmap import find_models, read_colmap
     from hyrfpack.data.nerfstudio import read_nerfstudio
 
     there = {
-        "colmap": find_model(folder) is not None,
-        "blender": (folder / "transforms_train.json").is_file(),
-        "nerfstudio": (folder / "transforms.json").is_file(),
+        "colmap": bool(find_models(folder)),
+        "blender": os.path.isfile(folder / "transforms_train.json"),
+        "nerfstudio": os.path.isfile(folder / "transforms.json"),
     }
     found = [name for name, present in there.items() if present]
     if not found or (layout is not None and not there[layout]):
@@ -62,12 +74,14 @@ def load_scene(
     chosen = layout or found[0]
     if chosen == "blender" and images is not None:
         raise HyrfDataError(f"{folder}: a Blender-style set names its own pictures; leave out the folder '{images}'")
+    if chosen != "colmap" and model is not None:
+        raise HyrfDataError(f"{folder}: the {chosen} layout has no COLMAP models to choose from; leave out '{model}'")
     if chosen == "colmap":
-        scene = read_colmap(folder, test_every=test_every, images=images)
+        scene = read_colmap(folder, test_every=test_every, images=images, model=model, max_size=max_size)
     elif chosen == "blender":
-        scene = read_blender(folder, test_every=test_every)
+        scene = read_blender(folder, test_every=test_every, max_size=max_size)
     else:
-        scene = read_nerfstudio(folder, test_every=test_every, images=images)
+        scene = read_nerfstudio(folder, test_every=test_every, images=images, max_size=max_size)
     if len(found) > 1:
         scene.notes.insert(0, f"poses are there as {' and '.join(found)}; {chosen} was taken")
     return scene

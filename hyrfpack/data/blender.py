@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
-from hyrfpack.data.assemble import Photo, make_scene, safe_name, skipped_note
+from hyrfpack.data.assemble import Photo, check_found, make_scene, safe_name
 from hyrfpack.data.pictures import find_picture, read_header
 from hyrfpack.data.transforms import focal_from_angle, number, pose_from_opengl, read_json
 from hyrfpack.data.undistort import Lens
@@ -12,10 +12,11 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Scene
 
 
-def read_blender(path: Path, *, test_every: int) -> Scene:
+def read_blender(path: Path, *, test_every: int, max_size: int) -> Scene:
     """Read a Blender-style set; the world is the file's (z up), pictures keep straight alpha.
 
     The set's own split counts: train, and test (val where there is no test). `test_every` is for sets with neither.
+    `max_size` is `load_scene`'s.
 
     Raises:
         HyrfDataError: a file is missing or cannot be used.
@@ -33,7 +34,16 @@ def read_blender(path: Path, *, test_every: int) -> Scene:
         if held_out == "val":
             notes.append("the set has no test split; val is used")
     tables = [path / f"transforms_{split}.json" for split in ("train", held_out) if split is not None]
-    return make_scene(path, "blender", photos, test_every=test_every, test_names=test_names, tables=tables, notes=notes)
+    return make_scene(
+        path,
+        "blender",
+        photos,
+        test_every=test_every,
+        max_size=max_size,
+        test_names=test_names,
+        tables=tables,
+        notes=notes,
+    )
 
 
 def _read_split(path: Path, split: str, notes: list[str]) -> list[Photo]:
@@ -42,11 +52,12 @@ def _read_split(path: Path, split: str, notes: list[str]) -> list[Photo]:
     angle = number(content, "camera_angle_x", file)
     if angle is None:
         raise HyrfDataError(f"{file}: has no 'camera_angle_x', so the focal length is unknown; add it")
-    photos, missing = [], 0
+    photos: list[Photo] = []
+    missing: list[str] = []
     for frame in content["frames"]:
         picture = find_picture(path / frame["file_path"])
         if picture is None:
-            missing += 1
+            missing.append(str(PurePosixPath(frame["file_path"])))
             continue
         header = read_header(picture)
         focal = focal_from_angle(angle, header.width, file)
@@ -55,7 +66,5 @@ def _read_split(path: Path, split: str, notes: list[str]) -> list[Photo]:
         if not name.endswith(picture.suffix):
             name += picture.suffix
         photos.append(Photo(name, picture, header, lens, pose_from_opengl(frame, file)))
-    if not photos:
-        raise HyrfDataError(f"{file}: none of its {missing} pictures is on disk; put them where 'file_path' says")
-    notes += skipped_note(missing, len(content["frames"]), file.name)
+    notes += check_found(path, photos, missing, file.name)
     return photos

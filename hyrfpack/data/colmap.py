@@ -1,38 +1,49 @@
-"""COLMAP reconstructions (`sparse/0` with cameras, images, points3D as .bin or .txt), read by pycolmap."""
+"""COLMAP reconstructions (`sparse/0` and the like with cameras, images, points3D as .bin or .txt), read by pycolmap."""
 
 from __future__ import annotations
 
+import math
+import os
 import re
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from hyrfpack.data.assemble import Photo, make_scene, safe_name, skipped_note
+from hyrfpack.data.assemble import Photo, check_found, make_scene, safe_name
 from hyrfpack.data.colmap_binary import check_binary_model
-from hyrfpack.data.pictures import find_mask, find_picture, read_header
+from hyrfpack.data.pictures import find_mask, find_picture, mask_folder, read_header
 from hyrfpack.data.undistort import Lens, brown
 from hyrfpack.errors import HyrfDataError, needs_package
 from hyrfpack.scene import Scene
 
-_MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
+_MODEL_FOLDERS = ("sparse", "colmap/sparse")
 _TABLES = ("cameras", "images", "points3D")
 
 
-def find_model(path: Path) -> Path | None:
-    """The folder below `path` that holds a COLMAP model (any of its files), or None."""
-    for folder in _MODEL_FOLDERS:
-        if any((path / folder / f"{table}{kind}").is_file() for table in _TABLES for kind in (".bin", ".txt")):
-            return path / folder
-    return None
+def find_models(path: Path) -> list[Path]:
+    """The folders below `path` that hold a COLMAP model (any of its files): those in `sparse/` by number, then by name,
+    then `sparse/` itself; or the same in `colmap/sparse/`."""
+
+    def holds_model(folder: Path) -> bool:
+        return any(os.path.isfile(folder / f"{table}{kind}") for table in _TABLES for kind in (".bin", ".txt"))
+
+    for parent in (path / name for name in _MODEL_FOLDERS):
+        inside = [entry for entry in parent.iterdir() if entry.is_dir()] if os.path.isdir(parent) else []
+        inside.sort(key=lambda entry: (int(entry.name) if entry.name.isdecimal() else math.inf, entry.name))
+        models = [folder for folder in (*inside, parent) if holds_model(folder)]
+        if models:
+            return models
+    return []
 
 
-def read_colmap(path: Path, *, test_every: int, images: str | None) -> Scene:
+def read_colmap(path: Path, *, test_every: int, images: str | None, model: str | None, max_size: int) -> Scene:
     """Read a folder with a COLMAP model and its photos.
 
     Args:
         path: the scene folder.
-        test_every: see `load_scene`.
+        test_every, max_size: see `load_scene`.
         images: the folder of photos; "images" when None. Intrinsics follow the size of the files in it.
+        model: name of the folder of the model; None takes the one with the most photos.
 
     Returns:
         The scene, in the frame and units of the model.
@@ -40,41 +51,72 @@ def read_colmap(path: Path, *, test_every: int, images: str | None) -> Scene:
     Raises:
         HyrfDataError: the model or the photos cannot be used.
     """
-    model = find_model(path)
-    if model is None:
-        raise HyrfDataError(f"{path}: no COLMAP model in {', '.join(_MODEL_FOLDERS)}; run the reconstruction first")
+    tables, notes = _choose_model(path, model)
     picture_folder = path / (images or "images")
     if not picture_folder.is_dir():
         there = ", ".join(sorted(entry.name for entry in path.iterdir() if entry.is_dir()))
         raise HyrfDataError(f"{path}: no photo folder '{picture_folder.name}'; there are the folders {there}")
 
-    cameras, posed, unposed, points, colors = _read_model(model)
-    notes = []
-    siblings = [entry.name for entry in model.parent.iterdir() if entry.is_dir() and entry.name.isdigit()]
-    if model.name == "0" and len(siblings) > 1:
-        notes.append(f"{model.parent} holds {len(siblings)} models; only '0' was read")
+    cameras, posed, unposed, points, colors = _read_model(tables)
     if unposed:
         notes.append(f"{unposed} photos were never registered and were skipped")
-    photos, missing = [], 0
+    masks = mask_folder(path, picture_folder.name)
+    photos: list[Photo] = []
+    missing: list[str] = []
     for name, camera_id, pose in posed:
         name = safe_name(name)
         file = find_picture(picture_folder / name)
         if file is None:
-            missing += 1
+            missing.append(str(PurePosixPath(images or "images") / name))
             continue
-        mask = find_mask(path, picture_folder.name, name)
+        mask = find_mask(masks, name)
         photos.append(Photo(name, file, read_header(file), cameras[camera_id], pose, mask))
-    notes += skipped_note(missing, len(posed), str(model))
+    notes += check_found(path, photos, missing, str(tables.relative_to(path)))
     return make_scene(
         path,
         "colmap",
         photos,
         test_every=test_every,
+        max_size=max_size,
         points=points,
         point_colors=colors,
-        tables=sorted(file for file in model.iterdir() if file.is_file()),
+        tables=sorted(file for file in tables.iterdir() if file.is_file()),
+        masks=masks,
         notes=notes,
     )
+
+
+def _choose_model(path: Path, name: str | None) -> tuple[Path, list[str]]:
+    """The model of a name, or the one with the most photos, and a note where there was a choice."""
+    models = find_models(path)
+    if not models:
+        raise HyrfDataError(f"{path}: no COLMAP model in {' or '.join(_MODEL_FOLDERS)}; run the reconstruction first")
+    if name is None and len(models) == 1:
+        return models[0], []
+    sizes = {model.name: _registered(model) for model in models}
+    there = ", ".join(f"{model} ({size} photos)" for model, size in sizes.items())
+    chosen = max(models, key=lambda model: sizes[model.name])  # the first of the largest
+    why = "with the most photos; --model takes another"
+    if name is not None:
+        if name not in sizes:
+            raise HyrfDataError(f"{path}: there is no COLMAP model '{name}'; name one of those that are there: {there}")
+        chosen, why = next(model for model in models if model.name == name), "as asked for"
+    return chosen, [f"there are {len(models)} COLMAP models: {there}; {chosen.name} was taken, {why}"]
+
+
+def _registered(model: Path) -> int:
+    """How many photos a model says that it has posed; 0 where it does not, which reading it finds the reason for."""
+    try:
+        if (model / "images.bin").is_file():
+            with (model / "images.bin").open("rb") as table:
+                return int.from_bytes(table.read(8), "little")
+        stated = _stated_count(model / "images.txt")
+        if stated is not None:
+            return stated
+        with (model / "images.txt").open(encoding="utf-8", errors="replace") as lines:
+            return (sum(not line.startswith("#") for line in lines) + 1) // 2  # two lines a photo
+    except OSError:
+        return 0
 
 
 def lens_from_colmap(model: str, width: int, height: int, params: np.ndarray) -> Lens:
@@ -153,12 +195,16 @@ def _pose(image) -> np.ndarray:
     return pose
 
 
-def _check_text_count(file: Path, count: int) -> None:
-    """Text tables state their length in a comment: the one way to notice that lines are lost."""
+def _stated_count(file: Path) -> int | None:
+    """The number of entries that a text table states in a comment, None where it does not."""
     with file.open(encoding="utf-8", errors="replace") as lines:
         comments = "".join(line for line, _ in zip(lines, range(8), strict=False) if line.startswith("#"))
     stated = re.search(r"Number of \w+: (\d{1,18})", comments)
-    if stated and int(stated[1]) != count:
-        raise HyrfDataError(
-            f"{file}: says {stated[1]} entries but holds {count}; the file is truncated, export it again"
-        )
+    return int(stated[1]) if stated else None
+
+
+def _check_text_count(file: Path, count: int) -> None:
+    """The stated count is the one way to notice that lines are lost."""
+    stated = _stated_count(file)
+    if stated is not None and stated != count:
+        raise HyrfDataError(f"{file}: says {stated} entries but holds {count}; the file is truncated, export it again")

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from hyrfpack.data.assemble import Photo, make_scene, safe_name, skipped_note
-from hyrfpack.data.pictures import Header, find_mask, find_picture, read_header
-from hyrfpack.data.transforms import focal_from_angle, number, pose_from_opengl, read_json
+from hyrfpack.data.assemble import Photo, check_found, make_scene, safe_name
+from hyrfpack.data.pictures import Header, find_mask, find_picture, mask_folder, read_header
+from hyrfpack.data.transforms import focal_from_angle, number, pose_from_opengl, read_json, slashed
 from hyrfpack.data.undistort import Lens, brown
 from hyrfpack.errors import HyrfDataError, needs_package
 from hyrfpack.scene import Scene
@@ -20,7 +20,7 @@ _PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RA
 _DENOMINATOR = ("k4", "k5", "k6")
 
 
-def read_nerfstudio(path: Path, *, test_every: int, images: str | None) -> Scene:
+def read_nerfstudio(path: Path, *, test_every: int, images: str | None, max_size: int) -> Scene:
     """Read a folder with a transforms.json.
 
     The world is that of the file's matrices. `applied_transform` says how it was turned from the reconstruction's
@@ -30,6 +30,7 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None) -> Scene
         path: the scene folder.
         test_every: see `load_scene`; `train_filenames`, `val_filenames`, `test_filenames` come first.
         images: a folder to take the photos from instead of the one the frames name.
+        max_size: see `load_scene`.
 
     Raises:
         HyrfDataError: a file is missing or cannot be used.
@@ -39,17 +40,21 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None) -> Scene
     frames = content["frames"]
     if images is not None and not (path / images).is_dir():
         raise HyrfDataError(f"{path}: no photo folder '{images}'; name one that is there")
-    keep, test_names = _own_split(content, file)
+    keep, test_names, notes = _own_split(content, file)
     strip = _common_folder([frame["file_path"] for frame in frames])
-    photos, missing, test = [], 0, set()
+    masks = mask_folder(path, images or strip.name)
+    photos: list[Photo] = []
+    missing: list[str] = []
+    test = set()
     for frame in frames:
         listed = PurePosixPath(frame["file_path"])
         if keep is not None and listed not in keep:
             continue
         name = safe_name(str(listed.relative_to(strip)))
-        picture = find_picture(path / listed if images is None else path / images / name)
+        wanted = listed if images is None else PurePosixPath(images) / name
+        picture = find_picture(path / wanted)
         if picture is None:
-            missing += 1
+            missing.append(str(wanted))
             continue
         header = read_header(picture)
         if not PurePosixPath(name).suffix:
@@ -57,37 +62,41 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None) -> Scene
         if listed in test_names:
             test.add(name)
         lens = _lens(content, frame, header, file)
-        mask = _mask(path, images or strip.name, frame, name, file)
+        mask = _mask(path, masks, frame, name, file)
         photos.append(Photo(name, picture, header, lens, pose_from_opengl(frame, file), mask))
-    notes = skipped_note(missing, len(frames), file.name)
+    notes += check_found(path, photos, missing, file.name)
     points, colors = _read_ply(path, content, file)
-    tables = [file] if points is None else [file, path / content["ply_file_path"]]
+    tables = [file] if points is None else [file, path / slashed(content["ply_file_path"])]
     return make_scene(
         path,
         "nerfstudio",
         photos,
         test_every=test_every,
+        max_size=max_size,
         test_names=None if keep is None else test,
         points=points,
         point_colors=colors,
         tables=tables,
+        masks=masks,
         notes=notes,
     )
 
 
-def _own_split(content: dict[str, Any], file: Path) -> tuple[set | None, set]:
-    """Listed paths to keep (None: all) and, among them, those held out."""
+def _own_split(content: dict[str, Any], file: Path) -> tuple[set | None, set, list[str]]:
+    """Listed paths to keep (None: all), among them those held out, and a note on half a split."""
     lists = {}
     for key in ("train_filenames", "val_filenames", "test_filenames"):
         names = content.get(key) or []
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise HyrfDataError(f"{file}: '{key}' is no list of file names; mend or remove it")
-        lists[key] = {PurePosixPath(name) for name in names}
+        lists[key] = {PurePosixPath(slashed(name)) for name in names}
     train, val, test = lists.values()
     held_out = test or val
     if not train or not held_out:
-        return None, set()
-    return train | held_out, held_out
+        given = [key for key, names in lists.items() if names]
+        half = f"{file.name} lists {' and '.join(given)} alone, which is half a split and is not used"
+        return None, set(), [half] if given else []
+    return train | held_out, held_out, []
 
 
 def _common_folder(listed: list[str]) -> PurePosixPath:
@@ -137,11 +146,11 @@ def _lens(content: dict[str, Any], frame: dict[str, Any], header: Header, file: 
     return Lens(*pinhole, "brown", brown(k1, k2, p1, p2, k3, k4, k5, k6))
 
 
-def _mask(path: Path, picture_folder: str, frame: dict[str, Any], name: str, file: Path) -> Path | None:
+def _mask(path: Path, folder: Path, frame: dict[str, Any], name: str, file: Path) -> Path | None:
     listed = frame.get("mask_path")
     if listed is None:
-        return find_mask(path, picture_folder, name)
-    mask = find_picture(path / listed) if isinstance(listed, str) else None
+        return find_mask(folder, name)
+    mask = find_picture(path / slashed(listed)) if isinstance(listed, str) else None
     if mask is None:
         raise HyrfDataError(f"{file}: mask {str(listed)[:80]} of {name} is not on disk; restore it or drop 'mask_path'")
     return mask
@@ -151,7 +160,7 @@ def _read_ply(path: Path, content: dict[str, Any], file: Path) -> tuple[np.ndarr
     listed = content.get("ply_file_path")
     if listed is None:
         return None, None
-    ply = path / str(listed)
+    ply = path / slashed(str(listed))
     if not isinstance(listed, str) or not os.path.isfile(ply):  # Path.is_file raises where a name is too long
         raise HyrfDataError(f"{file}: points {str(listed)[:80]} are not on disk; restore them or drop 'ply_file_path'")
     with needs_package("trimesh", f"{ply}: reading points"):

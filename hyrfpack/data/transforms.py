@@ -13,7 +13,7 @@ from hyrfpack.errors import HyrfDataError
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a transforms file and check that it has a list of frames, each with a path and a matrix.
+    """Read a transforms file and check that it has a list of frames, each with a path, which gets slashes.
 
     Raises:
         HyrfDataError: not to be read, not JSON, or without usable frames.
@@ -30,7 +30,13 @@ def read_json(path: Path) -> dict[str, Any]:
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise HyrfDataError(f"{path}: frame {index} has no 'file_path'; mend or remove the frame")
+        frame["file_path"] = slashed(frame["file_path"])
     return content
+
+
+def slashed(path: str) -> str:
+    """A path of a file that may have been written on Windows: with slashes in place of backslashes."""
+    return path.replace("\\", "/")
 
 
 def number(entries: dict[str, Any], key: str, path: Path) -> float | None:

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.scene import Camera
+from hyrfpack.scene import Camera, rigid_pose
 
 MAX_SIDE = 16384  # pixels; more is a mistake in the file
-RIGID_TOLERANCE = 1e-3
 
 
 def cameras_to_json(cameras: Sequence[tuple[str, Camera]]) -> str:
@@ -87,7 +86,7 @@ def _from_ours(item: dict[str, Any], name: str) -> tuple[str, Camera]:
     fx = focal_length(item["fx"])
     fy = focal_length(item.get("fy", fx))
     cx, cy = _finite(item.get("cx", width / 2)), _finite(item.get("cy", height / 2))
-    return str(item.get("name", name)), Camera(width, height, fx, fy, cx, cy, rigid_pose(item["camera_from_world"]))
+    return str(item.get("name", name)), Camera(width, height, fx, fy, cx, cy, item["camera_from_world"])
 
 
 def _from_transforms(item: dict[str, Any], name: str) -> tuple[str, Camera]:
@@ -101,21 +100,6 @@ def _from_transforms(item: dict[str, Any], name: str) -> tuple[str, Camera]:
     world_from_camera = rigid_pose(item["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
     name = str(item.get("file_path", name))
     return name, Camera(width, height, fx, fy, cx, cy, np.linalg.inv(world_from_camera))
-
-
-def rigid_pose(values: Any) -> np.ndarray:
-    """(4, 4) or (3, 4) nested lists to a pose. Raises ValueError unless it is a finite rigid transform."""
-    pose = np.array(values, np.float64)
-    if pose.shape == (3, 4):
-        pose = np.vstack((pose, (0, 0, 0, 1)))
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise ValueError("its pose is not 4 x 4 finite numbers")
-    rotation = pose[:3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(pose[3] - (0, 0, 0, 1)).max())
-    if not off <= RIGID_TOLERANCE or np.linalg.det(rotation) < 0:  # NaN, from squares that overflow, is refused too
-        raise ValueError("its pose is not a rotation and a translation")
-    return pose
 
 
 def side_length(value: Any) -> int:

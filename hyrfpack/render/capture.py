@@ -1,4 +1,4 @@
-"""The cameras of a capture, kept with a trained model: what it will be looked at from, about."""
+"""What a trained model keeps of its photos: their cameras, what it will be looked at from, about, and their size."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.render.camera_files import focal_length, rigid_pose, side_length
+from hyrfpack.render.camera_files import focal_length, side_length
 from hyrfpack.render.paths import orbit, stored_viewpoint
-from hyrfpack.scene import Camera, evenly_spaced
+from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 
 KEPT = 128  # cameras that a trained model keeps
 ORBIT = 48  # cameras around a model that kept none
@@ -49,7 +49,7 @@ def stored_cameras(facts: dict) -> list[Camera]:
                 focal_length(fy),
                 float(cx),
                 float(cy),
-                rigid_pose(np.reshape(pose, (3, 4))),
+                np.reshape(pose, (3, 4)),
             )
             for width, height, fx, fy, cx, cy, *pose in capture
         ]
@@ -57,3 +57,24 @@ def stored_cameras(facts: dict) -> list[Camera]:
         raise HyrfDataError(
             f"the cameras that the file keeps make no sense ({error!s:.160}); name the photos with --data"
         ) from error
+
+
+def max_size_of(scene: Scene) -> int | None:
+    """The limit on the size of photos that a model trained on a scene keeps as "max_size" of its provenance.
+
+    None, for nothing, where reading them again with DEFAULT_MAX_SIZE gives the same pictures: a model of small photos
+    is the same file, byte for byte, whether or not there is such a limit.
+    """
+    small = all(max(view.camera.width, view.camera.height) < DEFAULT_MAX_SIZE for view in scene.views)
+    return None if small and scene.max_size == DEFAULT_MAX_SIZE else scene.max_size
+
+
+def stored_max_size(facts: dict) -> int:
+    """The `max_size` of `load_scene` that gives photos the size which a model was trained at.
+
+    Args:
+        facts: from `hyrfpack.describe`. DEFAULT_MAX_SIZE where they say nothing of use.
+    """
+    stored = facts["provenance"].get("max_size")
+    usable = isinstance(stored, int) and not isinstance(stored, bool) and stored >= 0
+    return stored if usable else DEFAULT_MAX_SIZE

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.render.camera_files import focal_length, rigid_pose, side_length
-from hyrfpack.scene import Camera
+from hyrfpack.render.camera_files import focal_length, side_length
+from hyrfpack.scene import Camera, rigid_pose
 
 WHOLE_CIRCLE = 270.0  # degrees of azimuth; cameras that cover more are taken to stand all around
 LEVEL_RIGHTS = 0.05  # mean squared sine of the cameras' roll up to which they count as held level

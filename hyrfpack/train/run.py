@@ -24,9 +24,9 @@ from hyrfpack.evaluate.figures import training_curve
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
-from hyrfpack.render.capture import capture_of
+from hyrfpack.render.capture import capture_of, max_size_of
 from hyrfpack.render.paths import viewpoint_hint
-from hyrfpack.scene import Scene, evenly_spaced
+from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.progress import ProgressLine
 from hyrfpack.train.trainer import Trainer
@@ -83,15 +83,18 @@ def train(
         quiet: print nothing.
 
     Raises:
-        HyrfError: the folder holds another run, training cannot start or go on, no photo has a pixel to train on, or
-            the results would replace photos or other files, or cannot be written (a checkpoint that cannot, while
-            training, is a line on standard error).
+        HyrfError: the folder holds another run, training cannot start or go on, no photo has a pixel to train on or to
+            score, a held-out photo cannot be read (all of which is found before the first step), or the results would
+            replace photos or other files, or cannot be written (a checkpoint that cannot, while training, is a line on
+            standard error).
     """
     out = Path(out)
     config = config or TrainConfig()
     checkpoint = out / CHECKPOINT
     device = device if isinstance(device, torch.device) else choose_device(device)
     _prepare(out, scene, resume, overwrite)
+    cache = cache or PictureCache()
+    _check_photos(scene, cache)
     trainer = Trainer(scene, config, cache, device)
     if resume:
         trainer.load(checkpoint)
@@ -115,7 +118,8 @@ def _finish(trainer: Trainer, out: Path) -> dict:
     scene, config = trainer.scene, trainer.config
     if not trainer.records:
         raise HyrfTrainingError(
-            f"{scene.path}: the masks of all photos leave no pixel to train on; check that white means 'use this pixel'"
+            f"{scene.path}: masks leave no pixel of the photos that the {config.steps:,} steps came to; "
+            "take more steps than there are photos"
         )
 
     model = _drop_unseen_background(trainer)
@@ -128,11 +132,20 @@ def _finish(trainer: Trainer, out: Path) -> dict:
         "cameras": capture_of([view.camera for view in scene.train]),
         "psnr": statistics.median(record["psnr"] for record in trainer.records[-len(trainer.records) // 10 :]),
     }
+    max_size = max_size_of(scene)
+    if max_size is not None:
+        provenance["max_size"] = max_size
     report = hyrf_format.save(model, path, profile="raw", provenance=provenance)
     metrics = {
         "settings": config.to_dict(),
         "device": describe_device(trainer.device),
-        "scene": {"path": scene.path, "layout": scene.layout, "train": len(scene.train), "test": len(scene.test)},
+        "scene": {
+            "path": scene.path,
+            "layout": scene.layout,
+            "train": len(scene.train),
+            "test": len(scene.test),
+            "max_size": scene.max_size,
+        },
         "choices": trainer.choices,
         "notes": scene.notes,
         "gaussians": len(model),
@@ -189,6 +202,27 @@ def _prepare(out: Path, scene: Scene, resume: bool, overwrite: bool) -> None:
     views = [f"{VIEWS}/{name}" for name in picture_names(scene.test).values()]
     outputs = Outputs(scene=scene, overwrite=resume or overwrite)
     outputs.folder(out, [MODEL, CHECKPOINT, METRICS, CURVE, *views])
+
+
+def _check_photos(scene: Scene, cache: PictureCache) -> None:
+    """Refuse now what would else end the run after its last step: held-out photos that cannot be read, and masks that
+    leave nothing. Photos to train on are read in the first steps anyway, so that one that can be used is enough."""
+    held_out = [_is_usable(view.load()) for view in scene.test]
+    if held_out and not any(held_out):
+        raise _nothing_left(scene, scene.test, "to score")
+    if scene.train and not any(_is_usable(cache.get(view)) for view in scene.train):
+        raise _nothing_left(scene, scene.train, "to train on")
+
+
+def _is_usable(picture: Picture) -> bool:
+    return picture.mask is None or bool(picture.mask.any())
+
+
+def _nothing_left(scene: Scene, views: list[View], purpose: str) -> HyrfTrainingError:
+    return HyrfTrainingError(
+        f"{scene.path}: the masks of all {len(views)} photos {purpose} leave no pixel, {views[0].name} for one; check "
+        "that white means 'use this pixel'"
+    )
 
 
 @torch.no_grad()

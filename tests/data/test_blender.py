@@ -90,8 +90,8 @@ def _frame(root: Path, **entries) -> None:
         (lambda root: _frame(root, file_path=7), "file_path"),
         (lambda root: (root / "transforms_train.json").write_text('{"camera_angle_x": 0.7, "fra'), "JSON"),
         (lambda root: (root / "train" / "r_1.png").write_bytes(b""), "r_1.png"),
-        (lambda root: [file.unlink() for file in (root / "train").iterdir()], "none of its 3 pictures"),
-        (lambda root: [file.unlink() for file in (root / "test").iterdir()], "none of its 3 pictures"),
+        (lambda root: [file.unlink() for file in (root / "train").iterdir()], "none of the 3 photos"),
+        (lambda root: [file.unlink() for file in (root / "test").iterdir()], "none of the 3 photos"),
     ],
 )
 def test_broken_set_gives_one_sentence(tmp_path, opengl_frames, damage, says):

@@ -202,7 +202,7 @@ def _break_no_photo_folder(root: Path, folder) -> None:
 @pytest.mark.parametrize(
     ("damage", "says"),
     [
-        (_break_nothing_on_disk, "none of the posed photos"),
+        (_break_nothing_on_disk, "none of the [0-9] photos that"),
         (_break_nan_pose, "002.png"),
         (_break_infinite_translation, "002.png"),
         (_break_camera_count, "cameras.bin"),

@@ -198,7 +198,7 @@ def _top(root: Path, **entries) -> None:
         (lambda root: edit_frame(root, 1, transform_matrix=[[10**400] * 4] * 4), "transform_matrix"),
         (lambda root: edit_frame(root, 1, file_path="images/000.png"), "listed twice"),
         (lambda root: (root / "images" / "001.png").write_bytes(b""), "001.png"),
-        (lambda root: [file.unlink() for file in (root / "images").iterdir()], "none of the posed photos"),
+        (lambda root: [file.unlink() for file in (root / "images").iterdir()], "none of the [0-9] photos that"),
         (lambda root: (root / "transforms.json").write_text("[" * 100_000), "JSON"),
         (lambda root: (root / "transforms.json").write_bytes(b"\xff\xfe{"), "JSON"),
         (lambda root: (root / "transforms.json").write_text("[]"), "frames"),

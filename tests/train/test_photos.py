@@ -1,0 +1,96 @@
+"""Photos that cannot be used are found before the first step, not after the last."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import refused
+from PIL import Image
+from scenes import ball_scene
+
+from hyrfpack.data import PictureCache, load_scene
+from hyrfpack.errors import HyrfDataError, HyrfTrainingError
+from hyrfpack.scene import Picture, Scene, View
+from hyrfpack.train import TrainConfig, Trainer, train
+
+CONFIG = TrainConfig(steps=2, max_gaussians=60)
+
+
+@pytest.fixture
+def no_step(monkeypatch):
+    """Training fails at its first step: what is refused is refused before it."""
+
+    def step(self, view, picture):
+        raise AssertionError("a step was taken")
+
+    monkeypatch.setattr(Trainer, "_train_step", step)
+
+
+@pytest.fixture
+def photos(data, tmp_path) -> Path:
+    """A copy of ten small photos that may be damaged; 0000.png and 0008.png are held out."""
+    return shutil.copytree(data, tmp_path / "photos")
+
+
+def masked(view: View) -> View:
+    picture = view.load()
+    black = Picture(picture.rgb, None, np.zeros(picture.rgb.shape[:2], bool))
+    return dataclasses.replace(view, load=lambda: black)
+
+
+def split(train=lambda view: view, test=lambda view: view) -> Scene:
+    scene = ball_scene(views=6, points=60, side=24)
+    return dataclasses.replace(scene, train=[*map(train, scene.train[2:])], test=[*map(test, scene.train[:2])])
+
+
+def test_black_masks_of_all_photos_are_refused_before_the_first_step(no_step, tmp_path):
+    with pytest.raises(HyrfTrainingError, match=r"all 4 photos to train on leave no pixel, 002\.png for one"):
+        train(split(train=masked), tmp_path, CONFIG, quiet=True)
+
+
+def test_black_masks_of_all_held_out_photos_are_refused_before_the_first_step(no_step, tmp_path):
+    with pytest.raises(HyrfTrainingError, match=r"all 2 photos to score leave no pixel, 000\.png for one"):
+        train(split(test=masked), tmp_path, CONFIG, quiet=True)
+
+
+def test_a_black_mask_file_for_every_photo_is_refused_by_the_command(no_step, photos, tmp_path):
+    (photos / "masks").mkdir()
+    for number in range(10):
+        Image.new("L", (48, 48)).save(photos / "masks" / f"{number:04d}.png")
+
+    assert "leave no pixel" in refused("train", photos, "-o", tmp_path / "run", "--steps", 2)
+
+
+def test_one_photo_with_a_pixel_to_train_on_and_one_to_score_are_enough(tmp_path):
+    scene = split()
+    first, *others = scene.train
+    scene = dataclasses.replace(
+        scene, train=[masked(first), *others], test=[masked(scene.test[0]), scene.test[1]], notes=[]
+    )
+
+    result = train(scene, tmp_path, dataclasses.replace(CONFIG, steps=8), quiet=True)
+
+    assert result.metrics["evaluation"]["skipped"] == ["000.png"]
+
+
+def test_a_truncated_held_out_photo_is_refused_before_the_first_step_and_named(no_step, photos, tmp_path):
+    whole = (photos / "images" / "0008.png").read_bytes()
+    (photos / "images" / "0008.png").write_bytes(whole[: len(whole) // 2])
+
+    with pytest.raises(HyrfDataError, match=r"0008\.png: cannot decode the picture"):
+        train(load_scene(photos), tmp_path / "run", CONFIG, quiet=True)
+
+
+def test_photos_to_train_on_are_not_all_read_beforehand(tmp_path):
+    read = []
+
+    def counted(view: View) -> View:
+        return dataclasses.replace(view, load=lambda: read.append(view.name) or view.load())
+
+    train(split(train=counted), tmp_path, dataclasses.replace(CONFIG, steps=1), cache=PictureCache(), quiet=True)
+
+    assert len(read) <= 2  # the one that has a pixel, and that of the step
