@@ -15,13 +15,60 @@ Importing hyrfpack loads nothing else; each name below brings what it needs at i
 from __future__ import annotations
 
 import sys
+import warnings
 from importlib import import_module
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+_TOO_LATE = sys.platform == "linux" and "pycolmap" in sys.modules and "zlib" not in sys.modules
+# Before pycolmap, wherever that is loaded: its wheel for Linux exports a zlib of its own, and the system's, when it is
+# loaded second, calls into that one. Memory is corrupted then, and the process aborts at the next PNG or .spz file.
+import zlib  # noqa: E402, F401
+
+if _TOO_LATE:
+    warnings.warn(
+        "pycolmap was imported before zlib, so that compressing anything may abort this process: "
+        "import hyrfpack (or zlib) first",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+
+if TYPE_CHECKING:
+    from hyrfpack.bench import BenchReport as BenchReport
+    from hyrfpack.bench import bench as bench
+    from hyrfpack.compress import compress as compress
+    from hyrfpack.data import load_scene as load_scene
+    from hyrfpack.distill import DistillConfig as DistillConfig
+    from hyrfpack.distill import DistillReport as DistillReport
+    from hyrfpack.distill import distill as distill
+    from hyrfpack.errors import HyrfDataError as HyrfDataError
+    from hyrfpack.errors import HyrfError as HyrfError
+    from hyrfpack.errors import HyrfFormatError as HyrfFormatError
+    from hyrfpack.errors import HyrfTrainingError as HyrfTrainingError
+    from hyrfpack.evaluate import Evaluation as Evaluation
+    from hyrfpack.evaluate import evaluate as evaluate
+    from hyrfpack.export import ExportReport as ExportReport
+    from hyrfpack.export import export as export
+    from hyrfpack.format import describe as describe
+    from hyrfpack.format.codec import CompressionReport as CompressionReport
+    from hyrfpack.format.codec import load as load
+    from hyrfpack.format.codec import save as save
+    from hyrfpack.model import HybridModel as HybridModel
+    from hyrfpack.model import ModelConfig as ModelConfig
+    from hyrfpack.render import Rendering as Rendering
+    from hyrfpack.render import RenderSettings as RenderSettings
+    from hyrfpack.render import render as render
+    from hyrfpack.scene import Camera as Camera
+    from hyrfpack.scene import Picture as Picture
+    from hyrfpack.scene import Scene as Scene
+    from hyrfpack.scene import View as View
+    from hyrfpack.train import TrainConfig as TrainConfig
+    from hyrfpack.train import TrainResult as TrainResult
+    from hyrfpack.train import train as train
 
 __version__ = "0.1.0"
 
-# Public name -> the module that defines it.
+# Public name -> the module that has it.
 _PUBLIC = {
     "Camera": "hyrfpack.scene",
     "Picture": "hyrfpack.scene",
@@ -48,39 +95,38 @@ _PUBLIC = {
     "load": "hyrfpack.format",
     "save": "hyrfpack.format",
 }
-# Sub-packages that are also the one function they are about: `hyrfpack.render(...)` calls `hyrfpack.render.render`.
-_CALLABLE = ("bench", "compress", "distill", "evaluate", "export", "render", "train")
+# Functions that a sub-package has the name of: `hyrfpack.render` is `hyrfpack.render.render`.
+_NAMESAKES = ("bench", "compress", "distill", "evaluate", "export", "render", "train")
 
-__all__ = ["__version__", *_CALLABLE, *_PUBLIC]
-
-
-class _CallablePackage(ModuleType):
-    """A sub-package that can be called as the function of its own name."""
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        return getattr(self, self.__name__.rpartition(".")[2])(*args, **kwargs)
+__all__ = ["__version__", *_NAMESAKES, *_PUBLIC]
 
 
 class _Package(ModuleType):
-    """This package: gives the callable sub-packages their class when the import system binds them here."""
+    """This package: the function takes the place of its namesake when the import system binds that here."""
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in _CALLABLE and isinstance(value, ModuleType):
-            value.__class__ = _CallablePackage
+        if name in _NAMESAKES and isinstance(value, ModuleType):
+            package, value = value, getattr(value, name)
+            # What belongs to the sub-package can be reached through the function, too: `hyrfpack.train.Trainer`.
+            vars(package).update(vars(value))
+            value.__dict__ = vars(package)
         super().__setattr__(name, value)
 
 
 sys.modules[__name__].__class__ = _Package
 
 
-def __getattr__(name: str) -> Any:
-    if name in _CALLABLE:
-        return import_module(f"{__name__}.{name}")
-    if name in _PUBLIC:
-        value = getattr(import_module(_PUBLIC[name]), name)
-        globals()[name] = value
-        return value
-    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+if not TYPE_CHECKING:  # checkers know all there is, and shall tell of what is not
+
+    def __getattr__(name: str) -> Any:
+        if name in _NAMESAKES:
+            import_module(f"{__name__}.{name}")
+            return globals()[name]
+        if name in _PUBLIC:
+            value = getattr(import_module(_PUBLIC[name]), name)
+            globals()[name] = value
+            return value
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
 
 
 def __dir__() -> list[str]:

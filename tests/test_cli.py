@@ -432,20 +432,3 @@ def test_the_module_runs_as_a_program():
     root = Path(__file__).parents[1]
     result = subprocess.run([sys.executable, "-m", "hyrfpack", "--version"], capture_output=True, text=True, cwd=root)
     assert result.returncode == 0 and result.stdout.startswith("hyrfpack")
-
-
-def test_public_names_resolve_and_rooms_are_callable():
-    code = (
-        "import hyrfpack\n"
-        "for name in hyrfpack.__all__: getattr(hyrfpack, name)\n"
-        "from hyrfpack.render import paths\n"
-        "import hyrfpack.train.config\n"
-        "assert callable(hyrfpack.render) and callable(hyrfpack.train) and callable(hyrfpack.evaluate)\n"
-        "assert hyrfpack.render.paths is paths\n"
-        "try: hyrfpack.evaluate(None, [])\n"
-        "except hyrfpack.HyrfError as error: print(error)\n"
-        "try: hyrfpack.nothing\n"
-        "except AttributeError: print('and nothing else')"
-    )
-    result = python(code)
-    assert "no view to score" in result.stdout and "and nothing else" in result.stdout, result.stderr

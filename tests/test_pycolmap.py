@@ -1,0 +1,97 @@
+"""pycolmap brings a zlib of its own, and the system's, loaded after it, corrupts memory and aborts the process. So all
+of this runs in fresh interpreters: whatever imports zlib before, as numpy does in some versions, would hide it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from scenes import BALL_CENTERS, ball_scene, small_model
+
+from hyrfpack.export.splats import quaternion_of
+from hyrfpack.format import save
+from hyrfpack.render.capture import capture_of
+
+ORDER = """
+import sys
+class Watch:
+    def find_spec(self, name, path=None, target=None):
+        if name == "pycolmap":
+            assert "zlib" in sys.modules, "zlib is imported after pycolmap"
+            print("in order")
+sys.meta_path.insert(0, Watch())
+"""
+READ = "import hyrfpack\nscene = hyrfpack.load_scene('scene')\n"
+CALLS = {
+    "load_scene": "import zlib\nassert zlib.decompress(zlib.compress(bytes(10**6))) == bytes(10**6)",
+    "train": "assert hyrfpack.train(scene, 'run', hyrfpack.TrainConfig(steps=3), quiet=True).complete",
+    "compress": "hyrfpack.compress('model.hyrf', 'a.hyrf', data=scene)",
+    "save": "hyrfpack.save(hyrfpack.load('model.hyrf'), 'a.hyrf', provenance=hyrfpack.describe('model.hyrf'))",
+    "evaluate": "hyrfpack.evaluate(hyrfpack.load('model.hyrf'), scene.test, pictures='views')",
+    "render": "from hyrfpack.render.files import save_picture, to_image\nimport torch\nwith torch.no_grad():\n"
+    "    picture = hyrfpack.render(hyrfpack.load('model.hyrf'), scene.test[0].camera).rgb\n"
+    "save_picture('a.png', to_image(picture))",
+    "export .spz": "hyrfpack.export('model.hyrf', 'a.spz', data=scene)",
+    "export .ply": "hyrfpack.export('model.hyrf', 'a.ply', data=scene)",
+    "export .sog": "hyrfpack.export('model.hyrf', 'a.sog', data=scene)",
+    "export .html": "hyrfpack.export('model.hyrf', 'a.html', data=scene)",
+    "export COLMAP": "hyrfpack.export('model.hyrf', 'colmap', data=scene)",
+    "bench": "hyrfpack.bench('model.hyrf', scene, repeats=1, only=['codec'])",
+    "distill": "hyrfpack.export('model.hyrf', 'a.ply', data=scene, background=False)\n"
+    "hyrfpack.distill('a.ply', 'a.hyrf', hyrfpack.DistillConfig(1, 10, 16, 4, 2))",
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A COLMAP set as text, and a model of it."""
+    folder = tmp_path_factory.mktemp("colmap")
+    scene = ball_scene(8, side=24)
+    (folder / "scene" / "images").mkdir(parents=True)
+    tables = folder / "scene" / "sparse" / "0"
+    tables.mkdir(parents=True)
+    images = []
+    for number, view in enumerate(scene.train, start=1):
+        quat, shift = quaternion_of(view.camera.rotation), view.camera.camera_from_world[:3, 3]
+        images.append(" ".join(map(str, (number, *quat, *shift, 1, view.name))) + "\n\n")
+        Image.fromarray(view.load().rgb).save(folder / "scene" / "images" / view.name)
+    (tables / "cameras.txt").write_text("1 PINHOLE 24 24 24 24 12 12\n")
+    (tables / "images.txt").write_text("".join(images))
+    points = [(number, *point, 255, 128, 0, 0) for number, point in enumerate(scene.points, start=1)]
+    (tables / "points3D.txt").write_text("".join(" ".join(map(str, point)) + "\n" for point in points))
+    cameras = capture_of([view.camera for view in scene.train])
+    save(small_model(BALL_CENTERS, scale_logits=0.0), folder / "model.hyrf", provenance={"cameras": cameras})
+    return folder
+
+
+def fresh(code: str, folder: Path) -> subprocess.CompletedProcess:
+    """Run code in an interpreter of its own; one that aborts may hang in doing so."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "TRITON_INTERPRET": "0"}
+    command = [sys.executable, "-c", code]
+    return subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=int(os.environ.get("T", 120))
+    )
+
+
+def test_importing_hyrfpack_alone_loads_zlib(tmp_path):
+    done = fresh(
+        "import sys; before = 'zlib' in sys.modules; import hyrfpack; print(before, 'zlib' in sys.modules)", tmp_path
+    )
+    assert done.stdout.split() == ["False", "True"], done.stderr
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_zlib_comes_before_pycolmap_and_nothing_aborts(call, folder):
+    done = fresh(ORDER + READ + CALLS[call], folder)
+    assert done.returncode == 0, done.stderr
+    assert "in order" in done.stdout
+
+
+def test_pycolmap_before_hyrfpack_is_warned_of(tmp_path):
+    done = fresh("import pycolmap, hyrfpack", tmp_path)
+    assert ("import hyrfpack (or zlib) first" in done.stderr) == (sys.platform == "linux")
+    assert "Warning" not in fresh("import zlib, pycolmap, hyrfpack", tmp_path).stderr
