@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import Evaluation, evaluate
+from hyrfpack.evaluate.metrics import stated_error
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import (
     DEFAULT_PROFILE,
@@ -38,7 +38,6 @@ from hyrfpack.render.capture import stored_cameras
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 
 PSNR_DROP = 0.03  # dB that a file may cost, by estimate, unless told otherwise
-ASSUMED_PSNR = 30.0  # of a model that does not say how well it fits its photos
 FINETUNED = 4.0  # times as much noise, which fine-tuning takes back
 NOISE = (1e-8, 1e-2)  # least and largest mean squared error that files are made for
 VERIFIED = 6  # cameras at which a file's pictures are compared with the model's
@@ -252,7 +251,4 @@ def added_errors(planned: HybridModel, quantized: Quantized, plan: Plan) -> dict
 
 def default_noise(provenance: dict) -> float:
     """The mean squared error that costs PSNR_DROP: errors of photos and of quantising add up."""
-    psnr = provenance.get("psnr")
-    if not isinstance(psnr, int | float) or not 0 < psnr < 100:
-        psnr = ASSUMED_PSNR
-    return math.exp(-psnr / 10 * math.log(10)) * (10 ** (PSNR_DROP / 10) - 1)
+    return stated_error(provenance) * (10 ** (PSNR_DROP / 10) - 1)

@@ -9,6 +9,7 @@ from torch import Tensor
 from hyrfpack.ops.ssim import photometric_loss
 
 IDENTICAL_PSNR = 100.0  # dB, what two pictures without any difference score (the formula says infinity)
+ASSUMED_PSNR = 30.0  # dB, of a model that does not say how well it fits its photos
 
 
 def to_8bit(image: Tensor) -> Tensor:
@@ -34,6 +35,20 @@ def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
     squares = (image.double() - reference.double()) ** 2
     mean = float(squares.mean() if mask is None else squares[mask].mean())
     return min(-10 * math.log10(mean), IDENTICAL_PSNR) if mean > 0 else IDENTICAL_PSNR
+
+
+def stated_error(provenance: dict) -> float:
+    """Mean squared error of a model's pictures against its photos, by its file's own account.
+
+    What packing or a format adds to it has nothing to do with it, so the two add up.
+
+    Args:
+        provenance: of the file; its `psnr` counts, or ASSUMED_PSNR where there is none that makes sense.
+    """
+    stated = provenance.get("psnr")
+    if not isinstance(stated, int | float) or not 0 < stated < IDENTICAL_PSNR:
+        stated = ASSUMED_PSNR
+    return math.exp(-stated / 10 * math.log(10))
 
 
 def ssim(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:

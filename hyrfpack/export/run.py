@@ -22,7 +22,7 @@ from hyrfpack.export.formats import spz
 from hyrfpack.export.harmonics import MAX_DEGREE
 from hyrfpack.export.html import decode_page, encode_page
 from hyrfpack.export.kinds import COLMAP, PAGE, POINTS, TRANSFORMS, check_place, check_reach, check_request, kind_of
-from hyrfpack.export.measure import likeness
+from hyrfpack.export.measure import Likeness, likeness
 from hyrfpack.export.points import encode_points
 from hyrfpack.export.source import Source
 from hyrfpack.export.splats import Splats, concatenate
@@ -31,10 +31,7 @@ from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Scene, evenly_spaced
 
 PAGE_CAMERAS = 12  # that a page can be stepped through
-COARSE = 3.0  # dB that a format may cost before something is said about it
-INVISIBLE = 50.0  # dB from which on no difference can be seen, and none is told
-
-NO_CAMERAS = "places around the scene, for the file keeps no cameras (--data names photos)"
+COARSE = 1.0  # dB of PSNR against photos that a format may cost before something is said about it
 
 Say = Callable[[str], None]
 
@@ -186,12 +183,17 @@ def _measured(report: ExportReport, read: Source, packed: _Packed, kind: str, sp
     if not scores:
         say("nothing is measured, for the masks leave no pixel of the held-out photos")
         return report
-    file, before = scores["file"], scores[str(report.degree)].model
-    if min(before, INVISIBLE) - file.model > COARSE:
+    file, before = scores["file"], scores[str(report.degree)]
+    cost = _cost(before, file, read.error)
+    if cost > COARSE:
+        seen = "" if read.cameras else ", seen from made-up viewpoints (name photos with --data to be sure)"
         if read.model.config.antialiased and not packed.after[0].antialiased:
             say(f"{kind} cannot tell that the model is antialiased: say so where it is drawn, or choose .spz or .sog")
         else:
-            say(f"{kind} is too coarse for this scene, perhaps for its unit of length: choose another format")
+            say(
+                f"{kind} costs {cost:.1f} dB{seen}: it is too coarse for this scene, perhaps for its unit of length; "
+                "choose another format"
+            )
     return replace(
         report,
         views=file.views,
@@ -200,6 +202,21 @@ def _measured(report: ExportReport, read: Source, packed: _Packed, kind: str, sp
         photos_model=scores["model"].photos,
         photos_file=file.photos,
     )
+
+
+def _cost(before: Likeness, after: Likeness, error: float) -> float:
+    """PSNR in dB against photos that a format costs: as measured, or where no photos are given, by estimate.
+
+    What the format changes has nothing to do with what the model gets wrong, so squared errors add up: rounding that
+    shows only beside the model's own pictures costs nothing.
+
+    Args:
+        before, after: what was to be written, and what is read back.
+        error: mean squared error of the model's pictures against its photos.
+    """
+    if before.photos is not None and after.photos is not None:
+        return before.photos - after.photos
+    return 10 * math.log10((error + 10 ** (-after.model / 10)) / (error + 10 ** (-before.model / 10)))
 
 
 @torch.no_grad()

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.evaluate.metrics import stated_error
 from hyrfpack.format import describe, load
 from hyrfpack.model import HybridModel
 from hyrfpack.render.capture import stored_cameras
@@ -35,6 +36,7 @@ class Source:
         measured: cameras to measure at, with their photos where there are any. None of them is fitted, but where
             there are fewer than FEW in all.
         up, center: (3,) which way is up, unit length, and what is looked at, world units.
+        error: mean squared error of its pictures against its photos, by its own account.
     """
 
     model: HybridModel
@@ -43,6 +45,7 @@ class Source:
     measured: list[tuple[Camera, View | None]]
     up: np.ndarray
     center: np.ndarray
+    error: float
 
     @classmethod
     def read(cls, path: str | os.PathLike[str], data: Scene | None = None) -> Source:
@@ -56,22 +59,23 @@ class Source:
             raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to export; train it again")
         viewpoint = stored_viewpoint(facts)
         up, center = _up_and_center(viewpoint, path)
+        error = stated_error(facts["provenance"])
         if data is not None and data.train:
             named = [(view.name, view.camera) for view in data.train]
             measured = [(view.camera, view) for view in evenly_spaced(data.test, MEASURED)]
             cameras = [camera for _, camera in named]
             fitted = evenly_spaced(cameras, FITTED)
-            return cls(model, named, fitted, measured, _up_of(cameras, up), center)
+            return cls(model, named, fitted, measured, _up_of(cameras, up), center, error)
         stored = stored_cameras(facts)
         if not facts["provenance"].get("cameras"):
             between = evenly_spaced(stored[1::2], MEASURED)  # of an orbit with twice as many cameras as RING
             measured = [(camera, None) for camera in between]
-            return cls(model, [], _around(viewpoint, center, up), measured, up, center)
+            return cls(model, [], _around(viewpoint, center, up), measured, up, center, error)
         named = [(f"{number:04d}.png", camera) for number, camera in enumerate(stored)]
         spare = stored[::HELD_OUT] if len(stored) >= FEW else stored
         fitted = [c for number, c in enumerate(stored) if number % HELD_OUT] if len(stored) >= FEW else stored
         measured = [(camera, None) for camera in evenly_spaced(spare, MEASURED)]
-        return cls(model, named, fitted, measured, _up_of(stored, up), center)
+        return cls(model, named, fitted, measured, _up_of(stored, up), center, error)
 
 
 def _up_of(cameras: list[Camera], up: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from scenes import ball_scene, ring, small_model
+from scenes import ball_scene, ring, small_model, view_of
 
 import hyrfpack
 from hyrfpack.errors import HyrfError
@@ -26,9 +26,10 @@ from hyrfpack.export.run import page_of
 from hyrfpack.export.source import Source
 from hyrfpack.format import load, save
 from hyrfpack.model import Frame
+from hyrfpack.render import render
 from hyrfpack.render.capture import capture_of
 from hyrfpack.render.paths import viewpoint_hint
-from hyrfpack.scene import Camera
+from hyrfpack.scene import Camera, Picture, Scene
 
 POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
 FOUR = ring(4)
@@ -233,10 +234,57 @@ def test_a_format_that_forgets_antialiasing_is_told_from_a_coarse_one(tmp_path):
         said = []
         export(source, tmp_path / f"a{ending}", degree=0, say=said.append)
         assert word in said[-1]
-    tiny = small_model(POSITIONS, frame=Frame((0, 0, 0), 1e-5, (1.0, 1.0, 1.0)))
-    source = write(tmp_path / "tiny.hyrf", tiny, [moved(camera, 1e-5, (0, 0, 0)) for camera in FOUR])
-    export(source, tmp_path / "a.spz", degree=0, say=said.append)
-    assert "too coarse" in said[-1]
+
+
+def photographed(model, cameras) -> Scene:
+    """What a model shows to cameras, as noisy photos of it (30 dB); every other one is held out."""
+    rng = np.random.default_rng(0)
+    views = []
+    for number, camera in enumerate(cameras):
+        rgb = render(model, camera).rgb.detach().numpy() + rng.normal(scale=0.03, size=(32, 32, 3))
+        picture = Picture((rgb.clip(0, 1) * 255).round().astype(np.uint8))
+        views.append(view_of(f"{number}.png", camera, picture))
+    return Scene("made up", "colmap", views[::2], views[1::2], np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+
+
+def told_of(unit: float, judged: str, folder) -> tuple[str, ExportReport]:
+    """What an export to .spz says last of forty Gaussians in a unit of length, and its report."""
+    frame = Frame((0, 0, 0), unit, (1.0, 1.0, 1.0))
+    model = small_model(POSITIONS, frame=frame, fields=0.0, color_logits=1.0, scale_logits=-1.5)
+    cameras = [moved(camera, unit, (0, 0, 0)) for camera in ring(8)]
+    source, said = write(folder / "model.hyrf", model, cameras), []
+    if judged == "made-up viewpoints":
+        hyrfpack.compress(source, folder / "compact.hyrf", noise=1e-7)
+        source = folder / "compact.hyrf"
+    data = photographed(model, cameras) if judged == "photos" else None
+    report = export(source, folder / "a.spz", degree=0, data=data, say=said.append)
+    return said[-1], report
+
+
+JUDGED = ("photos", "cameras", "made-up viewpoints")
+
+
+@pytest.mark.parametrize("judged", JUDGED)
+@pytest.mark.parametrize("unit", [1e-5, 1e5])
+def test_a_unit_of_length_that_a_format_cannot_hold_is_told(unit, judged, tmp_path):
+    told, _ = told_of(unit, judged, tmp_path)
+    assert re.fullmatch(r"\.spz costs \d+\.\d dB[^\n]*: it is too coarse for this scene[^\n]*another format", told)
+    assert ("--data" in told) == (judged == "made-up viewpoints")
+
+
+@pytest.mark.parametrize("judged", JUDGED)
+def test_rounding_that_photos_do_not_show_is_no_alarm(judged, tmp_path):
+    told, report = told_of(1.0, judged, tmp_path)
+    assert min(report.by_degree[0], 50) - report.psnr > 3  # much, beside the model itself
+    assert told == f"measuring at {report.views} views"
+
+
+def test_a_format_is_judged_by_the_photos_where_there_are_some():
+    """Not by the model's own account, nor by how like the model's pictures those of the file are."""
+    cost = {"before": run.Likeness(60, 30.0, 1), "after": run.Likeness(20, 29.7, 1), "error": 1e-9}
+    assert run._cost(**cost) == pytest.approx(0.3)
+    cost["after"] = run.Likeness(20, None, 1)
+    assert run._cost(**cost) == pytest.approx(10 * np.log10((1e-9 + 1e-2) / (1e-9 + 1e-6)))
 
 
 def test_held_out_photos_score_the_model_and_the_file_and_are_not_fitted(plain, tmp_path, monkeypatch):
