@@ -15,6 +15,7 @@ from hyrfpack.scene import Camera
 USD = (".usda", ".usdc", ".usdz")
 WRITTEN = (".ply", ".splat", ".spz", ".glb", *USD, ".sog")
 READ = (".ply", ".splat", ".spz", ".sog")  # by `read_splats`; .compressed.ply is among .ply
+LISTED = 4  # names that are told of what a folder holds
 MAX_BYTES = 1 << 32  # of a file to be read: 17 million Gaussians as PLY
 
 
@@ -77,7 +78,7 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
     try:
         if path.is_dir():
             return sog.decode(_loose_sog(path), str(path))
-        if extension not in READ:
+        if path.exists() and extension not in READ:
             raise HyrfDataError(f"{path}: files with this ending are not known; name one of {', '.join(READ)}")
         return decode_splats(_bytes_of(path), extension, str(path))
     except OSError as error:
@@ -86,10 +87,24 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
 
 def _loose_sog(folder: Path) -> dict[str, bytes]:
     """The files of a SOG that is not bundled, by name: meta.json and the pictures that it names."""
+    names = os.listdir(folder)
+    if sog.META not in names:
+        splats = sorted(name for name in names if name.lower().endswith(READ))
+        advice = f"name {splats[0]} in it" if splats else "name another"
+        raise HyrfDataError(
+            f"{folder}: a folder is read as a loose SOG, {sog.META} with its pictures, and this one holds "
+            f"{_listed(names)}; {advice}"
+        )
     files = {sog.META: _bytes_of(folder / sog.META)}
     for name in sog.picture_names(files[sog.META], str(folder)):
         files[name] = _bytes_of(folder / name)
     return files
+
+
+def _listed(names: list[str]) -> str:
+    """The first few names of what lies in a folder, and how many more there are."""
+    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+    return (", ".join(sorted(names)[:LISTED]) or "nothing") + more
 
 
 def _bytes_of(path: Path) -> bytes:

@@ -85,3 +85,28 @@ def test_a_file_too_large_to_be_splats_is_refused_unread(tmp_path):
     os.truncate(path, MAX_BYTES + 1)  # a hole, not bytes
     with pytest.raises(HyrfDataError, match="is larger than 4,294,967,296 bytes; split it first$"):
         read_splats(path)
+
+
+@pytest.mark.parametrize(
+    "holds, told",
+    [
+        ((), "this one holds nothing; name another"),
+        (("b.webp", "a.webp"), "this one holds a.webp, b.webp; name another"),
+        (("scene.ply", "scene.SPZ", "notes.txt"), "this one holds notes.txt, scene.SPZ, scene.ply; name scene.SPZ in"),
+        (tuple(f"{n}.webp" for n in range(9)), "holds 0.webp, 1.webp, 2.webp, 3.webp and 5 more; name another"),
+    ],
+)
+def test_a_folder_without_a_sog_is_told_by_what_it_holds(holds, told, tmp_path):
+    for name in holds:
+        (tmp_path / name).write_bytes(b"")
+    for source in (tmp_path, tmp_path / "meta.json"):
+        with pytest.raises(HyrfDataError) as refusal:
+            read_splats(source)
+        assert "a folder is read as a loose SOG, meta.json with its pictures" in str(refusal.value)
+        assert told in str(refusal.value)
+
+
+@pytest.mark.parametrize("name", ["none.ply", "none.txt", "none", "none/meta.json"])
+def test_a_file_that_is_not_there_is_told_so_whatever_its_ending(name, tmp_path):
+    with pytest.raises(HyrfDataError, match="none.*: the file cannot be read"):
+        read_splats(tmp_path / name)
