@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -46,7 +46,7 @@ TRIALS, FINETUNED_TRIALS = 9, 4  # of a search
 
 
 @dataclass(frozen=True)
-class _Trial:
+class Trial:
     """A file that was made: its bytes, the error it adds by section, and what it scores."""
 
     data: bytes
@@ -112,7 +112,7 @@ def compress(
     cameras = [view.camera for view in data.train] if data is not None else stored_cameras(describe(source))
     say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
     sensitivity = measure_sensitivity(model, cameras)
-    packer = _Packer(model, without_cameras(provenance), sensitivity, data, finetune_steps, prune, say)
+    packer = Packer(model, without_cameras(provenance), sensitivity, data, finetune_steps, prune, say)
     start = noise or default_noise(provenance) * (FINETUNED if finetune_steps else 1)
     if target_bytes is not None:
         trial, found = packer.within_bytes(target_bytes, start)
@@ -129,8 +129,19 @@ def compress(
 
 
 @dataclass
-class _Packer:
-    """Makes files of one model, finer and coarser."""
+class Packer:
+    """Makes files of one model, finer and coarser; what its numbers do to pictures is measured once, before.
+
+    Attributes:
+        model: the model.
+        provenance: that the files tell.
+        sensitivity: of the model, see `measure_sensitivity`.
+        scene: photos to fine-tune on; None where there are none.
+        finetune_steps: of each file.
+        prune: leave out Gaussians that cost more in bytes than they give to pictures.
+        say: told what is going on.
+        cache: of the photos.
+    """
 
     model: HybridModel
     provenance: dict
@@ -139,11 +150,10 @@ class _Packer:
     finetune_steps: int
     prune: bool
     say: Callable[[str], None]
+    cache: PictureCache = field(default_factory=PictureCache)
 
-    def __post_init__(self) -> None:
-        self.cache = PictureCache()
-
-    def attempt(self, noise: float) -> _Trial:
+    def attempt(self, noise: float) -> Trial:
+        """A file that adds about so large a mean squared error to pictures."""
         plan = make_plan(self.model, self.sensitivity, noise, self.prune)
         if not self.finetune_steps:
             return self._pack(self.model, plan)
@@ -151,7 +161,7 @@ class _Packer:
         tuned = finetune(plan.apply(self.model), plan, self.scene.train, self.finetune_steps, cache=self.cache)
         return self._pack(tuned, dataclasses.replace(plan.of_applied(), reach=0))
 
-    def verified(self, trial: _Trial, wanted: float, cameras: Sequence[Camera]) -> _Trial:
+    def verified(self, trial: Trial, wanted: float, cameras: Sequence[Camera]) -> Trial:
         """The trial, or a finer one where its pictures turn out to be further off than `wanted` says.
 
         The estimate adds up errors that have nothing to do with each other. Where hundreds of faint Gaussians make up
@@ -173,8 +183,8 @@ class _Packer:
             trial = self.attempt(noise)
         return trial
 
-    def within_bytes(self, limit: int, start: float) -> tuple[_Trial, str]:
-        def attempt(noise: float) -> _Trial:
+    def within_bytes(self, limit: int, start: float) -> tuple[Trial, str]:
+        def attempt(noise: float) -> Trial:
             trial = self.attempt(noise)
             self.say(f"noise {noise:.2g}: {len(trial.data):,} bytes")
             return trial
@@ -189,11 +199,11 @@ class _Packer:
         noise, trial = answer
         return trial, f"noise {noise:.2g} gives {len(trial.data):,} of {limit:,} bytes"
 
-    def within_drop(self, limit: float, start: float) -> tuple[_Trial, str]:
+    def within_drop(self, limit: float, start: float) -> tuple[Trial, str]:
         views = self.scene.test or self.scene.train
         before = evaluate(self.model, views).psnr
 
-        def attempt(noise: float) -> _Trial:
+        def attempt(noise: float) -> Trial:
             trial = self.attempt(noise)
             trial = dataclasses.replace(trial, scores=evaluate(decode_model(trial.data), views))
             self.say(f"noise {noise:.2g}: {len(trial.data):,} bytes, {before - trial.scores.psnr:+.3f} dB lost")
@@ -212,11 +222,11 @@ class _Packer:
     def _trials(self) -> int:
         return FINETUNED_TRIALS if self.finetune_steps else TRIALS
 
-    def _pack(self, model: HybridModel, plan: Plan) -> _Trial:
+    def _pack(self, model: HybridModel, plan: Plan) -> Trial:
         planned = plan.apply(model)
         quantized = quantize(planned, plan)
         data = encode_model(model, "compact", self.provenance, plan=plan, quantized=quantized)
-        return _Trial(data, added_errors(planned, quantized, plan), None)
+        return Trial(data, added_errors(planned, quantized, plan), None)
 
 
 @torch.no_grad()

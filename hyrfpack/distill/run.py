@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import math
 import os
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -16,7 +17,10 @@ import torch
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import check_writable, write_atomic
 from hyrfpack.checks import check_float, check_int
-from hyrfpack.compress import compress
+from hyrfpack.compress.run import Packer, Trial
+from hyrfpack.compress.search import coarsest
+from hyrfpack.compress.sensitivity import measure_sensitivity
+from hyrfpack.data import PictureCache
 from hyrfpack.distill.start import initial_model
 from hyrfpack.distill.teacher import light_of, likeness, teaching_scene
 from hyrfpack.distill.views import Weighted, viewpoints
@@ -25,9 +29,9 @@ from hyrfpack.export.bake import small_camera
 from hyrfpack.export.draw import Drawable
 from hyrfpack.export.files import read_splats
 from hyrfpack.export.splats import Splats
+from hyrfpack.format.codec import decode_model
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
-from hyrfpack.render.capture import capture_of
 from hyrfpack.render.paths import viewpoint_hint
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 from hyrfpack.train.config import LARGEST_SEED, DensityConfig, LearningRates, TrainConfig
@@ -38,10 +42,13 @@ TEST_EVERY = 8  # of given cameras, one in so many is held out
 LIT_FROM = 64  # views at which it is measured what each Gaussian gives to pictures
 UNSEEN = 0.01  # of all light, what the faintest Gaussians together may send: they are left out
 FINETUNE = 0.5  # steps of fitting what is packed, for each step before
+REGRESSED, LEAST_REGRESSED = 250, 0.2  # steps from which on the first regression is whole, and its least share
 ESTIMATED = 0.5  # of what packing may add, to ask for: Gaussians that are left out together are missed more
 LEAST_NOISE = 0.5  # of the error before packing, or of the one allowed, that packing may add in any case
-TOLERATED, TRIES = 1.1, 4  # times as much as it may add, and how many files are made, finer ones where it is more
-FINER = 0.7  # times what would do if errors went with the noise: they fall more slowly
+# Times as much as it may add, fine-tuned and plain: at views to learn from, which are better than others.
+TOLERATED, TOLERATED_PLAIN = 1.1, 0.7
+PLAIN, PLAIN_ENDS = 1 / 16, (1 / 1024, 1.0)  # of it, to ask for without fine-tuning: first, at the least and most
+TRIALS = 5  # files that are made so
 # Warm: small steps from a model that is nearly right.
 RATES = LearningRates(
     positions=(2e-6, 2e-7),
@@ -60,7 +67,7 @@ class DistillConfig:
         steps: optimiser steps of fitting to the original's pictures, one each; half as many follow while packing.
         psnr: dB of held-out pictures against the original's that the file is made for: higher takes more bytes.
         size: pixels of the longer side of pictures.
-        train_views, test_views: how many viewpoints are made up, to teach and to score.
+        train_views, test_views: how many viewpoints are made up, to teach (at most) and to score.
         seed: of viewpoints, first weights and order; 0 to LARGEST_SEED.
     """
 
@@ -89,6 +96,7 @@ class DistillReport:
         psnr: dB, mean over these views, of the decoded file's pictures against the original's, over black.
         psnr_worst: of the view with the least.
         psnr_unpacked: mean, of the model before it was packed.
+        psnr_asked: of `DistillConfig`.
         bytes_source: of the original as it was given; None when it was no file.
         bytes_ply: of the original as PLY in INRIA's layout, without the header: 4 (17 + 3 (K - 1)) for each Gaussian.
         bytes_after: of the `.hyrf` file.
@@ -102,6 +110,7 @@ class DistillReport:
     psnr: float
     psnr_worst: float
     psnr_unpacked: float
+    psnr_asked: float
     bytes_source: int | None
     bytes_ply: int
     bytes_after: int
@@ -177,18 +186,22 @@ def distill_splats(
     if not len(kept):
         raise HyrfDataError(f"{name}: no view shows anything of the Gaussians; give others with --cameras")
     say(f"{len(splats) - len(kept):,} Gaussians are hardly seen and left out; fitting the fields to the others")
-    model = initial_model(Drawable.of(splats[kept], weighted.frame), torch.from_numpy(light[kept]), train, config.seed)
-    scene = teaching_scene(name, original, train, test)
-    _fit_to_pictures(model, scene, config, quiet)
+    share = min(1.0, max(LEAST_REGRESSED, config.steps / REGRESSED))
+    lit = Drawable.of(splats[kept], weighted.frame), torch.from_numpy(light[kept])
+    model = initial_model(*lit, train, config.seed, share)
+    scene, cache = teaching_scene(name, original, train, test), PictureCache()
+    _fit_to_pictures(model, scene, config, cache, quiet)
 
     unpacked = _mean(likeness(model, original, test))
     say(f"{unpacked:.2f} dB before packing")
     imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
     provenance = {"steps": config.steps, "seed": config.seed, "viewpoint": viewpoint_hint(train), "psnr": unpacked}
     provenance["choices"] = {"imported": imported}
-    _pack(model, target, scene, original, provenance, config, say)
+    _pack(model, target, scene, original, provenance, config, cache, say)
     decoded = hyrf_format.load(target)
     scores = likeness(decoded, original, test)
+    if _below(_mean(scores), config.psnr):
+        say(_shortfall(_mean(scores), unpacked, config, made_up=cameras is None))
     return DistillReport(
         gaussians_before=len(splats),
         gaussians_after=len(decoded),
@@ -197,6 +210,7 @@ def distill_splats(
         psnr=_mean(scores),
         psnr_worst=min(scores),
         psnr_unpacked=unpacked,
+        psnr_asked=config.psnr,
         bytes_source=None,
         bytes_ply=4 * len(splats) * (17 + 3 * (splats.harmonics.shape[1] - 1)),
         bytes_after=Path(target).stat().st_size,
@@ -209,7 +223,8 @@ def _cameras(
 ) -> tuple[list[Camera], list[Camera]]:
     """To teach with, and held out; of fewer than two given ones, the same."""
     if cameras is None:
-        counts = config.train_views, config.test_views
+        taught = math.ceil((1 + FINETUNE) * config.steps)  # pictures, and more than that are not looked at
+        counts = min(config.train_views, max(LIT_FROM, taught)), config.test_views
         train, test = (
             viewpoints(weighted, drawable, count, config.size, 2 * config.seed + held_out)
             for held_out, count in enumerate(counts)
@@ -227,10 +242,10 @@ def _lit(light: np.ndarray) -> np.ndarray:
     return np.sort(order[(sums > UNSEEN * sums[-1]) & (light[order] > 0)]) if len(order) else order
 
 
-def _fit_to_pictures(model: HybridModel, scene: Scene, config: DistillConfig, quiet: bool) -> None:
+def _fit_to_pictures(model: HybridModel, scene: Scene, config: DistillConfig, cache: PictureCache, quiet: bool) -> None:
     # No density control: every Gaussian has its place, and packing leaves out those that pictures do not miss.
     settings = TrainConfig(steps=config.steps, seed=config.seed, learning_rates=RATES, density=DensityConfig(stop=0.0))
-    trainer = Trainer(scene, settings, model=model)
+    trainer = Trainer(scene, settings, cache, model=model)
     with ProgressLine(config.steps, 0, quiet) as line:
         trainer.run(report=lambda t, loss, mse: line.update(t.step, loss, mse, len(t.model)))
 
@@ -242,27 +257,49 @@ def _pack(
     original: Drawable,
     provenance: dict,
     config: DistillConfig,
+    cache: PictureCache,
     say: Callable[[str], None],
 ) -> None:
     """Write a model as small as the quality asked for allows, as training views tell."""
-    views = [view.camera for view in evenly_spaced(scene.train, config.test_views)]
+    cameras = [view.camera for view in scene.train]
+    views = evenly_spaced(cameras, config.test_views)
     allowed, error = _mse(config.psnr), _mse(_mean(likeness(model, original, views)))
     room = max(allowed - error, LEAST_NOISE * min(allowed, error))
-    with tempfile.TemporaryDirectory() as folder:
-        raw, packed = Path(folder) / "model.hyrf", Path(folder) / "packed.hyrf"
-        provenance = {**provenance, "cameras": capture_of([view.camera for view in scene.train])}
-        hyrf_format.save(model, raw, profile="raw", provenance=provenance)
-        # Fine-tuning saves bytes, but its steps are too large for models that are very near already.
-        finetune_steps, noise = max(1, round(FINETUNE * config.steps)), ESTIMATED * room
-        for attempt in range(1, TRIES + 1):
-            compress(raw, packed, data=scene, finetune_steps=finetune_steps, noise=noise, say=say)
-            added = _mse(_mean(likeness(hyrf_format.load(packed), original, views))) - error
-            if added <= TOLERATED * room or attempt == TRIES:
-                break
-            noise = room if finetune_steps else noise * FINER * max(room / added, 1 / 8)
-            finetune_steps = 0
-            say("packing cost more than it may: once more, finer")
-        write_atomic(target, packed.read_bytes())  # only now: an interrupt leaves what was there before
+    say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
+    sensitivity = measure_sensitivity(model, cameras)
+    packer = Packer(model, provenance, sensitivity, scene, max(1, round(FINETUNE * config.steps)), True, say, cache)
+
+    @functools.cache
+    def attempt(noise: float) -> Trial:
+        return packer.attempt(noise)
+
+    def fits(trial: Trial, tolerated: float = TOLERATED_PLAIN) -> bool:
+        return _mse(_mean(likeness(decode_model(trial.data), original, views))) - error <= tolerated * room
+
+    trial = packer.attempt(ESTIMATED * room)
+    if not fits(trial, TOLERATED):  # fine-tuning saves bytes, but takes too large steps for models that are very near
+        packer.finetune_steps = 0
+        say("packing cost more than it may: once more, finer and without fine-tuning")
+        ends = PLAIN_ENDS[0] * room, PLAIN_ENDS[1] * room
+        found = coarsest(attempt, fits, PLAIN * room, TRIALS, ends)
+        trial = attempt(ends[0]) if found is None else found[1]
+    write_atomic(target, trial.data)  # only now: an interrupt leaves what was there before
+
+
+def _below(reached: float, asked: float) -> bool:
+    """Whether a PSNR is less than was asked for, as it is told."""
+    return round(reached, 1) < asked
+
+
+def _shortfall(reached: float, unpacked: float, config: DistillConfig, *, made_up: bool) -> str:
+    """What to do about a file that is less like the original than was asked for."""
+    told = (
+        f"asked for {config.psnr:g} dB and reached {reached:.1f} at held-out viewpoints, {unpacked:.1f} before packing"
+    )
+    if not _below(unpacked, config.psnr):
+        return f"{told}: ask for more than you need with --psnr"
+    where = ", or name with --cameras from where it will be looked at" if made_up else ""
+    return f"{told}: learn longer, as with --steps {2 * config.steps}{where}"
 
 
 def _mse(psnr: float) -> float:

@@ -84,7 +84,9 @@ def model_shape(drawable: Drawable, degree: int) -> ModelConfig:
     )
 
 
-def initial_model(drawable: Drawable, light: Tensor, cameras: Sequence[Camera], seed: int) -> HybridModel:
+def initial_model(
+    drawable: Drawable, light: Tensor, cameras: Sequence[Camera], seed: int, share: float = 1.0
+) -> HybridModel:
     """A model of splats, as like them as regression makes it.
 
     Args:
@@ -92,6 +94,7 @@ def initial_model(drawable: Drawable, light: Tensor, cameras: Sequence[Camera], 
         light: (N,) what each sends to pictures; errors count by its square root.
         cameras: that the splats' colours are looked at from.
         seed: of the first weights, and of the order.
+        share: of the usual steps of regression.
     """
     degree = drawable.degree
     config = model_shape(drawable, degree)
@@ -104,7 +107,7 @@ def initial_model(drawable: Drawable, light: Tensor, cameras: Sequence[Camera], 
     with torch.no_grad():
         for values in (model.radiance.weights[-1], model.radiance.biases[-1]):
             values.zero_()
-    _fit(model, drawable, shapes, light, cameras if degree else (), seed)
+    _fit(model, drawable, shapes, light, cameras if degree else (), seed, share)
     with torch.no_grad():  # what the field says of sizes and opacities comes off what Gaussians store
         raw = model.geometry(model.cube_coords(gaussians.positions))
         gaussians.scale_logits.copy_(shapes.sizes[:, None] - raw[:, 1:4].mean(1, keepdim=True))
@@ -113,7 +116,13 @@ def initial_model(drawable: Drawable, light: Tensor, cameras: Sequence[Camera], 
 
 
 def _fit(
-    model: HybridModel, drawable: Drawable, shapes: _Shapes, light: Tensor, cameras: Sequence[Camera], seed: int
+    model: HybridModel,
+    drawable: Drawable,
+    shapes: _Shapes,
+    light: Tensor,
+    cameras: Sequence[Camera],
+    seed: int,
+    share: float,
 ) -> None:
     """Fit the fields: the geometry to shapes, and the radiance, with the explicit colours, to colours at cameras."""
     count = len(model)
@@ -124,7 +133,7 @@ def _fit(
     poses = [torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32) for camera in cameras]
     no_turn = torch.eye(1, 4)
     optimizer = Optimizer(model, RATES)
-    steps = max(LEAST_STEPS, EPOCHS * count // BATCH)
+    steps = math.ceil(share * max(LEAST_STEPS, EPOCHS * count // BATCH))
     keep_freed_memory()
     with torch_on_one_thread():
         for step in range(steps):

@@ -8,5 +8,5 @@ from hyrfpack.distill import run, start
 @pytest.fixture(autouse=True)
 def short_work(monkeypatch: pytest.MonkeyPatch) -> None:
     """As little of everything as still makes a model."""
-    monkeypatch.setattr(start, "LEAST_STEPS", 20)
-    monkeypatch.setattr(run, "TRIES", 1)
+    monkeypatch.setattr(start, "LEAST_STEPS", 100)
+    monkeypatch.setattr(run, "TRIALS", 2)

@@ -51,3 +51,11 @@ def test_import_refuses_in_one_sentence(source: Path, tmp_path: Path) -> None:
     assert "broken.ply" in refused("import", tmp_path / "broken.ply", "-o", target)
     assert "JSON" in refused("import", source, "-o", target, "--cameras", source)
     assert not target.exists()
+
+
+def test_import_says_what_it_did_not_reach(source: Path, tmp_path: Path) -> None:
+    result = succeeded("import", source, "-o", tmp_path / "x.hyrf", *QUICK, "--psnr", 60, "--json")
+    numbers = json.loads(result.stdout)
+    assert numbers["psnr_asked"] == 60
+    assert f"asked for 60 dB and reached {numbers['psnr']:.1f} at held-out viewpoints" in result.stderr
+    assert "--steps 4" in result.stderr

@@ -8,7 +8,7 @@ import pytest
 from explicit_balls import LITTLE, ball
 
 import hyrfpack
-from hyrfpack.distill import DistillConfig, distill_splats, run
+from hyrfpack.distill import DistillConfig, distill_splats, run, teacher
 from hyrfpack.distill.teacher import likeness, teaching_scene
 from hyrfpack.distill.views import Weighted, viewpoints
 from hyrfpack.errors import HyrfDataError, HyrfError
@@ -114,9 +114,8 @@ def test_interrupt_while_packing_leaves_the_file_that_was_there(
 ) -> None:
     target = tmp_path / "x.hyrf"
     target.write_bytes(b"before")
-    monkeypatch.setattr(run, "TRIES", 2)
     monkeypatch.setattr(run, "TOLERATED", -np.inf)  # the first try will not do
-    monkeypatch.setattr(run, "compress", _interrupted_at_the_second(run.compress))
+    monkeypatch.setattr(run.Packer, "attempt", _interrupted_at_the_second(run.Packer.attempt))
     with pytest.raises(KeyboardInterrupt):
         distill_splats(ball(20), target, LITTLE)
     assert [path.name for path in tmp_path.iterdir()] == ["x.hyrf"]
@@ -133,6 +132,68 @@ def _interrupted_at_the_second(compress):
         return compress(*args, **options)
 
     return wrapped
+
+
+def counting(monkeypatch: pytest.MonkeyPatch, place, name: str) -> list:
+    """Arguments of each call of a function from now on."""
+    calls, whole = [], getattr(place, name)
+    monkeypatch.setattr(place, name, lambda *args, **options: calls.append(args) or whole(*args, **options))
+    return calls
+
+
+def test_nothing_is_measured_or_drawn_twice_however_often_packing_is_tried(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for tolerated in ("TOLERATED", "TOLERATED_PLAIN"):
+        monkeypatch.setattr(run, tolerated, -np.inf)  # no try will do
+    measured = counting(monkeypatch, run, "measure_sensitivity")
+    tried = counting(monkeypatch, run.Packer, "attempt")
+    drawn = counting(monkeypatch, teacher, "photograph")
+
+    distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, steps=12))
+
+    assert len(tried) > 2 and len(measured) == 1
+    assert len({noise for _, noise in tried}) == len(tried)
+    assert len(drawn) == LITTLE.train_views
+
+
+def test_a_short_import_looks_from_fewer_places_and_regresses_less(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked = counting(monkeypatch, run, "viewpoints")
+    started = counting(monkeypatch, run, "initial_model")
+    monkeypatch.setattr(run, "_fit_to_pictures", lambda *args: None)
+    monkeypatch.setattr(run, "_pack", _interrupt)
+    for steps in (1, 500):
+        with pytest.raises(KeyboardInterrupt):
+            distill_splats(ball(20), tmp_path / "x.hyrf", DistillConfig(steps=steps, size=16))
+    (_, _, few, *_), _, (_, _, many, *_), _ = looked  # the others are held out
+    (*_, less), (*_, whole) = started
+    assert few <= 64 < many == DistillConfig.train_views
+    assert less < whole == 1
+
+
+def _interrupt(*args):
+    raise KeyboardInterrupt
+
+
+def test_a_file_less_like_the_original_than_asked_for_says_so(tmp_path: Path) -> None:
+    said: list[str] = []
+    report = distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, psnr=60), say=said.append)
+    assert report.psnr_asked == 60
+    assert said[-1].startswith(f"asked for 60 dB and reached {report.psnr:.1f} at held-out viewpoints")
+    assert "--steps 12" in said[-1] and "--cameras" in said[-1]
+
+    said.clear()
+    distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, psnr=10), say=said.append)
+    assert not any("asked for" in sentence for sentence in said)
+
+
+def test_what_packing_took_is_asked_for_and_not_learned() -> None:
+    told = run._shortfall(36.5, 38.6, DistillConfig(psnr=37), made_up=True)
+    assert "reached 36.5" in told and told.endswith("with --psnr") and "--steps" not in told
+    assert "--cameras" not in run._shortfall(36.5, 36.6, DistillConfig(psnr=37), made_up=False)
+    assert not run._below(36.96, 37) and run._below(36.94, 37)
 
 
 def test_settings_out_of_range_are_refused() -> None:
