@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from math import isfinite
+from math import inf, isfinite
 
 import torch
 from torch import Tensor
@@ -30,7 +30,8 @@ class RenderSettings:
 
     Attributes:
         near: Gaussians nearer than this are dropped, local units (the frame's longest half-axis is 1).
-        cull_tolerance: how far outside the picture a centre may project, as a fraction of half its size.
+        cull_tolerance: how far outside the picture a centre may project, as a fraction of half its size; infinite for
+            anywhere in front of it.
         background_threshold: pixels with no more transmittance than this get no background (the paper's tau).
         background_stride: the background is evaluated at every background_stride-th pixel of each axis and
             interpolated between; 1 is exact.
@@ -44,8 +45,9 @@ class RenderSettings:
     transmittance_min: float = TRANSMITTANCE_MIN
 
     def __post_init__(self) -> None:
-        for name in ("near", "cull_tolerance", "background_threshold"):
+        for name in ("near", "background_threshold"):
             check_float(name, getattr(self, name))
+        check_float("cull_tolerance", self.cull_tolerance, most=inf)
         check_int("background_stride", self.background_stride, 1)
         check_float("transmittance_min", self.transmittance_min, 0, 1)
         if self.transmittance_min == 1:

@@ -134,7 +134,7 @@ def test_one_run_leaves_the_table_the_numbers_the_page_and_the_plot(model, tmp_p
     page = (tmp_path / "b.md").read_text()
     assert page.count("| float64 reference |") == len([item for item in numbers["rows"] if item["is_reference"]])
     (tmp_path / "b.md").write_text(page.replace("## mlp", "## mlp\n\nMy own words."))
-    assert hyrfpack("bench", model, *chosen[2:], *files).exit_code == 0
+    assert hyrfpack("bench", model, *chosen[2:], *files, "--overwrite").exit_code == 0
     assert "My own words." in (tmp_path / "b.md").read_text()
 
 
