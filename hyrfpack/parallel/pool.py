@@ -32,8 +32,14 @@ def _executor() -> ThreadPoolExecutor:
     )
 
 
-if hasattr(os, "register_at_fork"):  # a forked child has none of the threads and must start its own
-    os.register_at_fork(after_in_child=_executor.cache_clear)
+def _after_fork() -> None:
+    """A forked child has none of its parent's threads: the pool starts its own; torch would wait for them for ever."""
+    _executor.cache_clear()
+    torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 @cache

@@ -1,0 +1,100 @@
+"""multiprocessing and PyTorch's DataLoader fork on Linux: what worked before the fork works in the child."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+
+# Everything is used in the parent, then each in a child of its own, which is killed when it hangs.
+CODE = """
+import json, sys, warnings
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+import numpy as np, torch
+import hyrfpack
+from hyrfpack.data.demo_scene import write_demo_scene
+from hyrfpack.render.capture import capture_of
+from scenes import ball_scene, small_model
+
+warnings.filterwarnings("ignore", "This process .* is multi-threaded", DeprecationWarning)
+torch.set_num_threads(4)  # as on a machine with cores to spare
+scene = ball_scene(8, side=24)
+scene = replace(scene, test=scene.train[:2])
+model = small_model(np.random.default_rng(0).normal(size=(20_000, 3)) * 0.3, fields=1.0, scale_logits=-6.0)
+cameras = capture_of([view.camera for view in scene.train])
+hyrfpack.save(model, "model.hyrf", provenance={"cameras": cameras})
+write_demo_scene(Path("demo"), views=4, size=16)
+
+def load_scene():
+    return hyrfpack.load_scene("demo").train[0].load().rgb.tobytes()
+
+def load():
+    return hyrfpack.load("model.hyrf").gaussians.positions.detach().numpy().tobytes()
+
+def save():
+    hyrfpack.save(hyrfpack.load("model.hyrf"), "saved.hyrf", "raw")
+    return Path("saved.hyrf").read_bytes()
+
+def render():
+    with torch.no_grad():
+        return hyrfpack.render(model, scene.test[0].camera, decoded=model.decode()).rgb.numpy().tobytes()
+
+def evaluate():
+    return str(hyrfpack.evaluate(model, scene.test, pictures="views").psnr).encode()
+
+def train():
+    return hyrfpack.train(scene, "run", hyrfpack.TrainConfig(steps=3), overwrite=True).model.read_bytes()
+
+def compress():
+    hyrfpack.compress("model.hyrf", "compact.hyrf", data=scene, finetune_steps=2)
+    return Path("compact.hyrf").read_bytes()
+
+def export():
+    hyrfpack.export("model.hyrf", "model.spz", degree=1)
+    return Path("model.spz").read_bytes()
+
+def told(function, sender):
+    sender.send(function())
+
+fork, outcome = get_context("fork"), {}
+functions = [load_scene, load, save, render, evaluate, train, compress, export]
+before = [function() for function in functions]
+for function, expected in zip(functions, before):
+    receiver, sender = fork.Pipe(duplex=False)
+    child = fork.Process(target=told, args=(function, sender))
+    child.start()
+    sender.close()
+    receiver.poll(60) or child.kill()
+    try:
+        outcome[function.__name__] = receiver.recv() == expected
+    except EOFError:
+        outcome[function.__name__] = False
+    child.join()
+print(json.dumps(outcome))
+"""
+
+
+@pytest.fixture(scope="module")
+def outcome(tmp_path_factory) -> dict[str, bool]:
+    """For each function, whether a forked child got what its parent had got."""
+    tests = Path(__file__).parents[1]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (tests.parent, tests)))}
+    command, folder = [sys.executable, "-c", CODE], tmp_path_factory.mktemp("fork")
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize(
+    "function", ["load_scene", "load", "save", "render", "evaluate", "train", "compress", "export"]
+)
+def test_a_forked_child_gets_what_its_parent_got(function, outcome):
+    assert outcome[function]
