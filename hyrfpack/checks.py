@@ -1,4 +1,4 @@
-"""Refusing settings that make no sense where they are made, not in the middle of the work.
+"""Refusing settings and arguments that make no sense where they are given, not in the middle of the work.
 
 Settings are written as JSON beside results, so only Python's own numbers are taken: NumPy's have no place there.
 """
@@ -44,3 +44,21 @@ def check_pair(name: str, value: Any) -> None:
     """Raises ValueError: the value is no tuple of two."""
     if not (isinstance(value, tuple) and len(value) == 2):
         raise ValueError(f"{name} is {value!r}; it must be a tuple of two numbers")
+
+
+# Where what a call was given instead of can be had, by the type that it wants.
+_REMEDIES = {
+    "Camera": "a View has one: view.camera",
+    "HybridModel": "hyrfpack.load reads it from a file",
+    "Scene": "hyrfpack.load_scene reads it from a folder",
+    "View": "a Scene has lists of them: scene.test",
+    **{name: f"make one: hyrfpack.{name}(...)" for name in ("DistillConfig", "RenderSettings", "TrainConfig")},
+}
+
+
+def check_type(argument: str, value: object, kind: type) -> None:
+    """Refuse what a call from a program cannot be about: TypeError, with what to do, unless `value` is of a kind."""
+    if not isinstance(value, kind):
+        raise TypeError(
+            f"{argument} must be a {kind.__name__}, not a {type(value).__name__}; {_REMEDIES[kind.__name__]}"
+        )

@@ -26,23 +26,32 @@ NO_METAL = (
 )
 
 
-def choose_device(name: str = "auto", say: Callable[[str], None] = lambda sentence: None) -> torch.device:
+def choose_device(
+    name: str | torch.device = "auto", say: Callable[[str], None] = lambda sentence: None
+) -> torch.device:
     """The device of a name.
 
     Args:
         name: "auto" (a CUDA or ROCm device where one is usable and Triton is installed, the CPU otherwise), "cpu",
-            "cuda" (torch's current one; ROCm too is called so) or "cuda:N", or "mps".
+            "cuda" (torch's current one; ROCm too is called so) or "cuda:N", or "mps"; or a torch.device.
         say: told in a sentence where the choice runs without kernels.
 
     Returns:
         The device; "cuda:N" is also made torch's current one, on which kernels are launched.
 
     Raises:
-        HyrfError: there is no such device.
+        HyrfError: there is no such device, or this process was forked from one that uses the GPU.
     """
+    if isinstance(name, torch.device):
+        name = str(name) if name.type == "cuda" else name.type
     if not re.fullmatch(r"auto|cpu|mps|cuda(:[0-9]{1,3})?", name):
         raise HyrfError(f"'{name}' is no device; use auto, cpu, cuda, cuda:N or mps")
     kind, _, number = name.partition(":")
+    if kind in ("auto", "cuda") and torch.cuda._is_in_bad_fork():
+        raise HyrfError(
+            "this process was forked from one that uses the GPU, and cannot use it too; start it with "
+            "multiprocessing's method 'spawn', or take the device 'cpu'"
+        )
     if kind == "auto":
         kind = name = "cuda" if torch.cuda.is_available() and has_triton() else "cpu"
     if kind == "cuda":

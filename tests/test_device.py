@@ -46,6 +46,21 @@ def test_a_gpu_beyond_the_last_is_refused():
         choose_device("cuda:1")
 
 
+@pytest.mark.parametrize("name", ["auto", "cuda", "cuda:0"])
+def test_a_child_forked_from_a_process_that_uses_the_gpu_is_told_so_at_once(name, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "_is_in_bad_fork", lambda: True)
+    with pretended_gpu(), pytest.raises(HyrfError, match="was forked.*'spawn'"):
+        choose_device(name)
+    assert choose_device("cpu").type == "cpu"
+
+
+@needs_no_gpu
+def test_devices_may_be_given_as_torch_has_them():
+    assert choose_device(torch.device("cpu", 0)) == torch.device("cpu")
+    with pytest.raises(HyrfError, match="'cuda:0' is not there"):
+        choose_device(torch.device("cuda", 0))
+
+
 def test_kernels_refuse_tensors_of_another_gpu_than_the_current_one(monkeypatch):
     with pretended_gpu() as gpu:
         monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)

@@ -15,6 +15,8 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
+import torch
+from scenes import ball_scene, small_model
 
 import hyrfpack
 
@@ -77,6 +79,48 @@ def test_sub_packages_can_be_imported_from_in_every_way():
         "except AttributeError: print('and nothing else')"
     )
     assert fresh(code).stdout == "and nothing else\n", fresh(code).stderr
+
+
+# What each call is given instead, and what its sentence says.
+MISTAKEN = [
+    (lambda model, scene: hyrfpack.train("photos", "run"), "scene must be a Scene, not a str; .*load_scene"),
+    (lambda model, scene: hyrfpack.train(scene, "run", {"steps": 3}), "config must be a TrainConfig, not a dict"),
+    (lambda model, scene: hyrfpack.compress("m.hyrf", "a.hyrf", data="photos"), "data must be a Scene.*load_scene"),
+    (lambda model, scene: hyrfpack.compress(model, "a.hyrf"), "expected str.*not HybridModel"),
+    (lambda model, scene: hyrfpack.export("m.hyrf", "a.ply", data="photos"), "data must be a Scene.*load_scene"),
+    (lambda model, scene: hyrfpack.bench("m.hyrf", "photos"), "scene must be a Scene.*load_scene"),
+    (lambda model, scene: hyrfpack.evaluate("m.hyrf", scene.train), "model must be a HybridModel.*hyrfpack.load"),
+    (lambda model, scene: hyrfpack.evaluate(model, "photos"), "views must be a View, not a str; .*scene.test"),
+    (lambda model, scene: hyrfpack.evaluate(model, scene), "views must be a View, not a Scene; .*scene.test"),
+    (lambda model, scene: hyrfpack.render(model, scene.train[0]), "camera must be a Camera, not a View; .*view.camera"),
+    (lambda model, scene: hyrfpack.render("m.hyrf", scene.train[0].camera), "model must be a HybridModel"),
+    (lambda model, scene: hyrfpack.render(model, scene.train[0].camera, 0.1), "settings must be a RenderSettings"),
+    (lambda model, scene: hyrfpack.save("m.hyrf", "a.hyrf"), "model must be a HybridModel"),
+    (lambda model, scene: hyrfpack.distill("a.ply", "a.hyrf", 500), "config must be a DistillConfig"),
+    (lambda model, scene: hyrfpack.distill("a.ply", "a.hyrf", cameras=scene.train), "cameras must be a Camera"),
+]
+
+
+@pytest.mark.parametrize("call, sentence", MISTAKEN)
+def test_a_wrong_call_is_a_type_error_that_says_what_to_do(call, sentence, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(TypeError, match=sentence):
+        call(small_model([(0, 0, 0)]), ball_scene(2, side=8))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_loading_to_a_device_that_is_not_there_is_one_sentence(tmp_path):
+    hyrfpack.save(small_model([(0, 0, 0)]), tmp_path / "model.hyrf")
+    with pytest.raises(hyrfpack.HyrfError, match="'cuda' is not there"):
+        hyrfpack.load(tmp_path / "model.hyrf", device="cuda")
+
+
+def test_a_picture_of_a_loaded_model_is_plain_numbers(tmp_path):
+    hyrfpack.save(small_model([(0, 0, 0)]), tmp_path / "model.hyrf")
+    model, (view, _) = hyrfpack.load(tmp_path / "model.hyrf"), ball_scene(2, side=8).train
+    assert hyrfpack.render(model, view.camera).rgb.numpy().shape == (8, 8, 3)
+    assert hyrfpack.render(model.requires_grad_(), view.camera).rgb.requires_grad
 
 
 def test_type_checkers_see_the_public_names_and_nothing_else():

@@ -53,7 +53,7 @@ def run(variant: Variant, scene: Scene, config: TrainConfig, full_path: Path, ca
         The numbers of one row, ready for JSON; {"failed": why} where it did not train.
     """
     if variant is NO_CULLING:
-        full = load(full_path)
+        full = load(full_path).requires_grad_()  # its bytes are those that could be trained
         return measure(variant, full, full, scene)
     trainer = build_trainer(scene, config, variant, cache)
     try:

@@ -25,7 +25,6 @@ from hyrfpack.render.paths import viewpoint_hint
 from hyrfpack.scene import Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.density import DensityControl
-from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.progress import ProgressLine
 from hyrfpack.train.run import MODEL
 
@@ -64,9 +63,7 @@ def densifying_config(gaussians: int, settle: int, seed: int) -> TrainConfig:
 
 def continued(scene: Scene, model: HybridModel, config: TrainConfig) -> Trainer:
     """A trainer at the start of a run that goes on with `model`."""
-    trainer = Trainer(scene, config)
-    trainer.model = model
-    trainer.optimizer = Optimizer(model, config.learning_rates)
+    trainer = Trainer(scene, config, model=model)
     trainer.density = DimmingControl(config.density, config.steps, trainer.budget, len(model), config.seed)
     return trainer
 

@@ -13,6 +13,7 @@ from hyrfpack.bench.rendering import render_rows
 from hyrfpack.bench.rows import Row
 from hyrfpack.bench.subject import Subject, built_in_subject, read_subject
 from hyrfpack.bench.timing import ENOUGH_SECONDS
+from hyrfpack.checks import check_type
 from hyrfpack.errors import needs_package
 from hyrfpack.scene import Scene
 
@@ -74,6 +75,7 @@ def bench(
     Raises:
         HyrfError: the model or the photos cannot be used, a result is not finite, or Numba is missing.
         ValueError: there is no such group, no repeat, or a scene without a model.
+        TypeError: `scene` is no Scene.
     """
     for name in only or ():
         if name not in GROUPS:
@@ -82,6 +84,8 @@ def bench(
         raise ValueError(f"repeats is {repeats}; it must be at least 1")
     if scene is not None and model is None:
         raise ValueError("a scene was given without the model of it; the built-in model has its own photos")
+    if scene is not None:
+        check_type("scene", scene, Scene)
     with needs_package("numba", "measuring the compiled kernels"):
         import numba  # noqa: F401 - asked for here, before the work starts
     subject = built_in_subject(report) if model is None else read_subject(model, scene)

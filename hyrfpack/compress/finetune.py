@@ -72,7 +72,7 @@ def finetune(
         HyrfTrainingError: the loss or a gradient is not finite.
     """
     rounding = dataclasses.replace(plan, reach=0)
-    tuned = deepcopy(model)
+    tuned = deepcopy(model).requires_grad_(True)
     tuned.gaussians.positions.requires_grad_(False)
     share = min(1.0, steps / FULL_RATES)
     rates = {name: (share * first, share * last) for name, (first, last) in dataclasses.asdict(RATES).items()}

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from hyrfpack.checks import check_type
 from hyrfpack.compress.finetune import finetune
 from hyrfpack.compress.search import coarsest, finest
 from hyrfpack.compress.sensitivity import measure_sensitivity
@@ -90,7 +91,10 @@ def compress(
     Raises:
         HyrfError: a file cannot be read or written, the target is what is read, the options do not go together, or
             what is asked for cannot be had.
+        TypeError: `data` is no Scene.
     """
+    if data is not None:
+        check_type("data", data, Scene)
     Outputs(source, scene=data, overwrite=True).file(target)
     if profile != "compact":
         if data is not None or finetune_steps or target_bytes or max_psnr_drop is not None or noise:

@@ -47,6 +47,7 @@ def measure_sensitivity(model: HybridModel, cameras: Sequence[Camera], seed: int
     generator = torch.Generator().manual_seed(seed)
     squares = {name: torch.zeros_like(parameter) for name, parameter in model.named_parameters()}
     stretch = _stretch(model)
+    wanted = {name: parameter.requires_grad for name, parameter in model.named_parameters()}
     pixels, field_pixels = 0, 0
     for number, camera in enumerate(views):
         # Pairs alternate, so a field's views fall on cameras and between them.
@@ -68,8 +69,8 @@ def measure_sensitivity(model: HybridModel, cameras: Sequence[Camera], seed: int
                 gradient = (stretch * gradient[:, :, None]).sum(1)
             squares[name] += gradient.square()
             parameter.grad = None
-    for parameter in model.parameters():
-        parameter.requires_grad_(True)
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad_(wanted[name])
     return _gathered(model, squares, pixels, field_pixels, near)
 
 

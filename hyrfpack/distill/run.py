@@ -16,7 +16,7 @@ import torch
 
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import check_writable, write_atomic
-from hyrfpack.checks import check_float, check_int
+from hyrfpack.checks import check_float, check_int, check_type
 from hyrfpack.compress.run import Packer, Trial
 from hyrfpack.compress.search import coarsest
 from hyrfpack.compress.sensitivity import measure_sensitivity
@@ -135,7 +135,11 @@ def distill(
     Raises:
         HyrfDataError: the source cannot be read, or there is nothing to be seen in it.
         HyrfError: the target cannot be written.
+        TypeError: the settings or a camera are something else.
     """
+    check_type("config", config, DistillConfig)
+    for camera in cameras or ():
+        check_type("each of the cameras", camera, Camera)
     Outputs(source, overwrite=True).file(target)
     splats = read_splats(source)
     report = distill_splats(splats, target, config, name=str(source), cameras=cameras, say=say, quiet=quiet)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from hyrfpack.checks import check_type
 from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.figures import comparison
@@ -93,7 +94,12 @@ def evaluate(
 
     Raises:
         HyrfError: there is no view to score, or a file cannot be read or written.
+        TypeError: the model, a view or the settings are something else.
     """
+    check_type("model", model, HybridModel)
+    check_type("settings", settings, RenderSettings)
+    for view in views if isinstance(views, Sequence) else [views]:
+        check_type("each of the views", view, View)
     if not views:
         raise HyrfError("there is no view to score; name a split that has photos or a smaller --test-every")
     perceptual = None if lpips_weights is None else LPIPS.load(lpips_weights)

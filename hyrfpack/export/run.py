@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from hyrfpack.atomic import write_atomic
+from hyrfpack.checks import check_type
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.background import background_picture, background_reach, background_splats
 from hyrfpack.export.bake import bake
@@ -105,7 +106,10 @@ def export(
 
     Raises:
         HyrfError: a file cannot be read or written, or the options do not go together.
+        TypeError: `data` is no Scene.
     """
+    if data is not None:
+        check_type("data", data, Scene)
     kind = kind_of(target)
     check_request(kind, target, degree, crop, min_opacity)
     check_place(target, Outputs(source, scene=data, overwrite=True))

@@ -11,6 +11,8 @@ import numpy as np
 import torch
 
 from hyrfpack.atomic import write_atomic
+from hyrfpack.checks import check_type
+from hyrfpack.device import choose_device
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import compact, paper, raw
 from hyrfpack.format.arrays import RULES, check_rules, group_shapes, parse_config, to_model
@@ -64,7 +66,9 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
 
     Raises:
         HyrfError: there is no such profile, or a parameter is NaN, infinite or too large for the profile.
+        TypeError: `model` is no HybridModel.
     """
+    check_type("model", model, HybridModel)
     if profile not in PROFILES:
         raise HyrfError(f"there is no profile '{profile}'; use one of: {', '.join(PROFILES)}")
     sections, used = PROFILES[profile](model, **settings)
@@ -83,15 +87,19 @@ def decode_model(
 ) -> HybridModel:
     """Read a model from the bytes of a `.hyrf` file. Safe on any input.
 
+    Its parameters want no gradients, so that pictures of it are plain numbers; `model.requires_grad_()` changes that.
+
     Args:
-        device: where the parameters shall live.
+        device: where the parameters shall live, see `hyrfpack.device.choose_device`.
         name: what error messages call the file.
         fraction: read only this part of the file, from its first byte, 0 to 1; the rest may be missing. Files of
             profile "compact" come in layers: what is whole of them makes a coarser model. None wants the whole file.
 
     Raises:
         HyrfFormatError: the bytes are damaged, contradict themselves, or come from a newer version.
+        HyrfError: there is no such device.
     """
+    device = choose_device(device)
     return _decode(read_container(data, SECTIONS, name, fraction)).to(device)
 
 
@@ -127,6 +135,7 @@ def load(
     path: str | os.PathLike[str], device: str | torch.device = "cpu", fraction: float | None = None
 ) -> HybridModel:
     """Read a model from a `.hyrf` file. Arguments and errors as `decode_model`, and where no file can be read."""
+    device = choose_device(device)
     with Container.open(path, SECTIONS, fraction) as container:
         return _decode(container).to(device)
 
@@ -225,7 +234,7 @@ def _decode(container: Container) -> HybridModel:
             raise HyrfFormatError(f"{name}: section '{type}' holds numbers that are not finite; write the file again")
     for group in LAYERED if there > 1 else ():
         arrays[group] = np.concatenate([arrays.pop(layer_section(group, layer)) for layer in range(there)])
-    return to_model(config, arrays)
+    return to_model(config, arrays).requires_grad_(False)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from math import inf, isfinite
 import torch
 from torch import Tensor
 
-from hyrfpack.checks import check_float, check_int
+from hyrfpack.checks import check_float, check_int, check_type
 from hyrfpack.errors import HyrfError
 from hyrfpack.model import Decoded, HybridModel, viewpoint_of
 from hyrfpack.model.gaussians import take_rows
@@ -106,7 +106,11 @@ def render(
 
     Raises:
         HyrfError: a number that the view needs is NaN or infinite.
+        TypeError: the model, the camera or the settings are something else.
     """
+    check_type("model", model, HybridModel)
+    check_type("camera", camera, Camera)
+    check_type("settings", settings, RenderSettings)
     seconds: dict[str, float] = {}
     positions = model.gaussians.positions
     pose_here = torch.as_tensor(model.config.frame.local_pose(camera), dtype=positions.dtype)

@@ -16,6 +16,7 @@ import torch
 
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
+from hyrfpack.checks import check_type
 from hyrfpack.data import PictureCache
 from hyrfpack.device import choose_device, describe_device
 from hyrfpack.errors import HyrfError, HyrfTrainingError
@@ -87,11 +88,14 @@ def train(
             score, a held-out photo cannot be read (all of which is found before the first step), or the results would
             replace photos or other files, or cannot be written (a checkpoint that cannot, while training, is a line on
             standard error).
+        TypeError: `scene` is no Scene or `config` no TrainConfig.
     """
+    check_type("scene", scene, Scene)
     out = Path(out)
-    config = config or TrainConfig()
+    config = TrainConfig() if config is None else config
+    check_type("config", config, TrainConfig)
     checkpoint = out / CHECKPOINT
-    device = device if isinstance(device, torch.device) else choose_device(device)
+    device = choose_device(device)
     _prepare(out, scene, resume, overwrite)
     cache = cache or PictureCache()
     _check_photos(scene, cache)

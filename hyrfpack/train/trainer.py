@@ -68,6 +68,8 @@ class Trainer:
     def _take(self, model: HybridModel) -> None:
         """Train this model from here on."""
         model.precision = self.config.precision
+        if not any(parameter.requires_grad for parameter in model.parameters()):  # as of a model that was loaded
+            model.requires_grad_(True)
         self.model = model.to(self.device)
         self.optimizer = Optimizer(self.model, self.config.learning_rates)
 

@@ -127,3 +127,9 @@ def test_a_photo_of_nan_stops_it_with_the_step_and_the_view(trained, plan, scene
 
     with pytest.raises(HyrfTrainingError, match="stopped at step 1 on view '002.png'.*without --finetune"):
         finetune(plan.apply(trained), plan, [view], 3)
+
+
+def test_a_model_that_was_loaded_is_fitted_too(trained, plan, scene):
+    loaded = decode_model(encode_model(plan.apply(trained)))
+    tuned = finetune(loaded, plan, scene.train, 1)
+    assert not torch.equal(tuned.gaussians.color_logits, loaded.gaussians.color_logits)

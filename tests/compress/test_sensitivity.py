@@ -10,6 +10,7 @@ from scenes import ball_points, ring, small_model
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.compress.views import WIDER, views_between
 from hyrfpack.errors import HyrfError
+from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import GROUPS
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.contraction import contract, expand
@@ -228,3 +229,11 @@ def test_cameras_at_one_place_have_views_between_them():
 
     assert all(np.allclose(view.position, CAMERAS[0].position) for view in views)
     assert all(np.isfinite(view.camera_from_world).all() for view in views)
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_whether_gradients_are_wanted_is_left_as_it_was(wanted):
+    model = decode_model(encode_model(a_model())).requires_grad_(wanted)
+    sensitivity = measure_sensitivity(model, CAMERAS[:2])
+    assert sensitivity.colors.max() > 1e-12
+    assert all(parameter.requires_grad == wanted for parameter in model.parameters())

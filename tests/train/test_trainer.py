@@ -10,6 +10,7 @@ import torch
 from scenes import ball_scene, view_of
 
 from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.format import decode_model, encode_model
 from hyrfpack.ops.adam import adam_step
 from hyrfpack.render import render
 from hyrfpack.scene import Picture, Scene
@@ -497,3 +498,18 @@ def test_millimetres_and_kilometres_train_to_the_same_quality(whole):
 
 def test_a_scene_a_million_units_from_the_origin_trains_as_well(whole):
     assert psnr(trained(offset=(1e6, -1e6, 5e5))) == pytest.approx(psnr(whole), abs=0.1)
+
+
+def test_a_model_that_was_loaded_can_be_trained_on():
+    model = decode_model(encode_model(Trainer(a_scene(), SHORT).model))
+    before = model.gaussians.color_logits.clone()
+    trainer = Trainer(a_scene(), dataclasses.replace(SHORT, steps=1), model=model)
+    trainer.run()
+    assert not torch.equal(trainer.model.gaussians.color_logits, before)
+
+
+def test_what_is_frozen_on_purpose_stays_frozen():
+    model = Trainer(a_scene(), SHORT).model
+    model.geometry.requires_grad_(False)
+    trainer = Trainer(a_scene(), dataclasses.replace(SHORT, steps=1), model=model)
+    assert not any(parameter.requires_grad for parameter in trainer.model.geometry.parameters())
