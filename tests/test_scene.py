@@ -95,7 +95,7 @@ def posed(pose) -> Camera:
         ([[1, 2], [3]], "camera_from_world"),
         ("pose", "camera_from_world"),
         (None, "camera_from_world"),
-        ([[object()] * 4] * 4, "camera_from_world"),
+        ([[{}] * 4] * 4, "camera_from_world"),
     ],
     ids=str,
 )
