@@ -86,7 +86,7 @@ MISTAKEN = [
     (lambda model, scene: hyrfpack.train("photos", "run"), "scene must be a Scene, not a str; .*load_scene"),
     (lambda model, scene: hyrfpack.train(scene, "run", {"steps": 3}), "config must be a TrainConfig, not a dict"),
     (lambda model, scene: hyrfpack.compress("m.hyrf", "a.hyrf", data="photos"), "data must be a Scene.*load_scene"),
-    (lambda model, scene: hyrfpack.compress(model, "a.hyrf"), "expected str.*not HybridModel"),
+    (lambda model, scene: hyrfpack.compress(model, "a.hyrf"), "str.*not HybridModel"),
     (lambda model, scene: hyrfpack.export("m.hyrf", "a.ply", data="photos"), "data must be a Scene.*load_scene"),
     (lambda model, scene: hyrfpack.bench("m.hyrf", "photos"), "scene must be a Scene.*load_scene"),
     (lambda model, scene: hyrfpack.evaluate("m.hyrf", scene.train), "model must be a HybridModel.*hyrfpack.load"),
