@@ -7,6 +7,7 @@ Nothing here imports torch or numpy before a command needs it, so that `hyrfpack
 from __future__ import annotations
 
 import errno
+import sys
 import traceback
 from typing import Any
 
@@ -18,7 +19,7 @@ from hyrfpack.cli.demo import demo
 from hyrfpack.cli.export import export
 from hyrfpack.cli.files import compress, decompress, info
 from hyrfpack.cli.imports import import_
-from hyrfpack.cli.manners import add_manners, is_verbose, mend_streams
+from hyrfpack.cli.manners import add_manners, is_verbose, mend_streams, note
 from hyrfpack.cli.train import train
 from hyrfpack.cli.view import view
 from hyrfpack.cli.views import evaluate, render
@@ -34,7 +35,7 @@ class _Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
-            return super().invoke(ctx)
+            result = super().invoke(ctx)
         except HyrfError as error:
             if is_verbose():
                 traceback.print_exc()
@@ -44,9 +45,21 @@ class _Commands(click.Group):
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
             raise _failure(f"what was to be said cannot be printed ({error.strerror}); lead it elsewhere") from error
+        _tell_of_kernels()
+        return result
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(self.commands)  # in the order of use, not of the alphabet
+
+
+def _tell_of_kernels() -> None:
+    """Say it where the kernels that a command has compiled are lost with it."""
+    kernels = sys.modules.get("hyrfpack.parallel.compiled")
+    if kernels is not None and not kernels.are_kept():
+        note(
+            "compiled kernels cannot be kept, so that each run compiles them anew; name a folder for them in "
+            "NUMBA_CACHE_DIR, and one for matplotlib's fonts in MPLCONFIGDIR"
+        )
 
 
 def _failure(sentence: str) -> click.ClickException:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import logging
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING
@@ -113,9 +115,22 @@ def training_curve(records: Sequence[dict], path: str | os.PathLike[str]) -> Non
     save_figure(path, figure, format="png", metadata={"Software": None})
 
 
+@contextmanager
+def _drawing() -> Iterator[None]:
+    """Import matplotlib inside this block, which says nothing then: as of having no folder to keep its fonts in."""
+    logger = logging.getLogger("matplotlib")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with needs_package("matplotlib", "drawing figures"):
+            yield
+    finally:
+        logger.setLevel(level)
+
+
 def blank_figure(width: float, height: float) -> Figure:
     """A matplotlib figure to draw on, drawn by Agg whatever the screen; inches."""
-    with needs_package("matplotlib", "drawing figures"):
+    with _drawing():
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
@@ -155,7 +170,7 @@ def _running_mean(values: Sequence[float]) -> list[float]:
 
 def _error_colors(error: np.ndarray) -> np.ndarray:
     """(H, W) errors to (H, W, 3) colours, black at 0 and bright from ERROR_LIMIT on."""
-    with needs_package("matplotlib", "drawing figures"):
+    with _drawing():
         from matplotlib import colormaps
 
     return colormaps["inferno"](np.clip(error / ERROR_LIMIT, 0, 1))[..., :3]
@@ -177,7 +192,7 @@ def _color_bar(
 
 def _font(width: int, fraction: float = 0.036, fixed: bool = False) -> ImageFont.FreeTypeFont:
     """Type that fits a picture of that width; matplotlib brings the files on every system."""
-    with needs_package("matplotlib", "drawing figures"):
+    with _drawing():
         from matplotlib import get_data_path
 
     name = "DejaVuSansMono.ttf" if fixed else "DejaVuSans.ttf"

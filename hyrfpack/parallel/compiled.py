@@ -22,6 +22,15 @@ class _Cache(FunctionCache):
                 Path(self._cache_file._index_path).unlink()
 
 
+def are_kept() -> bool:
+    """Whether there is a folder that kernels can be kept in, from one process to the next."""
+    try:
+        _Cache(are_kept)
+    except RuntimeError:
+        return False
+    return True
+
+
 def compiled(**options: object) -> Callable[[Callable], Callable]:
     """A decorator: `numba.njit(nogil=True, **options)`, with the machine code cached on the disk.
 
