@@ -58,4 +58,4 @@ def test_import_says_what_it_did_not_reach(source: Path, tmp_path: Path) -> None
     numbers = json.loads(result.stdout)
     assert numbers["psnr_asked"] == 60
     assert f"asked for 60 dB and reached {numbers['psnr']:.1f} at held-out viewpoints" in result.stderr
-    assert "--steps 4" in result.stderr
+    assert "--steps 500" in result.stderr

@@ -182,7 +182,7 @@ def test_a_file_less_like_the_original_than_asked_for_says_so(tmp_path: Path) ->
     report = distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, psnr=60), say=said.append)
     assert report.psnr_asked == 60
     assert said[-1].startswith(f"asked for 60 dB and reached {report.psnr:.1f} at held-out viewpoints")
-    assert "--steps 12" in said[-1] and "--cameras" in said[-1]
+    assert "--steps 500" in said[-1] and "--cameras" in said[-1]
 
     said.clear()
     distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, psnr=10), say=said.append)
