@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif", ".dng")
 TABLES = tuple(f"{table}{kind}" for table in ("cameras", "images", "points3D") for kind in (".bin", ".txt"))
 POSES = ("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json")
-MODELS = ("sparse", "colmap")  # folders of COLMAP models
+MODELS = ("sparse", "colmap/sparse")  # folders of COLMAP models
 LONGEST_NAME, LONGEST_PATH = 255, 4095  # bytes, of common systems
 
 StrPath = str | os.PathLike[str]
@@ -61,7 +61,7 @@ class Outputs:
             self._folders |= _identities([folder])
         if scene is not None:
             self._files |= _identities(scene.files)
-            self._folders |= _identities({scene.path, *map(os.path.dirname, map(os.path.realpath, scene.files))})
+            self._folders |= _identities(_folders_between(scene.path, scene.files))
 
     def file(self, path: StrPath, *endings: str) -> None:
         """Check one file to be written, whose name must have one of the endings, if any are given."""
@@ -119,6 +119,16 @@ class Outputs:
             raise HyrfError(f"{folder}: the same command reads what lies in this folder; name another to write into")
 
 
+def _folders_between(top: StrPath, files: Iterable[StrPath]) -> set[Path]:
+    """A folder, those that files lie in, and where these lie in it, all on the way."""
+    root = _real(top)
+    found = {root}
+    for folder in {_real(file).parent for file in files}:
+        inside = [above for above in folder.parents if above.is_relative_to(root)]
+        found |= {folder, *inside}
+    return found
+
+
 def _identities(paths: Iterable[StrPath]) -> set[tuple[int, int]]:
     """Device and number of each path that is there: the same for all its names and links."""
     found = set()
@@ -173,7 +183,11 @@ def _of_a_set(folder: Path) -> bool:
 
 
 def _has_poses(folder: Path) -> bool:
-    return not _names(folder).isdisjoint((*TABLES, *POSES, *MODELS))
+    if not _names(folder).isdisjoint((*TABLES, *POSES)):
+        return True
+    places = [folder / place for place in MODELS]
+    places += [place / name for place in places for name in _names(place)]
+    return any(not _names(place).isdisjoint(TABLES) for place in places)
 
 
 def _has_pictures(folder: Path) -> bool:

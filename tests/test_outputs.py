@@ -50,11 +50,15 @@ def test_an_input_is_never_replaced_by_whatever_name(name, overwrite, tmp_path, 
         Outputs(model, overwrite=overwrite).folder(tmp_path, [name])
 
 
-@pytest.mark.parametrize("place", [".", "images", "elsewhere/.."])
+@pytest.mark.parametrize("place", [".", "images", "elsewhere/..", "images/left"])
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_nothing_is_put_beside_the_photos_and_poses_that_are_read(place, overwrite, photos):
-    outputs = Outputs(scene=load_scene(photos), overwrite=overwrite)
     (photos / "elsewhere").mkdir()
+    (photos / "images" / "left").mkdir()
+    first, poses = photos / "images" / "0000.png", photos / "transforms.json"
+    first.rename(photos / "images" / "left" / "0000.png")
+    poses.write_text(poses.read_text().replace("images/0000", "images/left/0000"))
+    outputs = Outputs(scene=load_scene(photos), overwrite=overwrite)
 
     with pytest.raises(HyrfError, match="the same command reads what lies in this folder"):
         outputs.file(photos / place / "new.hyrf")
@@ -93,6 +97,14 @@ def test_tables_of_a_reconstruction_are_poses(tmp_path, model):
     for refused in (table.parent, tmp_path):
         with pytest.raises(HyrfError, match="photos or poses lie in this folder"):
             Outputs(model).folder(refused, ["new.png"])
+
+
+def test_a_folder_is_poses_by_its_files_not_by_its_name(tmp_path, model):
+    for name in ("sparse", "colmap"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "screenshot.png").write_bytes(b"")
+
+    Outputs(model).file(tmp_path / "scene.html")
 
 
 def test_pictures_beside_a_single_new_file_do_not_matter(tmp_path, model):

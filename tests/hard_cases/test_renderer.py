@@ -171,11 +171,12 @@ def test_kept_geometry_and_solid_colours_that_are_not_finite_are_refused() -> No
 
 
 def test_a_pose_beyond_float32_is_refused() -> None:
-    camera = _camera(FRONT)
+    camera, model = _camera(FRONT), _balls()
     pose = camera.camera_from_world.copy()
-    pose[2, 3] = 1e300
+    pose[2, 3] = 3e38  # in local units it is more than float32 holds
+    model.config = dataclasses.replace(model.config, frame=dataclasses.replace(model.config.frame, scale=0.01))
     with pytest.raises(HyrfError, match="pose"):
-        render(_balls(), Camera(40, 30, *camera.intrinsics, pose))
+        render(model, Camera(40, 30, *camera.intrinsics, pose))
 
 
 def test_positions_whose_squares_overflow_are_refused() -> None:
