@@ -47,7 +47,8 @@ def choose_device(
     if not re.fullmatch(r"auto|cpu|mps|cuda(:[0-9]{1,3})?", name):
         raise HyrfError(f"'{name}' is no device; use auto, cpu, cuda, cuda:N or mps")
     kind, _, number = name.partition(":")
-    if kind in ("auto", "cuda") and torch.cuda._is_in_bad_fork():
+    # Asking for GPUs is enough to make a fork a bad one, also where there is none.
+    if kind in ("auto", "cuda") and torch.cuda._is_in_bad_fork() and torch.cuda.is_available():
         raise HyrfError(
             "this process was forked from one that uses the GPU, and cannot use it too; start it with "
             "multiprocessing's method 'spawn', or take the device 'cpu'"

@@ -55,6 +55,12 @@ def test_a_child_forked_from_a_process_that_uses_the_gpu_is_told_so_at_once(name
 
 
 @needs_no_gpu
+def test_a_forked_child_takes_the_cpu_where_there_is_no_gpu(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "_is_in_bad_fork", lambda: True)
+    assert choose_device("auto").type == "cpu"
+
+
+@needs_no_gpu
 def test_devices_may_be_given_as_torch_has_them():
     assert choose_device(torch.device("cpu", 0)) == torch.device("cpu")
     with pytest.raises(HyrfError, match="'cuda:0' is not there"):
