@@ -71,7 +71,7 @@ def render(
     Examples:
       hyrfpack render bonsai.hyrf -o orbit --video
       hyrfpack render bonsai.hyrf -o out --data photos/bonsai --split test
-      hyrfpack render bonsai.hyrf -o out --cameras path.json --depth
+      hyrfpack render bonsai.hyrf -o path --cameras path.json --depth
     """
     if sum(source is not None for source in (data, cameras, orbit)) > 1:
         raise click.UsageError("--data, --cameras and --orbit each say what to render; give one of them")
