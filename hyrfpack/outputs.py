@@ -78,32 +78,35 @@ class Outputs:
             raise HyrfError(
                 f"{path}: photos or poses lie in this folder; name another, or write there with --overwrite"
             )
-        _check_place(path)
+        _check_names([path])
+        _check_place(_folder_of(path))
 
     def folder(self, folder: StrPath, names: Iterable[str]) -> None:
         """Check files to be written into a folder and folders in it, by their names relative to it."""
         if os.path.lexists(folder) and not os.path.isdir(folder):
             raise HyrfError(f"{folder}: this is a file; name a folder")
         paths = [Path(folder, name) for name in names]
-        for place in dict.fromkeys((Path(folder), *(path.parent for path in paths))):
+        places = list(dict.fromkeys((Path(folder), *(path.parent for path in paths))))
+        for place in places:
             self._refuse_folder_read(place)
-        for path in paths:
+        there = [path for path in paths if os.path.lexists(path)]
+        for path in there:
             self._check(path)
         if not self.overwrite:
-            there = [path for path in paths if os.path.lexists(path)]
             if there:
                 more = f" and {len(there) - 1} more" if len(there) > 1 else ""
                 raise HyrfError(
                     f"{folder}: {there[0].relative_to(folder)}{more} of the files to be written "
                     f"{'are' if more else 'is'} there; name another folder, or replace them with --overwrite"
                 )
-            for place in dict.fromkeys((Path(folder), *(path.parent for path in paths))):
+            for place in places:
                 if _has_poses(place) or _has_pictures(place):
                     raise HyrfError(
                         f"{place}: photos or poses lie in this folder; name another, or write there with --overwrite"
                     )
-        for path in paths or [Path(folder, "file")]:
-            _check_place(path)
+        for place in places:
+            _check_place(place)
+        _check_names(paths)
 
     def _check(self, path: StrPath) -> None:
         """Refuse what is read, under whatever name, and what is no file."""
@@ -153,17 +156,22 @@ def _real(path: StrPath) -> Path:
         raise HyrfError(f"{path}: the place cannot be found ({error.strerror}); name a whole path") from error
 
 
-def _check_place(path: StrPath) -> None:
-    """Refuse a name that cannot be, and a place where no file can be made."""
-    place = _real(path)
-    for part in place.parts:
-        if len(os.fsencode(part)) > LONGEST_NAME:
-            raise HyrfError(f"{part[:40]}...: the name is longer than {LONGEST_NAME} bytes; shorten it")
-    if len(os.fsencode(place)) > LONGEST_PATH:
-        raise HyrfError(f"{str(place)[:40]}...: the path is longer than {LONGEST_PATH} bytes; shorten it")
-    above = next(folder for folder in place.parents if os.path.lexists(folder))
+def _check_names(paths: Iterable[StrPath]) -> None:
+    """Refuse names that cannot be."""
+    for path in map(os.path.abspath, paths):
+        for part in Path(path).parts:
+            if len(os.fsencode(part)) > LONGEST_NAME:
+                raise HyrfError(f"{part[:40]}...: the name is longer than {LONGEST_NAME} bytes; shorten it")
+        if len(os.fsencode(path)) > LONGEST_PATH:
+            raise HyrfError(f"{path[:40]}...: the path is longer than {LONGEST_PATH} bytes; shorten it")
+
+
+def _check_place(folder: Path) -> None:
+    """Refuse a folder that no file can be made in, or that cannot be made itself."""
+    place = _real(folder)
+    above = next(path for path in (place, *place.parents) if os.path.lexists(path))
     if not above.is_dir():
-        raise HyrfError(f"{path}: {above} is a file, no folder; name another place")
+        raise HyrfError(f"{folder}: {above} is a file, no folder; name another place")
     check_writable(above)
 
 

@@ -141,6 +141,17 @@ def test_what_cannot_be_written_is_told_before_the_work(name, words, tmp_path):
         Outputs().file(tmp_path / name, ".hyrf")
 
 
+def test_a_working_folder_that_was_removed_is_one_sentence(tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+
+    with pytest.raises(HyrfError, match="the place cannot be found"):
+        Outputs().file("small.hyrf")
+    with pytest.raises(HyrfError, match="the place cannot be found"):
+        Outputs().folder("pictures", ["0000.png"])
+
+
 @pytest.mark.skipif(not os.path.exists("/dev/null"), reason="there is no /dev/null")
 def test_devices_are_no_files():
     with pytest.raises(HyrfError, match="device or a pipe"):
