@@ -25,8 +25,12 @@ def write_atomic(path: str | os.PathLike[str], data: bytes | memoryview) -> None
 
     Of several writers at once the last one wins. Details and errors as `replacing`.
     """
-    with replacing(path, memoryview(data).nbytes) as temporary, open(temporary, "wb") as file:
-        file.write(data)
+    # The view is let go of in any case: that of a BytesIO, kept by the traceback of a failure, crashes Python 3.12.1
+    # when garbage is collected.
+    with memoryview(data) as view:
+        del data
+        with replacing(path, view.nbytes) as temporary, open(temporary, "wb") as file:
+            file.write(view)
 
 
 @contextmanager

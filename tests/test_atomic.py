@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import re
 import stat
@@ -253,6 +254,16 @@ def test_working_folder_that_was_removed_is_one_sentence(tmp_path, monkeypatch):
 
     with pytest.raises(HyrfError, match="model.hyrf: the file cannot be written .No such file or directory"):
         write_atomic("model.hyrf", b"new")
+
+
+def test_a_failed_write_lets_go_of_the_bytes(tmp_path):
+    buffer = io.BytesIO(b"new")
+
+    with pytest.raises(HyrfError) as kept:  # with its traceback, and what its frames hold
+        write_atomic(tmp_path, buffer.getbuffer())
+
+    buffer.close()  # BufferError while there is a view of it
+    assert kept.value
 
 
 def test_missing_folders_are_made(tmp_path):
