@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from hyrfpack import format as hyrf_format
-from hyrfpack.atomic import check_writable, write_atomic
+from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_float, check_int, check_type
 from hyrfpack.compress.run import Packer, Trial
 from hyrfpack.compress.search import coarsest
@@ -176,7 +176,7 @@ def distill_splats(
         HyrfError: the file cannot be written.
     """
     started = time.perf_counter()
-    check_writable(Path(target).parent)
+    Outputs(overwrite=True).file(target)
     weighted = Weighted.of(splats, name)
     original = Drawable.of(splats, weighted.frame)
     train, test = _cameras(weighted, original, config, cameras)

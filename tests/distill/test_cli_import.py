@@ -43,6 +43,11 @@ def test_import_learns_what_cameras_see_and_tells_numbers(source: Path, cameras:
     assert f"{numbers['psnr']:.2f} dB against the original" in words
 
 
+def test_import_makes_folders_that_are_missing(source: Path, tmp_path: Path) -> None:
+    succeeded("import", source, "-o", tmp_path / "not" / "yet" / "ball.hyrf", *QUICK)
+    assert (tmp_path / "not" / "yet" / "ball.hyrf").is_file()
+
+
 def test_import_refuses_in_one_sentence(source: Path, tmp_path: Path) -> None:
     target = tmp_path / "x.hyrf"
     assert "nothing.ply" in refused("import", tmp_path / "nothing.ply", "-o", target)

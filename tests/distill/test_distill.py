@@ -104,9 +104,11 @@ def test_cameras_that_look_away_are_one_sentence(tmp_path: Path) -> None:
         distill_splats(ball(20), tmp_path / "x.hyrf", LITTLE, cameras=[Camera(32, 32, 32, 32, 16, 16, pose)])
 
 
-def test_folder_that_is_missing_is_told_before_the_work(tmp_path: Path) -> None:
-    with pytest.raises(HyrfError, match="no file can be made in this folder"):
-        distill_splats(ball(20), tmp_path / "missing" / "x.hyrf", LITTLE)
+def test_folder_that_cannot_be_made_is_told_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    monkeypatch.setattr(run, "_cameras", lambda *arguments: pytest.fail("the work began"))
+    with pytest.raises(HyrfError, match="file is a file, no folder"):
+        distill_splats(ball(20), tmp_path / "file" / "x.hyrf", LITTLE)
 
 
 def test_interrupt_while_packing_leaves_the_file_that_was_there(
