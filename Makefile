@@ -39,37 +39,37 @@ test: lint $(PEERS) ## check style, then run all tests
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 
 test-newest: ## run the tests with the newest versions, on each Python that is here (6 GB and ten minutes each)
-	$(PYTHON) tools/versions.py newest
+	$(PYTHON) -m tools.safety.versions newest
 
 test-oldest: ## run the tests with the oldest versions that pyproject.toml allows, on Python 3.10
-	$(PYTHON) tools/versions.py oldest
+	$(PYTHON) -m tools.safety.versions oldest
 
 bench: $(READY) ## time each hot operation at several sizes against its references
-	$(BIN)/python tools/bench.py
+	$(BIN)/python -m tools.bench
 
 gpu: $(READY) ## check and measure the GPU kernels on this machine's GPU; results in docs/gpu/ (nine minutes at most)
-	$(BIN)/python tools/gpu_check.py
+	$(BIN)/python -m tools.gpu.check
 
 speed: $(READY) ## time beside error of every setting, on a small model; plot in runs/speed.png (two to four minutes)
 	$(BIN)/hyrfpack bench -o runs/speed.png
 
 sets: $(READY) ## train every real set for 1,000 steps and print the table (ten minutes)
-	$(BIN)/python tools/train_sets.py --steps 1000
+	$(BIN)/python -m tools.studies.train_sets --steps 1000
 
 choices: $(READY) ## the ablations behind the defaults (half an hour)
-	$(BIN)/python tools/design_choices.py
+	$(BIN)/python -m tools.studies.design_choices
 
 ablations: $(READY) ## what each part of the model is worth, beside the paper (under an hour)
-	$(BIN)/python tools/ablations.py
+	$(BIN)/python -m tools.studies.ablations
 
 precision: $(READY) ## the same training in float32 and in float64, whole and in parts (an hour)
-	$(BIN)/python tools/precision.py
+	$(BIN)/python -m tools.studies.precision
 
 kill: $(READY) ## kill the commands at random moments and check what is left (ten minutes)
-	$(BIN)/python tools/kill.py
+	$(BIN)/python -m tools.safety.kill
 
 fuzz: $(READY) ## feed the .hyrf reader a million hostile files (ten minutes)
-	$(BIN)/python tools/fuzz.py
+	$(BIN)/python -m tools.safety.fuzz
 
 lint: $(READY) ## check style only
 	$(BIN)/ruff check .

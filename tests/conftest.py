@@ -1,5 +1,5 @@
 """Shared fixtures: photos, programs under node. Tests may also import what lies beside this (`scenes`, tiny made-up
-worlds; `commands`), and `plans` of tools, which writes files of any profile."""
+worlds; `commands`), and what `tools` has."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,8 +20,6 @@ import pytest
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import torch
-
-sys.path += [str(Path(__file__).parent), str(Path(__file__).parents[1] / "tools")]
 
 # Without a GPU its kernels run in Triton's interpreter. Read once, when they are defined.
 os.environ.setdefault("TRITON_INTERPRET", "0" if torch.cuda.is_available() else "1")
@@ -50,7 +47,7 @@ def signals() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten small photos of the demo's scene, with poses; not to be changed."""
-    from hyrfpack.data.demo_scene import write_demo_scene
+    from hyrfpack.demo.scene import write_demo_scene
 
     return write_demo_scene(tmp_path_factory.mktemp("data"), views=10, size=48)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hyrfpack.distill import DistillConfig
-from hyrfpack.export.splats import Splats, normalized_quats
+from hyrfpack.splats.splats import Splats, normalized_quats
 
 LITTLE = DistillConfig(steps=6, size=24, train_views=6, test_views=2)
 

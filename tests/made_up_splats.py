@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
-from hyrfpack.export.splats import Splats, normalized_quats
+from hyrfpack.splats.splats import Splats, normalized_quats
 
 # Pieces of bytes that take the place of one, at fractions of a file; and how much of the file is left.
 EDITS = st.lists(st.tuples(st.floats(0, 0.999), st.binary(min_size=0, max_size=3)), min_size=1, max_size=4)

@@ -8,7 +8,7 @@ import pytest
 from scenes import small_model
 
 from hyrfpack.data import load_scene
-from hyrfpack.data.demo_scene import write_demo_scene
+from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.evaluate.figures import training_curve
 from hyrfpack.format import save

@@ -17,7 +17,7 @@ from pretend_gpu import pretended_gpu
 from scenes import ball_points, ball_scene, camera_at, small_model
 
 import hyrfpack
-from hyrfpack.data.demo_scene import write_demo_scene
+from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.model import HashGridConfig
 from hyrfpack.render import render
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer

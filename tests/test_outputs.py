@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from hyrfpack.data import load_scene
-from hyrfpack.data.demo_scene import write_demo_scene
+from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 from hyrfpack.train import TrainConfig, train

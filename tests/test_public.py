@@ -69,10 +69,10 @@ def test_sub_packages_can_be_imported_from_in_every_way():
     code = (
         "import hyrfpack.train.progress as progress, hyrfpack.train as t, hyrfpack.evaluate\n"
         "from hyrfpack.train import Trainer, progress as again\n"
-        "import hyrfpack.render.paths, sys\n"
+        "import hyrfpack.cameras.paths, sys\n"
         "assert progress is again is sys.modules['hyrfpack.train.progress'] is hyrfpack.train.progress\n"
         "assert t is hyrfpack.train is sys.modules['hyrfpack.train'].train\n"
-        "assert t.Trainer is Trainer and hyrfpack.render.paths.orbit\n"
+        "assert t.Trainer is Trainer and hyrfpack.cameras.paths.orbit\n"
         "progress.LOG_EVERY = 7\n"
         "assert hyrfpack.train.progress.LOG_EVERY == 7\n"
         "try: hyrfpack.nothing\n"

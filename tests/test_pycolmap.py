@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 from scenes import BALL_CENTERS, ball_scene, small_model
 
-from hyrfpack.export.splats import quaternion_of
+from hyrfpack.cameras.capture import capture_of
 from hyrfpack.format import save
-from hyrfpack.render.capture import capture_of
+from hyrfpack.splats.splats import quaternion_of
 
 ORDER = """
 import sys

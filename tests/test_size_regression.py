@@ -1,24 +1,20 @@
 """Bytes that fixed models take in each profile, held to within 1 % of what is recorded.
 
-python tests/test_size_regression.py        records the sizes anew (after a change that is meant to change them)
+python -m tests.test_size_regression     records the sizes anew (after a change that is meant to change them)
 """
 
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-sys.path.append(str(Path(__file__).parents[1] / "tools"))  # where it runs as a program
-
-from plans import encode
-
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
+from tools.safety.plans import encode
 
 RECORD = Path(__file__).parent / "golden" / "sizes.json"
 PROFILES = ("raw", "paper", "compact")

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from hyrfpack.bench.rows import Error, Row, difference, in_words
 from hyrfpack.bench.subject import Subject
-from hyrfpack.bench.timing import take_turns
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
@@ -24,6 +23,7 @@ from hyrfpack.format.compact import make_plan
 from hyrfpack.format.container import read_container
 from hyrfpack.format.info import SECTIONS
 from hyrfpack.format.metadata import read_metadata
+from hyrfpack.measure.timing import take_turns
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render
 

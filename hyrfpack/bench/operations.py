@@ -11,7 +11,7 @@ from torch import Tensor
 
 from hyrfpack.bench.rows import Row, difference, relative_difference, worst
 from hyrfpack.bench.subject import Subject
-from hyrfpack.bench.timing import take_turns
+from hyrfpack.measure.timing import take_turns
 from hyrfpack.model import HybridModel, viewpoint_of
 from hyrfpack.model.field import Field
 from hyrfpack.ops.hash_encode import hash_encode

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hyrfpack.bench.rows import Row, in_words
 from hyrfpack.bench.subject import Subject
-from hyrfpack.bench.timing import take_turns
+from hyrfpack.measure.timing import take_turns
 from hyrfpack.model import HybridModel
 from hyrfpack.render import RenderSettings, render
 

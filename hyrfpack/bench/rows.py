@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from hyrfpack.bench.timing import Ratio, Timing
 from hyrfpack.errors import HyrfError
+from hyrfpack.measure.timing import Ratio, Timing
 
 
 @dataclass(frozen=True)

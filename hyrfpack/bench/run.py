@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 
 from hyrfpack.bench.codec import codec_rows
-from hyrfpack.bench.machine import machine
 from hyrfpack.bench.operations import hash_encode_rows, mlp_rows, rasterize_rows
 from hyrfpack.bench.rendering import render_rows
 from hyrfpack.bench.rows import Row
 from hyrfpack.bench.subject import Subject, built_in_subject, read_subject
-from hyrfpack.bench.timing import ENOUGH_SECONDS
 from hyrfpack.checks import check_type
 from hyrfpack.errors import needs_package
+from hyrfpack.measure.machine import machine
+from hyrfpack.measure.timing import ENOUGH_SECONDS
 from hyrfpack.scene import Scene
 
 # What is measured, in order: functions of a subject, a number of repeats, and what to call with what was left out.

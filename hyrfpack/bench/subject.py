@@ -14,16 +14,16 @@ import torch
 from torch import Tensor
 
 from hyrfpack.bench.rows import difference
+from hyrfpack.cameras.capture import stored_cameras
+from hyrfpack.cameras.paths import orbit, stored_viewpoint
 from hyrfpack.compress.run import default_noise
 from hyrfpack.data import load_scene
-from hyrfpack.data.demo_scene import write_demo_scene
+from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.format import describe, load
 from hyrfpack.model import HybridModel
-from hyrfpack.render.capture import stored_cameras
-from hyrfpack.render.paths import orbit, stored_viewpoint
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 from hyrfpack.train import TrainConfig, train
 

@@ -6,11 +6,11 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from hyrfpack.bench.machine import machine_line
 from hyrfpack.bench.rows import Error, Row
 from hyrfpack.bench.run import BenchReport
-from hyrfpack.bench.timing import Timing
 from hyrfpack.errors import HyrfError
+from hyrfpack.measure.machine import machine_line
+from hyrfpack.measure.timing import Timing
 
 PARTS = {"codec": "error of each group of parameters", "rasterize": "error of each gradient"}
 END = "<!-- end -->"

@@ -59,8 +59,8 @@ def bench(
     from hyrfpack.bench import bench as measure
     from hyrfpack.bench import tables as words
     from hyrfpack.bench.figure import picture_format, plot
-    from hyrfpack.bench.machine import machine_line
     from hyrfpack.format import describe
+    from hyrfpack.measure.machine import machine_line
 
     picture_format(output)
     scene = None if data is None else read_scene(data, reading, describe(model))

@@ -142,7 +142,7 @@ def read_scene(path: Path, reading: dict[str, Any], model: dict | None = None) -
         if model is None:
             max_size = DEFAULT_MAX_SIZE
         else:
-            from hyrfpack.render.capture import stored_max_size
+            from hyrfpack.cameras.capture import stored_max_size
 
             max_size = stored_max_size(model)
         reading = {**reading, "max_size": max_size}

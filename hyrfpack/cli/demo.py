@@ -22,7 +22,7 @@ def demo(output: Path, steps: int, overwrite: bool, as_json: bool) -> None:
     Example:
       hyrfpack demo -o demo
     """
-    from hyrfpack.demo import FILES, run_demo
+    from hyrfpack.demo.run import FILES, run_demo
 
     Outputs(overwrite=overwrite).folder(output, FILES)
     result = run_demo(output, steps=steps, report=note)

@@ -72,8 +72,8 @@ def import_(
     """
     loose = source.parent if source.name == "meta.json" else source  # a SOG is a folder, or a file
     Outputs(source, cameras, folder=loose, overwrite=overwrite).file(output, ".hyrf")
+    from hyrfpack.cameras.camera_files import cameras_from_json
     from hyrfpack.distill import DistillConfig, distill
-    from hyrfpack.render.camera_files import cameras_from_json
 
     given = None if cameras is None else [camera for _, camera in cameras_from_json(cameras)]
     config = DistillConfig(steps=steps, psnr=psnr, size=size, seed=seed)

@@ -25,7 +25,7 @@ def view(model: Path, degree: int, port: int, host: str, no_browser: bool) -> No
       hyrfpack view bonsai.hyrf --port 8000 --no-browser
     """
     from hyrfpack.export.run import page_of
-    from hyrfpack.export.serve import serve
+    from hyrfpack.web.serve import serve
 
     note("making the page; press Ctrl-C to end")
     serve(lambda: page_of(model, degree), host=host, port=port, open_browser=not no_browser, say=click.echo)

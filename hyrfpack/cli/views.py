@@ -75,11 +75,11 @@ def render(
     """
     if sum(source is not None for source in (data, cameras, orbit)) > 1:
         raise click.UsageError("--data, --cameras and --orbit each say what to render; give one of them")
+    from hyrfpack.cameras.camera_files import cameras_from_json
+    from hyrfpack.cameras.paths import orbit as orbit_around
+    from hyrfpack.cameras.paths import stored_viewpoint
     from hyrfpack.format import describe, load
-    from hyrfpack.render.camera_files import cameras_from_json
     from hyrfpack.render.files import render_files, rendered_names
-    from hyrfpack.render.paths import orbit as orbit_around
-    from hyrfpack.render.paths import stored_viewpoint
     from hyrfpack.render.video import has_ffmpeg, write_video
 
     place = chosen_device(device)

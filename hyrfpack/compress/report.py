@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.atomic import write_atomic
-from hyrfpack.bench.machine import machine, machine_line
-from hyrfpack.bench.timing import take_turns
+from hyrfpack.cameras.capture import stored_cameras
 from hyrfpack.compress.report_page import FILES, PAGE, PLOT, SHOWN, Findings, Point, ShownView, page, picture_names
 from hyrfpack.compress.report_plot import draw
 from hyrfpack.compress.run import NOISE, default_noise
@@ -33,10 +32,11 @@ from hyrfpack.format.codec import (
 )
 from hyrfpack.format.compact import make_plan
 from hyrfpack.format.info import describe
+from hyrfpack.measure.machine import machine, machine_line
+from hyrfpack.measure.timing import take_turns
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
-from hyrfpack.render.capture import stored_cameras
 from hyrfpack.render.files import save_picture, to_image
 from hyrfpack.scene import Camera, Picture, Scene, View, evenly_spaced
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from hyrfpack.cameras.capture import stored_cameras
 from hyrfpack.checks import check_type
 from hyrfpack.compress.finetune import finetune
 from hyrfpack.compress.search import coarsest, finest
@@ -35,7 +36,6 @@ from hyrfpack.format.info import describe
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
-from hyrfpack.render.capture import stored_cameras
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 
 PSNR_DROP = 0.03  # dB that a file may cost, by estimate, unless told otherwise

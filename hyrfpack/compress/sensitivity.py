@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from hyrfpack.compress.views import views_between
+from hyrfpack.cameras.between import views_between
 from hyrfpack.format.arrays import GROUPS
 from hyrfpack.format.compact import Sensitivity
 from hyrfpack.model import HybridModel, expand

@@ -16,6 +16,7 @@ import torch
 
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
+from hyrfpack.cameras.paths import viewpoint_hint
 from hyrfpack.checks import check_float, check_int, check_type
 from hyrfpack.compress.run import Packer, Trial
 from hyrfpack.compress.search import coarsest
@@ -26,14 +27,13 @@ from hyrfpack.distill.teacher import light_of, likeness, teaching_scene
 from hyrfpack.distill.views import Weighted, viewpoints
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.export.bake import small_camera
-from hyrfpack.export.draw import Drawable
-from hyrfpack.export.files import read_splats
-from hyrfpack.export.splats import Splats
 from hyrfpack.format.codec import decode_model
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
-from hyrfpack.render.paths import viewpoint_hint
 from hyrfpack.scene import Camera, Scene, evenly_spaced
+from hyrfpack.splats.draw import Drawable
+from hyrfpack.splats.files import read_splats
+from hyrfpack.splats.splats import Splats
 from hyrfpack.train.config import LARGEST_SEED, DensityConfig, LearningRates, TrainConfig
 from hyrfpack.train.progress import ProgressLine
 from hyrfpack.train.trainer import Trainer

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from hyrfpack.export.draw import Drawable
-from hyrfpack.export.harmonics import BAND_0
 from hyrfpack.model import HashGridConfig, HybridModel, ModelConfig, viewpoint_of
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.hybrid import scale_bounds
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.scene import Camera
+from hyrfpack.splats.draw import Drawable
+from hyrfpack.splats.harmonics import BAND_0
 from hyrfpack.train.config import LearningRates
 from hyrfpack.train.optimizer import Optimizer
 

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from hyrfpack.evaluate.metrics import psnr
-from hyrfpack.export.draw import Drawable, draw, sent_light
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Camera, Picture, Scene, View
+from hyrfpack.splats.draw import Drawable, draw, sent_light
 
 LEAST_ALPHA = 1e-6  # below it a pixel has no colour of its own
 

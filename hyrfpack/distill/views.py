@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hyrfpack.cameras.paths import look_at
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.export.bake import small_camera
-from hyrfpack.export.draw import Drawable, draw
-from hyrfpack.export.splats import Splats
 from hyrfpack.model import Frame
-from hyrfpack.render.paths import look_at
 from hyrfpack.scene import Camera
+from hyrfpack.splats.draw import Drawable, draw
+from hyrfpack.splats.splats import Splats
 
 INSIDE = 0.01, 0.99  # of what is there, along each axis, the part that the frame's box spans
 LARGEST = 0.99  # of the splats' areas: what is larger counts as no larger

@@ -14,8 +14,6 @@ import torch
 from torch import Tensor
 
 from hyrfpack.export.bake import refuse_nonfinite, small_camera
-from hyrfpack.export.harmonics import BAND_0
-from hyrfpack.export.splats import Splats
 from hyrfpack.model import BACKGROUND_RADIUS, Frame, Geometry, HybridModel, viewpoint_of
 from hyrfpack.ops.background import pixel_directions, sphere_points
 from hyrfpack.ops.rasterize import rasterize
@@ -24,6 +22,8 @@ from hyrfpack.ops.shade import encode_directions
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
+from hyrfpack.splats.harmonics import BAND_0
+from hyrfpack.splats.splats import Splats
 
 # The sphere is a cube's six faces, each halved in both directions again and again: 2^level cells along a side.
 COARSEST, FINEST = 3, 9

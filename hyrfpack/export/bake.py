@@ -9,9 +9,6 @@ import torch
 from torch import Tensor
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.export.draw import sent_light
-from hyrfpack.export.harmonics import fibonacci_sphere, harmonics_basis, terms_of
-from hyrfpack.export.splats import Splats, normalized_quats
 from hyrfpack.model import Geometry, HybridModel, viewpoint_of
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import ALPHA_MIN
@@ -19,6 +16,9 @@ from hyrfpack.ops.shade import Shading, shade
 from hyrfpack.parallel.pool import run_tasks, torch_on_one_thread
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
+from hyrfpack.splats.draw import sent_light
+from hyrfpack.splats.harmonics import fibonacci_sphere, harmonics_basis, terms_of
+from hyrfpack.splats.splats import Splats, normalized_quats
 
 LONGEST_SIDE = 512  # pixels of the pictures in which light is measured
 SPHERE_DIRECTIONS = 32

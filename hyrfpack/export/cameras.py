@@ -13,8 +13,8 @@ import numpy as np
 
 from hyrfpack.atomic import replacing
 from hyrfpack.errors import needs_package
-from hyrfpack.export.splats import Splats
 from hyrfpack.scene import Camera, evenly_spaced
+from hyrfpack.splats.splats import Splats
 
 COLMAP_FILES = tuple(f"sparse/0/{table}.bin" for table in ("cameras", "frames", "images", "points3D", "rigs"))
 MAX_POINTS = 100_000  # in a COLMAP model: as many as a large reconstruction has

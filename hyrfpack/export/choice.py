@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.export.splats import Splats
+from hyrfpack.splats.splats import Splats
 
 
 def chosen(splats: Splats, crop: Sequence[float] | None = None, min_opacity: float = 0.0) -> Splats:

@@ -11,10 +11,10 @@ import numpy as np
 
 from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.export.cameras import COLMAP_FILES
-from hyrfpack.export.files import USD, WRITTEN
-from hyrfpack.export.formats import spz
-from hyrfpack.export.harmonics import MAX_DEGREE
 from hyrfpack.outputs import Outputs
+from hyrfpack.splats.files import USD, WRITTEN
+from hyrfpack.splats.formats import spz
+from hyrfpack.splats.harmonics import MAX_DEGREE
 
 PAGE, TRANSFORMS, COLMAP = ".html", ".json", ""
 POINTS = (".points.ply", ".points.glb")

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from hyrfpack.evaluate.metrics import psnr, to_8bit
-from hyrfpack.export.draw import Drawable, draw
-from hyrfpack.export.splats import Splats
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.background import pixel_directions
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, View
+from hyrfpack.splats.draw import Drawable, draw
+from hyrfpack.splats.splats import Splats
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError, needs_package
-from hyrfpack.export.formats.gltf import GLTF_UP, linear_colors
-from hyrfpack.export.placement import local_origin, local_positions, upright_rotation
-from hyrfpack.export.splats import Splats
 from hyrfpack.scene import Camera
+from hyrfpack.splats.formats.gltf import GLTF_UP, linear_colors
+from hyrfpack.splats.placement import local_origin, local_positions, upright_rotation
+from hyrfpack.splats.splats import Splats
 
 _CAMERA_COLOR = (255, 106, 0, 255)  # orange: rare in photos
 _DEPTH = 0.06  # of a frustum, in distances from camera to scene

@@ -18,18 +18,18 @@ from hyrfpack.export.background import background_picture, background_reach, bac
 from hyrfpack.export.bake import bake
 from hyrfpack.export.cameras import encode_transforms, write_colmap
 from hyrfpack.export.choice import chosen, kept_of
-from hyrfpack.export.files import decode_splats, encode_splats
-from hyrfpack.export.formats import spz
-from hyrfpack.export.harmonics import MAX_DEGREE
-from hyrfpack.export.html import decode_page, encode_page
 from hyrfpack.export.kinds import COLMAP, PAGE, POINTS, TRANSFORMS, check_place, check_reach, check_request, kind_of
 from hyrfpack.export.measure import Likeness, likeness
 from hyrfpack.export.points import encode_points
 from hyrfpack.export.source import Source
-from hyrfpack.export.splats import Splats, concatenate
 from hyrfpack.outputs import Outputs
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Scene, evenly_spaced
+from hyrfpack.splats.files import decode_splats, encode_splats
+from hyrfpack.splats.formats import spz
+from hyrfpack.splats.harmonics import MAX_DEGREE
+from hyrfpack.splats.splats import Splats, concatenate
+from hyrfpack.web.html import decode_page, encode_page
 
 PAGE_CAMERAS = 12  # that a page can be stepped through
 COARSE = 1.0  # dB of PSNR against photos that a format may cost before something is said about it

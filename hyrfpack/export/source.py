@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hyrfpack.cameras.capture import stored_cameras
+from hyrfpack.cameras.paths import look_at, orbit, stored_viewpoint
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.evaluate.metrics import stated_error
 from hyrfpack.format import describe, load
 from hyrfpack.model import HybridModel
-from hyrfpack.render.capture import stored_cameras
-from hyrfpack.render.paths import look_at, orbit, stored_viewpoint
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 
 FITTED = 256  # cameras at most that colours are fitted at: each takes memory and time

@@ -16,6 +16,8 @@ import torch
 
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
+from hyrfpack.cameras.capture import capture_of, max_size_of
+from hyrfpack.cameras.paths import viewpoint_hint
 from hyrfpack.checks import check_type
 from hyrfpack.data import PictureCache
 from hyrfpack.device import choose_device, describe_device
@@ -25,8 +27,6 @@ from hyrfpack.evaluate.figures import training_curve
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
-from hyrfpack.render.capture import capture_of, max_size_of
-from hyrfpack.render.paths import viewpoint_hint
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.progress import ProgressLine

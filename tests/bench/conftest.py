@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hyrfpack.bench import timing
+from hyrfpack.measure import timing
 
 
 @pytest.fixture(autouse=True)

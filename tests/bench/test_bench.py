@@ -11,7 +11,7 @@ import torch
 from scenes import ball_points, ball_scene, ring, small_model
 
 import hyrfpack
-from hyrfpack.bench import GROUPS, bench, operations, rendering, subject, timing
+from hyrfpack.bench import GROUPS, bench, operations, rendering, subject
 from hyrfpack.bench.codec import KNOBS, codec_rows, parameter_errors
 from hyrfpack.bench.operations import hash_encode_rows, mlp_rows, rasterize_rows
 from hyrfpack.bench.rendering import EXACT, SWEEPS, render_rows
@@ -21,6 +21,7 @@ from hyrfpack.format import encode_model, save
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.paper import PaperSettings
+from hyrfpack.measure import timing
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.rasterize import rasterize

@@ -12,10 +12,10 @@ from scenes import ball_points, small_model
 from hyrfpack.bench import GROUPS, BenchReport, Error, Row
 from hyrfpack.bench.figure import panels, plot
 from hyrfpack.bench.tables import fill, markdown, tables
-from hyrfpack.bench.timing import Ratio, Timing
 from hyrfpack.cli.bench import GROUPS as CHOICES
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import save
+from hyrfpack.measure.timing import Ratio, Timing
 
 
 def row(group, setting, value, ms=1.0, rms=1e-3, **more) -> Row:

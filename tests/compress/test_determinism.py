@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plans import drawn_plan, encode
 from scenes import small_model
 
 from hyrfpack.format import encode_model
 from hyrfpack.model import HybridModel
+from tools.safety.plans import drawn_plan, encode
 
 ROOT = Path(__file__).parents[2]
 COUNT = 3000
@@ -57,7 +57,7 @@ def test_compiled_kernels_and_numpy_write_the_same_bytes(blocked, tmp_path):
     model = a_model()
     plan = drawn_plan(model, layered=True)
     (tmp_path / "plan").write_bytes(pickle.dumps(plan))
-    paths = [str(Path(__file__).parent), str(ROOT / "tests"), str(ROOT / "tools"), str(ROOT)]
+    paths = [str(Path(__file__).parent), str(ROOT / "tests"), str(ROOT)]
     script = SCRIPT.format(paths=paths, blocked=blocked, plan=str(tmp_path / "plan"))
 
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=os.environ, check=False)

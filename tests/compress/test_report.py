@@ -12,13 +12,13 @@ from commands import succeeded
 from PIL import Image
 from scenes import ball_points, ball_scene, ring, small_model
 
+from hyrfpack.cameras.capture import capture_of
 from hyrfpack.compress import compress
 from hyrfpack.compress.report import amplification, write_report
 from hyrfpack.compress.report_page import size_in_words
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
 from hyrfpack.format import CompressionReport, load, save
-from hyrfpack.render.capture import capture_of
 from hyrfpack.scene import Scene
 
 MARKUP = "<script>alert(1)</script>&amp;.png"
@@ -68,7 +68,7 @@ def quick() -> Iterator[None]:
     """Here neither times need be fair nor sensitivities precise."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrfpack.compress.report.TURNS", 1)
-        patch.setattr("hyrfpack.bench.timing.WARM_SECONDS", 0.0)
+        patch.setattr("hyrfpack.measure.timing.WARM_SECONDS", 0.0)
         patch.setattr("hyrfpack.compress.sensitivity.MOST", 24)
         yield
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from scenes import ball_points, ring, small_model
 
+from hyrfpack.cameras.between import WIDER, views_between
 from hyrfpack.compress.sensitivity import measure_sensitivity
-from hyrfpack.compress.views import WIDER, views_between
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import GROUPS

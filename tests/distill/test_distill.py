@@ -12,8 +12,8 @@ from hyrfpack.distill import DistillConfig, distill_splats, run, teacher
 from hyrfpack.distill.teacher import likeness, teaching_scene
 from hyrfpack.distill.views import Weighted, viewpoints
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.export.draw import Drawable, draw
 from hyrfpack.scene import Camera
+from hyrfpack.splats.draw import Drawable, draw
 
 
 def test_report_says_what_is_in_the_file(tmp_path: Path) -> None:

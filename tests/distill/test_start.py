@@ -10,8 +10,8 @@ from hyrfpack.distill import start
 from hyrfpack.distill.start import initial_model, rotations
 from hyrfpack.distill.teacher import teaching_scene
 from hyrfpack.distill.views import Weighted, viewpoints
-from hyrfpack.export.draw import Drawable
-from hyrfpack.export.splats import Splats
+from hyrfpack.splats.draw import Drawable
+from hyrfpack.splats.splats import Splats
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 
 

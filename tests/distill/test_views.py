@@ -6,8 +6,8 @@ import numpy as np
 from explicit_balls import ball
 
 from hyrfpack.distill.views import CLUTTER, COVERED, DISTANCES, Weighted, coverage, viewpoints
-from hyrfpack.export.draw import Drawable
-from hyrfpack.export.splats import Splats, concatenate
+from hyrfpack.splats.draw import Drawable
+from hyrfpack.splats.splats import Splats, concatenate
 
 
 def seen(splats: Splats, count: int = 12, seed: int = 0):

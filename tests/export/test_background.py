@@ -8,11 +8,11 @@ from scenes import camera_at, ring, small_model
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.background import background_picture, background_splats, cell_centers, cells_of
 from hyrfpack.export.bake import bake
-from hyrfpack.export.draw import Drawable, draw
-from hyrfpack.export.splats import concatenate
 from hyrfpack.model import BACKGROUND_RADIUS, Frame
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Camera
+from hyrfpack.splats.draw import Drawable, draw
+from hyrfpack.splats.splats import concatenate
 
 POSITIONS = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 3))
 

@@ -9,11 +9,11 @@ from scenes import camera_at, ring, small_model
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.bake import LONGEST_SIDE, bake, small_camera
-from hyrfpack.export.draw import Drawable, draw
-from hyrfpack.export.harmonics import BAND_0, harmonics_basis
 from hyrfpack.model import Frame
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Camera
+from hyrfpack.splats.draw import Drawable, draw
+from hyrfpack.splats.harmonics import BAND_0, harmonics_basis
 
 POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (60, 3))
 ALL = RenderSettings(cull_tolerance=1e9)

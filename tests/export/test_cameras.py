@@ -12,8 +12,8 @@ from hyrfpack import atomic
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.cameras import encode_transforms, write_colmap
-from hyrfpack.export.splats import Splats
 from hyrfpack.scene import Camera
+from hyrfpack.splats.splats import Splats
 
 
 def cameras(count: int = 9, kinds: int = 1) -> list[tuple[str, Camera]]:

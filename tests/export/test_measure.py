@@ -12,8 +12,8 @@ from scenes import camera_at, ring, small_model, view_of
 from hyrfpack.export.background import background_picture
 from hyrfpack.export.bake import bake
 from hyrfpack.export.measure import _equirect_colors, likeness
-from hyrfpack.export.splats import Splats
 from hyrfpack.scene import Camera, Picture
+from hyrfpack.splats.splats import Splats
 
 POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
 CAMERAS = ring(3)

@@ -9,8 +9,8 @@ from scenes import look_at
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.export.points import encode_points
-from hyrfpack.export.splats import Splats
 from hyrfpack.scene import Camera
+from hyrfpack.splats.splats import Splats
 
 POSES = [look_at((0, -4, 1), (0, 0, 0)), look_at((3, 2, 1), (0, 0, 0))]
 CAMERAS = [Camera(64, 48, 60.0, 60.0, 30.0, 25.0, pose) for pose in POSES]

@@ -13,13 +13,13 @@ import trimesh
 from scenes import ball_scene, ring, small_model, view_of
 
 import hyrfpack
+from hyrfpack.cameras.capture import capture_of
+from hyrfpack.cameras.paths import viewpoint_hint
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
 from hyrfpack.export import ExportReport, export, run
 from hyrfpack.export.bake import bake
 from hyrfpack.export.choice import chosen
-from hyrfpack.export.files import USD, WRITTEN, decode_splats
-from hyrfpack.export.html import decode_page
 from hyrfpack.export.kinds import ENDINGS, kind_of
 from hyrfpack.export.measure import likeness
 from hyrfpack.export.run import page_of
@@ -27,9 +27,9 @@ from hyrfpack.export.source import Source
 from hyrfpack.format import load, save
 from hyrfpack.model import Frame
 from hyrfpack.render import render
-from hyrfpack.render.capture import capture_of
-from hyrfpack.render.paths import viewpoint_hint
 from hyrfpack.scene import Camera, Picture, Scene
+from hyrfpack.splats.files import USD, WRITTEN, decode_splats
+from hyrfpack.web.html import decode_page
 
 POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
 FOUR = ring(4)

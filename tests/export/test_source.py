@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scenes import ball_scene, ring, small_model
 
+from hyrfpack.cameras.capture import capture_of
+from hyrfpack.cameras.paths import viewpoint_hint
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.source import FEW, MEASURED, Source
 from hyrfpack.format import save
-from hyrfpack.render.capture import capture_of
-from hyrfpack.render.paths import viewpoint_hint
 from hyrfpack.scene import Camera, Scene
 
 POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (20, 3))

@@ -14,13 +14,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plans import drawn_plan, encode
 
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import decode_model, describe, encode_model, load, repack, save
 from hyrfpack.format.container import Section, read_container, write_container
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
+from tools.safety.plans import drawn_plan, encode
 
 PROFILES = ("raw", "paper", "compact")
 

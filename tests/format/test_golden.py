@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from make_golden import FILES as GOLDEN_FILES
-from plans import encode
 
 from hyrfpack.format import describe, load, metadata
 from hyrfpack.model import Frame, HashGridConfig, ModelConfig
+from tools.safety.make_golden import FILES as GOLDEN_FILES
+from tools.safety.plans import encode
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 FILES = sorted(GOLDEN.glob("*.hyrf"))

@@ -8,10 +8,8 @@ import zlib
 from dataclasses import replace
 from pathlib import Path
 
-import minimal_reader
 import numpy as np
 import pytest
-from plans import encode
 from scenes import small_model
 
 from hyrfpack.errors import HyrfFormatError
@@ -20,6 +18,8 @@ from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.compact import plan
 from hyrfpack.format.container import read_container, write_container
 from hyrfpack.quant.integers import encode_integers
+from tools.safety import minimal_reader
+from tools.safety.plans import encode
 
 GOLDEN = sorted((Path(__file__).parents[1] / "golden").glob("*.hyrf"))
 PROFILES = ("raw", "paper", "compact")

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plans import encode
 from scenes import small_model
 
 from hyrfpack.errors import HyrfFormatError
@@ -23,6 +22,7 @@ from hyrfpack.format.compact import plan
 from hyrfpack.format.container import Container, Section, read_container, write_container
 from hyrfpack.format.metadata import Metadata, read_metadata
 from hyrfpack.model import HybridModel
+from tools.safety.plans import encode
 
 GROUPS = ("POSI", "COLO", "SCAL", "OPAC")
 FIELDS = ("GTAB", "RTAB", "GMLP", "RMLP")

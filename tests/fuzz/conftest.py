@@ -1,17 +1,14 @@
-"""Makes the forger of tools/fuzz_mutate.py, and the scene folders of tests/data, at hand."""
+"""Makes the scene folders of tests/data at hand."""
 
 from __future__ import annotations
 
 import runpy
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 TESTS = Path(__file__).parents[1]
-
-sys.path.append(str(TESTS.parent / "tools"))
 
 
 @pytest.fixture(scope="module")

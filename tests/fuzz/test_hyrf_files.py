@@ -1,4 +1,4 @@
-"""Hostile `.hyrf` files: a corpus of them, and a taste of what tools/fuzz.py makes by the million.
+"""Hostile `.hyrf` files: a corpus of them, and a taste of what tools/safety/fuzz.py makes by the million.
 
 `corpus/bugs` holds one file for each defect that was found, `corpus/sentences` one for each complaint of the reader,
 both named after what they are about.
@@ -17,15 +17,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fuzz import allowance, check_file, check_model, decode
-from fuzz_mutate import GROUPS, KINDS, assemble, disassemble, mutant, seeds
-from plans import even_plan
 from scenes import small_model
 
 from hyrfpack.cli.files import info
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import encode_model, repack
 from hyrfpack.format.info import SECTIONS
+from tools.safety.fuzz import allowance, check_file, check_model, decode
+from tools.safety.fuzz_mutate import GROUPS, KINDS, assemble, disassemble, mutant, seeds
+from tools.safety.plans import even_plan
 
 CORPUS = Path(__file__).parent / "corpus"
 

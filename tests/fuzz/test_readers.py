@@ -23,17 +23,17 @@ import pycolmap
 import pytest
 import torch
 import trimesh
-from fuzz_mutate import EXTREMES, HOSTILE_JSON, edit_bytes, places
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from hyrfpack.cameras.camera_files import cameras_from_json
+from hyrfpack.cameras.paths import frame_viewpoint, orbit
 from hyrfpack.data import load_scene
 from hyrfpack.data.pictures import read_header, read_pixels
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.render.camera_files import cameras_from_json
-from hyrfpack.render.paths import frame_viewpoint, orbit
 from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
+from tools.safety.fuzz_mutate import EXTREMES, HOSTILE_JSON, edit_bytes, places
 
 numbers = st.integers(0, 2**32 - 1).map(Random)  # hypothesis chooses the seed: mutants are cheap, and small already
 search = settings(max_examples=150, deadline=None)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from plans import drawn_plan, even_plan
 from scenes import ball_points, ring, small_model
 
 from hyrfpack import compress, load, save
@@ -13,6 +12,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.container import read_container
 from hyrfpack.model import HybridModel
+from tools.safety.plans import drawn_plan, even_plan
 
 STEP = 2.0**-10
 WIDEST = STEP * 16 / 15  # of the steps that `even_plan` may come to

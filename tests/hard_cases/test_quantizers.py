@@ -12,7 +12,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plans import even_plan
 from scenes import camera_at, small_model
 
 from hyrfpack.errors import HyrfError
@@ -33,6 +32,7 @@ from hyrfpack.quant import (
 )
 from hyrfpack.quant.huffman import MAX_LENGTH
 from hyrfpack.render import render
+from tools.safety.plans import even_plan
 
 LARGEST = float(np.finfo(np.float32).max)
 SMALLEST = 2.0**-149

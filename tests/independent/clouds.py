@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import astuple, dataclass, replace
 
 import numpy as np
-import peers_formats
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
-from hyrfpack.export.splats import Splats
+from hyrfpack.splats.splats import Splats
+from tools.studies import peers_formats
 
 TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0])  # by 180 degrees: from SPZ's axes (right, up, back) to those of a PLY
 KINDS = 24

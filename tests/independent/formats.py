@@ -7,10 +7,10 @@ from dataclasses import astuple, dataclass, replace
 from functools import partial
 
 import numpy as np
-from clouds import BAND_0, EXACT, Differences
+from independent.clouds import BAND_0, EXACT, Differences
 
-from hyrfpack.export.formats import gltf, ply, sog, splat, spz
-from hyrfpack.export.splats import Splats
+from hyrfpack.splats.formats import gltf, ply, sog, splat, spz
+from hyrfpack.splats.splats import Splats
 
 UP = np.array([0.36, -0.8, 0.48])  # of the made-up cloud, for glTF and USD
 BYTE = 0.5 / 255 * 1.01  # half a step, and float32

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from clouds import (
+from independent.clouds import (
     EXACT,
     TURN_ABOUT_X,
     cloud_of_ours,
@@ -17,9 +17,9 @@ from clouds import (
     ply_of,
     turned_back,
 )
-from formats import LOOSEST
+from independent.formats import LOOSEST
 
-from hyrfpack.export.splats import Splats
+from hyrfpack.splats.splats import Splats
 
 
 def test_the_same_cloud_in_another_order_with_other_quaternions_is_no_different():

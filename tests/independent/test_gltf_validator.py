@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from clouds import made_up
-from formats import FORMATS
+from independent.clouds import made_up
+from independent.formats import FORMATS
 
 # What it says of an extension that it does not know, by where.
 UNKNOWN = {

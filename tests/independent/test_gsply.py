@@ -12,13 +12,22 @@ from unittest.mock import patch
 
 import numba
 import numpy as np
-import peers_formats
 import pytest
-from clouds import TURN_ABOUT_X, Cloud, cloud_of_ours, cloud_of_ply, differences, made_up, ply_of, turned_back
-from formats import COMPRESSED_PLY, FORMATS, SPZ
+from independent.clouds import (
+    TURN_ABOUT_X,
+    Cloud,
+    cloud_of_ours,
+    cloud_of_ply,
+    differences,
+    made_up,
+    ply_of,
+    turned_back,
+)
+from independent.formats import COMPRESSED_PLY, FORMATS, SPZ
 from PIL import Image
 
-from hyrfpack.export.files import decode_splats
+from hyrfpack.splats.files import decode_splats
+from tools.studies import peers_formats
 
 if TYPE_CHECKING:
     from gsply import GSData

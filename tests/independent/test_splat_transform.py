@@ -8,11 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from clouds import cloud_of_ours, cloud_of_ply, differences, made_up, ply_of
-from formats import COMPRESSED_PLY, FORMATS, SOG, SPZ
-from peers_formats import read_ply, write_ply
+from independent.clouds import cloud_of_ours, cloud_of_ply, differences, made_up, ply_of
+from independent.formats import COMPRESSED_PLY, FORMATS, SOG, SPZ
 
-from hyrfpack.export.files import decode_splats
+from hyrfpack.splats.files import decode_splats
+from tools.studies.peers_formats import read_ply, write_ply
 
 READ = ("ply", "splat", "spz3", "spz4", "sog")
 

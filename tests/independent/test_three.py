@@ -6,10 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from clouds import BAND_0, TURN_ABOUT_X, Cloud, Differences, cloud_of_ours, differences, made_up, turned_back
-from formats import BYTE, FORMATS, UP
+from independent.clouds import (
+    BAND_0,
+    TURN_ABOUT_X,
+    Cloud,
+    Differences,
+    cloud_of_ours,
+    differences,
+    made_up,
+    turned_back,
+)
+from independent.formats import BYTE, FORMATS, UP
 
-from hyrfpack.export.formats import gltf
+from hyrfpack.splats.formats import gltf
 
 # three.js keeps colours and harmonics as bytes, whatever the file holds.
 ROUNDING = Differences(0, 0, 1e-6, BYTE, color=0.02, harmonic=BYTE / BAND_0)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clouds import EXACT, Cloud, cloud_of, cloud_of_ours, differences, made_up
-from formats import UP
+from independent.clouds import EXACT, Cloud, cloud_of, cloud_of_ours, differences, made_up
+from independent.formats import UP
 from scipy.spatial.transform import Rotation
 
 from hyrfpack.scene import Camera
@@ -18,7 +18,7 @@ pytest.importorskip("pxr", reason="usd-core is not installed")
 
 from pxr import Usd, UsdGeom
 
-from hyrfpack.export.formats import usd
+from hyrfpack.splats.formats import usd
 
 KINDS = ("usda", "usdc", "usdz")
 TEXT_IS_SLOW = "UsdAsciiPerformanceChecker"  # the validator would rather have .usdc, whatever the text says

@@ -20,8 +20,8 @@ from multiprocessing import get_context
 from pathlib import Path
 import numpy as np, torch
 import hyrfpack
-from hyrfpack.data.demo_scene import write_demo_scene
-from hyrfpack.render.capture import capture_of
+from hyrfpack.demo.scene import write_demo_scene
+from hyrfpack.cameras.capture import capture_of
 from scenes import ball_scene, small_model
 
 warnings.filterwarnings("ignore", "This process .* is multi-threaded", DeprecationWarning)

@@ -17,7 +17,7 @@ import triton.language as tl
 from torch import Tensor
 
 from hyrfpack.ops.background.reference import RADIUS, grid_size
-from hyrfpack.ops.gpu_words import unpack
+from hyrfpack.ops.gpu_pairs import unpack
 from hyrfpack.ops.hash_encode.gpu import axis_vertices, level_numbers, vertex_row, whole_rows
 from hyrfpack.ops.mlp.tiles import factor, precision, product, relu_factor
 from hyrfpack.ops.shade.directions import viewpoint_of

@@ -18,7 +18,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyrfpack.ops.gpu_words import unpack
+from hyrfpack.ops.gpu_pairs import unpack
 from hyrfpack.ops.hash_encode.reference import PRIME_Y, PRIME_Z, level_offsets
 
 # One point a thread: no value changes threads on its way to a fetch or an atomic, and 32 registers let every thread

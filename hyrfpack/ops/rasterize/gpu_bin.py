@@ -14,7 +14,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyrfpack.ops.gpu_words import unpack
+from hyrfpack.ops.gpu_pairs import unpack
 from hyrfpack.ops.rasterize.gpu_ellipse import TILE, ellipse, tile_columns, tile_rows
 from hyrfpack.ops.rasterize.gpu_project import (
     COVARIANCE,

@@ -12,7 +12,7 @@ import math
 import triton
 import triton.language as tl
 
-from hyrfpack.ops.gpu_words import pack
+from hyrfpack.ops.gpu_pairs import pack
 from hyrfpack.ops.rasterize import reference
 from hyrfpack.ops.rasterize.gpu_ellipse import EXPONENT_MIN, TILE
 from hyrfpack.ops.rasterize.gpu_project import (

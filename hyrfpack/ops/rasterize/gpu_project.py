@@ -16,7 +16,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyrfpack.ops.gpu_words import pack
+from hyrfpack.ops.gpu_pairs import pack
 from hyrfpack.ops.rasterize import reference
 from hyrfpack.ops.rasterize.gpu_ellipse import TILE, UNIT, ellipse, tile_columns, tile_rows
 from hyrfpack.ops.shade.directions import viewpoint_of

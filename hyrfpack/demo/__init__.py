@@ -1,0 +1,1 @@
+"""The built-in scene, and the round through everything on it."""

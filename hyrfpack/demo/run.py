@@ -1,0 +1,181 @@
+"""Everything once, on a scene made on the spot: photos, training, compression, decompression, rendering, scores."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from hyrfpack.compress import compress
+from hyrfpack.data import load_scene
+from hyrfpack.demo.scene import write_demo_scene
+from hyrfpack.evaluate import evaluate
+from hyrfpack.evaluate.figures import comparison, contact_sheet
+from hyrfpack.evaluate.metrics import psnr, to_8bit
+from hyrfpack.export import ExportReport, export
+from hyrfpack.format import load, repack
+from hyrfpack.model import HybridModel
+from hyrfpack.render import render
+from hyrfpack.render.files import render_files, save_picture
+from hyrfpack.scene import Scene, evenly_spaced
+from hyrfpack.train import TrainConfig, train
+
+DRAWN_VIEWS = 4
+SCENE, RUN, RENDERS, PAGE, PICTURE, BACK = "scene", "run", "renders", "demo.html", "demo.png", "back.hyrf"
+PACKED = {profile: f"{profile}.hyrf" for profile in ("paper", "compact")}
+FILES = (  # what a demo leaves, one of each kind
+    PICTURE,
+    PAGE,
+    BACK,
+    *PACKED.values(),
+    f"{SCENE}/transforms.json",
+    f"{SCENE}/images/0000.png",
+    f"{RUN}/model.hyrf",
+    f"{RENDERS}/0000.png",
+)
+
+
+@dataclass(frozen=True)
+class ProfileResult:
+    """One profile of the demo's model, measured on the decoded file.
+
+    Attributes:
+        profile: "raw", "paper" or "compact".
+        psnr, ssim: means over the held-out views.
+        bytes: on disk.
+        compress_seconds: reading the trained file and writing this one, for "compact" with the measuring; None for the
+            file that training wrote.
+        decompress_seconds: reading this file and writing it as raw.
+    """
+
+    profile: str
+    psnr: float
+    ssim: float
+    bytes: int
+    compress_seconds: float | None
+    decompress_seconds: float
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What a demo came to.
+
+    Attributes:
+        steps, gaussians: of the training.
+        train_seconds: its time, kernels compiled on the way included.
+        frames_per_second: one over the median time to render a held-out view from the compact file.
+        profiles: raw, paper, compact.
+        picture: path of the picture that shows it.
+        page: what the page that shows it in a browser takes, and how like the compact file it looks.
+    """
+
+    steps: int
+    gaussians: int
+    train_seconds: float
+    frames_per_second: float
+    profiles: list[ProfileResult]
+    picture: Path
+    page: ExportReport
+
+    def table(self) -> list[str]:
+        """The profiles as lines of aligned text, then the speed."""
+        lines = ["profile  PSNR (dB)    SSIM       bytes  compress (s)  decompress (s)"]
+        for p in self.profiles:
+            there = "-" if p.compress_seconds is None else f"{p.compress_seconds:.2f}"
+            back = f"{p.decompress_seconds:.2f}"
+            lines.append(f"{p.profile:<7}  {p.psnr:9.2f}  {p.ssim:.4f}  {p.bytes:10,}  {there:>12}  {back:>14}")
+        rate = self.steps / self.train_seconds
+        return [*lines, f"{rate:.0f} training steps/s, {self.frames_per_second:.0f} rendered frames/s"]
+
+    def to_dict(self) -> dict:
+        """Plain numbers, strings, lists and dictionaries, ready for JSON."""
+        return {**asdict(self), "picture": str(self.picture)}
+
+
+def run_demo(
+    folder: str | os.PathLike[str],
+    *,
+    steps: int = 3000,
+    views: int = 60,
+    size: int = 200,
+    report: Callable[[str], None] = lambda sentence: None,
+) -> DemoResult:
+    """Make a scene, train on it, compress, decompress, render, score, export, and draw one picture of it.
+
+    Leaves in `folder`: `scene/` (photos and poses), `run/` (the training), `paper.hyrf`, `compact.hyrf`, `back.hyrf`
+    (compact.hyrf decompressed), `renders/` (held-out views from compact.hyrf), `demo.html` (compact.hyrf in a browser)
+    and `demo.png`. Earlier results are replaced.
+
+    Args:
+        folder: made if missing.
+        steps: of the training.
+        views, size: how many photos, and their width and height in pixels.
+        report: called with a sentence before each part.
+
+    Raises:
+        HyrfError: something cannot be written.
+    """
+    folder = Path(folder)
+    report(f"making a scene of {views} photos")
+    write_demo_scene(folder / SCENE, views=views, size=size)
+    scene = load_scene(folder / SCENE)
+    report(f"training {steps:,} steps on {len(scene.train)} photos, {len(scene.test)} held out")
+    trained = train(scene, folder / RUN, TrainConfig(steps=steps), overwrite=True)
+    if trained.model is None:
+        raise KeyboardInterrupt
+
+    report("compressing, decompressing and scoring")
+    back, profiles = folder / BACK, []
+    for profile in ("raw", *PACKED):
+        path, compress_seconds = trained.model, None
+        if profile != "raw":
+            path = folder / PACKED[profile]
+            compress_seconds = _seconds(lambda path=path, profile=profile: compress(trained.model, path, profile))
+        decompress_seconds = _seconds(lambda path=path: repack(path, back))
+        scores = evaluate(load(back), scene.test)
+        stored = path.stat().st_size
+        profiles.append(ProfileResult(profile, scores.psnr, scores.ssim, stored, compress_seconds, decompress_seconds))
+
+    report("rendering held-out views")
+    model = load(path)
+    for _ in render_files(model, [(view.name, view.camera) for view in scene.test], folder / RENDERS):
+        pass
+    report("making a page for the browser")
+    page = export(path, folder / PAGE, data=scene)
+    result = DemoResult(
+        steps=steps,
+        gaussians=len(model),
+        train_seconds=trained.metrics["seconds"],
+        frames_per_second=1 / scores.seconds_per_frame,
+        profiles=profiles,
+        picture=folder / PICTURE,
+        page=page,
+    )
+    save_picture(result.picture, _draw(model, scene, result))
+    return result
+
+
+@torch.no_grad()
+def _draw(model: HybridModel, scene: Scene, result: DemoResult) -> Image.Image:
+    """The demo's picture: held-out views of the compact file under the table."""
+    decoded = model.decode()
+    solid = np.array(model.config.solid, np.float32)
+    rows = []
+    for view in evenly_spaced(scene.test, DRAWN_VIEWS):
+        photo = torch.from_numpy(view.load().composite(solid))
+        image = to_8bit(render(model, view.camera, decoded=decoded).rgb)
+        rows.append(comparison(photo, image, caption=f"{view.name}   {psnr(image, photo):.2f} dB"))
+    title = f"hyrfpack demo: {result.gaussians:,} Gaussians, {result.steps:,} steps in {result.train_seconds:.0f} s"
+    return contact_sheet(rows, title, result.table())
+
+
+def _seconds(action: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    action()
+    return time.perf_counter() - start

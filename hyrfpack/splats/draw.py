@@ -1,0 +1,120 @@
+"""Splats drawn by our own rasteriser, as `hyrfpack.render` draws models: what files of other programs look like."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyrfpack.model import Frame, viewpoint_of
+from hyrfpack.ops.rasterize import Rasterization, rasterize
+from hyrfpack.ops.rasterize.cull import frustum_cull
+from hyrfpack.parallel.pool import torch_on_one_thread
+from hyrfpack.render import RenderSettings
+from hyrfpack.scene import Camera
+from hyrfpack.splats.harmonics import harmonics_basis
+from hyrfpack.splats.splats import Splats
+
+
+@dataclass(frozen=True)
+class Drawable:
+    """Splats ready to be drawn many times: float32 tensors in the local units of a frame.
+
+    Attributes:
+        frame: whose local units these are; near planes follow it.
+        positions (N, 3), scales (N, 3), quats (N, 4) wxyz, opacities (N,), harmonics (N, K, 3): as in Splats.
+        antialiased: as in Splats.
+    """
+
+    frame: Frame
+    positions: Tensor
+    scales: Tensor
+    quats: Tensor
+    opacities: Tensor
+    harmonics: Tensor
+    antialiased: bool
+
+    @classmethod
+    def of(cls, splats: Splats, frame: Frame) -> Drawable:
+        """Bring splats to the local units of a frame."""
+        return cls(
+            frame,
+            torch.from_numpy(frame.to_local(splats.positions).astype(np.float32)),
+            torch.from_numpy(splats.scales / np.float32(frame.scale)),
+            torch.from_numpy(splats.quats),
+            torch.from_numpy(splats.opacities),
+            torch.from_numpy(splats.harmonics),
+            splats.antialiased,
+        )
+
+    @property
+    def degree(self) -> int:
+        """Of the spherical harmonics."""
+        return round(self.harmonics.shape[1] ** 0.5) - 1
+
+    def colors_from(self, viewpoint: Tensor, index: Tensor) -> Tensor:
+        """Colours (n, 3), not cut, of the splats at `index` (n,), seen from `viewpoint` (3,) local units."""
+        directions = torch.nn.functional.normalize(self.positions[index] - viewpoint, dim=-1, eps=1e-12)
+        return torch.einsum("nk,nkc->nc", harmonics_basis(directions, self.degree), self.harmonics[index]) + 0.5
+
+
+@torch_on_one_thread()
+@torch.no_grad()
+def draw(
+    drawable: Drawable,
+    camera: Camera,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+) -> Rasterization:
+    """Draw splats as a camera sees them, over black; `transmittance` of the result says what lies behind.
+
+    Args:
+        drawable: what to draw.
+        camera: from where, in world units.
+        settings: near plane (local units), culling and transmittance as in `hyrfpack.render`.
+    """
+    pose = torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32)
+    size = camera.intrinsics, camera.width, camera.height
+    index = frustum_cull(drawable.positions, pose, *size, settings.near, settings.cull_tolerance)
+    return rasterize(
+        drawable.positions[index],
+        drawable.quats[index],
+        drawable.scales[index],
+        drawable.opacities[index],
+        drawable.colors_from(viewpoint_of(pose), index).clamp_min(0),
+        pose,
+        *size,
+        near=settings.near,
+        antialiased=drawable.antialiased,
+        transmittance_min=settings.transmittance_min,
+    )
+
+
+def sent_light(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    camera: Camera,
+    pose: Tensor,
+    antialiased: bool,
+) -> Tensor:
+    """The light (N,) that each Gaussian sends to a picture, in pixels: the sum of T alpha.
+
+    A picture is the sum of T alpha color, so this is the derivative of its summed pixels by the Gaussians' colours.
+
+    Args:
+        means, quats, scales, opacities: as in `rasterize`, local units; all are drawn.
+        camera: its size and intrinsics count.
+        pose: (4, 4) its camera_from_local.
+        antialiased: as in `rasterize`.
+    """
+    size = camera.intrinsics, camera.width, camera.height
+    with torch.enable_grad():
+        colors = torch.zeros_like(means, requires_grad=True)
+        how = {"near": RenderSettings().near, "antialiased": antialiased}
+        raster = rasterize(means, quats, scales, opacities, colors, pose, *size, **how)
+        if not raster.rgb.requires_grad:  # nothing is drawn
+            return means.new_zeros(len(means))
+        return torch.autograd.grad(raster.rgb[..., 0].sum(), colors)[0][:, 0]

@@ -1,0 +1,74 @@
+"""The .splat format of antimatter15's viewer: 32 bytes a Gaussian and nothing else.
+
+    position   3 float32
+    scale      3 float32, linear
+    colour     4 bytes: red, green, blue as 0.5 + Y00 k of the harmonics k of degree 0, and the opacity, all times 255
+    rotation   4 bytes: quaternion wxyz, q * 128 + 128
+
+Little-endian. Higher harmonics cannot be stored: colours are the same from all sides.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.splats.formats.checked import checked_splats
+from hyrfpack.splats.harmonics import BAND_0
+from hyrfpack.splats.splats import Splats
+
+_RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
+
+
+def encode(splats: Splats) -> bytes:
+    """Splats as a .splat file, without their higher harmonics and `antialiased`.
+
+    Gaussians come in the order of opacity times volume, largest first (equal ones as they were): viewers draw the file
+    while it loads, and so the first bytes show the most.
+
+    Raises:
+        HyrfDataError: a position is too large for float32.
+    """
+    if np.abs(splats.positions).max(initial=0) > np.finfo(np.float32).max:
+        raise HyrfDataError("a Gaussian lies farther from the origin than .splat's numbers reach; move the scene there")
+    order = np.argsort(-splats.opacities * np.prod(splats.scales, axis=1, dtype=np.float64), kind="stable")
+    colors = splats.base_colors
+    records = np.empty(len(splats), _RECORD)
+    records["position"] = splats.positions[order]
+    records["scale"] = splats.scales[order]
+    records["color"] = _to_bytes(np.column_stack((colors, splats.opacities)) * 255)[order]
+    records["rotation"] = _to_bytes(splats.quats * 128 + 128)[order]
+    return records.tobytes()
+
+
+def decode(data: bytes, name: str) -> Splats:
+    """Splats of a .splat file.
+
+    Args:
+        data: the file.
+        name: what messages call it.
+
+    Raises:
+        HyrfDataError: its length is no multiple of 32, or a number is not finite, or a scale negative.
+    """
+    if len(data) % _RECORD.itemsize:
+        raise HyrfDataError(
+            f"{name}: {len(data):,} bytes are no whole number of Gaussians of 32 bytes; this is no .splat file, or it "
+            "is truncated"
+        )
+    records = np.frombuffer(data, _RECORD)
+    if (records["scale"] < 0).any():
+        raise HyrfDataError(f"{name}: a scale is negative; this is no .splat file, or it is damaged")
+    colors = records["color"] / np.float32(255)
+    return checked_splats(
+        name,
+        records["position"],
+        records["scale"],
+        (records["rotation"] - np.float32(128)) / 128,
+        colors[:, 3],
+        (colors[:, None, :3] - 0.5) / BAND_0,
+    )
+
+
+def _to_bytes(values: np.ndarray) -> np.ndarray:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)

@@ -1,0 +1,137 @@
+"""Splats: explicit 3D Gaussians as the files of other programs hold them. Numpy; knows nothing of models."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hyrfpack.splats.harmonics import BAND_0, MAX_DEGREE, harmonics_rotation, terms_of
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Explicit 3D Gaussians (3D Gaussian Splatting, Kerbl et al. 2023) in world units, activated.
+
+    A Gaussian seen along the unit vector d, from the camera to its centre, has the display-referred sRGB colour
+
+        max(0, 0.5 + sum_k harmonics_k Y_k(d))
+
+    with the basis Y of `hyrfpack.splats.harmonics`.
+
+    Attributes:
+        positions: (N, 3) float64.
+        scales: (N, 3) float32 standard deviations along the rotated axes, >= 0.
+        quats: (N, 4) float32 wxyz, unit length.
+        opacities: (N,) float32 in [0, 1].
+        harmonics: (N, (degree + 1)^2, 3) float32, degree 0 to 3.
+        antialiased: opacities are meant to be compensated for the rasteriser's low-pass filter (Mip-Splatting).
+
+    Raises:
+        ValueError: shapes do not fit together, or a number is not finite or out of its range.
+    """
+
+    positions: np.ndarray
+    scales: np.ndarray
+    quats: np.ndarray
+    opacities: np.ndarray
+    harmonics: np.ndarray
+    antialiased: bool = False
+
+    def __post_init__(self) -> None:
+        count = len(self.positions)
+        shapes = {"positions": (count, 3), "scales": (count, 3), "quats": (count, 4), "opacities": (count,)}
+        shapes["harmonics"] = (count, terms_of(self.degree), 3)
+        for name, shape in shapes.items():
+            values = getattr(self, name)
+            if values.shape != shape:
+                raise ValueError(f"{name} has shape {values.shape}; {shape} is needed")
+            with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused; NaN may signal
+                values = np.ascontiguousarray(values, np.float64 if name == "positions" else np.float32)
+            if not np.isfinite(values).all():
+                raise ValueError(f"{name} must be finite")
+            object.__setattr__(self, name, values)
+        if not 0 <= self.degree <= MAX_DEGREE:
+            raise ValueError(f"the harmonics have degree {self.degree}; 0 to {MAX_DEGREE} are known")
+        if (self.scales < 0).any() or not ((self.opacities >= 0) & (self.opacities <= 1)).all():
+            raise ValueError("scales must not be negative, and opacities lie in [0, 1]")
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def __getitem__(self, index: np.ndarray | slice) -> Splats:
+        """Those at `index`: integers, booleans or a slice."""
+        names = ("positions", "scales", "quats", "opacities", "harmonics")
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
+
+    @property
+    def degree(self) -> int:
+        """Of the spherical harmonics."""
+        return round(self.harmonics.shape[1] ** 0.5) - 1
+
+    @property
+    def base_colors(self) -> np.ndarray:
+        """(N, 3) float32 colours of degree 0, what directions have in common, cut to [0, 1]."""
+        return np.clip(0.5 + np.float32(BAND_0) * self.harmonics[:, 0], 0, 1)
+
+    def with_degree(self, degree: int) -> Splats:
+        """The same with harmonics cut, or filled up with zeros, to another degree."""
+        terms = terms_of(degree)
+        harmonics = self.harmonics[:, :terms]
+        missing = ((0, 0), (0, terms - harmonics.shape[1]), (0, 0))
+        return replace(self, harmonics=np.pad(harmonics, missing))
+
+    def rotated(self, rotation: np.ndarray) -> Splats:
+        """Turned about the origin: positions, axes and colours.
+
+        Args:
+            rotation: (3, 3) proper rotation R; a point x comes to R x.
+        """
+        turn = quaternion_of(rotation)
+        quats = _multiply(turn, self.quats.astype(np.float64))
+        harmonics = np.einsum("jk,nkc->njc", harmonics_rotation(rotation, self.degree), self.harmonics)
+        return replace(self, positions=self.positions @ np.asarray(rotation).T, quats=quats, harmonics=harmonics)
+
+
+def concatenate(parts: Sequence[Splats]) -> Splats:
+    """All splats of the parts, one after the other, at the highest degree among them. `antialiased` as the first."""
+    degree = max(part.degree for part in parts)
+    same = [part.with_degree(degree) for part in parts]
+    names = ("positions", "scales", "quats", "opacities", "harmonics")
+    return replace(same[0], **{name: np.concatenate([getattr(part, name) for part in same]) for name in names})
+
+
+def normalized_quats(quats: np.ndarray) -> np.ndarray:
+    """Quaternions (N, 4) wxyz to unit length and w >= 0, float32; those without length become no rotation."""
+    quats = np.array(quats, np.float64)
+    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+    quats = np.where(lengths > 0, quats / np.where(lengths > 0, lengths, 1), [1.0, 0.0, 0.0, 0.0])
+    return np.where(quats[:, :1] < 0, -quats, quats).astype(np.float32)
+
+
+def quaternion_of(rotation: np.ndarray) -> np.ndarray:
+    """(4,) float64 wxyz, unit length and w >= 0, of a proper rotation (3, 3)."""
+    r = np.asarray(rotation, np.float64)
+    # Its outer product with itself: the column of the largest diagonal entry has no cancellation.
+    outer = np.empty((4, 4))
+    outer[0, 0] = 1 + r[0, 0] + r[1, 1] + r[2, 2]
+    outer[1, 1] = 1 + r[0, 0] - r[1, 1] - r[2, 2]
+    outer[2, 2] = 1 - r[0, 0] + r[1, 1] - r[2, 2]
+    outer[3, 3] = 1 - r[0, 0] - r[1, 1] + r[2, 2]
+    outer[0, 1] = outer[1, 0] = r[2, 1] - r[1, 2]
+    outer[0, 2] = outer[2, 0] = r[0, 2] - r[2, 0]
+    outer[0, 3] = outer[3, 0] = r[1, 0] - r[0, 1]
+    outer[1, 2] = outer[2, 1] = r[0, 1] + r[1, 0]
+    outer[1, 3] = outer[3, 1] = r[0, 2] + r[2, 0]
+    outer[2, 3] = outer[3, 2] = r[1, 2] + r[2, 1]
+    quat = outer[np.argmax(np.diagonal(outer))]
+    quat = quat / np.linalg.norm(quat)
+    return -quat if quat[0] < 0 else quat
+
+
+def _multiply(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Hamilton products (N, 4) of a quaternion (4,) and quaternions (N, 4), wxyz."""
+    w, v = first[0], first[1:]
+    s, u = second[:, :1], second[:, 1:]
+    return np.concatenate((w * s - u @ v[:, None], w * u + s * v + np.cross(v, u)), axis=1)

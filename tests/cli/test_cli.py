@@ -1,0 +1,434 @@
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from commands import hyrfpack, refused, succeeded
+from PIL import Image
+
+from hyrfpack.cli.files import DEFAULT_PROFILE, PROFILES
+from hyrfpack.cli.train import PRESETS, train
+from hyrfpack.demo.scene import write_demo_scene
+from hyrfpack.format import load
+
+COMMANDS = (
+    "train",
+    "compress",
+    "decompress",
+    "render",
+    "evaluate",
+    "info",
+    "bench",
+    "demo",
+    "export",
+    "view",
+    "import",
+)
+
+
+def python(code: str) -> subprocess.CompletedProcess:
+    """Run code in a fresh interpreter that finds this package."""
+    root = str(Path(__file__).parents[2])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+
+
+@pytest.fixture(scope="module")
+def run(data, tmp_path_factory) -> Path:
+    """A run of 30 steps on ten small pictures."""
+    folder = tmp_path_factory.mktemp("runs") / "tiny"
+    result = succeeded("train", data, "-o", folder, "--steps", 30, "--max-gaussians", 500, "--json")
+    assert json.loads(result.stdout)["complete"] is True
+    return folder
+
+
+@pytest.fixture(scope="module")
+def packed(run, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("packed") / "paper.hyrf"
+    succeeded("compress", run / "model.hyrf", "-o", path, "--profile", "paper")
+    return path
+
+
+# -- the whole chain -------------------------------------------------------------------------------------------------
+
+
+def test_train_leaves_a_model_metrics_and_pictures(run):
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["settings"]["steps"] == 30 and metrics["settings"]["max_gaussians"] == 500
+    assert metrics["bytes"] == (run / "model.hyrf").stat().st_size
+    assert {path.name for path in (run / "views").iterdir()} == {"0000.png", "0008.png"}
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_compress_reports_the_bytes_on_disk(profile, run, tmp_path):
+    arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--profile", profile, "--json")
+    report = json.loads(succeeded(*arguments).stdout)
+    assert report["profile"] == profile and report["file"] == str(tmp_path / "p.hyrf")
+    assert report["bytes_after"] == (tmp_path / "p.hyrf").stat().st_size <= (run / "model.hyrf").stat().st_size
+    assert sum(section["after"] for section in report["sections"]) < report["bytes_after"]
+
+
+def test_compact_is_the_default_and_smaller_than_the_paper_profile(run, packed, tmp_path):
+    report = json.loads(succeeded("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--json").stdout)
+    assert report["profile"] == "compact" and report["bytes_after"] < 0.7 * packed.stat().st_size
+    assert report["error"] > 0 and sum(report["shares"].values()) == pytest.approx(1)
+
+
+def test_compress_prints_every_section_and_what_it_costs(run, tmp_path):
+    printed = succeeded("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf").stdout
+    words = ("positions", "geometry hash table", "radiance decoder", "padding", "bits/Gaussian", "bits/number")
+    for word in (*words, "of the loss", "estimated loss"):
+        assert word in printed
+
+
+def test_compress_with_photos_says_what_was_lost_on_those_held_out(run, data, tmp_path):
+    arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--overwrite", "--data", data)
+    scores = [
+        json.loads(succeeded("evaluate", path, "--data", data, "--json").stdout)
+        for path in (run / "model.hyrf", tmp_path / "p.hyrf")
+        if succeeded(*arguments)
+    ]
+    report = json.loads(succeeded(*arguments, "--json").stdout)
+    assert (report["psnr_before"], report["psnr"]) == pytest.approx([score["psnr"] for score in scores])
+    assert (report["ssim_before"], report["ssim"]) == pytest.approx([score["ssim"] for score in scores])
+    assert "held-out photos: PSNR" in succeeded(*arguments).stdout
+
+
+def test_compress_keeps_to_a_target_size(run, tmp_path):
+    whole = json.loads(succeeded("compress", run / "model.hyrf", "-o", tmp_path / "w.hyrf", "--json").stdout)
+    target = int(0.8 * whole["bytes_after"])
+    arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--target-size")
+    report = json.loads(succeeded(*arguments, f"{target / 1000}kB", "--json").stdout)
+    assert 0.9 * target < report["bytes_after"] <= target
+    assert f"of {target:,} bytes" in report["found"]
+
+
+def test_compress_fits_the_quantised_model_to_the_photos_and_keeps_every_gaussian_if_told(run, data, tmp_path):
+    arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--data", data, "--json")
+    report = json.loads(succeeded(*arguments, "--finetune", 3, "--no-prune").stdout)
+    assert report["gaussians"] == len(load(run / "model.hyrf"))
+    assert report["psnr"] > 12
+
+
+def test_the_last_line_says_what_became_of_the_numbers(run, tmp_path):
+    raw, paper = (
+        succeeded(
+            "compress", run / "model.hyrf", "-o", tmp_path / f"{profile}.hyrf", "--profile", profile
+        ).stdout.splitlines()
+        for profile in ("raw", "paper")
+    )
+    assert re.search("bytes, [0-9,]+ Gaussians, every number as float32$", raw[-1])
+    assert "times smaller than as float32" in paper[-1]
+
+
+def test_decompress_of_a_raw_file_is_byte_exact(run, tmp_path):
+    succeeded("decompress", run / "model.hyrf", "-o", tmp_path / "back.hyrf")
+    assert (tmp_path / "back.hyrf").read_bytes() == (run / "model.hyrf").read_bytes()
+
+
+def test_decompressed_files_score_like_the_file_they_come_from(packed, data, tmp_path):
+    succeeded("decompress", packed, "-o", tmp_path / "back.hyrf")
+    scores = [
+        json.loads(succeeded("evaluate", path, "--data", data, "--json").stdout)
+        for path in (packed, tmp_path / "back.hyrf")
+    ]
+    assert scores[0]["views"] == scores[1]["views"]
+    assert scores[0]["bytes"] == packed.stat().st_size != scores[1]["bytes"]
+
+
+def test_evaluate_prints_strict_json_only(packed, data):
+    result = succeeded("evaluate", packed, "--data", data, "--json")
+    values = json.loads(result.stdout, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    assert {"psnr", "ssim", "lpips", "bytes", "gaussians", "views", "seconds_per_frame"} <= set(values)
+    assert [view["name"] for view in values["views"]] == ["0000.png", "0008.png"]
+    assert values["lpips"] is None and values["lpips_reason"]
+    assert values["psnr"] > 12
+
+
+def test_evaluate_scores_the_split_that_is_named(packed, data):
+    values = json.loads(succeeded("evaluate", packed, "--data", data, "--split", "all", "--json").stdout)
+    assert len(values["views"]) == 10
+    held_out = json.loads(succeeded("evaluate", packed, "--data", data, "--test-every", 5, "--json").stdout)
+    assert [view["name"] for view in held_out["views"]] == ["0000.png", "0005.png"]
+
+
+def test_evaluate_prints_a_table_and_writes_pictures(packed, data, tmp_path):
+    printed = succeeded("evaluate", packed, "--data", data, "--pictures", tmp_path / "views").stdout
+    assert "0008.png" in printed and "mean" in printed and "LPIPS: no weights" in printed
+    assert len(list((tmp_path / "views").iterdir())) == 2
+
+
+def test_info_tells_what_the_file_holds_and_why(packed):
+    facts = json.loads(succeeded("info", packed, "--json").stdout)
+    assert facts["profile"] == "paper" and facts["bytes"] == packed.stat().st_size
+    assert facts["provenance"]["choices"]["preset"]
+    printed = succeeded("info", packed).stdout
+    for words in (f"{facts['bytes']:,} bytes", "profile paper", "chosen in training", "preset", "radiance hash table"):
+        assert words in printed
+
+
+def test_render_names_pictures_after_photos(packed, data, tmp_path):
+    succeeded("render", packed, "-o", tmp_path, "--data", data, "--split", "test")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0000.png", "0008.png"]
+    assert Image.open(tmp_path / "0008.png").size == (48, 48)
+
+
+def test_render_goes_around_the_scene_by_itself(packed, tmp_path):
+    result = json.loads(succeeded("render", packed, "-o", tmp_path, "--orbit", 3, "--depth", "--json").stdout)
+    assert [Path(path).name for path in result["pictures"]] == ["0000.png", "0001.png", "0002.png"]
+    assert np.asarray(Image.open(tmp_path / "0001.depth.tiff")).max() > 0.1
+    assert np.asarray(Image.open(tmp_path / "0001.png")).std() > 5
+
+
+def test_render_takes_cameras_from_a_file(packed, tmp_path):
+    camera = {"name": "left/eye", "width": 20, "height": 10, "fx": 15, "camera_from_world": np.eye(4).tolist()}
+    (tmp_path / "cameras.json").write_text(json.dumps([camera]))
+    succeeded("render", packed, "-o", tmp_path / "out", "--cameras", tmp_path / "cameras.json")
+    assert Image.open(tmp_path / "out" / "left" / "eye.png").size == (20, 10)
+
+
+def test_video_without_ffmpeg_is_a_note_beside_the_pictures(packed, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    result = succeeded("render", packed, "-o", tmp_path / "out", "--orbit", 2, "--video", "--json")
+    assert json.loads(result.stdout)["video"] is None
+    assert "no ffmpeg" in result.stderr
+    assert len(list((tmp_path / "out").iterdir())) == 2
+
+
+@pytest.mark.usefixtures("signals")
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ((), "the same command with --resume goes on"),
+        (("--overwrite",), "with --resume instead of --overwrite goes on"),
+    ],
+    ids=["new", "overwriting"],
+)
+def test_an_interrupted_training_saves_exits_with_1_and_says_how_to_go_on(options, told, data, tmp_path):
+    before = signal.getsignal(signal.SIGINT)
+
+    def interrupt_once_training_listens():
+        while signal.getsignal(signal.SIGINT) is before:
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt_once_training_listens, daemon=True).start()
+    result = hyrfpack("train", data, "-o", tmp_path, "--steps", 1_000_000, "--max-gaussians", 200, "--json", *options)
+    assert result.exit_code == 1 and isinstance(result.exception, SystemExit)
+    assert json.loads(result.stdout)["complete"] is False
+    assert told in result.stderr
+    assert (tmp_path / "checkpoint.pt").is_file() and not (tmp_path / "model.hyrf").exists()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_demo_ends_with_a_table_and_a_picture(tmp_path):
+    from hyrfpack.demo.run import run_demo
+
+    result = run_demo(tmp_path, steps=10, views=10, size=32)
+    assert Image.open(tmp_path / "demo.png").width > 900
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "scene", "run", "paper.hyrf", "compact.hyrf", "back.hyrf", "renders", "demo.html", "demo.png",
+    }  # fmt: skip
+    assert [profile.profile for profile in result.profiles] == ["raw", "paper", "compact"]
+    assert [profile.bytes for profile in result.profiles] == [
+        (tmp_path / name).stat().st_size for name in ("run/model.hyrf", "paper.hyrf", "compact.hyrf")
+    ]
+    assert result.gaussians == len(load(tmp_path / "compact.hyrf"))
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(
+            load(tmp_path / "back.hyrf").parameters(), load(tmp_path / "compact.hyrf").parameters(), strict=True
+        )
+    )
+    json.dumps(result.to_dict(), allow_nan=False)
+    assert len(result.table()) == 5
+
+
+# -- what users get wrong --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("info", "none.hyrf"),
+        ("info", "."),
+        ("info", "junk.hyrf"),
+        ("compress", "none.hyrf", "-o", "x.hyrf"),
+        ("compress", "junk.hyrf", "-o", "x.hyrf"),
+        ("decompress", "junk.hyrf", "-o", "x.hyrf"),
+        ("render", "junk.hyrf", "-o", "out"),
+        ("render", "none.hyrf", "-o", "out", "--orbit", "2"),
+        ("evaluate", "none.hyrf", "--data", "."),
+        ("train", "nowhere", "-o", "run"),
+        ("train", "junk.hyrf", "-o", "run"),
+        ("train", "empty", "-o", "run"),
+        ("train", "data", "-o", "run", "--resume"),
+    ],
+)
+def test_a_wrong_input_is_one_sentence_that_names_it(arguments, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "junk.hyrf").write_bytes(b"no model at all" * 20)
+    (tmp_path / "empty").mkdir()
+    if "data" in arguments:
+        write_demo_scene(tmp_path / "data", views=9, size=16)
+    sentence = refused(*arguments)
+    assert sentence.removeprefix("Error: ").startswith("run" if "--resume" in arguments else arguments[1])
+    assert not any((tmp_path / name).exists() for name in ("x.hyrf", "out", "run"))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("train", "data"),
+        ("train", "data", "-o", "run", "--steps", "0"),
+        ("train", "data", "-o", "run", "--preset", "huge"),
+        ("train", "data", "-o", "run", "--seed", str(2**64)),
+        ("import", "a.ply", "-o", "b.hyrf", "--seed", str(2**64)),
+        ("train", "data", "-o", "run", "--resume", "--overwrite"),
+        ("compress", "a.hyrf", "-o", "b.hyrf", "--profile", "zip"),
+        ("render", "a.hyrf", "-o", "out", "--orbit", "3", "--data", "d"),
+        ("evaluate", "a.hyrf"),
+        ("fly", "away"),
+    ],
+)
+def test_wrong_usage_exits_with_2(arguments):
+    refused(*arguments)
+
+
+# What `compress` is asked on the command line, and what it answers.
+REFUSED_OPTIONS = {
+    "fine-tuning without photos": (("--finetune", 5), "need photos; name their folder with --data"),
+    "a loss without photos": (("--max-psnr-drop", 0.1), "need photos; name their folder with --data"),
+    "two aims": (("--data", "DATA", "--target-size", "20kB", "--max-psnr-drop", 0.1), "give one of them"),
+    "photos for the paper profile": (("--data", "DATA", "--profile", "paper"), "profile 'paper' has no settings"),
+    "a size for the raw profile": (("--target-size", "1MB", "--profile", "raw"), "profile 'raw' has no settings"),
+    "too small a size": (("--target-size", "900"), "does not fit into 900 bytes"),
+    "photos that are not there": (("--data", "nowhere"), "nowhere"),
+    "a gain": (("--data", "DATA", "--max-psnr-drop", "-1"), "--max-psnr-drop"),
+    "no step": (("--data", "DATA", "--finetune", 0), "--finetune"),
+    "words for a size": (("--target-size", "small"), "'small' is no size"),
+    "no size": (("--target-size", "0"), "'0' is no size"),
+    "a size of nothing": (("--target-size", "0.0001kB"), "is no size"),
+    "a negative size": (("--target-size", "-5kB"), "is no size"),
+    "two points": (("--target-size", "1.2.3MB"), "is no size"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED_OPTIONS)
+def test_options_of_compress_that_cannot_be_met_are_one_sentence(case, run, data, tmp_path):
+    options, words = REFUSED_OPTIONS[case]
+    (tmp_path / "old.hyrf").write_bytes(b"old")
+    options = [data if option == "DATA" else option for option in options]
+    assert words in refused("compress", run / "model.hyrf", "-o", tmp_path / "old.hyrf", "--overwrite", *options)
+    assert (tmp_path / "old.hyrf").read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_second_training_does_not_overwrite_the_first(run, data):
+    before = (run / "model.hyrf").read_bytes()
+    assert "--overwrite" in refused("train", data, "-o", run, "--steps", 5)
+    assert (run / "model.hyrf").read_bytes() == before
+
+
+@pytest.mark.parametrize("command", ["compress", "decompress"])
+def test_the_output_may_not_be_the_input(command, packed, tmp_path):
+    before = packed.read_bytes()
+    (tmp_path / "link.hyrf").symlink_to(packed)
+    for target in (packed, packed.parent / ".." / packed.parent.name / packed.name, tmp_path / "link.hyrf"):
+        assert "input itself" in refused(command, packed, "-o", target)
+        assert "input itself" in refused(command, packed, "-o", target, "--overwrite")
+    assert packed.read_bytes() == before
+
+
+def test_a_failed_command_leaves_the_old_file_alone(packed, tmp_path):
+    damaged = bytearray(packed.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    (tmp_path / "damaged.hyrf").write_bytes(damaged)
+    (tmp_path / "old.hyrf").write_bytes(b"old")
+    assert "damaged" in refused("decompress", tmp_path / "damaged.hyrf", "-o", tmp_path / "old.hyrf", "--overwrite")
+    assert (tmp_path / "old.hyrf").read_bytes() == b"old"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["damaged.hyrf", "old.hyrf"]
+
+
+def test_an_output_folder_that_is_missing_is_made(packed, tmp_path):
+    succeeded("decompress", packed, "-o", tmp_path / "not" / "yet" / "there.hyrf")
+    assert (tmp_path / "not" / "yet" / "there.hyrf").is_file()
+
+
+def test_pictures_cannot_go_into_a_file(packed, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    refused("render", packed, "-o", tmp_path / "file", "--orbit", 1)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_an_empty_split_and_missing_weights_are_named(packed, data, tmp_path):
+    assert "split 'test'" in refused("evaluate", packed, "--data", data, "--test-every", 0)
+    assert "none.pt" in refused("evaluate", packed, "--data", data, "--lpips-weights", tmp_path / "none.pt")
+
+
+def test_a_bug_of_ours_keeps_its_traceback(packed, monkeypatch):
+    def broken(path):
+        raise ValueError("a bug")
+
+    monkeypatch.setattr("hyrfpack.format.describe", broken)
+    result = hyrfpack("info", packed)
+    assert result.exit_code == 1
+    assert isinstance(result.exception, ValueError) and result.exc_info[2] is not None
+
+
+# -- help, defaults, imports -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself_with_an_example(command):
+    text = succeeded(command, "--help").stdout
+    assert "Example" in text and f"hyrfpack {command}" in text
+
+
+def test_all_commands_are_listed():
+    text = succeeded("--help").stdout
+    assert all(f"\n  {command}" in text for command in COMMANDS)
+
+
+def test_command_line_offers_what_the_library_has():
+    from hyrfpack.format import codec
+    from hyrfpack.train import config
+
+    assert PRESETS == config.PRESETS
+    assert (PROFILES, DEFAULT_PROFILE) == (tuple(codec.PROFILES), codec.DEFAULT_PROFILE)
+    defaults = config.TrainConfig().to_dict()
+    options = {option.name: option.default for option in train.params if option.name in defaults}
+    assert {"steps", "seed", "preset", "max_gaussians", "antialiased", "background", "log2_table_size"} <= set(options)
+    with train.make_context("train", ["data", "-o", "run"]) as context:
+        assert {name: context.params[name] for name in options} == {name: defaults[name] for name in options}
+
+
+def test_importing_the_package_or_the_command_line_loads_no_numerics():
+    code = "import hyrfpack, hyrfpack.cli, sys; print({'torch', 'numpy', 'numba', 'PIL', 'rich'} & set(sys.modules))"
+    assert python(code).stdout.strip() == "set()"
+
+
+def test_info_loads_no_numerics(packed):
+    code = (
+        "import sys; from hyrfpack.cli import main\n"
+        f"main(['info', {str(packed)!r}, '--json'], standalone_mode=False)\n"
+        "assert not {'torch', 'numpy', 'matplotlib', 'PIL', 'rich'} & set(sys.modules)"
+    )
+    result = python(code)
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["profile"] == "paper"
+
+
+def test_the_module_runs_as_a_program():
+    root = Path(__file__).parents[2]
+    result = subprocess.run([sys.executable, "-m", "hyrfpack", "--version"], capture_output=True, text=True, cwd=root)
+    assert result.returncode == 0 and result.stdout.startswith("hyrfpack")

@@ -1,0 +1,296 @@
+"""Disk full, over the whole command line: one sentence, exit code 2, old files as they were, no half file, no litter.
+
+A full disk is a tmpfs of this test's own where mounting is allowed, and everywhere a limit on the size of a file
+(ulimit -f), which stops a write in the middle in the same way.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import io
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import hyrfpack
+from PIL import Image
+from scenes import ball_scene
+
+from hyrfpack import format as hyrf_format
+from hyrfpack.data import PictureCache
+from hyrfpack.errors import HyrfError
+from hyrfpack.train import TrainConfig, Trainer, train
+
+resource = pytest.importorskip("resource", reason="limits and mounts are of Unix")
+STEPS = ("--steps", 20, "--max-gaussians", 500)
+PICTURE = re.compile(r"\.(png|tiff)$")
+
+
+@contextmanager
+def file_limit(size: int) -> Iterator[None]:
+    """No file of this process may grow past `size` bytes."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.fixture
+def disk(tmp_path) -> Iterator[Path]:
+    """A disk of 8 MiB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=8m", "none", str(folder)], capture_output=True, text=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip(f"a disk cannot be mounted here ({mounted.stderr.strip()})")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def fill(disk: Path, leave: int) -> Path:
+    """Put a file on the disk that leaves `leave` bytes; returns it."""
+    ballast = disk / "ballast"
+    ballast.write_bytes(bytes(shutil.disk_usage(disk).free - leave))
+    return ballast
+
+
+def files_in(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def run(data, tmp_path_factory) -> Path:
+    """A training that nothing disturbs; it also compiles the kernels, whose cache the limits below would hit."""
+    folder = tmp_path_factory.mktemp("runs") / "tiny"
+    assert hyrfpack("train", data, "-o", folder, *STEPS).exit_code == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def packed(run, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("packed") / "packed.hyrf"
+    assert hyrfpack("compress", run / "model.hyrf", "-o", path).exit_code == 0
+    return path
+
+
+# Command -> what it is asked, given data, the trained model, the packed one, and its output folder.
+WRITERS = {
+    "train": lambda data, model, packed, out: ("train", data, "-o", out, "--overwrite", *STEPS),
+    "compress": lambda data, model, packed, out: ("compress", model, "-o", out / "model.hyrf", "--overwrite"),
+    "decompress": lambda data, model, packed, out: ("decompress", packed, "-o", out / "model.hyrf", "--overwrite"),
+    "render": lambda data, model, packed, out: ("render", packed, "-o", out, "--orbit", 2, "--overwrite"),
+    "render depth": lambda data, model, packed, out: (
+        "render",
+        packed,
+        "-o",
+        out,
+        "--orbit",
+        2,
+        "--depth",
+        "--overwrite",
+    ),
+    "evaluate": lambda data, model, packed, out: ("evaluate", packed, "--data", data, "--pictures", out, "--overwrite"),
+    "demo": lambda data, model, packed, out: ("demo", "-o", out, "--overwrite", "--steps", 2),
+}
+
+
+def check_refusal(result, out: Path, before: dict[str, bytes], reason: str) -> None:
+    assert result.exit_code == 2, result.output
+    assert result.stdout == "" and "Traceback" not in result.stderr
+    (sentence,) = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
+    assert sentence.startswith(f"Error: {out}") and reason in sentence
+    assert files_in(out) == before
+
+
+def old_outputs(out: Path) -> dict[str, bytes]:
+    """Files of an earlier run under every name that a command here writes."""
+    names = ("model.hyrf", "metrics.json", "curve.png", "views/0000.png", "0000.png", "0000.depth.tiff")
+    for name in names:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_bytes(f"old {name}".encode())
+    (out / "scene" / "images").mkdir(parents=True)
+    (out / "scene" / "images" / "0000.png").write_bytes(b"old photo")
+    return files_in(out)
+
+
+@pytest.mark.parametrize("command", WRITERS)
+def test_full_disk_is_one_sentence_and_the_old_files_stay(command, data, run, packed, disk):
+    out = disk / "out"
+    before = old_outputs(out)
+    fill(disk, leave=0)
+
+    result = hyrfpack(*WRITERS[command](data, run / "model.hyrf", packed, out))
+
+    check_refusal(result, out, before, "the disk is full and this file was not written; free ")
+
+
+@pytest.mark.parametrize("command", WRITERS)
+def test_file_limit_is_one_sentence_and_the_old_files_stay(command, data, run, packed, tmp_path):
+    before = old_outputs(tmp_path)
+    arguments = WRITERS[command](data, run / "model.hyrf", packed, tmp_path)
+
+    with file_limit(1000):
+        result = hyrfpack(*arguments)
+
+    check_refusal(result, tmp_path, before, "so large a file is not allowed here (see 'ulimit -f')")
+
+
+@pytest.mark.parametrize("command", WRITERS)
+def test_read_only_disk_is_one_sentence(command, data, run, packed, disk):
+    out = disk / "out"
+    before = old_outputs(out)
+    subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+
+    result = hyrfpack(*WRITERS[command](data, run / "model.hyrf", packed, out))
+
+    check_refusal(result, out, before, "(Read-only file system); choose another place")
+    assert "step" not in result.stderr  # training is refused before it starts
+
+
+def test_disk_that_fills_while_rendering_keeps_the_whole_pictures(packed, disk):
+    size = 256 * 256 // 4
+    fill(disk, leave=8 * size)
+
+    result = hyrfpack("render", packed, "-o", disk / "out", "--orbit", 100)
+
+    assert result.exit_code == 2 and "the disk is full" in result.stderr
+    left = sorted((disk / "out").iterdir())
+    assert 1 <= len(left) < 100 and all(PICTURE.search(path.name) for path in left)
+    for path in left:
+        Image.open(path).load()
+
+
+# -- training --------------------------------------------------------------------------------------------------------
+
+
+def test_training_goes_on_without_checkpoints_that_do_not_fit(data, run, tmp_path):
+    """The model fits on the disk and the checkpoint, three times as large, does not."""
+    size = (run / "model.hyrf").stat().st_size
+    with file_limit(2 * size):
+        result = hyrfpack("train", data, "-o", tmp_path, *STEPS)
+
+    assert result.exit_code == 0, result.output
+    told = [line for line in result.stderr.splitlines() if "training goes on, without the checkpoint of step" in line]
+    assert len(told) == 19 and all(line.startswith(f"{tmp_path / 'checkpoint.pt'}: ") for line in told)
+    assert (tmp_path / "model.hyrf").read_bytes() == (run / "model.hyrf").read_bytes()
+    assert {path.name for path in tmp_path.iterdir()} == {"model.hyrf", "metrics.json", "curve.png", "views"}
+
+
+CONFIG = TrainConfig(steps=40, seed=1, max_gaussians=120)
+
+
+def balls(before_load=lambda count: None):
+    """Six views whose photos call `before_load` with how many were loaded so far."""
+    scene, count = ball_scene(views=6, points=60, side=24), [0]
+
+    def watched(view):
+        def load():
+            count[0] += 1
+            before_load(count[0])
+            return view.load()
+
+        return dataclasses.replace(view, load=load)
+
+    return dataclasses.replace(scene, train=[watched(view) for view in scene.train])
+
+
+def test_disk_that_fills_in_training_keeps_the_checkpoint_and_resumes_to_the_same_model(disk):
+    whole = Trainer(balls(), CONFIG)
+    whole.run()
+    out = disk / "run"
+
+    def fill_from_the_30th(count: int) -> None:
+        # Again and again: a checkpoint that was being written gives its forerunner's room back when it is done.
+        if count >= 30:
+            with suppress(OSError), open(disk / "ballast", "ab", buffering=0) as ballast:
+                ballast.write(bytes(shutil.disk_usage(disk).free))
+
+    out.mkdir()
+    (out / "model.hyrf").write_bytes(b"old")
+
+    kept = r"checkpoint of step \d+ is kept, the same command with --resume instead of --overwrite goes on"
+    with pytest.raises(HyrfError, match=rf"model.hyrf: the disk is full.*{kept}") as e:
+        train(balls(fill_from_the_30th), out, CONFIG, overwrite=True, cache=PictureCache(0), quiet=True)
+
+    assert files_in(out).keys() == {"model.hyrf", "checkpoint.pt"} and (out / "model.hyrf").read_bytes() == b"old"
+    assert 10 <= int(re.search(r"checkpoint of step (\d+)", str(e.value))[1]) <= 30
+    (disk / "ballast").unlink()
+    result = train(balls(), out, CONFIG, resume=True, quiet=True)
+    for name, parameter in hyrf_format.load(result.model).named_parameters():
+        np.testing.assert_array_equal(parameter.detach(), dict(whole.model.named_parameters())[name].detach())
+
+
+def test_stop_without_room_for_the_checkpoint_says_which_one_is_kept(tmp_path):
+    """Ctrl-C on a full disk: there is nothing to go on for."""
+    trainer = Trainer(balls(), CONFIG)
+    path = tmp_path / "checkpoint.pt"
+    trainer.run(checkpoint=path, stop=lambda: trainer.step == 10)
+    kept = path.read_bytes()
+
+    with file_limit(1000), pytest.raises(HyrfError, match="checkpoint.pt: so large a file"):
+        trainer.run(checkpoint=path, stop=lambda: trainer.step == 13, warn=str)
+
+    assert trainer.saved == 10 and files_in(tmp_path) == {"checkpoint.pt": kept}
+
+
+def test_trainer_warns_of_a_checkpoint_that_cannot_be_written(tmp_path):
+    trainer = Trainer(balls(), dataclasses.replace(CONFIG, steps=2))
+
+    (tmp_path / "file").write_bytes(b"")
+
+    with pytest.warns(UserWarning, match="cannot be made.*training goes on, without the checkpoint of step 1"):
+        assert trainer.run(checkpoint=tmp_path / "file" / "checkpoint.pt")
+
+
+def test_folder_removed_while_training_is_made_again_for_the_model(tmp_path):
+    out = tmp_path / "run"
+    scene = balls(lambda count: shutil.rmtree(out, ignore_errors=True) if count >= 20 else None)
+
+    result = train(scene, out, CONFIG, cache=PictureCache(0), quiet=True)
+
+    assert result.complete and hyrf_format.load(out / "model.hyrf") is not None
+    assert json.loads((out / "metrics.json").read_text())["settings"]["seed"] == 1
+
+
+# -- what is printed -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")
+def test_standard_output_on_a_full_disk_is_one_sentence(packed):
+    command = [sys.executable, "-m", "hyrfpack", "info", packed]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, env=environment)
+
+    assert done.returncode == 2
+    assert done.stderr.startswith("Error: what was to be said cannot be printed") and "Traceback" not in done.stderr
+
+
+class FullLog(io.StringIO):
+    written = 0
+
+    def write(self, text: str) -> int:
+        FullLog.written += 1
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_log_on_a_full_disk_does_not_end_the_training(monkeypatch, tmp_path):
+    monkeypatch.setattr("hyrfpack.train.progress.LOG_EVERY", 0.0)
+    monkeypatch.setattr("sys.stderr", FullLog())
+
+    result = train(balls(), tmp_path, dataclasses.replace(CONFIG, steps=2))
+
+    assert result.complete and FullLog.written >= 2

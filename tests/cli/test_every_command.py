@@ -1,0 +1,398 @@
+"""Every command against every one of its inputs as output: what a person has is never lost.
+
+The rule: no command writes over what it reads, into a folder that holds photos or poses, or over a file that exists,
+unless --overwrite says so, and over an input never; every command checks all its outputs before it works.
+
+`python tests/cli/test_every_command.py` tries all of it and prints the table that docs can show.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import Result
+from commands import hyrfpack
+from PIL import Image
+
+REFUSED, REPLACED, WRITTEN = "refused", "replaced", "written"
+WORK_BEGAN = "the work begins"  # said in place of what would take minutes
+
+# -- what commands read ------------------------------------------------------------------------------------------------
+
+SETS = {  # folders of photos and poses, of COLMAP, as NeRF-synthetic and of nerfstudio, and what is read of each
+    "hall": (
+        "",
+        "/images",
+        "/masks",
+        "/sparse/0",
+        "/images/0001.png",
+        "/masks/0001.png",
+        "/sparse/0/images.bin",
+    ),
+    "blender": (
+        "",
+        "/train",
+        "/test",
+        "/transforms_train.json",
+        "/transforms_test.json",
+        "/train/0.png",
+        "/test/0.png",
+    ),
+    "nerfstudio": ("", "/images", "/masks", "/transforms.json", "/points.ply", "/images/0001.png", "/masks/0001.png"),
+}
+KINDS = (".ply", ".splat", ".spz", ".glb", ".sog", ".html", ".points.ply", ".points.glb", ".json")
+USD = (".usda", ".usdc", ".usdz")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command line, with {} where the output is named, what is named there, and what must come of it.
+
+    Attributes:
+        command: without "hyrfpack".
+        output: a path below the world.
+        plain, overwriting: what must come of it without and with --overwrite.
+    """
+
+    command: str
+    output: str
+    plain: str = REFUSED
+    overwriting: str = REFUSED
+
+    def __str__(self) -> str:
+        return self.command.format(self.output)
+
+
+def _inputs(command: str, *outputs: str) -> list[Case]:
+    """Cases of outputs that are inputs, which nothing replaces."""
+    return [Case(command, output) for output in outputs]
+
+
+def _of_set(name: str, new: str = "") -> list[str]:
+    """What is read of a set, and files of a new name in its folders."""
+    paths = [name + part for part in SETS[name]]
+    return paths + [f"{path}/{new}" for path in paths if new and not Path(path).suffix]
+
+
+def _cases() -> list[Case]:
+    cases = []
+    for name in SETS:
+        cases += _inputs(f"train {name} -o {{}} --steps 2", *_of_set(name))
+        cases += _inputs(f"render model.hyrf --data {name} -o {{}}", "model.hyrf", *_of_set(name))
+        cases += _inputs(f"evaluate model.hyrf --data {name} --pictures {{}}", "model.hyrf", *_of_set(name))
+        cases += _inputs(f"compress model.hyrf --data {name} -o {{}}", "model.hyrf", *_of_set(name, "new.hyrf"))
+        cases += _inputs(f"compress model.hyrf --data {name} -o small.hyrf --report {{}}", "model.hyrf", *_of_set(name))
+        cases += _inputs(f"export model.hyrf --data {name} -o {{}}", "model.hyrf", *_of_set(name))
+        cases += _inputs(f"bench model.hyrf --data {name} -o {{}}", "model.hyrf", *_of_set(name, "new.png"))
+        cases += _inputs(
+            f"bench model.hyrf --data {name} -o new.png --json {{}}", "model.hyrf", *_of_set(name, "new.json")
+        )
+        cases += _inputs(
+            f"bench model.hyrf --data {name} -o new.png --markdown {{}}", "model.hyrf", *_of_set(name, "new.md")
+        )
+    for ending in (*KINDS, *USD):  # a file of each kind among photos that are read
+        cases += _inputs("export model.hyrf --data hall -o {}", f"hall/images/new{ending}", f"hall/new{ending}")
+    cases += _inputs("train nerfstudio -o {} --steps 2", "nerfstudio/images/..", "{world}/nerfstudio")
+    cases += _inputs("train link-to-set -o {} --steps 2", "link-to-set", "hall", "hall/images")
+    cases += _inputs("train views-of-its-own -o {} --images views --steps 2", "views-of-its-own")
+    names = ("packed.hyrf", "soft.hyrf", "hard.hyrf", "old/../packed.hyrf", "{world}/packed.hyrf")
+    for command in ("compress packed.hyrf -o {}", "decompress packed.hyrf -o {}"):
+        cases += _inputs(command, *names)
+        cases += _inputs(command.replace("packed.hyrf", "soft.hyrf"), *names)
+    cases += _inputs("render model.hyrf --cameras cameras.json -o {}", "model.hyrf", "cameras.json")
+    cases += _inputs("render model.hyrf --cameras nerfstudio/transforms.json -o {}", "nerfstudio/transforms.json")
+    cases += _inputs("evaluate model.hyrf --data blender --lpips-weights lpips.pth --pictures {}", "lpips.pth")
+    cases += _inputs("export model.hyrf -o {}", "model.hyrf")
+    cases += _inputs("export named.json -o {}", "named.json")  # a model of another name
+    cases += _inputs("import ball.ply -o {}", "ball.ply", "{world}/ball.ply", "old/../ball.ply")
+    cases += _inputs("import ball.hyrf.ply -o {}", "soft-ball.hyrf", "hard-ball.hyrf")
+    cases += _inputs("import ball.ply --cameras cameras.json -o {}", "cameras.json")
+    cases += _inputs("import ball.ply --cameras poses.hyrf -o {}", "poses.hyrf")
+    cases += _inputs("import loose -o {}", "loose", "loose/meta.json", "loose/means_l.webp")
+    cases += _inputs("import loose/meta.json -o {}", "loose", "loose/meta.json", "loose/means_l.webp")
+    # Files of others, which only --overwrite replaces, and sets of photos that the command does not read.
+    cases += [
+        Case("train hall -o {} --steps 2 --max-gaussians 50", "run", REFUSED, REPLACED),
+        Case("compress packed.hyrf -o {} --profile paper", "old/a.hyrf", REFUSED, REPLACED),
+        Case("compress packed.hyrf -o {} --profile paper", "soft-to-old.hyrf", REFUSED, REPLACED),
+        Case("compress model.hyrf -o old/new.hyrf --profile paper --report {}", "old/report", REFUSED, REPLACED),
+        Case("decompress packed.hyrf -o {}", "old/a.hyrf", REFUSED, REPLACED),
+        Case("render model.hyrf --orbit 1 -o {}", "old/pictures", REFUSED, REPLACED),
+        Case("evaluate model.hyrf --data hall --pictures {}", "old/pictures", REFUSED, REPLACED),
+        *(Case("export model.hyrf --sh-degree 0 -o {}", f"old/a{ending}", REFUSED, REPLACED) for ending in KINDS),
+        Case("export model.hyrf -o {}", "old/colmap", REFUSED, REPLACED),
+        Case("import ball.ply --steps 1 --size 16 -o {}", "old/a.hyrf", REFUSED, REPLACED),
+        Case("bench model.hyrf -o {}", "old/a.png", REFUSED, WRITTEN),
+        Case("bench model.hyrf -o new.png --json {}", "old/a.json", REFUSED, WRITTEN),
+        Case("bench model.hyrf -o new.png --markdown {}", "old/a.md"),  # it has no places for tables
+        Case("demo --steps 1 -o {}", "old/demo", REFUSED, WRITTEN),
+        *(Case("demo --steps 1 -o {}", name, REFUSED, WRITTEN) for name in SETS),
+        Case("train hall -o {} --steps 2 --max-gaussians 50", "nerfstudio", REFUSED, WRITTEN),
+        Case("render model.hyrf --orbit 1 -o {}", "hall/images", REFUSED, REPLACED),
+        Case("render model.hyrf --orbit 1 -o {}", "blender", REFUSED, WRITTEN),
+        Case("evaluate model.hyrf --data hall --pictures {}", "nerfstudio/images", REFUSED, REPLACED),
+        Case("export model.hyrf -o {}", "hall", REFUSED, REPLACED),
+        Case("compress packed.hyrf -o {} --profile paper", "hall/small.hyrf", REFUSED, WRITTEN),
+        Case("decompress packed.hyrf -o {}", "nerfstudio/images/back.hyrf", REFUSED, WRITTEN),
+        Case("export model.hyrf --sh-degree 0 -o {}", "blender/train/a.ply", REFUSED, WRITTEN),
+        Case("import ball.ply --steps 1 --size 16 -o {}", "hall/ball.hyrf", REFUSED, WRITTEN),
+    ]
+    # What may be written: a folder of its own, even within the set, and new names.
+    cases += [
+        Case("train hall -o {} --steps 2 --max-gaussians 50", "hall/run", WRITTEN, WRITTEN),
+        Case("render model.hyrf --data hall -o {}", "hall/renders", WRITTEN, WRITTEN),
+        Case("decompress packed.hyrf -o {}", "back.hyrf", WRITTEN, WRITTEN),
+        Case("bench model.hyrf --data hall -o {}", "new.png", WRITTEN, WRITTEN),
+        Case("demo --steps 1 -o {}", "demo", WRITTEN, WRITTEN),
+    ]
+    return cases
+
+
+CASES = _cases()
+
+
+# -- a world to lose ---------------------------------------------------------------------------------------------------
+
+
+def make_world(folder: Path) -> Path:
+    """A folder with a set of photos of each layout, models, splats and files of others, as small as they work."""
+    from explicit_balls import ball
+
+    from hyrfpack.cameras.camera_files import cameras_to_json
+    from hyrfpack.data import load_scene
+    from hyrfpack.demo.scene import write_demo_scene
+    from hyrfpack.export.cameras import write_colmap
+    from hyrfpack.splats.formats import ply, sog
+
+    nerfstudio = write_demo_scene(folder / "nerfstudio", views=4, size=16)
+    poses = json.loads((nerfstudio / "transforms.json").read_text())
+    (nerfstudio / poses["ply_file_path"]).rename(nerfstudio / "points.ply")
+    poses["ply_file_path"] = "points.ply"
+    (nerfstudio / "transforms.json").write_text(json.dumps(poses))
+    photos = sorted((nerfstudio / "images").iterdir())
+
+    _add_masks(nerfstudio, photos)
+    scene = load_scene(nerfstudio)
+    named = [(f"{Path(view.name).stem}.png", view.camera) for view in scene.views]
+    for name, images in (("hall", "images"), ("views-of-its-own", "views")):
+        write_colmap(named, folder / name, None)
+        shutil.copytree(nerfstudio / "images", folder / name / images)
+    _add_masks(folder / "hall", photos)
+    _make_blender(folder / "blender", photos, poses["frames"])
+
+    _ok("train", nerfstudio, "-o", folder / "trained", "--steps", 3, "--max-gaussians", 40)
+    (folder / "trained" / "model.hyrf").rename(folder / "model.hyrf")
+    shutil.rmtree(folder / "trained")
+    _ok("compress", folder / "model.hyrf", "-o", folder / "packed.hyrf", "--profile", "paper")
+    shutil.copy(folder / "model.hyrf", folder / "named.json")
+    (folder / "cameras.json").write_text(cameras_to_json(named))
+    shutil.copy(folder / "cameras.json", folder / "poses.hyrf")
+    (folder / "lpips.pth").write_bytes(b"weights")
+    for name in ("ball.ply", "ball.hyrf.ply"):
+        (folder / name).write_bytes(ply.encode(ball(20)))
+    (folder / "loose").mkdir()
+    for name, data in sog.encode_files(ball(20)).items():
+        (folder / "loose" / name).write_bytes(data)
+    _make_foreign(folder, named[0][0])
+    (folder / "soft.hyrf").symlink_to("packed.hyrf")
+    os.link(folder / "packed.hyrf", folder / "hard.hyrf")
+    (folder / "soft-ball.hyrf").symlink_to("ball.hyrf.ply")
+    os.link(folder / "ball.hyrf.ply", folder / "hard-ball.hyrf")
+    (folder / "soft-to-old.hyrf").symlink_to("old/a.hyrf")
+    (folder / "link-to-set").symlink_to("hall")
+    return folder
+
+
+def _add_masks(root: Path, photos: list[Path]) -> None:
+    (root / "masks").mkdir()
+    for photo in photos:
+        Image.fromarray(np.full((16, 16), 255, np.uint8)).save(root / "masks" / photo.name)
+
+
+def _make_blender(root: Path, photos: list[Path], frames: list[dict]) -> None:
+    """A NeRF-synthetic set: its photos and poses in two splits."""
+    angle = 2 * math.atan(8 / frames[0]["fl_x"])
+    for split, numbers in (("train", (0, 1, 2)), ("test", (3,))):
+        (root / split).mkdir(parents=True)
+        listed = []
+        for place, number in enumerate(numbers):
+            shutil.copy(photos[number], root / split / f"{place}.png")
+            matrix = frames[number]["transform_matrix"]
+            listed.append({"file_path": f"./{split}/{place}", "transform_matrix": matrix})
+        content = {"camera_angle_x": angle, "frames": listed}
+        (root / f"transforms_{split}.json").write_text(json.dumps(content))
+
+
+def _make_foreign(folder: Path, photo: str) -> None:
+    """Files that other programs made, named as the commands' own."""
+    from hyrfpack.compress.report_page import FILES
+    from hyrfpack.demo.run import FILES as DEMO
+
+    scored = f"{Path(photo).stem}.png"
+    names = [f"a{ending}" for ending in (".hyrf", ".png", ".json", ".md", *KINDS)]
+    names += ["colmap/sparse/0/cameras.bin", "pictures/0000.png", f"pictures/{scored}", f"report/{FILES[0]}"]
+    for path in (*(f"old/{name}" for name in names), f"old/demo/{DEMO[0]}", "run/metrics.json"):
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_bytes(b"of another program")
+
+
+def _ok(*arguments: object) -> None:
+    result = hyrfpack(*arguments)
+    assert result.exit_code == 0, result.output
+
+
+def files_of(folder: Path) -> dict[str, str]:
+    """What every file and link below a folder is: the SHA-256 of its bytes, where a link points; "" of a folder."""
+    found = {}
+    for place, folders, names in os.walk(folder):
+        for name in (*folders, *names):
+            path = Path(place, name)
+            if path.is_symlink():
+                found[str(path.relative_to(folder))] = f"-> {os.readlink(path)}"
+            else:
+                is_file = path.is_file()
+                content = hashlib.sha256(path.read_bytes()).hexdigest() if is_file else ""
+                found[str(path.relative_to(folder))] = content
+    return found
+
+
+# -- trying it ---------------------------------------------------------------------------------------------------------
+
+
+def run_case(case: Case, world: Path, overwrite: bool) -> tuple[str, Result]:
+    """Run a case in a world that is the working folder. Returns what came of it, in a word or with what went wrong."""
+    output = case.output.format(world=world)
+    before = files_of(world)
+    result = hyrfpack(*case.command.format(output).split(), *(["--overwrite"] if overwrite else []))
+    after = files_of(world)
+
+    changed = sorted(path for path in before.keys() | after.keys() if before.get(path) != after.get(path))
+    errors = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
+    began = errors == [f"Error: {WORK_BEGAN}"]
+    if "Traceback" in result.output or (result.exit_code and not (result.exit_code == 2 and len(errors) == 1)):
+        return f"exit code {result.exit_code}, {len(errors)} sentences", result
+    if result.exit_code and not began:
+        return (f"refused, but {changed[0]} changed" if changed else REFUSED), result
+    place = str(Path(os.path.realpath(output)).relative_to(os.path.realpath(world)))
+    beyond = [path for path in changed if path != place and not path.startswith(f"{place}/")]
+    beyond = [path for path in beyond if path not in ("old/new.hyrf", "new.png", "small.hyrf")]  # other outputs
+    if beyond:
+        return f"wrote over {beyond[0]}", result
+    lost = [path for path in changed if path in before and before[path]]
+    return (REPLACED if lost else WRITTEN), result
+
+
+def _replace_work(patch: pytest.MonkeyPatch) -> None:
+    """What takes minutes says instead that it begins."""
+    from hyrfpack.errors import HyrfError
+
+    def begin(*arguments: object, **options: object) -> None:
+        raise HyrfError(WORK_BEGAN)
+
+    patch.setattr(import_module("hyrfpack.bench"), "bench", begin)
+    patch.setattr(import_module("hyrfpack.demo.run"), "run_demo", begin)
+
+
+def _forbid_work(patch: pytest.MonkeyPatch) -> None:
+    """Whatever is drawn, to learn, measure, bake or score, is an error: refusals come before."""
+    for name in ("bench", "compress", "demo", "distill", "evaluate", "export", "render", "train"):
+        import_module(f"hyrfpack.{name}")
+    rasterize = import_module("hyrfpack.ops.rasterize").rasterize
+
+    def draw(*arguments: object, **options: object) -> None:
+        raise AssertionError("a picture was drawn before the refusal")
+
+    for name, module in list(sys.modules.items()):
+        if name.startswith("hyrfpack.") and getattr(module, "rasterize", None) is rasterize:
+            patch.setattr(module, "rasterize", draw)
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_world(tmp_path_factory.mktemp("template"))
+
+
+@pytest.fixture
+def world(template: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A world of one's own, which is the working folder."""
+    monkeypatch.chdir(copy_of(template, tmp_path / "world"))
+    return tmp_path / "world"
+
+
+def copy_of(template: Path, folder: Path) -> Path:
+    """A copy of a world, hard links included."""
+    shutil.copytree(template, folder, symlinks=True)
+    for link, name in (("hard.hyrf", "packed.hyrf"), ("hard-ball.hyrf", "ball.hyrf.ply")):
+        (folder / link).unlink()
+        os.link(folder / name, folder / link)
+    return folder
+
+
+@pytest.mark.parametrize("overwrite", [False, True], ids=["plain", "overwrite"])
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_every_command_keeps_what_a_person_has(case, overwrite, world, monkeypatch):
+    expected = case.overwriting if overwrite else case.plain
+    _replace_work(monkeypatch)
+    if expected == REFUSED:
+        _forbid_work(monkeypatch)
+
+    outcome, result = run_case(case, world, overwrite)
+
+    assert outcome == expected, result.output
+
+
+def test_the_table_names_every_command_that_writes():
+    from hyrfpack.cli import main
+
+    writes = {name for name, command in main.commands.items() if any("--overwrite" in p.opts for p in command.params)}
+    assert {case.command.split()[0] for case in CASES} == writes
+
+
+def test_a_world_is_one_that_commands_can_read(world):
+    """Else they would refuse for another reason."""
+    for name in SETS:
+        _ok("evaluate", "model.hyrf", "--data", name, "--pictures", f"pictures-{name}")
+    for source in ("ball.ply", "loose"):
+        _ok("import", source, "-o", f"{source}-new.hyrf", "--steps", 1, "--size", 16)
+    _ok("render", "model.hyrf", "--cameras", "cameras.json", "-o", "renders")
+
+
+# -- the table ---------------------------------------------------------------------------------------------------------
+
+
+def markdown_table() -> str:
+    """What comes of every case, tried now, as a Markdown table; what should not have is in capitals."""
+    from tempfile import TemporaryDirectory
+
+    lines = ["| command | input as output | without --overwrite | with --overwrite |", "|---|---|---|---|"]
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        template = make_world(Path(folder, "template"))
+        _replace_work(patch)
+        for number, case in enumerate(CASES):
+            cells = []
+            for overwrite, expected in ((False, case.plain), (True, case.overwriting)):
+                world = copy_of(template, Path(folder, f"{number}{overwrite}"))
+                patch.chdir(world)
+                outcome, _ = run_case(case, world, overwrite)
+                cells.append(outcome if outcome == expected else outcome.upper())
+                patch.chdir(folder)
+                shutil.rmtree(world)
+            command = case.command.format("OUTPUT")
+            output = case.output.format(world="/absolute/path")
+            lines.append(f"| `hyrfpack {command}` | `{output}` | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(markdown_table())

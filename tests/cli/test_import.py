@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from commands import refused, succeeded
+from explicit_balls import ball
+
+from hyrfpack.cameras.camera_files import cameras_to_json
+from hyrfpack.distill.views import Weighted, viewpoints
+from hyrfpack.splats.draw import Drawable
+from hyrfpack.splats.formats import ply
+
+QUICK = ("--steps", 2, "--size", 24)
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    path = tmp_path / "ball.ply"
+    path.write_bytes(ply.encode(ball(40)))
+    return path
+
+
+@pytest.fixture
+def cameras(tmp_path: Path) -> Path:
+    weighted = Weighted.of(ball(40), "ball")
+    made = viewpoints(weighted, Drawable.of(ball(40), weighted.frame), 9, 48, 3)
+    path = tmp_path / "cameras.json"
+    path.write_text(cameras_to_json([(str(number), camera) for number, camera in enumerate(made)]))
+    return path
+
+
+def test_import_learns_what_cameras_see_and_tells_numbers(source: Path, cameras: Path, tmp_path: Path) -> None:
+    target = tmp_path / "ball.hyrf"
+    result = succeeded("import", source, "-o", target, *QUICK, "--cameras", cameras, "--json")
+    numbers = json.loads(result.stdout)
+    assert numbers["views"] == 2  # of 9, the first and the ninth
+    assert numbers["bytes_after"] == target.stat().st_size
+    assert numbers["bytes_source"] == source.stat().st_size
+    words = succeeded("import", source, "-o", target, *QUICK, "--cameras", cameras, "--overwrite").stdout
+    assert f"{numbers['bytes_after']:,}" in words
+    assert f"{numbers['psnr']:.2f} dB against the original" in words
+
+
+def test_import_makes_folders_that_are_missing(source: Path, tmp_path: Path) -> None:
+    succeeded("import", source, "-o", tmp_path / "not" / "yet" / "ball.hyrf", *QUICK)
+    assert (tmp_path / "not" / "yet" / "ball.hyrf").is_file()
+
+
+def test_import_refuses_in_one_sentence(source: Path, tmp_path: Path) -> None:
+    target = tmp_path / "x.hyrf"
+    assert "nothing.ply" in refused("import", tmp_path / "nothing.ply", "-o", target)
+    assert "name another file" in refused("import", source, "-o", source)
+    (tmp_path / "broken.ply").write_bytes(source.read_bytes()[:-7])
+    assert "broken.ply" in refused("import", tmp_path / "broken.ply", "-o", target)
+    assert "JSON" in refused("import", source, "-o", target, "--cameras", source)
+    assert not target.exists()
+
+
+def test_import_says_what_it_did_not_reach(source: Path, tmp_path: Path) -> None:
+    result = succeeded("import", source, "-o", tmp_path / "x.hyrf", *QUICK, "--psnr", 60, "--json")
+    numbers = json.loads(result.stdout)
+    assert numbers["psnr_asked"] == 60
+    assert f"asked for 60 dB and reached {numbers['psnr']:.1f} at held-out viewpoints" in result.stderr
+    assert "--steps 500" in result.stderr

@@ -1,0 +1,211 @@
+"""How every command speaks: --quiet, --verbose, closed streams, wide characters, completion."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from commands import hyrfpack, refused, succeeded
+from rich.cells import cell_len
+from scenes import small_model
+
+from hyrfpack.cli import main
+from hyrfpack.cli.common import note, table
+from hyrfpack.cli.files import _typed
+from hyrfpack.format import describe, save
+
+ROOT = Path(__file__).parents[2]
+TINY = ("--steps", 3, "--max-gaussians", 50)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("models") / "model.hyrf"
+    save(small_model([[0.0, 0, 0]]), path, profile="raw")
+    return path
+
+
+def shell(redirections: str, *command: object) -> subprocess.CompletedProcess:
+    """Run a command with redirections as a shell writes them; Python finds this package."""
+    words = ["sh", "-c", f'exec "$@" {redirections}', "sh", *map(str, command)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    return subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
+
+
+def program(redirections: str, *arguments: object) -> subprocess.CompletedProcess:
+    """The command line in a process of its own."""
+    return shell(redirections, sys.executable, "-m", "hyrfpack", *arguments)
+
+
+# -- quiet and verbose -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", main.commands)
+def test_every_command_can_be_quiet_and_verbose(command):
+    printed = succeeded(command, "--help").stdout
+    assert "--quiet" in printed and "--verbose" in printed
+
+
+@pytest.mark.parametrize("before", [True, False], ids=["before the command", "after it"])
+def test_quiet_training_and_rendering_say_their_results_alone(before, data, tmp_path):
+    for command, *arguments in (
+        ("train", data, "-o", tmp_path / "run", *TINY),
+        ("render", tmp_path / "run" / "model.hyrf", "-o", tmp_path / "out", "--orbit", 2),
+    ):
+        result = succeeded(*(("--quiet", command) if before else (command, "--quiet")), *arguments)
+        assert result.stderr == "" and str(tmp_path) in result.stdout
+    assert succeeded(command, *arguments, "--overwrite").stderr != ""
+
+
+def test_quiet_holds_for_whatever_speaks_and_only_as_long_as_the_command_runs(model, monkeypatch):
+    def talkative(path):
+        note("a note")
+        print("a library", file=sys.stderr)
+        with click.progressbar(range(3), label="a bar", file=sys.stderr) as numbers:
+            list(numbers)
+        return describe(path)
+
+    monkeypatch.setattr("hyrfpack.format.describe", talkative)
+    before = sys.stderr
+    assert succeeded("info", model, "--quiet").stderr == ""
+    assert sys.stderr is before
+    loud = succeeded("info", model).stderr
+    assert all(words in loud for words in ("a note", "a library", "a bar"))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("info", "--quiet", "none.hyrf"),
+        ("--quiet", "info", "none.hyrf"),
+        ("info", "--quiet", "a", "b"),
+        ("info", "--quiet", "a", "--nothing"),
+        ("--quiet", "nothing"),
+    ],
+)
+def test_errors_are_said_quietly_too(arguments):
+    assert refused(*arguments)
+
+
+def test_verbose_tells_versions_device_and_times(data, tmp_path):
+    result = succeeded("train", data, "-o", tmp_path, *TINY, "--verbose", "--device", "cpu")
+    first, *others = result.stderr.splitlines()
+    assert all(f"{name} " in first for name in ("hyrfpack", "Python", "torch", "numpy"))
+    assert any(line.endswith("device: cpu") for line in others)
+    assert any("seconds: " in line and "backward" in line for line in others)
+    assert "the end, after" in others[-1]
+    assert result.stdout.startswith(str(tmp_path))
+
+
+@pytest.mark.parametrize("arguments", [("info", "none.hyrf", "--verbose"), ("--verbose", "info", "none.hyrf")])
+def test_verbose_shows_where_an_error_comes_from_and_ends_with_the_sentence(arguments):
+    result = hyrfpack(*arguments)
+    assert result.exit_code == 2 and result.stdout == ""
+    assert "Traceback" in result.stderr and "in describe" in result.stderr
+    assert result.stderr.splitlines()[-1].startswith("Error: none.hyrf")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("info", "--quiet", "--verbose", "x"),
+        ("--quiet", "info", "--verbose", "x"),
+        ("--verbose", "info", "x", "--quiet"),
+        ("--quiet", "--verbose", "info", "x"),
+    ],
+)
+def test_quiet_and_verbose_exclude_each_other(arguments):
+    result = hyrfpack(*arguments)
+    assert result.exit_code == 2 and "--quiet and --verbose contradict each other" in result.stderr
+
+
+def test_the_command_that_a_report_shows_is_without_them(model):
+    command = main.commands["compress"]
+    with command.make_context("compress", [str(model), "-o", "b.hyrf", "--verbose", "--no-prune"]) as context:
+        assert _typed(context) == f"hyrfpack compress {model} --output b.hyrf --no-prune"
+
+
+# -- streams that are not there --------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a shell of Unix closes them")
+def test_training_runs_to_its_end_where_standard_error_is_closed(data, tmp_path):
+    done = program("2>&-", "train", data, "-o", tmp_path, *TINY)
+    assert done.returncode == 0 and describe(tmp_path / "model.hyrf")["gaussians"] > 0
+    assert done.stdout.startswith(str(tmp_path / "model.hyrf")) and "step 3/3" not in done.stdout
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a shell of Unix closes them")
+def test_rendering_runs_to_its_end_where_no_stream_can_be_written_to(model, tmp_path):
+    camera = {"width": 20, "height": 10, "fx": 15, "camera_from_world": np.eye(4).tolist()}
+    (tmp_path / "cameras.json").write_text(json.dumps([camera]))
+    done = program("<&- >&- 2</dev/null", "render", model, "-o", tmp_path, "--cameras", tmp_path / "cameras.json")
+    assert done.returncode == 0 and len(list(tmp_path.glob("*.png"))) == 1
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a shell of Unix closes them")
+def test_no_file_takes_the_number_of_a_closed_stream():
+    """What a library prints would go into it."""
+    code = (
+        "import os; from hyrfpack.cli import main; main(['--version'], standalone_mode=False); "
+        "os._exit(0 if os.open(os.devnull, os.O_RDONLY) > 2 else 3)"
+    )
+    assert shell("<&- 2>&-", sys.executable, "-c", code).returncode == 0
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a shell of Unix closes them")
+def test_a_closed_standard_output_is_no_traceback(model):
+    done = program(">&-", "info", model)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")
+def test_notes_that_cannot_be_printed_do_not_end_the_work(data, tmp_path):
+    assert program("2>/dev/full", "train", data, "-o", tmp_path, *TINY).returncode == 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="file names are bytes on Linux")
+def test_names_that_the_encoding_lacks_are_printed_with_escapes(model, tmp_path):
+    for name in (b"\xe9.hyrf", "模型.hyrf".encode()):
+        path = os.fsdecode(os.path.join(os.fsencode(tmp_path), name))
+        shutil.copy(model, path)
+        done = program("", "info", path)
+        assert done.returncode == 0 and done.stdout.startswith(str(tmp_path)), done.stderr
+
+
+# -- columns, completion ---------------------------------------------------------------------------------------------
+
+
+def test_columns_of_a_table_stand_under_each_other_with_wide_characters():
+    text = table(["文件", "dB", "名"], [["写真.png", "1.00", "ü"], ["a.png", "-", "日本"], ["e\u0301.png", "12", ""]])
+    lines = text.splitlines()
+    assert cell_len(lines[1]) == max(map(cell_len, lines))
+    assert [cell_len(line[: line.index(word)]) for line, word in zip(lines[2:4], ("1.00", "-"), strict=True)] == [
+        10,
+        13,
+    ]
+    assert cell_len(lines[0]) == cell_len(lines[3]) == 10 + 4 + 2 + 4
+    assert lines[2].endswith("   ü")
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_is_a_script_for_the_shell(shell):
+    if shell == "bash" and not shutil.which("bash"):
+        pytest.skip("there is no bash here")
+    result = CliRunner().invoke(main, prog_name="hyrfpack", env={"_HYRFPACK_COMPLETE": f"{shell}_source"})
+    assert result.exit_code == 0 and "hyrfpack" in result.stdout and f"{shell}_complete" in result.stdout
+
+
+def test_completion_knows_commands_and_options():
+    words = {"COMP_WORDS": "hyrfpack tr", "COMP_CWORD": "1", "_HYRFPACK_COMPLETE": "bash_complete"}
+    assert CliRunner().invoke(main, prog_name="hyrfpack", env=words).stdout.split() == ["plain,train"]
+    words |= {"COMP_WORDS": "hyrfpack --quiet train --max-g", "COMP_CWORD": "3"}
+    assert CliRunner().invoke(main, prog_name="hyrfpack", env=words).stdout.split() == ["plain,--max-gaussians"]

@@ -1,0 +1,81 @@
+"""The size that photos are read at: kept with a model, taken from there, and said."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from commands import hyrfpack, succeeded
+from PIL import Image
+
+from hyrfpack.cameras.capture import stored_max_size
+from hyrfpack.format import describe
+
+
+@pytest.fixture(scope="module")
+def shrunk_run(data, tmp_path_factory) -> Path:
+    """A run on ten photos, shrunk from 48 to 24 pixels."""
+    folder = tmp_path_factory.mktemp("runs") / "shrunk"
+    succeeded("train", data, "-o", folder, "--steps", 10, "--max-gaussians", 200, "--max-size", 24)
+    return folder
+
+
+def test_a_model_says_at_which_size_it_was_trained(shrunk_run, tmp_path):
+    packed = tmp_path / "packed.hyrf"
+    succeeded("compress", shrunk_run / "model.hyrf", "-o", packed, "--profile", "paper")
+    for file in (shrunk_run / "model.hyrf", packed):
+        assert describe(file)["provenance"]["max_size"] == 24
+    metrics = json.loads((shrunk_run / "metrics.json").read_text())
+    assert metrics["scene"]["max_size"] == 24
+    assert any("shrunk from up to 48 x 48 to 24 pixels" in note for note in metrics["notes"])
+
+
+def test_evaluate_reads_photos_at_the_size_that_the_model_was_trained_at_and_says_so(shrunk_run, data):
+    command = ("evaluate", shrunk_run / "model.hyrf", "--data", data)
+    plain, numbers = succeeded(*command), json.loads(succeeded(*command, "--json").stdout)
+    assert "2 photos of up to 24 x 24 pixels (--max-size 24)" in plain.stdout
+    assert "10 of 10 photos are shrunk from up to 48 x 48 to 24 pixels on the longer side" in plain.stderr
+    assert (numbers["max_size"], numbers["picture_size"]) == (24, [24, 24])
+    stored = json.loads((shrunk_run / "metrics.json").read_text())["evaluation"]
+    assert numbers["psnr"] == pytest.approx(stored["psnr"], abs=1e-9)
+
+
+def test_max_size_given_comes_before_the_models(shrunk_run, data):
+    command = ("evaluate", shrunk_run / "model.hyrf", "--data", data, "--max-size")
+    assert json.loads(succeeded(*command, 0, "--json").stdout)["picture_size"] == [48, 48]
+    assert "of up to 16 x 16 pixels (--max-size 16)" in succeeded(*command, 16).stdout
+    assert "of up to 48 x 48 pixels (as they are stored)" in succeeded(*command, 0).stdout
+
+
+def test_render_makes_pictures_of_the_size_that_the_model_was_trained_at_and_says_so(shrunk_run, data, tmp_path):
+    printed = succeeded("render", shrunk_run / "model.hyrf", "-o", tmp_path, "--data", data).stdout
+    assert "2 pictures, 24 x 24 pixels" in printed
+    assert Image.open(tmp_path / "0000.png").size == (24, 24)
+
+
+@pytest.mark.parametrize(
+    ("command", "output"), [("compress", "packed.hyrf"), ("export", "scene.splat"), ("bench", "bench.png")]
+)
+def test_every_command_with_photos_reads_them_at_the_models_size(shrunk_run, data, command, output, tmp_path):
+    (tmp_path / output).touch()  # so that it refuses to go on once the photos are read
+    result = hyrfpack(command, shrunk_run / "model.hyrf", "--data", data, "-o", tmp_path / output)
+    assert result.exit_code == 2 and "to 24 pixels on the longer side" in result.stderr
+
+
+def test_small_photos_leave_no_word_of_their_size(data, tmp_path):
+    """A model of them is the same, byte for byte, as without a limit."""
+    succeeded("train", data, "-o", tmp_path, "--steps", 2, "--max-gaussians", 50)
+    assert "max_size" not in describe(tmp_path / "model.hyrf")["provenance"]
+    assert json.loads((tmp_path / "metrics.json").read_text())["scene"]["max_size"] == 1600
+
+
+def test_photos_kept_as_they_are_leave_a_word(data, tmp_path):
+    succeeded("train", data, "-o", tmp_path, "--steps", 2, "--max-gaussians", 50, "--max-size", 0)
+    assert describe(tmp_path / "model.hyrf")["provenance"]["max_size"] == 0
+
+
+@pytest.mark.parametrize("stored", [None, -1, True, 1.5, "800", [800], {}])
+def test_a_limit_that_makes_no_sense_is_as_none(stored):
+    assert stored_max_size({"provenance": {"max_size": stored}}) == 1600
+    assert stored_max_size({"provenance": {"max_size": 0}}) == 0

@@ -1,0 +1,228 @@
+from __future__ import annotations
+
+import io
+import json
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_up_splats import made_up
+from scipy.spatial.transform import Rotation
+
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.splats.formats import gltf
+from hyrfpack.splats.placement import local_origin, upright_rotation
+from hyrfpack.splats.splats import Splats
+
+Y_DOWN, Z_UP = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+
+
+def same(first: Splats, second: Splats) -> bool:
+    """All but positions; quaternions are brought to unit length on reading."""
+    equal = all(np.array_equal(getattr(first, name), getattr(second, name)) for name in ("scales", "opacities"))
+    return (
+        equal
+        and np.array_equal(first.harmonics, second.harmonics)
+        and np.allclose(first.quats, second.quats, rtol=0, atol=1e-7)
+    )
+
+
+def json_of(data: bytes) -> dict:
+    return json.loads(data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
+
+
+def glb_of(content: dict, binary: bytes) -> bytes:
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    binary += bytes(-len(binary) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
+    return head + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_what_is_written_is_read_in_the_same_axes(degree):
+    splats = made_up(degree=degree)
+    read = gltf.decode(gltf.encode(splats, up=Y_DOWN), "a.glb")
+    assert same(read, splats)
+    np.testing.assert_array_equal(read.positions, splats.positions.astype(np.float32))
+
+
+def test_the_same_splats_make_the_same_bytes():
+    assert gltf.encode(made_up(), up=Z_UP) == gltf.encode(made_up(), up=Z_UP)
+
+
+def test_attributes_lie_where_the_specification_says():
+    splats = made_up(3, degree=1)
+    data = gltf.encode(splats, up=Y_DOWN)
+    content = json_of(data)
+    primitive = content["meshes"][0]["primitives"][0]
+    assert content["extensionsUsed"] == ["KHR_gaussian_splatting"] and primitive["mode"] == 0
+    assert primitive["extensions"]["KHR_gaussian_splatting"] == {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+
+    def numbers(semantic: str, width: int) -> np.ndarray:
+        accessor = content["accessors"][primitive["attributes"][semantic]]
+        view = content["bufferViews"][accessor["bufferView"]]
+        start = len(data) - content["buffers"][0]["byteLength"] + view["byteOffset"]
+        return np.frombuffer(data, "<f4", 3 * width, start).reshape(3, width)
+
+    w, x, y, z = splats.quats.T
+    np.testing.assert_array_equal(numbers("KHR_gaussian_splatting:ROTATION", 4), np.stack((x, y, z, w), 1))
+    np.testing.assert_array_equal(numbers("KHR_gaussian_splatting:SCALE", 3), splats.scales)
+    np.testing.assert_array_equal(numbers("KHR_gaussian_splatting:OPACITY", 1)[:, 0], splats.opacities)
+    np.testing.assert_array_equal(numbers("KHR_gaussian_splatting:SH_DEGREE_1_COEF_2", 3), splats.harmonics[:, 3])
+    stored = splats.positions.astype(np.float32)
+    assert content["accessors"][0]["min"] == stored.min(0).tolist()
+    assert content["accessors"][0]["max"] == stored.max(0).tolist()
+
+
+def test_viewers_without_the_extension_see_coloured_upright_points():
+    splats = made_up(50)
+    cloud = trimesh.load_scene(io.BytesIO(gltf.encode(splats, up=Y_DOWN)), file_type="glb").to_geometry()
+    np.testing.assert_allclose(cloud.vertices, splats.positions * (1, -1, -1), atol=1e-6)
+    srgb = np.clip(0.5 + splats.harmonics[:, 0] / np.sqrt(4 * np.pi), 0, 1)
+    bright = srgb > 0.05
+    np.testing.assert_allclose((cloud.colors[:, :3] / 255)[bright], srgb[bright] ** 2.2, atol=0.012)
+    np.testing.assert_allclose(cloud.colors[:, 3] / 255, splats.opacities, atol=0.5 / 255 + 1e-6)
+
+
+@pytest.mark.parametrize("up", [Y_DOWN, -Y_DOWN, Z_UP, -Z_UP, np.array([1.0, 0, 0]), np.array([0.48, -0.6, 0.64])])
+def test_the_node_turns_up_to_y(up):
+    splats = made_up(5)
+    data = gltf.encode(splats, up=up)
+    turn = Rotation.from_quat(json_of(data)["nodes"][0]["rotation"])
+    np.testing.assert_allclose(turn.apply(up), (0, 1, 0), atol=1e-12)
+    upright = gltf.decode(data, "a.glb", upright=True)
+    np.testing.assert_allclose(upright.positions, turn.apply(splats.positions), atol=1e-6)
+    np.testing.assert_allclose(upright.harmonics, splats.rotated(turn.as_matrix()).harmonics, atol=1e-6)
+
+
+def test_y_down_turns_by_half_about_x_and_z_up_by_a_quarter():
+    np.testing.assert_array_equal(upright_rotation(Y_DOWN, -Y_DOWN), np.diag((1, -1, -1)))
+    np.testing.assert_array_equal(upright_rotation(Z_UP, -Y_DOWN), [[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+
+
+def test_a_scene_far_away_keeps_its_precision():
+    splats = made_up(100, shift=(5e5, -4e6, 120.0))
+    data = gltf.encode(splats, up=Z_UP)
+    np.testing.assert_allclose(gltf.decode(data, "a.glb").positions, splats.positions, rtol=0, atol=1e-6)
+    assert np.abs(json_of(data)["accessors"][0]["max"]).max() < 8
+    assert not local_origin(made_up(100, shift=(2, 2, 2)).positions).any()
+
+
+def test_smaller_integers_strides_and_matrices_of_others_are_read():
+    record = struct.pack("<3f4hHHBBBx3f", 1, 2, 3, 0, 0, 32767, 0, 5, 65535, 255, 0, 51, 0.1, 0.2, 0.3)
+    fields = {
+        "POSITION": (0, 5126, False, "VEC3"),
+        "KHR_gaussian_splatting:ROTATION": (12, 5122, True, "VEC4"),
+        "KHR_gaussian_splatting:OPACITY": (22, 5123, True, "SCALAR"),
+        "KHR_gaussian_splatting:SCALE": (24, 5121, True, "VEC3"),
+        "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0": (28, 5126, False, "VEC3"),
+    }
+    accessors = [
+        {"bufferView": 0, "byteOffset": offset, "componentType": kind, "normalized": norm, "count": 2, "type": shape}
+        for offset, kind, norm, shape in fields.values()
+    ]
+    primitive = {
+        "attributes": {name: number for number, name in enumerate(fields)},
+        "mode": 0,
+        "extensions": {"KHR_gaussian_splatting": {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
+    }
+    content = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [1]}],
+        # Doubled and moved, below a node that turns a quarter about z.
+        "nodes": [
+            {"mesh": 0, "matrix": [2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0, 10, 0, 0, 1]},
+            {"children": [0], "rotation": [0, 0, 0.5**0.5, 0.5**0.5]},
+        ],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": [{"buffer": 0, "byteLength": 80, "byteStride": 40}],
+        "buffers": [{"byteLength": 80}],
+    }
+    read = gltf.decode(glb_of(content, 2 * record), "a.glb", upright=True)
+    np.testing.assert_allclose(read.positions, [(-4, 12, 6)] * 2, atol=1e-12)
+    np.testing.assert_allclose(read.scales, [(2, 0, 0.4)] * 2, atol=1e-7)
+    np.testing.assert_allclose(read.opacities, [1, 1])
+    turned = Rotation.from_quat(read.quats[:, [1, 2, 3, 0]]).as_matrix()
+    expected = Rotation.from_euler("z", 90, degrees=True) * Rotation.from_quat([0, 0, 1, 0])
+    np.testing.assert_allclose(turned, [expected.as_matrix()] * 2, atol=1e-6)
+    np.testing.assert_allclose(read.harmonics[:, 0], [(0.1, 0.2, 0.3)] * 2, atol=1e-7)
+
+
+def test_nothing_is_refused_in_a_sentence():
+    with pytest.raises(HyrfDataError, match="no Gaussian"):
+        gltf.encode(made_up()[:0], up=Y_DOWN)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda c: c["nodes"][0].update(scale=[1, 1, 2]), "scales axes differently"),
+        (lambda c: c["nodes"][0].update(children=[0]), "no tree"),
+        (lambda c: c["nodes"][0].pop("mesh"), "no Gaussian splats"),
+        (lambda c: c["meshes"][0].update(primitives=c["meshes"][0]["primitives"] * 50), "many times"),
+        (lambda c: c["accessors"][0].update(count=41), "past the end"),
+        (lambda c: c["accessors"][0].update(count=-1), "past the end"),
+        (lambda c: c["accessors"][0].update(sparse={}), "sparse"),
+        (lambda c: c["buffers"][0].update(uri="a.bin"), "within the .glb"),
+        (lambda c: c["accessors"][0].update(bufferView=-1), "do not fit together"),
+        (lambda c: c["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"].pop("kernel"), "'ellipse'"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_in_a_sentence(change, sentence):
+    data = gltf.encode(made_up(40, degree=0), up=Y_DOWN)
+    content = json_of(data)
+    change(content)
+    with pytest.raises(HyrfDataError, match=f"^a.glb: .*{sentence}"):
+        gltf.decode(glb_of(content, data[-content["buffers"][0]["byteLength"] :]), "a.glb")
+
+
+_SMALL = gltf.encode(made_up(3, degree=1), up=Y_DOWN)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    places=st.lists(st.tuples(st.integers(0, len(_SMALL) - 1), st.integers(0, 255)), max_size=4),
+    end=st.integers(0, len(_SMALL)) | st.just(len(_SMALL)),
+)
+def test_damaged_bytes_are_splats_or_a_sentence(places, end):
+    data = bytearray(_SMALL)
+    for place, value in places:
+        data[place] = value
+    try:
+        assert isinstance(gltf.decode(bytes(data[:end]), "a.glb"), Splats)
+    except HyrfDataError:
+        pass
+
+
+_BINARY = json_of(_SMALL)["buffers"][0]["byteLength"]
+_VALUES = st.sampled_from([None, -1, 0, 1e308, 2**70, True, "x", [], {}, [1], float("nan")])
+
+
+@settings(max_examples=150, deadline=None)
+@given(keys=st.lists(st.integers(0, 30), min_size=1, max_size=6), value=_VALUES)
+def test_any_odd_entry_of_the_json_is_splats_or_a_sentence(keys, value):
+    content = json_of(_SMALL)
+    target = content
+    for key in keys:  # walk down, and put the value where it ends
+        names = list(target) if isinstance(target, dict) else list(range(len(target)))
+        name = names[key % len(names)]
+        if not isinstance(target[name], dict | list) or not target[name]:
+            break
+        above, target = target, target[name]
+    else:
+        target, name = above, name
+    target[name] = value
+    try:
+        assert isinstance(gltf.decode(glb_of(content, _SMALL[-_BINARY:]), "a.glb"), Splats)
+    except HyrfDataError:
+        pass

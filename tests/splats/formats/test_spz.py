@@ -1,0 +1,264 @@
+"""SPZ: records packed by hand, bounds of what is lost, real files, and what hostile files meet."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import tracemalloc
+import zlib
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.splats.formats import compressed_ply, spz
+from hyrfpack.splats.splats import Splats, normalized_quats
+
+# Half a turn about x changes the sign of harmonics that are odd in y and z together.
+HALF_TURN = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
+
+
+def make_splats(count: int, degree: int = 3, antialiased: bool = False) -> Splats:
+    rng = np.random.default_rng(count)
+    return Splats(
+        rng.normal(0, 5, (count, 3)),
+        np.exp(rng.normal(-3, 1, (count, 3))),
+        normalized_quats(rng.normal(size=(count, 4))),
+        rng.uniform(0, 1, count),
+        rng.uniform(-0.95, 0.95, (count, (degree + 1) ** 2, 3)),
+        antialiased,
+    )
+
+
+def sections_of_one(version: int, degree: int = 0) -> list[bytes]:
+    """One Gaussian, packed by hand: at (1, -2, 0.5) of the file with 8 fractional bits."""
+    fixed = b"\x00\x01\x00" + b"\x00\xfe\xff" + b"\x80\x00\x00"
+    position = struct.pack("<3e", 1, -2, 0.5) if version == 1 else fixed
+    # w is largest: index 3; x = -256/511 sqrt(1/2), y = 0, z = 511/511 sqrt(1/2)
+    rotation = struct.pack("<I", 3 << 30 | (512 | 256) << 20 | 511) if version >= 3 else bytes([0, 128, 128])
+    harmonics = bytes(range(128, 128 + 3 * ((degree + 1) ** 2 - 1)))
+    return [position, bytes([51]), bytes([255, 0, 51]), bytes([160, 144, 176]), rotation, harmonics]
+
+
+def file_of(sections: list[bytes], version: int, degree: int = 0, count: int = 1, bits: int = 8, flags: int = 0):
+    if version < 4:
+        return gzip.compress(
+            struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, bits, flags, 0) + b"".join(sections)
+        )
+    streams = [(zstandard.compress(section), len(section)) for section in sections if section]
+    extension = struct.pack("<II", 0x12345678, 5) + b"hello" if flags & 2 else b""
+    header = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, degree, bits, flags, len(streams), 32 + len(extension))
+    table = b"".join(struct.pack("<QQ", len(stream), length) for stream, length in streams)
+    return header + extension + table + b"".join(stream for stream, _ in streams)
+
+
+@pytest.mark.parametrize("version", [1, 2, 3, 4])
+def test_decode_reads_a_record_packed_by_hand(version):
+    splats = spz.decode(file_of(sections_of_one(version, degree=1), version, degree=1, flags=1), "a.spz")
+
+    np.testing.assert_array_equal(splats.positions, [[1, 2, -0.5]])  # half a turn about x
+    np.testing.assert_allclose(splats.scales, np.exp([[0, -1, 1]]), rtol=1e-6)
+    np.testing.assert_allclose(splats.opacities, [0.2], rtol=1e-6)
+    np.testing.assert_allclose(splats.harmonics[0, 0], np.array([0.5, -0.5, -0.3]) / 0.15, rtol=1e-6)
+    np.testing.assert_allclose(splats.harmonics[0, 1:], HALF_TURN[1:4, None] * np.arange(9).reshape(3, 3) / 128)
+    x, y, z = (-256 / 511 * 0.5**0.5, 0, 0.5**0.5) if version >= 3 else (-1, 1 / 255, 1 / 255)
+    expected = np.array([np.sqrt(max(0, 1 - x * x - y * y - z * z)), x, -y, -z])
+    np.testing.assert_allclose(abs(splats.quats[0] @ expected) / np.linalg.norm(expected), 1, rtol=1e-6)
+    assert splats.antialiased
+
+
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_what_is_lost_stays_within_the_promised_bounds(version, degree):
+    splats = make_splats(3000, degree, antialiased=degree == 2)
+
+    decoded = spz.decode(spz.encode(splats, version), "a.spz")
+
+    farthest = np.abs(splats.positions).max()
+    assert np.abs(decoded.positions - splats.positions).max() <= farthest / 2**22 / 2
+    assert np.abs(np.log(decoded.scales / splats.scales)).max() <= 1 / 32 + 1e-5
+    assert np.abs(decoded.opacities - splats.opacities).max() <= 0.5 / 255 + 1e-6
+    assert np.abs(decoded.harmonics[:, 0] - splats.harmonics[:, 0]).max() <= 0.5 / (0.15 * 255) + 1e-6
+    assert np.abs(decoded.harmonics - splats.harmonics)[:, 1:].max(initial=0) <= 1 / 64 + 1e-6
+    cosines = np.abs((decoded.quats.astype(np.float64) * splats.quats).sum(1)).min()
+    assert 2 * np.arccos(min(cosines, 1)) < 0.006
+    assert decoded.degree == degree and decoded.antialiased == splats.antialiased
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_numbers_that_were_decoded_are_encoded_as_they_were(version):
+    once = spz.encode(make_splats(500), version)
+    twice = spz.encode(spz.decode(once, "a.spz"), version)
+
+    first, second = spz.decode(once, "a.spz"), spz.decode(twice, "a.spz")
+    for name in ("positions", "scales", "opacities", "harmonics"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name), name)
+    np.testing.assert_allclose(first.quats, second.quats, atol=0.002)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_stored_numbers_are_those_of_the_model_turned_about_x(version):
+    splats = make_splats(1)
+    turned = splats.rotated(np.diag([1.0, -1, -1]))
+    data = spz.encode(splats, version)
+    content = gzip.decompress(data)[16:] if version == 3 else zstandard.decompress(data[32 + 6 * 16 :])
+
+    stored = [int.from_bytes(content[at : at + 3], "little", signed=True) for at in (0, 3, 6)]
+
+    assert np.allclose(np.array(stored) / turned.positions[0], stored[0] / turned.positions[0, 0], rtol=1e-5)
+    if version == 3:
+        assert np.abs(np.frombuffer(content[20:], np.uint8) / 128 - 1 - turned.harmonics[0, 1:].ravel()).max() < 0.016
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_no_gaussians_make_a_file_too(version):
+    assert len(spz.decode(spz.encode(make_splats(0, 2), version), "a.spz")) == 0
+
+
+def test_positions_use_the_bits_that_the_farthest_one_leaves():
+    near = Splats(*(np.repeat(part, 2, axis=0) for part in (np.array([[0.1, 0.2, 0.3]]), np.ones((1, 3)))),
+                  np.tile([1.0, 0, 0, 0], (2, 1)), np.ones(2), np.zeros((2, 1, 3)))  # fmt: skip
+    for farthest, step in ((0.5, 2**-23), (1.0, 2**-22), (100.0, 2**-16), (4e6, 2**-1)):
+        near.positions[1, 0] = -farthest
+        error = np.abs(spz.decode(spz.encode(near), "a.spz").positions - near.positions).max()
+        assert error <= step / 2
+    near.positions[1, 0] = 5e6
+    with pytest.raises(HyrfDataError, match="5,000,000 units from the origin, and SPZ reaches 4,194,303"):
+        spz.encode(near)
+
+
+def test_numbers_out_of_reach_become_the_nearest():
+    splats = Splats(np.zeros((2, 3)), np.array([[0, 1e-9, 1e9]] * 2), np.tile([1.0, 0, 0, 0], (2, 1)),
+                    np.array([0.0, 1]), np.array([[[9.0, -9, 0], [5, -5, 0], [0] * 3, [0] * 3]] * 2))  # fmt: skip
+    decoded = spz.decode(spz.encode(splats), "a.spz")
+    np.testing.assert_allclose(decoded.scales[0], np.exp([-10, -10, 255 / 16 - 10]), rtol=1e-6)
+    np.testing.assert_array_equal(decoded.opacities, [0, 1])
+    np.testing.assert_allclose(decoded.harmonics[0, 0, :2], [0.5 / 0.15, -0.5 / 0.15], rtol=1e-6)
+    assert decoded.harmonics[0, 1, 0] > 0.96 and decoded.harmonics[0, 1, 1] < -0.96
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_harmonics_of_degree_4_are_left_out(version):
+    decoded = spz.decode(file_of(sections_of_one(version, degree=4), version, degree=4), "a.spz")
+    assert decoded.degree == 3
+    np.testing.assert_allclose(decoded.harmonics[0, 15], HALF_TURN[15] * np.arange(42, 45) / 128)
+
+
+def test_extensions_are_skipped():
+    assert len(spz.decode(file_of(sections_of_one(4), 4, flags=2), "a.spz")) == 1
+    assert len(spz.decode(file_of([*sections_of_one(3), b"extension"], 3, flags=2), "a.spz")) == 1
+
+
+def test_the_same_splats_make_the_same_bytes_without_a_time():
+    data = spz.encode(make_splats(50))
+    assert data[:10] == b"\x1f\x8b\x08\0\0\0\0\0\0\xff"
+    assert data == spz.encode(make_splats(50)) and spz.encode(make_splats(50), 4) == spz.encode(make_splats(50), 4)
+
+
+def test_biker_is_the_model_of_its_compressed_ply(shared_data):
+    folder = shared_data / "trained_models"
+    splats = spz.decode((folder / "biker.spz").read_bytes(), "biker.spz")
+    other = compressed_ply.decode((folder / "biker.compressed.ply").read_bytes(), "biker.compressed.ply")
+
+    assert len(splats) == len(other) == 152_746
+    assert np.abs(splats.positions - other.positions).max() <= 2**-13 + 1e-6
+    assert np.abs(np.log(splats.scales / np.maximum(other.scales, np.exp(-10)))).max() <= 1 / 32 + 1e-4
+    assert np.abs(splats.opacities - other.opacities).max() <= 0.003
+    assert np.abs(splats.harmonics - other.harmonics).max() <= 0.5 / (0.15 * 255) + 0.001
+    assert np.abs((splats.quats * other.quats).sum(1)).min() > 0.99999
+
+
+GOOD = {version: file_of(sections_of_one(version), version) for version in (3, 4)}
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "this is no SPZ file"),
+        (b"ply\n", "this is no SPZ file"),
+        (GOOD[3][:20], "ends within its header"),
+        (GOOD[3][:-4], "is truncated"),
+        (GOOD[3][:-8] + bytes(8), "gzip stream is damaged"),
+        (GOOD[4][:31], "ends within its header"),
+        (GOOD[4][:100], "outside of the file"),
+        (GOOD[4][:-1], "is truncated"),
+        (gzip.compress(b"NGSQ" + bytes(40)), "do not start with 'NGSP'"),
+        (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 5, 1, 0, 8, 0, 0)), "this is SPZ version 5"),
+        (file_of([*sections_of_one(3), b"!"], 3), "goes on after its 1 Gaussians"),
+        (file_of(sections_of_one(3), 3, count=2), "before its 2 Gaussians do"),
+        (file_of(sections_of_one(4), 4, count=2), "a stream of 9 bytes stands where 2 Gaussians need 18"),
+        (file_of(sections_of_one(4), 4, degree=1), "5 streams do not fit harmonics of degree 1"),
+        (file_of(sections_of_one(3), 3, degree=5), "harmonics of degree 5"),
+        (file_of(sections_of_one(3), 3, bits=40), "40 fractional bits"),
+        (file_of(sections_of_one(3), 3, flags=0x80), "levels of detail"),
+        (file_of(sections_of_one(3), 3, count=2**32 - 1), "far more than"),
+        (file_of(sections_of_one(4), 4, count=2**32 - 1), "far more than"),
+        (
+            file_of([b"\0\x7c" * 3, *sections_of_one(1)[1:]], 1),
+            "the position of Gaussian 0 of 1 is not a finite number",
+        ),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",  # gzip's bytes hold the time
+)
+def test_decode_refuses_with_a_sentence(data, words):
+    with pytest.raises(HyrfDataError, match=words) as error:
+        spz.decode(data, "some.spz")
+    assert str(error.value).startswith("some.spz: ")
+
+
+def test_versions_that_are_not_written_are_a_mistake_of_the_caller():
+    with pytest.raises(ValueError, match="version 2"):
+        spz.encode(make_splats(1), 2)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_a_bomb_is_not_unpacked(version):
+    zeros = bytes(50_000_000)
+    sections = sections_of_one(version)
+    if version == 3:
+        bomb = file_of([*sections, zeros], 3)
+    else:
+        good = file_of(sections, 4)
+        first = zstandard.compress(zeros)
+        rest = good[32 + 5 * 16 + struct.unpack_from("<Q", good, 32)[0] :]
+        bomb = good[:32] + struct.pack("<QQ", len(first), 9) + good[48 : 32 + 5 * 16] + first + rest
+    tracemalloc.start()
+    with pytest.raises(HyrfDataError):
+        spz.decode(bomb, "bomb.spz")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2_000_000
+
+
+@settings(max_examples=40, deadline=None, derandomize=True, database=None)
+@given(
+    version=st.sampled_from([3, 4]),
+    inside=st.booleans(),
+    edits=st.lists(st.tuples(st.floats(0, 0.999), st.integers(0, 255)), min_size=1, max_size=4),
+    length=st.sampled_from([1.0, 1.0, 0.9, 0.3]),
+)
+def test_damaged_files_become_splats_or_a_sentence(version, inside, edits, length):
+    data = spz.encode(make_splats(20, 1), version)
+    inside &= version == 3
+    data = bytearray(gzip.decompress(data) if inside else data)
+    for place, byte in edits:
+        data[int(place**3 * len(data))] = byte  # mostly near the start
+    data = bytes(data[: int(length * len(data))])
+    try:
+        splats = spz.decode(gzip.compress(data) if inside else data, "a.spz")
+    except HyrfDataError as error:
+        assert str(error).startswith("a.spz: ")
+    else:
+        assert np.isfinite(splats.positions).all()
+
+
+def test_the_checksum_of_gzip_is_compared():
+    content = gzip.decompress(GOOD[3])
+    deflate = zlib.compressobj(wbits=-15)
+    body = deflate.compress(content) + deflate.flush()
+    wrong = b"\x1f\x8b\x08\0\0\0\0\0\0\xff" + body + struct.pack("<II", zlib.crc32(content) ^ 1, len(content))
+    with pytest.raises(HyrfDataError, match="gzip stream is damaged"):
+        spz.decode(wrong, "a.spz")

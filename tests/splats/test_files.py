@@ -1,0 +1,112 @@
+"""Which format a file is of is read off its ending, and what is written can be read."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+from scenes import ring
+
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.splats.files import MAX_BYTES, READ, WRITTEN, decode_splats, encode_splats, read_splats
+from hyrfpack.splats.splats import Splats, normalized_quats
+
+UP = np.array([0.0, -1.0, 0.0])
+PLACES = {  # centre and unit of a scene
+    "about the origin": ((0, 0, 0), 1),
+    "tiny": ((0, 0, 0), 1e-3),
+    "huge": ((0, 0, 0), 1e3),
+    "far away": ((-3, 700, 2), 0.5),
+    "map coordinates": ((4.5e5, 5.4e6, 300), 20),
+}
+
+
+def cloud(count: int = 50, center=(0, 0, 0), unit: float = 1.0) -> Splats:
+    generator = np.random.default_rng(0)
+    return Splats(
+        generator.uniform(-1, 1, (count, 3)) * unit + center,
+        unit * np.exp(generator.uniform(-5, -1, (count, 3))),
+        normalized_quats(generator.normal(size=(count, 4))),
+        generator.uniform(0.01, 0.99, count),
+        generator.normal(size=(count, 16, 3)) * 0.1,
+    )
+
+
+def encoded(splats: Splats, extension: str) -> bytes:
+    return encode_splats(splats, extension, up=UP, camera=ring(1)[0])
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("extension", WRITTEN)
+def test_every_format_brings_as_many_gaussians_back_to_the_same_place(extension, place):
+    splats = cloud(50, *PLACES[place])
+    if extension == ".spz" and place == "map coordinates":
+        with pytest.raises(HyrfDataError, match=r"5,4\d\d,\d\d\d units from the origin, and SPZ reaches [^\n]*$"):
+            encoded(splats, extension)
+        return
+    back = decode_splats(encoded(splats, extension), extension, "it")
+    apart = np.linalg.norm(back.positions[:, None] - splats.positions, axis=-1)
+    assert sorted(apart.argmin(0)) == list(range(50))  # formats may change the order
+    unit = PLACES[place][1]
+    assert apart.min(0).max() < 2e-4 * unit + 2e-7 * np.abs(splats.positions).max()
+    assert back.degree == (0 if extension == ".splat" else 3)
+
+
+@pytest.mark.parametrize("extension", READ)
+def test_files_are_read_by_their_ending_in_any_case(extension, tmp_path):
+    path = tmp_path / f"SCENE{extension.upper()}"
+    path.write_bytes(encoded(cloud(), extension))
+    assert len(read_splats(path)) == 50
+    assert len(read_splats(str(path))) == 50
+
+
+@pytest.mark.parametrize("extension", READ)
+def test_damaged_files_are_one_sentence_that_names_them(extension, tmp_path):
+    path = tmp_path / f"broken{extension}"
+    path.write_bytes(encoded(cloud(), extension)[:-7])
+    with pytest.raises(HyrfDataError, match=rf"broken{extension}\b[^\n]*$"):
+        read_splats(path)
+
+
+def test_no_file_and_unknown_endings_and_folders_are_one_sentence(tmp_path):
+    (tmp_path / "scene.obj").write_bytes(b"v 0 0 0")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "folder.ply").mkdir()
+    for name in ("none.ply", "none.obj", "scene.obj", "empty", "folder.ply", "meta.json", "empty/meta.json"):
+        with pytest.raises(HyrfDataError) as refusal:
+            read_splats(tmp_path / name)
+        assert str(tmp_path) in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_a_file_too_large_to_be_splats_is_refused_unread(tmp_path):
+    path = tmp_path / "large.ply"
+    path.touch()
+    os.truncate(path, MAX_BYTES + 1)  # a hole, not bytes
+    with pytest.raises(HyrfDataError, match="is larger than 4,294,967,296 bytes; split it first$"):
+        read_splats(path)
+
+
+@pytest.mark.parametrize(
+    "holds, told",
+    [
+        ((), "this one holds nothing; name another"),
+        (("b.webp", "a.webp"), "this one holds a.webp, b.webp; name another"),
+        (("scene.ply", "scene.SPZ", "notes.txt"), "this one holds notes.txt, scene.SPZ, scene.ply; name scene.SPZ in"),
+        (tuple(f"{n}.webp" for n in range(9)), "holds 0.webp, 1.webp, 2.webp, 3.webp and 5 more; name another"),
+    ],
+)
+def test_a_folder_without_a_sog_is_told_by_what_it_holds(holds, told, tmp_path):
+    for name in holds:
+        (tmp_path / name).write_bytes(b"")
+    for source in (tmp_path, tmp_path / "meta.json"):
+        with pytest.raises(HyrfDataError) as refusal:
+            read_splats(source)
+        assert "a folder is read as a loose SOG, meta.json with its pictures" in str(refusal.value)
+        assert told in str(refusal.value)
+
+
+@pytest.mark.parametrize("name", ["none.ply", "none.txt", "none", "none/meta.json"])
+def test_a_file_that_is_not_there_is_told_so_whatever_its_ending(name, tmp_path):
+    with pytest.raises(HyrfDataError, match="none.*: the file cannot be read"):
+        read_splats(tmp_path / name)

@@ -1,0 +1,268 @@
+"""The variants of `tools/studies/ablations.py` lack what they say they lack, and train all that they keep."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+
+import numpy as np
+import pytest
+import torch
+from scenes import ball_scene, ring, small_model
+
+from hyrfpack.data import PictureCache
+from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.model.hash_grid import HashGrid
+from hyrfpack.render import render
+from hyrfpack.train import DensityConfig, LearningRates, TrainConfig, Trainer
+from tools.studies import ablation_models, ablations
+
+# Density control clones and splits from the second step on.
+DENSITY = DensityConfig(start=0.05, stop=0.7, rounds=5, gradient=1e-6)
+SHORT = TrainConfig(steps=24, seed=3, max_gaussians=160, density=DENSITY)
+VARIANTS = {variant.name: variant for variant in ablation_models.TRAINED}
+EVERYTHING = {*Gaussians.NAMES, "geometry", "radiance"}
+KEEPS = {
+    "full": EVERYTHING,
+    "single field": EVERYTHING - {"geometry"},  # the radiance field, doubled, is the one
+    "no explicit properties": {"positions", "geometry", "radiance"},
+    "no neural fields": set(Gaussians.NAMES),
+    "no neural Gaussians, sphere kept": {*Gaussians.NAMES, "radiance"},
+    "no background sphere": EVERYTHING,
+    "no explicit colour": EVERYTHING - {"color_logits"},
+    "no explicit scale": EVERYTHING - {"scale_logits"},
+    "no explicit opacity": EVERYTHING - {"opacity_logits"},
+    "spherical harmonics for colour": EVERYTHING,
+    "no pre-culling, in training neither": EVERYTHING,
+}
+
+
+def a_scene():
+    return ball_scene(6, 60, side=24)
+
+
+def untrained(name: str, config: TrainConfig = SHORT) -> Trainer:
+    return ablation_models.build_trainer(a_scene(), config, VARIANTS[name])
+
+
+def group(name: str) -> str:
+    """The parameter group of a parameter's full name."""
+    head, _, rest = name.partition(".")
+    return rest if head == "gaussians" else head
+
+
+def decoded(model, viewpoint=(3.0, 1.0, 0.5)) -> list[torch.Tensor]:
+    """Scales, rotations, opacities and colours of all Gaussians."""
+    geometry = model.decode_geometry()
+    return [geometry.scales, geometry.quats, geometry.opacities, model.decode_colors(torch.tensor(viewpoint))]
+
+
+def changed(model, parameter: torch.Tensor) -> list[bool]:
+    """Which of `decoded` change when a parameter is moved."""
+    before = [values.detach().clone() for values in decoded(model)]
+    with torch.no_grad():
+        parameter += torch.rand(parameter.shape, generator=torch.Generator().manual_seed(5)) + 0.5
+    return [not torch.equal(old, new) for old, new in zip(before, decoded(model), strict=True)]
+
+
+# -- what is kept and what is not --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_a_run_moves_all_that_a_variant_keeps_and_nothing_else(name):
+    trainer = untrained(name)
+    before = {key: p.detach().clone() for key, p in trainer.model.named_parameters()}
+
+    assert trainer.run()
+
+    assert len(trainer.model) > 60  # density control has added some
+    after = dict(trainer.model.named_parameters())
+    # New rows are copies at first, so moved means: values that were not there before.
+    moved = {group(key) for key, p in after.items() if not torch.isin(p.detach(), before[key]).all()}
+    assert moved == KEEPS[name]
+    assert {group(key) for key, p in after.items() if p.requires_grad} == KEEPS[name]
+    assert all(parameter.isfinite().all() for parameter in after.values())
+
+
+@pytest.mark.parametrize("name", [name for name in VARIANTS if VARIANTS[name].lacking])
+def test_logits_that_are_lacking_are_zero_to_the_end(name):
+    trainer = untrained(name)
+    trainer.run()
+
+    for logits in VARIANTS[name].lacking:
+        values = getattr(trainer.model.gaussians, logits)
+        assert len(values) == len(trainer.model) > 60
+        assert not values.any()
+
+
+@pytest.mark.parametrize("name", [name for name in VARIANTS if VARIANTS[name].lacking])
+def test_without_logits_gaussians_start_at_the_mean_of_those_they_would_have_had(name):
+    full, model = untrained("full").model, untrained(name).model
+
+    scales, _, opacities, colors = decoded(model)
+    expected_scales, _, expected_opacities, expected_colors = decoded(full)
+    torch.testing.assert_close(opacities, expected_opacities, atol=1e-3, rtol=0)  # 0.1 for all of them
+    fraction, expected = (
+        values / model.scale_bounds(model.gaussians.positions) for values in (scales, expected_scales)
+    )
+    torch.testing.assert_close(fraction.logit().mean(0), expected.logit().mean(0), atol=1e-3, rtol=0)
+    torch.testing.assert_close(colors.logit().mean(0), expected_colors.logit().mean(0), atol=1e-3, rtol=0)
+
+
+def test_the_full_row_is_the_product():
+    product, ours = Trainer(a_scene(), SHORT), untrained("full")
+    product.run()
+    ours.run()
+
+    for (name, expected), (_, value) in zip(
+        product.model.named_parameters(), ours.model.named_parameters(), strict=True
+    ):
+        assert torch.equal(expected, value), name
+
+
+def test_a_single_field_has_one_grid_that_everything_reads():
+    full, model = untrained("full").model, untrained("single field").model
+
+    grids = [part for part in model.modules() if isinstance(part, HashGrid)]
+    assert len(grids) == 1
+    rows = full.geometry.grid.config.rows + full.radiance.grid.config.rows
+    assert rows < grids[0].config.rows < 1.5 * rows
+    assert all(changed(model, grids[0].table))
+
+
+@pytest.mark.parametrize("name", ["no neural fields", "no neural Gaussians, sphere kept"])
+def test_no_field_has_a_say_in_isotropic_diffuse_gaussians(name):
+    model = untrained(name).model
+
+    for field in (model.geometry, model.radiance):
+        for parameter in field.parameters():
+            assert not any(changed(model, parameter))
+
+
+def test_isotropic_diffuse_gaussians_are_those_of_a_model_with_silent_fields():
+    positions = np.random.default_rng(2).normal(size=(7, 3)) * 2  # some outside the box
+    silent = small_model(positions, fields=0.0, color_logits=[0.3, -1.0, 2.0], opacity_logits=-0.5)
+    model = ablation_models.IsotropicDiffuse(silent.config, silent.gaussians)
+    index = torch.tensor([1, 2, 5])
+
+    for value, expected in zip(decoded(model), decoded(silent), strict=True):
+        torch.testing.assert_close(value, expected, atol=1e-7, rtol=1e-6)
+    assert torch.equal(model.decode_geometry(index).scales, model.decode_geometry().scales[index])
+    assert torch.equal(model.decode_colors(torch.zeros(3), index), model.decode_colors(torch.zeros(3))[index])
+
+
+# -- spherical harmonics -----------------------------------------------------------------------------------------------
+
+
+def test_harmonics_are_orthonormal_on_the_sphere():
+    z, weights = np.polynomial.legendre.leggauss(8)  # exact for polynomials of degree 15
+    phi = 2 * np.pi * np.arange(16) / 16
+    radius = np.sqrt(1 - z**2)[:, None]
+    sphere = np.stack((radius * np.cos(phi), radius * np.sin(phi), np.broadcast_to(z[:, None], (8, 16))), -1)
+
+    basis = ablation_models.harmonics_to_degree_3(torch.from_numpy(sphere.reshape(-1, 3))).numpy()
+
+    gram = (basis * np.repeat(weights * 2 * np.pi / 16, 16)[:, None]).T @ basis
+    np.testing.assert_allclose(gram, np.eye(16), atol=1e-12)
+
+
+def test_harmonic_colours_start_as_the_points_colours_from_everywhere():
+    full, model = untrained("full").model, untrained("spherical harmonics for colour").model
+
+    assert model.gaussians.color_logits.shape == (len(model), 48)
+    for viewpoint in ring(3):
+        colors = model.decode_colors(torch.from_numpy(viewpoint.position).float())
+        torch.testing.assert_close(colors, torch.sigmoid(full.gaussians.color_logits), atol=1e-6, rtol=0)
+
+
+def test_harmonic_colours_are_the_sum_that_3dgs_takes():
+    model = untrained("spherical harmonics for colour").model
+    generator = torch.Generator().manual_seed(1)
+    coefficients = torch.randn(len(model), 16, 3, generator=generator) / 3  # h of each band and channel
+    rates = torch.full((16, 1), 20.0)
+    rates[0] = 1
+    model.gaussians.color_logits.data = (coefficients * rates).flatten(1)
+    viewpoint, index = torch.tensor([3.0, 1.0, 0.5]), torch.tensor([4, 9])
+
+    basis = ablation_models.harmonics_to_degree_3(
+        torch.nn.functional.normalize(model.gaussians.positions.detach().double() - viewpoint, dim=-1)
+    )
+    expected = ((basis[..., None] * coefficients).sum(1) + 0.5).clamp_min(0)
+    assert (expected == 0).any()  # some are cut
+    torch.testing.assert_close(model.decode_colors(viewpoint).double(), expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(model.decode_colors(viewpoint, index).double(), expected[index], atol=1e-5, rtol=0)
+
+
+def test_the_radiance_field_has_no_say_in_harmonic_colours():
+    model = untrained("spherical harmonics for colour").model
+
+    assert not any(any(changed(model, parameter)) for parameter in model.radiance.parameters())
+
+
+# -- running and reporting ---------------------------------------------------------------------------------------------
+
+
+def test_without_pre_culling_every_gaussian_is_decoded():
+    model = untrained("full").model
+    camera = dataclasses.replace(ring(1)[0], width=6, cx=3.0)  # a slit that sees few of them
+
+    with ablations.culling(ablation_models.NO_CULLING):
+        everything = render(model, camera)
+
+    assert len(everything.decoded) == len(model)
+    assert len(render(model, camera).decoded) < len(model)
+
+
+@pytest.mark.parametrize("steps", [1, 3], ids=["in the last step", "midway"])
+def test_a_run_that_diverges_is_a_result(steps, tmp_path):
+    config = dataclasses.replace(SHORT, steps=steps, learning_rates=LearningRates(fields=(1e38, 1e38)))
+
+    result = ablations.run(VARIANTS["no explicit scale"], a_scene(), config, tmp_path / "full.hyrf", PictureCache())
+
+    assert list(result) == ["failed"]
+    assert "finite" in result["failed"]
+
+
+def test_one_call_measures_the_variants_and_prints_their_tables(tmp_path, monkeypatch, capsys):
+    scene = a_scene()
+    scene = dataclasses.replace(scene, train=scene.train[:4], test=scene.train[4:])
+    monkeypatch.setattr(ablations.hyrfpack, "load_scene", lambda folder: scene)
+    arguments = ["ablations", "--steps", "3", "--seeds", "1", "--sets", "balls", "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", [*arguments, "--only", "harmonics", "culling"])
+
+    ablations.main()
+    first = capsys.readouterr().out
+    monkeypatch.setattr(ablations, "run", None)  # what is kept is not run again
+    monkeypatch.setattr(sys, "argv", [*sys.argv, "--reuse"])
+    ablations.main()
+
+    assert capsys.readouterr().out == first
+    for name in ("full", "spherical harmonics for colour", "no pre-culling"):
+        assert f"| {name} | " in first
+    assert "single field" not in first
+
+
+def result(psnr: float, **other) -> dict:
+    return {"psnr": psnr, "ssim": 0.5, "gaussians": 100, "bytes": 800, "frames_ratio": 0.5, **other}
+
+
+def test_tables_hold_differences_their_spread_and_runs_that_failed():
+    failed = {"failed": "the loss is not finite"}
+    single, scale = VARIANTS["single field"], VARIANTS["no explicit scale"]
+    results = {
+        ("full", "a"): [result(20.0), result(21.0)],
+        ("full", "b"): [result(30.0), result(30.0)],
+        (single.name, "a"): [result(19.0, bytes=1000), result(20.5, bytes=1000)],
+        (single.name, "b"): [result(30.2, bytes=1000), result(30.4, bytes=1000)],
+        (scale.name, "a"): [failed, result(18.5)],
+        (scale.name, "b"): [failed, failed],
+    }
+    variants = [VARIANTS["full"], single, scale]
+
+    text = ablations.report(results, ["a", "b"], variants)
+
+    assert "| full | 24.07, 30.37 | 20.50 ± 0.50 | 30.00 ± 0.00 |" in text
+    assert "| single field | -0.29 | -0.75 ± 0.25 | +0.30 ± 0.10 | -0.23 | 1 of 2 |" in text
+    assert "| no explicit scale | -1.63 | -2.50 ± 0.00 (1 did not train) | did not train | -2.50 | 1 of 1 |" in text
+    assert "| single field | 0.90 | 1.25 | 0.95 | 0.50 |" in text
+    assert "| no explicit scale | did not train |" in text  # in the table of set b

@@ -1,0 +1,302 @@
+"""tools/gpu/check.py: counts by hand, what is written, what happens when something breaks, and that it runs through."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from hyrfpack.ops.dispatch import has_triton
+from hyrfpack.ops.rasterize.reference import project
+from tools.gpu import check as gpu_check
+from tools.gpu import frames as gpu_frames
+from tools.gpu import kernels as gpu_kernels
+from tools.gpu import report as gpu_report
+from tools.gpu import roofline as gpu_roofline
+from tools.gpu import tests as gpu_tests
+from tools.gpu import timing as gpu_timing
+from tools.gpu.compare import Call, checked
+from tools.gpu.rows import goal
+from tools.gpu.scene import make_cameras, make_model, splats_of
+from tools.gpu.setup import Setup, find_set
+from tools.gpu.worker import run_items
+
+CUDA = torch.cuda.is_available()
+GPU = "gpu" if has_triton() else "cpu"
+TINY = Setup(
+    device="cuda" if CUDA else "cpu",
+    implementation=GPU,
+    width=16,
+    height=16,
+    kernel_gaussians=24,
+    frame_gaussians=(200,),
+    error_rows=32,
+    crop=16,
+    repeats=1,
+    views=4,
+    warm_steps=1,
+    steps=2,
+    demo_views=9,
+    demo_size=16,
+    quality_steps=4,
+)
+RATES = gpu_timing.Rates(copy=1e12, bf16=4e14, fp32=2e13)
+
+# One child of gpu_worker for the tests: items that print a row, raise, die, hang, or leave the device unusable.
+CHILD = f"""
+import sys
+sys.path.insert(0, {str(gpu_check.ROOT)!r})
+import os, time
+from tools.gpu import worker as gpu_worker
+usable = True
+def run(item):
+    global usable
+    yield {{"what": item}}
+    if item == "raises":
+        raise ValueError("one\\nline")
+    if item == "breaks":
+        usable = False
+        raise RuntimeError("illegal access")
+    if item == "lacks":
+        import no_such_package
+    if item == "dies":
+        print("last words", flush=True)
+        os._exit(9)
+    if item == "hangs":
+        time.sleep(60)
+sys.exit(gpu_worker.work(run, sys.argv[1:], lambda: usable))
+"""
+
+
+def run_children(*items: str, seconds: float = 20.0) -> dict[str, list[str]]:
+    """What rows say of each item: "fine", or the status and its reason."""
+    rows = run_items(lambda left: [sys.executable, "-c", CHILD, *left], items, seconds)
+    told: dict[str, list[str]] = {}
+    for row in rows:
+        told.setdefault(row["item"], []).append(f"{row['status']}: {row['note']}" if "status" in row else "fine")
+    return told
+
+
+def test_work_of_the_rasteriser_is_that_counted_by_hand() -> None:
+    assert gpu_roofline.project(10).bytes == 10 * 4 * (3 + 4 + 3 + 1 + 2 + 3 + 1 + 1)
+    # 3 Gaussians sorted by 4 bytes, 5 pairs by the 13 bits of 8,160 tiles: 4 and 2 passes of 8 bytes there and back.
+    sorting = 3 * 4 * 16 + 5 * 2 * 16
+    assert gpu_roofline.bin_pairs(3, 5, 8160).bytes == 3 * 28 + 5 * 8 + sorting
+    work = gpu_roofline.blend(pairs=6, pixels=512, reached=0.5, blended=2.0)
+    assert work.bytes == 3 * 40 + 512 * 16
+    assert work.flops == 3 * 256 * 12 + 2 * 512 * 10
+    work = gpu_roofline.blend_backward(pairs=6, pixels=512, reached=0.5, blended=2.0)
+    assert work.bytes == 3 * (40 + 44) + 512 * 20
+    assert work.flops == 3 * 256 * 12 + 2 * 512 * 40
+
+
+def test_work_of_the_fields_is_that_counted_by_hand() -> None:
+    # 100 points, 16 levels of 2 features; 12,800 corners, so that all of 5,000 rows may be needed.
+    assert gpu_roofline.hash_encode(100, 16, 5000).bytes == 100 * 3 * 4 + 100 * 32 * 4 + 5000 * 8
+    assert gpu_roofline.hash_encode(100, 16, 50_000).bytes == 100 * 3 * 4 + 100 * 32 * 4 + 12_800 * 8
+    assert gpu_roofline.hash_encode_backward(100, 16, 50_000).bytes == 100 * 3 * 4 + 100 * 32 * 4 + 50_000 * 8
+    weights = 32 * 64 + 64 * 64 + 64 * 8
+    work = gpu_roofline.decode(100, (32, 64, 64, 8), 16, 5000, mixed=True)
+    assert work.bytes == 100 * 3 * 4 + 5000 * 8 + 100 * 8 * (4 + 4) and work.unit == "bf16"
+    assert work.flops == 100 * (16 * (49 + 32) + 2 * weights + 10 * 8)
+    work = gpu_roofline.mlp(100, (32, 64, 64, 8), mixed=True)
+    assert (work.bytes, work.flops, work.unit) == (100 * 40 * 4 + weights * 4, 100 * weights * 2, "bf16")
+    work = gpu_roofline.shade(100, (24, 64, 64, 3), mixed=True)
+    assert work.bytes == 100 * ((3 + 3 + 3) * 4 + 64 * 2)
+    assert work.flops == 100 * (2 * (24 * 64 + 64 * 64 + 64 * 3) + 60)
+    # Of 500 Gaussians 100 are drawn, whose positions are read once.
+    fused = gpu_roofline.project_shaded(500, 100, (24, 64, 64, 3), mixed=True)
+    assert fused.bytes == 500 * 72 + 100 * ((3 + 3) * 4 + 64 * 2)
+    assert (fused.flops, fused.unit) == (work.flops, "bf16")
+    # 100 of 180 nodes are needed; their 12,800 corners may be all of 5,000 rows.
+    work = gpu_roofline.background(700, 180, 100, (56, 64, 64, 3), 16, 5000, mixed=False)
+    assert work.bytes == 700 * 4 + 180 * 3 * 4 + 5000 * 8 and work.unit == "fp32"
+    assert work.flops == 100 * (16 * (49 + 32) + 2 * (56 * 64 + 64 * 64 + 64 * 3) + 130)
+    work = gpu_roofline.mlp_backward(100, (32, 64, 64, 8), mixed=False)
+    assert work.flops == 2 * 100 * (2 * weights + 32 * 64 + 64 * 64) and work.unit == "fp32"
+
+
+def test_work_of_loss_and_optimiser_is_that_counted_by_hand() -> None:
+    assert gpu_roofline.photometric_loss(10).bytes == 10 * 3 * 3 * 4
+    assert gpu_roofline.photometric_loss(10).flops == 10 * 3 * (8 * 2 * 11 * 2 + 40)
+    assert gpu_roofline.adam(10).bytes == 10 * (4 + 3) * 4
+
+
+def test_roofline_is_the_slower_of_memory_and_arithmetic() -> None:
+    memory, arithmetic = gpu_roofline.Work(2e9, 2e10), gpu_roofline.Work(2e9, 8e11, "bf16")
+    assert memory.least_ms(RATES) == pytest.approx(2.0)
+    assert arithmetic.least_ms(RATES) == pytest.approx(2.0)
+    assert memory.shares(4.0, RATES) == pytest.approx((0.5, 0.25))
+    assert gpu_roofline.Work(1e9, 8e12, "bf16").least_ms(RATES) == pytest.approx(20.0)
+
+
+def test_kernels_of_the_profiler_are_added_up_and_grouped_by_stage() -> None:
+    class Event:
+        def __init__(self, key: str, microseconds: float, device: str = "DeviceType.CUDA") -> None:
+            self.key, self.self_device_time_total, self.device_type = key, microseconds, device
+
+    events = [Event("project_kernel", 2000), Event("blend_kernel", 6000), Event("aten::sort", 5000, "DeviceType.CPU")]
+    times = gpu_timing.sum_kernels([*events, Event("DeviceRadixSortKernel", 1000), Event("memset", 500)], runs=2)
+    assert list(times) == ["blend_kernel", "project_kernel", "DeviceRadixSortKernel", "memset"]
+    stages = gpu_timing.group_kernels(times, gpu_kernels.STAGES, "bin")
+    assert stages == {"project": 1.0, "blend": 3.0, "bin": 0.75}
+
+
+def test_count_of_blended_gaussians_matches_a_walk_from_pixel_to_pixel() -> None:
+    whole = splats_of(make_model(2000, torch.device("cpu")), make_cameras(4, 128, 128)[1])
+    splats = gpu_kernels.cropped(whole, 16)
+    splats.inputs["opacities"].fill_(0.97)  # so that all pixels are finished before the last
+    values = [splats.inputs[name] for name in ("means", "quats", "scales", "opacities")]
+    seen = project(*values, *splats.view, 0.01, False)
+    order = torch.argsort(seen.depths).tolist()
+    pixels = torch.cartesian_prod(torch.arange(16), torch.arange(16)) + 0.5
+    offsets = pixels[:, None] - seen.means2d
+    matrices = seen.conics[:, [0, 1, 1, 2]].view(-1, 2, 2)
+    distances = torch.einsum("pgi,gij,pgj->pg", offsets, matrices, offsets)
+    alphas = (seen.opacities * torch.exp(-0.5 * distances)).tolist()
+    touching = [i for i in order if any(row[i] >= 1 / 255 for row in alphas)]
+    added, needed = 0, set()
+    for row in alphas:
+        light = 1.0
+        for i in touching:
+            if light <= 1 / 512:
+                break
+            needed.add(i)
+            if row[i] >= 1 / 255:
+                added += 1
+                light *= 1 - min(0.99, row[i])
+    blended, reached = gpu_kernels.count_blended(splats)
+    assert len(needed) < len(touching)  # or the count of what is reached would say nothing
+    assert (blended, reached) == pytest.approx((added / 256, len(needed) / len(touching)), rel=1e-3)
+
+
+def test_errors_beyond_their_bounds_fail_a_row() -> None:
+    def double(implementation: str, x: torch.Tensor) -> torch.Tensor:
+        return x * (2.0 if implementation == "reference" else 2.001)
+
+    call = Call(double, {"x": torch.linspace(1, 2, 5)}, ("x",), (1e-2, 1e-4))
+    row = checked(call, "gpu")
+    assert row["value error"] == pytest.approx(5e-4, rel=1e-2)
+    assert row["status"] == "failed" and "beyond 1e-04" in row["note"]
+
+
+def test_numbers_that_are_not_finite_fail_a_row() -> None:
+    call = Call(lambda implementation, x: x if implementation == "reference" else x * float("nan"), {}, ())
+    call = Call(call.run, {"x": torch.ones(3)}, ("x",))
+    assert checked(call, "gpu")["status"] == "failed"
+
+
+def test_an_item_that_raises_dies_or_breaks_the_device_leaves_the_others() -> None:
+    told = run_children("one", "raises", "breaks", "dies", "lacks", "two")
+    assert told["one"] == told["two"] == ["fine"]
+    assert told["raises"] == ["fine", "failed: ValueError: one line"]
+    assert told["breaks"] == ["fine", "failed: RuntimeError: illegal access"]
+    assert told["dies"] == ["fine", "failed: its process ended: last words"]
+    assert told["lacks"][1].startswith("left out: ModuleNotFoundError: No module named 'no_such_package'")
+
+
+def test_an_item_that_hangs_is_killed_at_the_time_limit_and_the_rest_is_named() -> None:
+    told = run_children("one", "hangs", "two", seconds=1.5)
+    assert told["one"] == ["fine"]
+    assert told["hangs"][-1] == told["two"][-1] == "failed: not done within the part's 2 s"
+
+
+def test_a_child_that_cannot_start_fails_each_item_once() -> None:
+    rows = list(run_items(lambda left: [sys.executable, "-c", "raise SystemExit('no')"], ["a", "b"], 20.0))
+    assert [row["item"] for row in rows] == ["a", "b"]
+    assert all("its process ended: no" in row["note"] for row in rows)
+
+
+def test_a_part_whose_module_is_broken_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(gpu_check.PARTS, "broken", ("tools.gpu.no_such_module", 5.0))
+    rows = gpu_check.check(["broken"], TINY)
+    assert rows[0]["status"] == "failed" and "tools.gpu.no_such_module" in rows[0]["note"]
+
+
+def test_page_has_goals_failures_and_a_table_for_each_kind(tmp_path: Path) -> None:
+    rows = [
+        {"part": "kernels", "item": "a", "table": "Kernels", "kernel": "a|b", "ms": 0.5, "pairs": 1_234_567},
+        {"part": "kernels", "item": "b", "status": "failed", "note": "RuntimeError: no"},
+        {"part": "frames", "item": "1", **goal("frames", 312.0, 300.0, "frames/s", at_least=True)},
+        {"part": "frames", "item": "1", **goal("steps", 12.0, 10.0, "min", at_least=False)},
+    ]
+    page = gpu_report.write(tmp_path / "new", {"device": "NVIDIA H200", "torch": "2.11"}, {"width": 1920}, rows)
+    assert page.name == "nvidia-h200.md"
+    text = page.read_text()
+    assert "# NVIDIA H200\n" in text and "torch 2.11" in text
+    assert "| kernel | ms | pairs |\n| --- | --: | --: |\n| a\\|b | 0.5 | 1,234,567 |" in text
+    assert "| frames: at least 300 frames/s | 312 frames/s | yes |" in text
+    assert "| steps: at most 10 min | 12 min | no |" in text
+    assert "| kernels: b |  | failed | RuntimeError: no |" in text
+    assert text.index("## Goals") < text.index("## Failed and left out") < text.index("## Kernels")
+    assert json.loads(page.with_suffix(".json").read_text())["rows"] == rows
+
+
+def test_settings_survive_the_way_to_a_child() -> None:
+    assert Setup.from_json(TINY.to_json()) == TINY
+
+
+def test_set_is_the_one_asked_for_or_one_of_the_data_folder(tmp_path: Path) -> None:
+    for name in ("b", "a"):
+        (tmp_path / name / "sparse").mkdir(parents=True)
+    assert find_set(tmp_path / "b", None, tmp_path) == tmp_path / "b"
+    assert find_set(None, str(tmp_path), Path("/nowhere")) == tmp_path / "a"
+    assert find_set(None, None, tmp_path / "nowhere") is None
+
+
+@pytest.mark.skipif(CUDA, reason="there is a GPU")
+def test_without_a_gpu_it_ends_with_one_sentence_and_code_2(capsys: pytest.CaptureFixture) -> None:
+    assert gpu_check.main([]) == 2
+    assert capsys.readouterr().err == f"gpu_check: {gpu_check.NO_GPU}\n"
+
+
+def test_it_starts_from_the_repository_root_without_an_installed_hyrfpack() -> None:
+    # -S leaves out the environment's packages, and with them an installed hyrfpack; torch is found where it is.
+    environment = {**os.environ, "PYTHONPATH": str(Path(torch.__file__).parents[1])}
+    command = [sys.executable, "-S", "-m", "tools.gpu.check", "--help"]
+    done = subprocess.run(command, cwd=gpu_check.ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0 and "--parts" in done.stdout, done.stderr
+
+
+def test_the_command_writes_its_page_and_fails_where_a_check_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(gpu_check, "Setup", lambda data: replace(TINY, device="cpu", data=str(tmp_path / "no set")))
+    assert gpu_check.main(["--parts", "quality", "--out", str(tmp_path)]) == 1
+    (page,) = tmp_path.glob("*.md")
+    assert all(f"| {run} | " in page.read_text() for run in ("CPU", "GPU, float32", "GPU, mixed"))
+    assert "| quality: " + str(tmp_path / "no set") in page.read_text()
+    assert capsys.readouterr().out.endswith("1 failed\n")
+
+
+@pytest.mark.parametrize("item", gpu_kernels.items(TINY))
+def test_kernels_part_runs_through(item: str) -> None:
+    rows = list(gpu_kernels.run(item, TINY))
+    assert rows and not [row for row in rows if "status" in row]
+
+
+def test_matrix_case_runs_through() -> None:
+    (row,) = gpu_tests.run("rasterize, one large Gaussian", TINY)
+    assert "status" not in row, row
+
+
+def test_tests_part_runs_some_of_a_file_and_tells_of_a_failure(tmp_path: Path) -> None:
+    file = tmp_path / "test_some.py"
+    file.write_text("def test_gpu_good(): pass\ndef test_gpu_bad(): assert 1 == 2\ndef test_cpu(): assert False\n")
+    row = gpu_tests.run_pytest(str(file))
+    assert row["result"].startswith("1 failed, 1 passed, 1 deselected")
+    assert row["status"] == "failed" and "1 == 2" in row["note"]
+
+
+def test_frames_part_runs_through() -> None:
+    rows = list(gpu_frames.run("200", TINY))
+    tables = {row["table"] for row in rows}
+    assert {"The room", "Frames, 16 x 16", "Rasterising against gsplat", "Training"} <= tables
+    assert not [row for row in rows if row.get("status") == "failed"]

@@ -1,0 +1,151 @@
+"""Speed, size and memory of `compact` files, with and without Numba, beside `raw` files of the same models.
+
+The models are drawn: points near a wavy surface, logits that vary slowly with some noise on top, and sensitivities
+that spread over decades as those of trained models do. What a trained model loses is for `bench/` to say; here the
+error is that of the explicit logits, against the model that was coded.
+"""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from unittest import mock
+
+import numpy as np
+import torch
+
+from hyrfpack.format.arrays import to_arrays, to_model
+from hyrfpack.format.codec import decode_model, encode_model
+from hyrfpack.format.compact import Plan, Sensitivity, make_plan
+from hyrfpack.measure.timing import take_turns
+from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
+from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.parallel import has_numba
+
+SIZES = ((100_000, 14), (1_000_000, 17))  # Gaussians, log2 of the radiance table; that of geometry is half as large
+REPEATS = 3
+NOISE = 2e-6
+
+
+def drawn_model(count: int, log2_table_size: int) -> HybridModel:
+    """A model with `count` Gaussians."""
+    rng = np.random.default_rng(0)
+    frame = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
+    config = ModelConfig(frame, HashGridConfig(log2_table_size - 1), HashGridConfig(log2_table_size))
+    places = rng.uniform(-1, 1, (count, 3))
+    places[:, 2] = 0.3 * np.sin(4 * places[:, 0]) + rng.normal(0, 0.02, count)
+    waves = np.sin(places @ rng.normal(0, 8, (3, 5)))
+    logits = torch.from_numpy(waves + rng.normal(0, 0.3, (count, 5))).float()
+    gaussians = Gaussians(torch.from_numpy(places).float(), logits[:, :3], logits[:, 3:4], logits[:, 4:])
+    model = HybridModel(config, gaussians, torch.Generator().manual_seed(0))
+    arrays = to_arrays(model)
+    for group in ("GTAB", "RTAB"):
+        arrays[group] = rng.normal(0, 0.1, arrays[group].shape).astype(np.float32)
+    return to_model(config, arrays)
+
+
+def drawn_sensitivity(model: HybridModel) -> Sensitivity:
+    """Log-normal sensitivities, 3 to 4 decades wide."""
+    rng = np.random.default_rng(1)
+    sizes = {group: values.size for group, values in to_arrays(model).items()}
+
+    def spread(count: int, mean: float) -> np.ndarray:
+        return np.exp(rng.normal(np.log(mean), 2, count))
+
+    gaussian = spread(len(model), 1e-9)
+    return Sensitivity(
+        100 * gaussian,
+        gaussian,
+        gaussian / 2,
+        2 * gaussian,
+        {group: spread(sizes[group], 1e-8) for group in ("GTAB", "RTAB")},
+        {group: spread(sizes[group], 1e-4) for group in ("GMLP", "RMLP")},
+    )
+
+
+def bench() -> list[dict]:
+    """Time all ways, interleaved; medians.
+
+    Returns:
+        A row for each size and way: bytes, times, the largest root mean square error of an explicit logit, and the
+        peak of what numpy holds while decoding, over the decoded model.
+    """
+    return [row for size in SIZES for row in _bench_model(*size)]
+
+
+def _bench_model(count: int, log2_table_size: int) -> list[dict]:
+    model = drawn_model(count, log2_table_size)
+    sensitivity = drawn_sensitivity(model)
+    plan = make_plan(model, sensitivity, NOISE, prune=False)
+    ways = {"compact (cpu)": True, "compact (numpy)": False} if has_numba() else {"compact (numpy)": False}
+
+    planning, _ = take_turns({"plan": partial(make_plan, model, sensitivity, NOISE, prune=False)}, REPEATS)
+    encoders = {"raw": partial(encode_model, model)}
+    encoders |= {
+        way: _with_numba(fast, partial(encode_model, model, "compact", plan=plan)) for way, fast in ways.items()
+    }
+    encoding, files = take_turns(encoders, REPEATS)
+    if len({files[way] for way in ways}) > 1:
+        raise AssertionError("the bytes depend on whether there is Numba")
+    decoders = {way: _with_numba(ways.get(way, True), partial(decode_model, data)) for way, data in files.items()}
+    decoding, models = take_turns(decoders, REPEATS)
+    return [
+        {
+            "gaussians": count,
+            "profile": way,
+            "bytes": len(data),
+            "plan_ms": planning["plan"].ms if way in ways else None,
+            "encode_ms": encoding[way].ms,
+            "decode_ms": decoding[way].ms,
+            "decode_over_raw": decoding[way].over(decoding["raw"]).wall,
+            "decode_work_ms": decoding[way].work_ms,
+            "peak_over_model": _peak(decoders[way]) / sum(4 * p.numel() for p in model.parameters()),
+            "rms_error": _error(models[way], model, plan if way in ways else None),
+        }
+        for way, data in files.items()
+    ]
+
+
+def _with_numba(fast: bool, task: Callable[[], object]) -> Callable[[], object]:
+    def run() -> object:
+        with _numba(fast):
+            return task()
+
+    return run
+
+
+@contextmanager
+def _numba(fast: bool) -> Iterator[None]:
+    """The codecs with compiled kernels, or as they are where Numba is missing."""
+    with mock.patch("hyrfpack.quant.rans.has_numba", lambda: fast):
+        yield
+
+
+def _peak(task: Callable[[], object]) -> float:
+    """Most bytes that numpy holds at once during a task."""
+    tracemalloc.start()
+    try:
+        task()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def _error(decoded: HybridModel, model: HybridModel, plan: Plan | None) -> float:
+    """Root mean square error of the explicit logits, of the worst group."""
+    order = slice(None) if plan is None else plan.kept
+    after, before = to_arrays(decoded), to_arrays(model)
+    groups = ("COLO", "SCAL", "OPAC")
+    return max(float(np.sqrt(np.square(after[group] - before[group][order]).mean())) for group in groups)
+
+
+def main() -> None:
+    """Print the rows."""
+    for row in bench():
+        print(row)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,168 @@
+"""Speed and size of the integer coder beside zstd, constriction and our Huffman coder in the same run.
+
+constriction and Huffman code the same tokens as we do, and their sizes count the extra bits as they are; what splits
+values into tokens is not in their times. zstd codes the values as bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from hyrfpack.measure.timing import take_turns
+from hyrfpack.parallel import has_numba
+from hyrfpack.quant import HuffmanStream, decode_integers, encode_integers, huffman_decode, huffman_encode
+from hyrfpack.quant.integers import EXTRA_BITS
+from hyrfpack.quant.rans import decode_tokens
+
+try:
+    import zstandard
+except ImportError:
+    zstandard = None
+try:
+    import constriction
+except ImportError:
+    constriction = None
+
+COUNTS = (3_400_000, 30_000)
+REPEATS = 3
+
+Coder = tuple[Callable[[], bytes], Callable[[bytes], np.ndarray], int]
+
+
+def laplace_with_contexts(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals of eight known scales from 0.3 to 10 steps."""
+    rng = np.random.default_rng(0)
+    contexts = rng.integers(0, 8, count).astype(np.uint8)
+    return np.rint(rng.laplace(scale=np.geomspace(0.3, 10, 8)[contexts])).astype(np.int32), contexts
+
+
+def morton_gaps(count: int) -> tuple[np.ndarray, None]:
+    """Gaps along the Morton curve between points near a surface, on a grid of 2^14 an axis."""
+    rng = np.random.default_rng(0)
+    plane = rng.integers(0, 1 << 14, (count + 1, 2))
+    height = 8000 + 2000 * np.sin(plane[:, 0] / 2000) + rng.normal(0, 20, count + 1)
+    code = np.zeros(count + 1, np.int64)
+    for axis, place in enumerate((*plane.T, height.astype(np.int64))):
+        for bit in range(14):
+            code |= (place >> bit & 1) << (3 * bit + axis)
+    return np.diff(np.sort(code)), None
+
+
+def mostly_zero(count: int) -> tuple[np.ndarray, None]:
+    """Residuals that are 0 in nine cases out of ten."""
+    return np.rint(np.random.default_rng(0).laplace(scale=0.22, size=count)).astype(np.int32), None
+
+
+SETS = {"laplace, 8 contexts": laplace_with_contexts, "Morton gaps": morton_gaps, "mostly zero": mostly_zero}
+
+
+def bench() -> list[dict]:
+    """Time all coders, interleaved; medians.
+
+    Returns:
+        A row for each set, size and coder: bits a symbol, how much that is above the entropy (of each context's tokens,
+        plus the extra bits), and million symbols a second. All coders are exact, which is checked.
+    """
+    return [row for name, make in SETS.items() for count in COUNTS for row in _bench_set(name, *make(count))]
+
+
+def _bench_set(name: str, values: np.ndarray, contexts: np.ndarray | None) -> list[dict]:
+    count, signed = len(values), bool(values.min() < 0)
+    tokens = decode_tokens(encode_integers(values, contexts, signed=signed), count, contexts).tokens
+    groups = np.zeros(count, np.uint8) if contexts is None else contexts
+    histograms = np.stack([np.bincount(tokens[groups == group], minlength=126) for group in range(groups.max() + 1)])
+    shares = histograms / np.maximum(histograms.sum(axis=1, keepdims=True), 1)
+    extra = int(EXTRA_BITS[tokens].sum(dtype=np.int64))
+    entropy = (extra - (histograms * np.log2(np.where(shares > 0, shares, 1))).sum()) / count
+
+    coders = {}
+    for implementation in ("cpu", "numpy") if has_numba() else ("numpy",):
+        coders[f"ours ({implementation})"] = _ours(values, contexts, signed, implementation)
+    coders["ours, Huffman"] = _huffman(tokens, extra)
+    if constriction:
+        coders["constriction"] = _constriction(tokens, groups, shares, extra)
+    if zstandard:
+        coders["zstd-19"] = _zstd(values)
+
+    encoding, blobs = take_turns({coder: encode for coder, (encode, _, _) in coders.items()}, REPEATS)
+    for coder, (_, decode, _) in coders.items():
+        expected = values if coder.startswith(("ours (", "zstd")) else tokens
+        if not np.array_equal(decode(blobs[coder]), expected):
+            raise AssertionError(f"{coder} does not give back what it was given")
+    decoding, _ = take_turns({c: partial(decode, blobs[c]) for c, (_, decode, _) in coders.items()}, REPEATS)
+    rows = [{"set": name, "symbols": count, "coder": "entropy", "bits_per_symbol": entropy, "above_entropy_%": 0.0}]
+    for coder, (_, _, more_bits) in coders.items():
+        bits = (8 * len(blobs[coder]) + more_bits) / count
+        rows.append(
+            {
+                "set": name,
+                "symbols": count,
+                "coder": coder,
+                "bits_per_symbol": bits,
+                "above_entropy_%": 100 * (bits / entropy - 1),
+                "encode_msymbols_per_s": count / encoding[coder].ms / 1e3,
+                "decode_msymbols_per_s": count / decoding[coder].ms / 1e3,
+            }
+        )
+    return rows
+
+
+def _ours(values: np.ndarray, contexts: np.ndarray | None, signed: bool, implementation: str) -> Coder:
+    options = {"signed": signed, "implementation": implementation}
+    encode = partial(encode_integers, values, contexts, **options)
+    return encode, lambda data: decode_integers(data, len(values), contexts, **options), 0
+
+
+def _huffman(tokens: np.ndarray, extra: int) -> Coder:
+    return (
+        lambda: huffman_encode(tokens).to_bytes(),
+        lambda data: huffman_decode(HuffmanStream.from_bytes(data)),
+        extra,
+    )
+
+
+def _constriction(tokens: np.ndarray, groups: np.ndarray, shares: np.ndarray, extra: int) -> Coder:
+    """One range coder, the contexts one after another; its models are taken as known and not counted."""
+    places = [np.flatnonzero(groups == group) for group in range(len(shares))]
+    models = [constriction.stream.model.Categorical(row.astype(np.float64), perfect=False) for row in shares]
+
+    def encode() -> bytes:
+        coder = constriction.stream.queue.RangeEncoder()
+        for place, model in zip(places, models, strict=True):
+            coder.encode(tokens[place].astype(np.int32), model)
+        return coder.get_compressed().tobytes()
+
+    def decode(data: bytes) -> np.ndarray:
+        coder, decoded = constriction.stream.queue.RangeDecoder(np.frombuffer(data, np.uint32)), np.empty_like(tokens)
+        for place, model in zip(places, models, strict=True):
+            decoded[place] = coder.decode(model, len(place))
+        return decoded
+
+    return encode, decode, extra
+
+
+def _zstd(values: np.ndarray) -> Coder:
+    dtype = np.result_type(np.min_scalar_type(values.min()), np.min_scalar_type(values.max()))
+    raw = values.astype(dtype).tobytes()
+    encode = partial(zstandard.ZstdCompressor(level=19).compress, raw)
+    return encode, lambda data: np.frombuffer(zstandard.ZstdDecompressor().decompress(data), dtype), 0
+
+
+def main() -> None:
+    """Print the table."""
+    for module, name in ((zstandard, "zstandard"), (constriction, "constriction")):
+        if module is None:
+            print(f"{name} is not installed and left out")
+    print(f"medians of {REPEATS}; bits a symbol, above the entropy, million symbols a second")
+    print(f"{'':52}{'bits':>9}{'above':>9}{'encode':>9}{'decode':>9}")
+    for row in bench():
+        head = f"{row['set']:22}{row['symbols']:>12,}  {row['coder']:16}"
+        speeds = "".join(f"{row[f'{what}_msymbols_per_s']:9.1f}" for what in ("encode", "decode") if len(row) > 5)
+        print(f"{head}{row['bits_per_symbol']:9.4f}{row['above_entropy_%']:8.2f}%{speeds}")
+
+
+if __name__ == "__main__":
+    main()

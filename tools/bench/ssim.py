@@ -1,0 +1,64 @@
+"""Speed and error of the photometric loss with its gradient, beside its torch reference in the same run."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hyrfpack.measure.timing import take_turns
+from hyrfpack.ops.ssim import photometric_loss
+
+REPEATS = 7
+SIZES = ((200, 200), (240, 320), (800, 800))  # height, width
+
+
+def pictures(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """A smooth picture and the same with noise, (H, W, 3) in [0, 1]."""
+    random = torch.Generator().manual_seed(0)
+    small = torch.rand(1, 3, height // 10, width // 10, generator=random)
+    smooth = torch.nn.functional.interpolate(small, size=(height, width), mode="bilinear")[0].permute(1, 2, 0)
+    noise = 0.05 * torch.randn(height, width, 3, generator=random)
+    return (smooth + noise).clamp(0, 1), smooth.contiguous()
+
+
+def value_and_gradient(image: Tensor, target: Tensor, mask: Tensor | None, implementation: str) -> tuple[float, Tensor]:
+    image = image.clone().requires_grad_()
+    loss = photometric_loss(image, target, mask, implementation=implementation)
+    loss.backward()
+    return loss.item(), image.grad
+
+
+def compare(image: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, float]:
+    """Times of loss and gradient together, and errors against float64 (the gradient's over its largest value)."""
+    tasks = {way: lambda way=way: value_and_gradient(image, target, mask, way) for way in ("cpu", "reference")}
+    times, _ = take_turns(tasks, REPEATS)
+    value, gradient = tasks["cpu"]()
+    expected, slope = value_and_gradient(image.double(), target.double(), mask, "reference")
+    return {
+        "ms": times["cpu"].ms,
+        "ns_a_pixel": 1e6 * times["cpu"].ms / image[..., 0].numel(),
+        "reference_ms": times["reference"].ms,
+        "times_faster": times["reference"].ms / times["cpu"].ms,
+        "value_error": abs(value - expected),
+        "gradient_error": ((gradient - slope).abs().max() / slope.abs().max()).item(),
+    }
+
+
+def bench() -> list[dict]:
+    """Time the loss with its gradient and the reference, interleaved; medians."""
+    rows = []
+    for height, width in SIZES:
+        image, target = pictures(height, width)
+        half = torch.rand(height, width, generator=torch.Generator().manual_seed(1)) < 0.5
+        for name, mask in (("none", None), ("half", half)):
+            rows.append({"picture": f"{width}x{height}x3", "mask": name, **compare(image, target, mask)})
+    return rows
+
+
+def main() -> None:
+    for row in bench():
+        print(row)
+
+
+if __name__ == "__main__":
+    main()

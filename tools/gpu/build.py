@@ -1,0 +1,395 @@
+"""Builds every Triton kernel of hyrfpack.ops for several GPUs, needing none, and tells what each takes.
+
+    python -m tools.gpu.build                  a table: registers, shared memory and spills of each kernel and target
+    python -m tools.gpu.build --json           the same for programs; tests/tools/test_gpu_build.py reads it
+
+The operations run as ever, on small tensors of the CPU, but each launch of a kernel only builds it: for a driver that
+names the target, with the types, constants, alignment and options that the launch has. So no list of kernels and
+signatures is kept here, and a kernel that no operation below launches is told of.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib
+import json
+import multiprocessing
+import os
+import pkgutil
+import re
+import subprocess
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from unittest import mock
+
+os.environ.pop("TRITON_INTERPRET", None)  # read when kernels are defined
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from triton.backends.compiler import GPUTarget
+from triton.runtime.jit import JITFunction
+
+TARGETS = {
+    "sm_90": GPUTarget("cuda", 90, 32),
+    "sm_80": GPUTarget("cuda", 80, 32),
+    "sm_100": GPUTarget("cuda", 100, 32),
+    "gfx942": GPUTarget("hip", "gfx942", 64),
+}
+PROCESSES = 2
+Run = Callable[[], object]
+
+
+@dataclass(frozen=True)
+class Build:
+    """One kernel built for one target.
+
+    Attributes:
+        kernel: its module and name.
+        target: a key of TARGETS.
+        constants: what it was built for: constexprs and arguments that are 1 or None, and what is a multiple of 16.
+        warps: in a program.
+        registers: of a thread; of AMD's vector registers.
+        shared: bytes of a program.
+        spills: bytes of local memory a thread (NVIDIA) or registers (AMD) that did not fit.
+        error: why it could not be built; empty where it was.
+    """
+
+    kernel: str
+    target: str
+    constants: str = ""
+    warps: int = 0
+    registers: int = 0
+    shared: int = 0
+    spills: int = 0
+    error: str = ""
+
+
+# What is run. A launch builds a kernel anew for sizes that are multiples of 16, that are not, and that are 1.
+
+
+def ssim_runs(count: int, width: int, height: int) -> Iterator[Run]:
+    from hyrfpack.ops.ssim import photometric_loss
+
+    for mask in (None, torch.ones(height, width, dtype=torch.bool)):
+        image = torch.rand(height, width, 3, requires_grad=True)
+        yield lambda image=image, mask=mask: photometric_loss(image, image.detach(), mask).backward()
+
+
+def hash_encode_runs(count: int, width: int, height: int) -> Iterator[Run]:
+    from hyrfpack.model.hash_grid import HashGridConfig
+    from hyrfpack.ops.hash_encode import hash_encode, level_offsets
+
+    resolutions, size = HashGridConfig(log2_table_size=10).resolutions, 10
+    table = torch.rand(level_offsets(resolutions, size)[-1], 2, requires_grad=True)
+    coords = torch.rand(count, 3, requires_grad=True)
+    # By columns as `mlp` hands gradients on, and by rows.
+    for grad in (torch.ones(2 * len(resolutions), count).T, torch.ones(count, 2 * len(resolutions))):
+        yield lambda grad=grad: hash_encode(coords, table, resolutions, size).backward(grad)
+
+
+def mlp_runs(count: int, width: int, height: int) -> Iterator[Run]:
+    from hyrfpack.ops.mlp import mlp
+    from hyrfpack.ops.shade import DIRECTION_FEATURES
+
+    for inputs, outputs in ((32 + DIRECTION_FEATURES["frequency"], 3), (32, 8)):  # radiance, geometry
+        widths = [inputs, 64, 64, outputs]
+        shapes = list(zip(widths[1:], widths, strict=False))
+        weights = [torch.rand(shape, requires_grad=True) for shape in shapes]
+        biases = [torch.rand(shape[0], requires_grad=True) for shape in shapes]
+        x = torch.rand(inputs, count).T.requires_grad_()
+        for mixed in (False, True):
+            yield lambda x=x, w=weights, b=biases, mixed=mixed: mlp(x, w, b, mixed=mixed).sum().backward()
+
+
+def rasterize_runs(count: int, width: int, height: int) -> Iterator[Run]:
+    from hyrfpack.ops.rasterize import rasterize
+
+    def run(antialiased: bool, depth: bool, absgrad: bool) -> None:
+        shapes = (count, 3), (count, 4), (count, 3), (count,), (count, 3)
+        inputs = [torch.rand(shape, requires_grad=True) for shape in shapes]
+        drawn = rasterize(
+            *inputs,
+            torch.eye(4),
+            (50.0, 50.0, width / 2, height / 2),
+            width,
+            height,
+            antialiased=antialiased,
+            depth=depth,
+            absgrad=torch.zeros(count, 2) if absgrad else None,
+        )
+        (drawn.rgb.sum() + drawn.transmittance.sum()).backward()
+
+    for options in ((False, False, True), (False, True, False), (True, False, True), (True, True, False)):
+        yield partial(run, *options)
+
+
+def adam_runs(count: int, width: int, height: int) -> Iterator[Run]:
+    from hyrfpack.ops.adam import adam_step
+
+    def run(start: int) -> None:
+        lists = [[torch.rand(count + start)[start:]] for _ in range(4)]
+        adam_step(*lists, step=1, rate=0.1)
+
+    yield partial(run, 0)
+    yield partial(run, 1)
+
+
+def shade_runs(count: int, width: int, height: int) -> Iterator[Run]:
+    from hyrfpack.ops.rasterize.shaded import rasterize_shaded
+    from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, shade
+
+    def run(encoding: str, mixed: bool, antialiased: bool) -> None:
+        first = torch.rand(count, 64, dtype=torch.bfloat16 if mixed else torch.float32)
+        weights, biases = (torch.rand(64, 64), torch.rand(3, 64)), (torch.rand(64), torch.rand(3))
+        directions = torch.rand(64, DIRECTION_FEATURES[encoding])
+        shading = Shading(first, directions, weights, biases, torch.rand(count, 3), encoding, mixed)
+        means, quats, scales, opacities = (torch.rand(count, *shape) for shape in ((3,), (4,), (3,), ()))
+        shade(means, torch.zeros(3), shading)
+        lens = (50.0, 50.0, width / 2, height / 2)
+        rasterize_shaded(
+            means, quats, scales, opacities, shading, torch.eye(4), lens, width, height, antialiased=antialiased
+        )
+
+    for options in (("frequency", True, False), ("frequency", False, True), ("sh", True, True), ("sh", False, False)):
+        yield partial(run, *options)
+
+
+def background_runs(count: int, width: int, height: int) -> Iterator[Run]:
+    from hyrfpack.model.hash_grid import HashGridConfig
+    from hyrfpack.ops.background import background_grid
+    from hyrfpack.ops.shade import DIRECTION_FEATURES
+
+    grid = HashGridConfig(log2_table_size=10)
+    for encoding, mixed in (("frequency", True), ("frequency", False), ("sh", True), ("sh", False)):
+        widths = [2 * grid.levels + DIRECTION_FEATURES[encoding], 64, 64, 3]
+        settings = {
+            "threshold": 0.1,
+            "stride": 2 if mixed else 4,
+            "pose": torch.eye(4),
+            "intrinsics": (50.0, 50.0, width / 2, height / 2),
+            "half_extent": (1.0, 1.0, 1.0),
+            "table": torch.rand(grid.rows, 2),
+            "resolutions": grid.resolutions,
+            "log2_table_size": grid.log2_table_size,
+            "weights": [torch.rand(shape) for shape in zip(widths[1:], widths, strict=False)],
+            "biases": [torch.rand(size) for size in widths[1:]],
+            "encoding": encoding,
+            "mixed": mixed,
+        }
+        yield partial(background_grid, torch.rand(height, width), **settings)
+
+
+OPERATIONS = {
+    "mlp": mlp_runs,
+    "shade": shade_runs,
+    "background": background_runs,
+    "rasterize": rasterize_runs,
+    "ssim": ssim_runs,
+    "hash_encode": hash_encode_runs,
+    "adam": adam_runs,
+}
+# All sizes (points, width, height) and runs on the first target; on the others those that take most registers.
+SIZES = (1003, 101, 67), (1024, 128, 96), (1, 1, 1)
+FIRST = 2
+
+
+@triton.jit
+def _hungry(numbers, COUNT: tl.constexpr):
+    """Takes more registers than there are: can this target be built for, and are spills seen?"""
+    at = tl.arange(0, COUNT)
+    a = tl.load(numbers + at)
+    b = tl.load(numbers + COUNT + at)
+    total = tl.sum(a * b, 0)
+    tl.store(numbers + at, a + total)
+    tl.store(numbers + COUNT + at, b + total)
+
+
+class _Driver:
+    """In place of the driver of a GPU: only names it."""
+
+    def __init__(self, target: GPUTarget) -> None:
+        self.get_current_target = lambda: target
+        self.get_current_device = lambda: 0
+        self.get_current_stream = lambda device: 0
+
+
+class _Filled(TorchFunctionMode):
+    """New memory holds ones, where a kernel would have written: sizes that the host reads of it stay small."""
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        return result.fill_(1) if func in (torch.empty, torch.empty_like, Tensor.new_empty) else result
+
+
+def build(task: tuple[str, str]) -> list[Build]:
+    """Run one operation as on one target; what was built, and what went wrong."""
+    operation, name = task
+    target, builds = TARGETS[name], {}
+    launch = JITFunction.run
+
+    def record(kernel: JITFunction, *args: object, grid: object, warmup: bool, **options: object) -> None:
+        try:
+            built = launch(kernel, *args, grid=grid, warmup=True, **options)
+            if built.hash not in builds:
+                builds[built.hash] = _describe(kernel, name, built)
+        except Exception as error:  # of the compilers, of many kinds
+            builds[str(error)] = Build(_name(kernel), name, error=_say(error))
+
+    with ExitStack() as stack:
+        for change in _pretend(name):
+            stack.enter_context(change)
+        triton.runtime.driver.set_active(_Driver(target))
+        stack.enter_context(mock.patch.object(JITFunction, "run", record))
+        try:
+            if operation == "probe":
+                numbers = 256 * target.warp_size
+                _hungry[(1,)](torch.empty(2 * numbers), COUNT=numbers, num_warps=1)
+            else:
+                whole = name == next(iter(TARGETS))
+                for sizes in SIZES if whole else SIZES[:1]:
+                    for run in islice(OPERATIONS[operation](*sizes), None if whole else FIRST):
+                        run()
+        except Exception as error:  # of the host's part; the other operations go on
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            builds[""] = Build(operation, name, error=f"{_say(error)} ({last.filename}:{last.lineno})")
+    return list(builds.values())
+
+
+def _pretend(name: str) -> Iterator[object]:
+    """What makes the operations launch on tensors of the CPU what they would launch on this target."""
+    from hyrfpack.ops import dispatch
+
+    def choose(implementation: str, available: tuple[str, ...], *tensors: Tensor) -> str:
+        return "gpu" if "gpu" in available else "reference"
+
+    target = TARGETS[name]
+    capability = (9, 4) if target.backend == "hip" else divmod(target.arch, 10)
+    properties = SimpleNamespace(multi_processor_count=132, name=name)
+    yield mock.patch.object(dispatch, "choose", choose)  # before an operation takes it
+    yield mock.patch.object(torch.version, "hip", "6.4" if target.backend == "hip" else None)
+    yield mock.patch.object(torch.cuda, "get_device_properties", lambda *_: properties)
+    yield mock.patch.object(torch.cuda, "get_device_capability", lambda *_: capability)
+    yield _Filled()
+
+
+def _say(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def _describe(kernel: JITFunction, target: str, built: object) -> Build:
+    source = built.src
+    constants = [f"{source.fn.arg_names[path[0]]}={value}" for path, value in source.constants.items()]
+    aligned = [source.fn.arg_names[path[0]] for path in source.attrs]
+    registers, spills = _resources(built)
+    metadata = built.metadata
+    described = " ".join(constants) + " /16: " + " ".join(aligned)
+    return Build(_name(kernel), target, described, metadata.num_warps, registers, metadata.shared, spills)
+
+
+def _resources(built: object) -> tuple[int, int]:
+    """Registers and spills of a kernel."""
+    if "amdgcn" in built.asm:
+        counts = dict(re.findall(r"\.(\w+_count):\s*(\d+)", built.asm["amdgcn"]))
+        return int(counts["vgpr_count"]), int(counts["vgpr_spill_count"]) + int(counts["sgpr_spill_count"])
+    tool = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
+    with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
+        file.write(built.asm["cubin"])
+        file.flush()
+        command = [tool, "--dump-resource-usage", file.name]
+        listed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    usage = {key: int(value) for key, value in re.findall(r"(REG|STACK|LOCAL):(\d+)", listed)}
+    return usage["REG"], usage["STACK"] + usage["LOCAL"]
+
+
+def list_kernels(_: object = None) -> list[str]:
+    """Names of the kernels of hyrfpack.ops: of what returns nothing and is called by no other."""
+    import hyrfpack.ops
+
+    for module in pkgutil.walk_packages(hyrfpack.ops.__path__, "hyrfpack.ops."):
+        if module.name.rpartition(".")[2].startswith("gpu"):
+            importlib.import_module(module.name)
+    modules = [module for name, module in sys.modules.items() if name.startswith("hyrfpack.ops.")]
+    found = {value for module in modules for value in vars(module).values() if isinstance(value, JITFunction)}
+    called = {other for function in found for other in _called(function)}
+    return sorted(_name(function) for function in found - called if not _returns(function))
+
+
+def _name(function: JITFunction) -> str:
+    return f"{function.module.removeprefix('hyrfpack.ops.')}.{function.fn.__name__}"
+
+
+def _returns(function: JITFunction) -> bool:
+    return any(isinstance(node, ast.Return) and node.value is not None for node in ast.walk(function.parse()))
+
+
+def _called(function: JITFunction) -> Iterator[object]:
+    """What a function's code may name: globals, and what lies in modules among them."""
+    names = function.fn.__code__.co_names
+    for value in (function.fn.__globals__.get(name) for name in names):
+        if isinstance(value, ModuleType):
+            yield from (getattr(value, name) for name in names if hasattr(value, name))
+        elif isinstance(value, JITFunction):
+            yield value
+
+
+def build_all() -> dict[str, list]:
+    """Build all for all targets.
+
+    Returns:
+        "builds": a row for each; "probes": one row a target of a kernel that must spill; "left_out": kernels that
+        nothing launched.
+    """
+    # Each task has a process of its own, as what operations choose when they are imported depends on the target.
+    with multiprocessing.get_context("fork").Pool(PROCESSES, maxtasksperchild=1) as pool:
+        kernels = pool.apply_async(list_kernels)
+        probes = sum(pool.map(build, [("probe", name) for name in TARGETS], chunksize=1), [])
+        able = [probe.target for probe in probes if not probe.error]
+        tasks = [(operation, name) for operation in OPERATIONS for name in able]
+        builds = sum(pool.map(build, tasks, chunksize=1), [])
+        launched = {build.kernel for build in builds}
+        left_out = [kernel for kernel in kernels.get() if kernel not in launched]
+    return {"builds": list(map(asdict, builds)), "probes": list(map(asdict, probes)), "left_out": left_out}
+
+
+def table(report: dict[str, list]) -> Iterator[str]:
+    """Lines of a table: of each kernel and target the most of all its builds."""
+    rows: dict[tuple[str, str, int], list[dict]] = {}
+    for row in report["builds"]:
+        if not row["error"]:
+            rows.setdefault((row["kernel"], row["target"], row["warps"]), []).append(row)
+    yield f"{'kernel':40} {'target':8} {'warps':>5} {'builds':>6} {'registers':>9} {'shared':>7} {'spills':>6}"
+    for (kernel, target, warps), builds in sorted(rows.items()):
+        registers, shared, spills = (max(row[key] for row in builds) for key in ("registers", "shared", "spills"))
+        yield f"{kernel:40} {target:8} {warps:5} {len(builds):6} {registers:9} {shared:7} {spills:6}"
+    for row in report["builds"]:
+        if row["spills"] or row["error"]:
+            yield f"{row['kernel']} on {row['target']}: {row['error'] or 'spills'} {row['constants']}"
+    for row in report["probes"]:
+        if row["error"]:
+            yield f"{row['target']} cannot be built for: {row['error']}"
+    for kernel in report["left_out"]:
+        yield f"{kernel}: nothing launched it"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--json", action="store_true", help="for programs")
+    as_json = parser.parse_args().json
+    report = build_all()
+    print(json.dumps(report) if as_json else "\n".join(table(report)))
+
+
+if __name__ == "__main__":
+    main()

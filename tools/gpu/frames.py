@@ -1,0 +1,170 @@
+"""Whole frames and whole training steps of a made-up room, beside gsplat where that is installed."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Iterator
+
+import torch
+from torch import Tensor
+
+from hyrfpack.model import HybridModel
+from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.render import render
+from hyrfpack.scene import Camera
+from tools.gpu.rows import Row, goal, kernel_rows
+from tools.gpu.scene import Splats, count_blended, disturb, make_cameras, make_model, make_scene, splats_of
+from tools.gpu.setup import GOAL_GAUSSIANS, Setup
+from tools.gpu.timing import kernel_times, synchronize, take_turns
+
+GOAL_FRAMES, GOAL_SPEED = 300.0, 0.8
+GSPLAT_TRANSMITTANCE_MIN = 1e-4  # where gsplat finishes a pixel; ours goes on as far when the two are compared
+
+
+def items(setup: Setup) -> list[str]:
+    """One for each number of Gaussians."""
+    return [str(count) for count in setup.frame_gaussians]
+
+
+def run(item: str, setup: Setup) -> Iterator[Row]:
+    """Statistics, frames, rasteriser and training of that many Gaussians, trained a little first."""
+    count, device = int(item), setup.torch_device
+    cameras = make_cameras(setup.views, setup.width, setup.height)
+    truth = make_model(count, device)
+    scene = make_scene(truth, cameras)
+    model, training = truth, None
+    try:
+        from tools.gpu.training import timed_training
+
+        training = timed_training(scene, disturb(truth), setup)
+        model = training.model
+    except ModuleNotFoundError as error:  # the trainer needs more packages than rendering
+        yield {"table": "Training", "Gaussians": f"{count:,}", "status": "left out", "note": f"{error}"}
+    splats = splats_of(model, cameras[1])
+    yield _statistics(splats, model)
+    if training:
+        yield from training.rows()
+    yield from _frames(model, count, cameras, setup)
+    yield from _rasterizer(splats, count, setup)  # last: gsplat may build an extension first, and take all the time
+
+
+def _statistics(splats: Splats, model: HybridModel) -> Row:
+    with torch.no_grad():
+        drawn = rasterize(*splats.inputs.values(), *splats.view)
+    pixels = drawn.transmittance.numel()
+    blended, reached = count_blended(splats)
+    return {
+        "table": "The room",
+        "Gaussians": f"{len(model):,}",
+        "visible": f"{int(drawn.visible.sum()):,}",
+        "pairs": f"{int(drawn.pairs):,}",
+        "pairs a pixel": 256 * int(drawn.pairs) / pixels,
+        "blended a pixel": blended,
+        "of a tile's pairs reached": f"{reached:.0%}",
+        "light from the background": f"{float(drawn.transmittance.mean()):.1%}",
+        "median opacity": float(splats.inputs["opacities"].median()),
+        "hash rows a level": f"2^{model.config.radiance.log2_table_size}",
+    }
+
+
+def _frames(model: HybridModel, count: int, cameras: list[Camera], setup: Setup) -> Iterator[Row]:
+    """Frames a second over all cameras, by the wall clock with the device waited for at the end."""
+    device = setup.torch_device
+    _reset_peak(device)
+    with torch.no_grad():
+        decoded = model.decode()
+        ways: dict[str, Callable[[Camera], object]] = {
+            "decoded once": lambda camera: render(model, camera, decoded=decoded),
+            "decoded each frame": lambda camera: render(model, camera),
+        }
+        for name, draw in ways.items():
+            ms = _frame_ms(draw, cameras, setup)
+            yield {
+                "table": f"Frames, {setup.width} x {setup.height}",
+                "Gaussians": f"{len(model):,}",
+                "model": name,
+                "frames/s": 1e3 / ms,
+                "ms": ms,
+                "peak MB": _peak(device),
+            }
+            if name == "decoded once" and count == GOAL_GAUSSIANS:
+                yield goal(f"frames of {count:,} Gaussians", 1e3 / ms, GOAL_FRAMES, "frames/s", at_least=True)
+        times = kernel_times(lambda: render(model, cameras[1], decoded=decoded), 5, device)
+    yield from kernel_rows(times, f"A frame of {len(model):,} Gaussians: kernels on the device")
+
+
+def _frame_ms(draw: Callable[[Camera], object], cameras: list[Camera], setup: Setup) -> float:
+    for camera in cameras[:3]:
+        draw(camera)
+    synchronize(setup.torch_device)
+    start, frames = time.perf_counter(), 0
+    for _ in range(setup.repeats):
+        for camera in cameras:
+            draw(camera)
+            frames += 1
+        synchronize(setup.torch_device)
+        if time.perf_counter() - start > 3:
+            break
+    return 1e3 * (time.perf_counter() - start) / frames
+
+
+def _rasterizer(splats: Splats, count: int, setup: Setup) -> Iterator[Row]:
+    """The rasteriser alone, and gsplat's on the same Gaussians; forward alone and with all gradients."""
+    tasks = _passes("hyrfpack", lambda inputs: _ours(inputs, splats))
+    row = {"table": "Rasterising against gsplat", "Gaussians": f"{count:,}"}
+    try:
+        tasks |= _passes("gsplat", _gsplat(splats))
+    except Exception as error:  # not there, or not for this torch: whatever it is, ours is measured
+        yield {**row, "status": "left out", "note": f"gsplat's rasteriser cannot be compared: {str(error)[:200]}"}
+    tasks = {name: (lambda run=run: run(splats.inputs)) for name, run in tasks.items()}
+    times = take_turns(tasks, setup.repeats, setup.torch_device)
+    for way in ("forward", "forward and backward"):
+        ours, theirs = times[f"hyrfpack {way}"], times.get(f"gsplat {way}")
+        cells = {"pass": way, "ms": ours, "gsplat ms": theirs}
+        yield row | cells | ({"speed over gsplat's": theirs / ours} if theirs else {})
+        if theirs and count == GOAL_GAUSSIANS:
+            yield goal(f"rasterising {count:,}, {way}", theirs / ours, GOAL_SPEED, "of gsplat's speed", at_least=True)
+
+
+def _passes(name: str, draw: Callable[[dict[str, Tensor]], Tensor]) -> dict[str, Callable]:
+    def forward(inputs: dict[str, Tensor]) -> Tensor:
+        with torch.no_grad():
+            return draw(inputs)
+
+    def both(inputs: dict[str, Tensor]) -> tuple[Tensor, ...]:
+        leaves = {key: tensor.detach().requires_grad_() for key, tensor in inputs.items()}
+        return torch.autograd.grad(draw(leaves).sum(), list(leaves.values()))
+
+    return {f"{name} forward": forward, f"{name} forward and backward": both}
+
+
+def _ours(inputs: dict[str, Tensor], splats: Splats) -> Tensor:
+    return rasterize(*inputs.values(), *splats.view, transmittance_min=GSPLAT_TRANSMITTANCE_MIN).rgb
+
+
+def _gsplat(splats: Splats) -> Callable[[dict[str, Tensor]], Tensor]:
+    """gsplat's rasteriser with the rules of ours, as far as it has them."""
+    from gsplat import rasterization
+
+    fx, fy, cx, cy = splats.camera.intrinsics
+    view = splats.pose.to(splats.inputs["means"])[None]
+    intrinsics = view.new_tensor([[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]])
+    size = splats.camera.width, splats.camera.height
+
+    def draw(inputs: dict[str, Tensor]) -> Tensor:
+        return rasterization(*inputs.values(), view, intrinsics, *size, near_plane=0.01, packed=False)[0]
+
+    draw(splats.inputs)  # builds its extension, or fails here
+    return draw
+
+
+def _reset_peak(device: torch.device) -> None:
+    gc.collect()  # what training held
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+
+
+def _peak(device: torch.device) -> float | None:
+    """Most memory that tensors took since, in MB."""
+    return torch.cuda.max_memory_allocated(device) / 1e6 if device.type == "cuda" else None

@@ -1,0 +1,147 @@
+"""Are the kernels right on this device: the tests of the operations where pytest is there, and a matrix of our own."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from hyrfpack.ops.hash_encode import hash_encode, level_offsets, level_resolutions
+from hyrfpack.ops.mlp import mlp
+from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.ssim import photometric_loss
+from tools.gpu.compare import Call, checked
+from tools.gpu.rows import Row
+from tools.gpu.setup import Setup
+
+ROOT = Path(__file__).parents[2]
+TABLE = "Right on this device"
+NO_DEVICE = "test_gpu_build.py"  # builds the kernels for GPUs that need not be there
+NOTHING_RAN = 5  # pytest's exit code where no test was chosen
+
+
+def items(setup: Setup) -> list[str]:
+    """The cases of the matrix, then the files of tests; a file has none for pytest where that is not installed."""
+    files = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "tests" / "ops").glob("test_*.py"))
+    files = [file for file in files if not file.endswith(NO_DEVICE)]
+    return [*CASES, *(files if importlib.util.find_spec("pytest") else [])]
+
+
+def run(item: str, setup: Setup) -> Iterator[Row]:
+    """One case, or the gpu rows of one file of tests."""
+    if item in CASES:
+        call = CASES[item](setup.torch_device)
+        yield {"table": TABLE, "case": item, **checked(call, setup.implementation)}
+    else:
+        yield {"table": TABLE, "case": f"pytest {item} -k gpu", **run_pytest(item)}
+
+
+def run_pytest(file: str) -> Row:
+    """Run the gpu rows of one file; the cells tell how many passed, and why not."""
+    # Not strict: a GPU's machine may lack the plugins that pyproject.toml has settings of.
+    lenient = ["-o", "addopts=--import-mode=importlib", "-p", "no:cacheprovider"]
+    command = [sys.executable, "-m", "pytest", "-q", "--no-header", *lenient, "-k", "gpu", file]
+    wide = {**os.environ, "COLUMNS": "400"}  # as long as the sentence that tells why a test failed
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=wide)
+    lines = [line.strip() for line in (done.stdout + done.stderr).splitlines() if line.strip()]
+    row: Row = {"result": lines[-1].strip("= ") if lines else ""}
+    if done.returncode not in (0, NOTHING_RAN):
+        named = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
+        reasons = [line for line in lines if line.startswith("E ")]
+        row |= {"status": "failed", "note": " ".join([*named[:1], *reasons[:1]]) or row["result"]}
+    return row
+
+
+def _normal(seed: int, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def _rasterize(count: int, width: int, height: int, size: float, **options: object) -> Callable[[torch.device], Call]:
+    def make(device: torch.device) -> Call:
+        inputs = {
+            "means": _normal(0, count, 3) * 0.8 + torch.tensor([0.0, 0.0, 4.0]),
+            "quats": _normal(1, count, 4),
+            "scales": size * torch.exp(0.5 * _normal(2, count, 3)),
+            "opacities": torch.sigmoid(1.5 * _normal(3, count)),
+            "colors": torch.sigmoid(_normal(4, count, 3)),
+        }
+        view = (torch.eye(4, dtype=torch.float64), (width, width, width / 2, height / 2), width, height)
+
+        def draw(implementation: str, **tensors: Tensor) -> Tensor:
+            drawn = rasterize(*tensors.values(), *view, implementation=implementation, **options)
+            return torch.cat((drawn.rgb, drawn.transmittance[..., None]), dim=-1)
+
+        inputs = {name: tensor.to(device) for name, tensor in inputs.items()}
+        return Call(draw, inputs, tuple(inputs), (1e-3, 1e-2))
+
+    return make
+
+
+def _hash_encode(points: int, log2: int, wanted: tuple[str, ...]) -> Callable[[torch.device], Call]:
+    def make(device: torch.device) -> Call:
+        resolutions = level_resolutions(16, 8, 512)
+
+        def look_up(implementation: str, coords: Tensor, table: Tensor) -> Tensor:
+            return hash_encode(coords, table, resolutions, log2, implementation=implementation)
+
+        # Numbers of 16 bits: a point lies in the same cell, at the same place, in every precision.
+        coords = torch.randint(0, 1 << 16, (points, 3), generator=torch.Generator().manual_seed(0)) / (1 << 16)
+        table = _normal(1, level_offsets(resolutions, log2)[-1], 2)
+        return Call(look_up, {"coords": coords.to(device), "table": table.to(device)}, wanted)
+
+    return make
+
+
+def _mlp(rows: int, widths: tuple[int, ...], mixed: bool) -> Callable[[torch.device], Call]:
+    def make(device: torch.device) -> Call:
+        layers = len(widths) - 1
+        inputs = {"x": _normal(0, rows, widths[0])}
+        for layer, (i, o) in enumerate(zip(widths, widths[1:], strict=False)):
+            inputs[f"weight {layer}"] = _normal(layer + 1, o, i) / i**0.5
+        for layer, width in enumerate(widths[1:]):
+            inputs[f"bias {layer}"] = 0.1 * _normal(layer + 9, width)
+
+        def decode(implementation: str, x: Tensor, **parameters: Tensor) -> Tensor:
+            numbers = list(parameters.values())
+            return mlp(x, numbers[:layers], numbers[layers:], mixed=mixed, implementation=implementation)
+
+        inputs = {name: tensor.to(device) for name, tensor in inputs.items()}
+        return Call(decode, inputs, tuple(inputs), (3e-3, 1e-2) if mixed else (1e-4, 1e-3))
+
+    return make
+
+
+def _loss(height: int, width: int, share: float | None) -> Callable[[torch.device], Call]:
+    def make(device: torch.device) -> Call:
+        target = torch.sigmoid(_normal(0, height, width, 3))
+        image = (target + 0.1 * _normal(1, height, width, 3)).clamp(0, 1)
+        mask = None if share is None else (_normal(2, height, width).sigmoid() < share).to(device)
+
+        def loss(implementation: str, image: Tensor, target: Tensor) -> Tensor:
+            return photometric_loss(image, target, mask, implementation=implementation)
+
+        return Call(loss, {"image": image.to(device), "target": target.to(device)}, ("image",))
+
+    return make
+
+
+CASES: dict[str, Callable[[torch.device], Call]] = {
+    "rasterize, 400 Gaussians, 45 x 37": _rasterize(400, 45, 37, 0.1),
+    "rasterize, 3,000 small Gaussians, 64 x 48": _rasterize(3000, 64, 48, 0.02),
+    "rasterize, antialiased": _rasterize(300, 48, 32, 0.03, antialiased=True),
+    "rasterize, one large Gaussian": _rasterize(1, 33, 20, 2.0),
+    "hash encode, 3,000 points, hashed": _hash_encode(3000, 12, ("table",)),
+    "hash encode, gradient of coordinates": _hash_encode(500, 14, ("coords", "table")),
+    "mlp 32-64-64-8, float32": _mlp(3001, (32, 64, 64, 8), False),
+    "mlp 56-64-64-3, float32": _mlp(1000, (56, 64, 64, 3), False),
+    "mlp 32-64-64-8, mixed": _mlp(3001, (32, 64, 64, 8), True),
+    "mlp 56-64-64-3, mixed": _mlp(1000, (56, 64, 64, 3), True),
+    "loss, 61 x 83": _loss(61, 83, None),
+    "loss, half masked": _loss(40, 50, 0.5),
+}

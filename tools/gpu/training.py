@@ -1,0 +1,108 @@
+"""Training steps of a model that is given, timed as a user would wait for them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+
+from hyrfpack.model import HybridModel
+from hyrfpack.scene import Scene
+from hyrfpack.train import TrainConfig, Trainer
+from hyrfpack.train.config import FULL_STEPS
+from hyrfpack.train.density import DensityControl
+from hyrfpack.train.optimizer import Optimizer
+from tools.gpu.rows import Row, goal, kernel_rows
+from tools.gpu.setup import GOAL_GAUSSIANS, Setup
+from tools.gpu.timing import kernel_times, synchronize
+
+GOAL_MINUTES = 10.0
+PROFILED_STEPS = 5
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a timed run came to; `kernels` are milliseconds a step by kernel of the device."""
+
+    model: HybridModel
+    gaussians: int
+    steps: int
+    seconds: float
+    psnr: tuple[float, float]
+    stages: dict[str, float]
+    peak: float | None
+    kernels: dict[str, float]
+
+    def rows(self) -> Iterator[Row]:
+        """The run, its stages as the host saw them, and its kernels."""
+        rate = self.steps / self.seconds
+        minutes = FULL_STEPS / rate / 60
+        full = f"{minutes:.1f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
+        name = f"{self.gaussians:,}"
+        total = sum(self.stages.values())
+        yield {
+            "table": "Training",
+            "Gaussians": name,
+            "steps timed": self.steps,
+            "steps/s": rate,
+            "30,000 steps": full,
+            "PSNR before, after": f"{self.psnr[0]:.1f}, {self.psnr[1]:.1f} dB",
+            "peak MB": self.peak,
+            "host's time": ", ".join(f"{stage} {seconds / total:.0%}" for stage, seconds in self.stages.items()),
+        }
+        if self.gaussians == GOAL_GAUSSIANS:
+            yield goal(f"30,000 steps of {name} Gaussians", minutes, GOAL_MINUTES, "min", at_least=False)
+        yield from kernel_rows(self.kernels, f"A training step of {name} Gaussians: kernels on the device")
+
+
+def timed_training(scene: Scene, model: HybridModel, setup: Setup) -> Training:
+    """Train `model` on the scene for a while: warm-up, timed steps, then a few under the profiler."""
+    device, count = setup.torch_device, len(model)
+    trainer = continued(scene, model, TrainConfig(steps=FULL_STEPS, max_gaussians=count), device)
+    errors: list[float] = []
+    advance(trainer, setup.warm_steps, setup.step_seconds / 3, errors)
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    synchronize(device)
+    first, start, stages = trainer.step, time.perf_counter(), dict(trainer.seconds)
+    advance(trainer, setup.steps, setup.step_seconds, errors)
+    synchronize(device)
+    seconds, steps = time.perf_counter() - start, trainer.step - first
+    stages = {name: value - stages.get(name, 0.0) for name, value in trainer.seconds.items()}
+    peak = torch.cuda.max_memory_allocated(device) / 1e6 if device.type == "cuda" else None
+    kernels = kernel_times(lambda: advance(trainer, PROFILED_STEPS, setup.step_seconds, []), 1, device)
+    return Training(
+        model=trainer.model,
+        gaussians=count,
+        steps=steps,
+        seconds=seconds,
+        psnr=(_psnr(errors[:5]), _psnr(errors[-5:])),
+        stages=dict(sorted(stages.items(), key=lambda item: -item[1])),
+        peak=peak,
+        kernels={name: ms / PROFILED_STEPS for name, ms in kernels.items()},
+    )
+
+
+def continued(scene: Scene, model: HybridModel, config: TrainConfig, device: torch.device) -> Trainer:
+    """A trainer at the start of a run that goes on with `model`."""
+    trainer = Trainer(scene, config, device=device)
+    model.precision = config.precision
+    trainer.model = model
+    trainer.optimizer = Optimizer(model, config.learning_rates)
+    trainer.density = DensityControl(config.density, config.steps, trainer.budget, len(model), config.seed, device)
+    return trainer
+
+
+def advance(trainer: Trainer, steps: int, seconds: float, errors: list[float]) -> None:
+    """Take that many steps, or as many as the time allows; mean squared errors are appended to `errors`."""
+    last, end = trainer.step + steps, time.perf_counter() + seconds
+    trainer.run(
+        report=lambda trainer, loss, mse: errors.append(mse),
+        stop=lambda: trainer.step >= last or time.perf_counter() >= end,
+    )
+
+
+def _psnr(errors: list[float]) -> float:
+    return float(-10 * torch.tensor(errors).mean().log10())

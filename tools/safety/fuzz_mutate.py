@@ -1,0 +1,512 @@
+"""Hostile `.hyrf` files: small valid ones, and what a forger makes of them with a hex editor or the specification.
+
+`mutant(number, seed)` is a pure function, so a number is all that is needed to make an input again. Half of the inputs
+are damaged without repair and stop at a checksum; for the other half all checksums and lengths are right again, so that
+what was forged reaches the decoder it was meant for.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from random import Random
+
+import numpy as np
+import torch
+
+from hyrfpack.format import decode_model, encode_model
+from hyrfpack.format.arrays import group_shapes, parse_config, to_arrays
+from hyrfpack.format.codec import PROFILES
+from hyrfpack.format.container import read_container
+from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
+from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.quant import HuffmanCode, MinMaxQuantizer, ResidualVectorQuantizer, huffman_encode
+from tools.safety.plans import encode
+
+GOLDEN = Path(__file__).parents[2] / "tests" / "golden"
+GROUPS = ("POSI", "COLO", "SCAL", "OPAC", "GTAB", "GMLP", "RTAB", "RMLP")
+EXTREMES = (0, 1, 2, 3, 7, 8, 16, 57, 58, 127, 128, 255, 256, 257, 1023, 1024, 1025, 65535, 65536, 65537)
+EXTREMES += tuple(2**power + step for power in (20, 28, 31, 32, 34, 40, 48, 60, 63, 64) for step in (-1, 0, 1))
+HOSTILE_TEXT = ("", "\n", "\x1b[2J", "\ud800", "\0", "a" * 3000, "__class__", "../../x", "\u202e", "NaN", "sum", "sh")
+HOSTILE_JSON = (None, True, False, 0, 1, -1, 0.5, -0.0, 5e-324, 1e-300, 1e308, -1e308, 10**18, 2**63, 10**400, [], {})
+HOSTILE_JSON += (*HOSTILE_TEXT, [0, 0, 0], [1e308] * 3, [[[]]], {"a": 1})
+RANGES = {"log2_table_size": (3, 25), "levels": (0, 33), "base": (1, 70), "finest": (1, 70), "hidden": (0, 70)}
+
+
+@dataclass
+class Part:
+    """A section to be written: fields of its line in the table of contents, and its bytes."""
+
+    type: bytes
+    codec: int
+    flags: int
+    data: bytes
+    raw_length: int
+
+
+# --- bytes of a file, whatever they say ---
+
+
+def assemble(parts: list[Part]) -> bytes:
+    """A file of these sections with all places, lengths and checksums right, whatever the sections say."""
+    minor = int(any(5 <= part.codec <= 8 for part in parts))
+    offset = 48 + 40 * len(parts)
+    toc, payloads = [], []
+    for part in parts:
+        stored, crc = len(part.data), zlib.crc32(part.data)
+        fields = (part.type, part.codec & 0xFFFF, part.flags & 0xFFFF, offset, stored, part.raw_length % 2**64, crc, 0)
+        toc.append(struct.pack("<4sHHQQQII", *fields))
+        payloads.append(part.data + bytes(-stored % 8))
+        offset += stored + -stored % 8
+    table = b"".join(toc)
+    header = struct.pack(
+        "<8sHHIQQIII", b"\x89HYRF\r\n\n", 1, minor, 0, offset, 48, len(table), len(parts), zlib.crc32(table)
+    )
+    return b"".join((header, struct.pack("<I", zlib.crc32(header)), table, *payloads))
+
+
+def disassemble(data: bytes) -> list[Part]:
+    """The sections of a valid file."""
+    container = read_container(data)
+    return [
+        Part(section.type.encode(), section.codec, int(section.required), bytes(section.data), section.raw_length)
+        for section in container.sections
+    ]
+
+
+def resealed(data: bytearray) -> bytes:
+    """The file with the checksums of its header and of its table of contents right."""
+    (length,) = struct.unpack_from("<I", data, 32)
+    struct.pack_into("<I", data, 40, zlib.crc32(data[48 : 48 + length]))
+    struct.pack_into("<I", data, 44, zlib.crc32(data[:44]))
+    return bytes(data)
+
+
+# --- valid files to start from ---
+
+
+def _model(count: int, hidden: int = 3, background: bool = True, **config: object) -> HybridModel:
+    rng = np.random.default_rng(count)
+    shape = ModelConfig(
+        frame=Frame(center=(1.5, -0.1, 3.0), scale=12.5, half_extent=(1.0, 0.75, 0.25)),
+        geometry=HashGridConfig(log2_table_size=4, levels=2, base=2, finest=5),
+        radiance=HashGridConfig(log2_table_size=5, levels=2, base=3, finest=7),
+        hidden=hidden,
+        background=background,
+        **config,
+    )
+    values = torch.from_numpy(rng.normal(size=(count, 8)).astype(np.float32))
+    model = HybridModel(shape, Gaussians(values[:, :3], values[:, 3:6], values[:, 6:7], values[:, 7:]))
+    with torch.no_grad():
+        for parameter in (*model.geometry.parameters(), *model.radiance.parameters()):
+            parameter.copy_(torch.from_numpy(rng.laplace(scale=0.1, size=parameter.shape)))
+    return model
+
+
+def _codec(values: np.ndarray, codec: int, rng: Random) -> bytes:
+    """A matrix in any of the codecs that need no other section."""
+    if codec in (1, 2):
+        return values.astype(f"<f{4 // codec}").tobytes()
+    if codec == 3:
+        stages, size = rng.choice(((1, 1), (1, 4), (2, 8), (5, 3), (1, 300), (16, 2)))
+        indices, codebooks = ResidualVectorQuantizer(stages, size, "float16", iterations=1).encode(values)
+        head = struct.pack("<BBH", stages, values.shape[1], size) + codebooks.astype("<f2").tobytes()
+        streams = [huffman_encode(np.ascontiguousarray(stage)).to_bytes() for stage in indices.T]
+        return head + b"".join(struct.pack("<Q", len(stream)) + stream for stream in streams)
+    codes, params = MinMaxQuantizer(rng.choice((1, 3, 8, 8, 11, 16))).encode(values)
+    # A code far deeper than the symbols need: long codes are read another way.
+    symbols = np.unique(codes)
+    deep = None
+    if 2 <= len(symbols) <= 57 and rng.random() < 0.5:
+        depths = np.minimum(np.arange(1, len(symbols) + 2), len(symbols)).astype(np.uint8)
+        deep = HuffmanCode(np.append(symbols.astype(np.int32), -1), depths)
+    return params.to_bytes() + huffman_encode(codes.ravel(), deep).to_bytes()
+
+
+@lru_cache
+def seeds() -> tuple[tuple[bytes, ...], tuple[float, ...]]:
+    """Valid files, and how often each is taken: the small ones, which decode faster, more often.
+
+    Each profile with 0, 1, 20 and 200 Gaussians, with and without background; the golden files; Gaussians in layers;
+    and groups in codecs that no profile gives them.
+    """
+    rng = Random(0)
+    models = [_model(0), _model(1, background=False), _model(20, direction_encoding="sh"), _model(200, hidden=2)]
+    files = [(encode(model, profile), 1 if len(model) == 200 else 10) for profile in PROFILES for model in models]
+    files += [(file.read_bytes(), 10) for file in sorted(GOLDEN.glob("*.hyrf"))]
+    files.append((encode_model(models[2], "paper", color=(3, 8), scale=(2, 4), opacity=(1, 16)), 10))
+    files.append((encode(models[3], "compact", noise=1e-9, prune=False), 2))
+    files.append((encode(_alike(models[3]), "compact", prune=False), 10))
+    files += [(encode(model, "compact", prune=False, layered=True), 10) for model in (models[2], _model(40))]
+    mixed = [models[1], _model(5), _model(6), models[2], models[3], _model(2500)]
+    for model in mixed:
+        weight = {200: 0.5, 2500: 0.1}.get(len(model), 10)
+        for profile, exchanged in (("raw", 1.0), ("compact", 0.4)):
+            data = encode(model, profile)
+            arrays, parts = to_arrays(decode_model(data)), disassemble(data)
+            for part in parts[1:]:
+                # Other sections need the lattice of codec 6.
+                if rng.random() < exchanged and (profile == "raw" or part.type != b"POSI"):
+                    part.codec = rng.choice((2, 3, 3, 4, 4))
+                    part.data = _codec(arrays[part.type.decode()], part.codec, rng)
+            files.append((assemble(parts), weight))
+    return tuple(zip(*files, strict=True))
+
+
+def _alike(model: HybridModel) -> HybridModel:
+    """Gaussians that are all the same: their streams have one symbol, which takes no bytes however many there are."""
+    with torch.no_grad():
+        for parameter in model.gaussians.parameters():
+            parameter.copy_(parameter[:1].expand_as(parameter))
+    return model
+
+
+def _seed(rng: Random) -> bytes:
+    return rng.choices(*seeds())[0]
+
+
+@lru_cache
+def _disassembled(data: bytes) -> tuple[Part, ...]:
+    return tuple(disassemble(data))
+
+
+# --- damage without repair ---
+
+
+def edit_bytes(data: bytes, rng: Random, most: int = 4) -> bytes:
+    """A few edits of any kind, anywhere."""
+    edited = bytearray(data)
+    for _ in range(rng.randint(1, most)):
+        at = rng.randrange(len(edited) + 1)
+        kind = rng.randrange(7)
+        if kind == 0 and at < len(edited):
+            edited[at] ^= 1 << rng.randrange(8)
+        elif kind == 1 and at < len(edited):
+            edited[at] = rng.choice((0, 1, 0x7F, 0x80, 0xFE, 0xFF, rng.randrange(256)))
+        elif kind == 2:
+            width = rng.choice((1, 2, 4, 8))
+            edited[at : at + width] = (rng.choice(EXTREMES) % 256**width).to_bytes(width, "little")
+        elif kind == 3:
+            del edited[at : at + rng.randint(1, 16)]
+        elif kind == 4:
+            edited[at:at] = rng.randbytes(rng.randint(1, 16))
+        elif kind == 5:
+            edited[at : at + 8] = bytes([rng.choice((0, 255))]) * 8
+        else:
+            other = rng.randrange(len(edited) + 1)
+            edited[at:at] = edited[other : other + rng.randint(1, 64)]
+    return bytes(edited)
+
+
+def _flip_bits(rng: Random) -> bytes:
+    data = bytearray(_seed(rng))
+    for _ in range(rng.choice((1, 1, 2, 8))):
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    return bytes(data)
+
+
+def _damage_bytes(rng: Random) -> bytes:
+    return edit_bytes(_seed(rng), rng)
+
+
+def _truncate(rng: Random) -> bytes:
+    data = _seed(rng)
+    return data[: rng.choice((rng.randrange(len(data)), rng.randrange(500), len(data) - rng.randint(1, 9)))]
+
+
+def _extend(rng: Random) -> bytes:
+    return _seed(rng) + rng.choice((bytes, rng.randbytes))(rng.randint(1, 100))
+
+
+def _splice(rng: Random) -> bytes:
+    first, second = _seed(rng), _seed(rng)
+    return first[: rng.randrange(len(first))] + second[rng.randrange(len(second)) :]
+
+
+# --- a forger who repairs checksums ---
+
+
+def _forge_header(rng: Random) -> bytes:
+    """Numbers of the header and of the table of contents at their extremes."""
+    data = bytearray(_seed(rng))
+    (count,) = struct.unpack_from("<I", data, 36)
+    for _ in range(rng.randint(1, 2)):
+        entry = 48 + 40 * rng.randrange(count)
+        places = (8, 2), (10, 2), (12, 4), (16, 8), (24, 8), (32, 4), (36, 4)
+        columns = (0, 4), (4, 2), (6, 2), (8, 8), (16, 8), (24, 8), (32, 4), (36, 4)
+        at, width = rng.choice(places) if rng.random() < 0.4 else rng.choice(columns)
+        at += entry if (at, width) in columns and (at, width) not in places else 0
+        old = int.from_bytes(data[at : at + width], "little")
+        new = rng.choice((rng.choice(EXTREMES), old + rng.choice((-8, -1, 1, 8)), len(data), rng.getrandbits(64)))
+        data[at : at + width] = (new % 256**width).to_bytes(width, "little")
+    return resealed(data)
+
+
+def _forge_sections(rng: Random) -> bytes:
+    """Sections dropped, doubled, moved, swapped, borrowed, renamed, and said to be what they are not."""
+    parts = [replace(part) for part in _pick(rng)]
+    for _ in range(rng.randint(1, 2)):
+        one, other = rng.randrange(len(parts)), rng.randrange(len(parts))
+        kind = rng.randrange(9)
+        if kind == 0 and len(parts) > 1:
+            del parts[one]
+        elif kind == 1:
+            parts.insert(other, replace(parts[one]))
+        elif kind == 2:
+            parts[one], parts[other] = parts[other], parts[one]
+        elif kind == 3:
+            parts[one].data, parts[other].data = parts[other].data, parts[one].data
+        elif kind == 4:
+            borrowed = rng.choice(_pick(rng))
+            parts[one].data, parts[one].codec = borrowed.data, borrowed.codec
+        elif kind == 5:
+            parts[one].codec = rng.choice((*range(10), 65535))
+        elif kind == 6:
+            parts[one].raw_length = rng.choice((*EXTREMES, parts[one].raw_length + 4))
+        elif kind == 7:
+            parts[one].flags = rng.choice((0, 1, 2, 65535))
+        else:
+            parts[one].type = rng.choice(
+                (b"NEW_", b"posi", b"\0\0\0\0", b"\xff\n\x1b ", b"META", b"POSI", b"POS1", b"COL3")
+            )
+    return assemble(parts)
+
+
+def _forge_payload(rng: Random) -> bytes:
+    """Any bytes of a section."""
+    parts = [replace(part) for part in _pick(rng)]
+    part = rng.choice(parts)
+    part.data = edit_bytes(part.data, rng)
+    if part.type == b"META" and part.codec == 0:
+        part.raw_length = len(part.data)
+    return assemble(parts)
+
+
+def _forge_metadata(rng: Random) -> bytes:
+    """Metadata with other values, keys, nesting or text; often with the raw lengths that it then asks for."""
+    parts = [replace(part) for part in _pick(rng)]
+    values = json.loads(zlib.decompress(parts[0].data) if parts[0].codec == 5 else parts[0].data)
+    for _ in range(rng.choice((1, 1, 2))):
+        kind = rng.randrange(8)
+        everywhere = places(values)
+        sizes = [(node, key) for node, key in everywhere if key in RANGES]
+        if kind < 3 and sizes:
+            node, key = rng.choice(sizes)
+            node[key] = rng.choice((rng.randint(*RANGES[key]), rng.choice(EXTREMES)))
+        elif kind == 3:
+            values["gaussians"] = rng.choice((rng.randrange(3000), rng.choice(EXTREMES), 8_000_000))
+            if rng.random() < 0.3:
+                first = rng.randint(0, min(values["gaussians"], 50))
+                values["layers"] = rng.choice(([first, values["gaussians"] - first], [values["gaussians"]], [0] * 9))
+        else:
+            node, key = rng.choice(everywhere)
+            if kind == 4 and isinstance(node, dict):
+                del node[key]
+            elif kind == 5 and isinstance(node, dict):
+                node[rng.choice(HOSTILE_TEXT)] = copy.deepcopy(rng.choice(HOSTILE_JSON))
+            else:
+                node[key] = copy.deepcopy(rng.choice(HOSTILE_JSON))
+    text = json.dumps(values).encode()
+    if rng.random() < 0.1:
+        deep = rng.choice((60, 70, 300, 950, 100_000))
+        text = text[:-1] + b',"provenance":{"a":' + b"[" * deep + b"]" * deep + b"}}"
+    elif rng.random() < 0.1:
+        text = edit_bytes(text, rng)
+    parts[0].data, parts[0].raw_length = text, len(text)
+    if rng.random() < 0.3:
+        _deflate(parts[0], rng)
+    else:
+        parts[0].codec = 0
+    if rng.random() < 0.6:
+        try:
+            shapes = group_shapes(parse_config(values["config"]), int(values["gaussians"]))
+            for part in parts[1:]:
+                rows, columns = shapes[part.type.decode()]
+                part.raw_length = 4 * rows * columns
+        except Exception:  # the metadata is no longer sane, and need not be
+            pass
+    return assemble(parts)
+
+
+def _deflate(part: Part, rng: Random) -> None:
+    """The metadata as codec 5 has it; now and then not quite."""
+    part.codec, text = 5, part.data
+    kind = rng.randrange(12)
+    part.data = zlib.compress(text + b" " * (50_000_000 if kind == 0 and rng.random() < 0.1 else 0), rng.choice((0, 9)))
+    if kind == 1:
+        part.raw_length += rng.choice((-1, 1, 1 << 19, 1 << 20, 1 << 28))
+    elif kind == 2:
+        part.data = part.data[: -rng.randint(1, 8)]
+    elif kind == 3:
+        part.data += rng.randbytes(rng.randint(1, 8))
+    elif kind == 4:
+        part.data = edit_bytes(part.data, rng)
+
+
+def places(node: dict | list) -> list[tuple[dict | list, str | int]]:
+    """Every value inside nested JSON, as (what holds it, its key)."""
+    keys = list(node) if isinstance(node, dict) else range(len(node))
+    found = [(node, key) for key in keys]
+    for key in keys:
+        if isinstance(node[key], (dict, list)):
+            found += places(node[key])
+    return found
+
+
+def _forge_fields(rng: Random) -> bytes:
+    """One field of a codec forged, and the lengths around it repaired."""
+    parts = [replace(part) for part in _pick(rng)]
+    coded = [part for part in parts[1:] if part.codec in (3, 4, 6, 7, 8)] or parts[1:]
+    part = rng.choice(coded)
+    fields = _fields(part)
+    for _ in range(rng.choice((1, 1, 2))):
+        name = rng.choice(list(fields))
+        value = fields[name]
+        if isinstance(value, tuple):
+            number, width = value
+            new = rng.choice((number + rng.choice((-1, 1)), rng.choice(EXTREMES), rng.getrandbits(8)))
+            fields[name] = (new % 256**width, width)
+        elif name.startswith("chunks") and len(value) >= 4 and rng.random() < 0.5:
+            # Bits moved from one chunk to another: the sum, and with it the length, stays right.
+            sizes = np.frombuffer(value[: len(value) // 2 * 2], "<u2").astype(np.int64)
+            one, other, moved = rng.randrange(len(sizes)), rng.randrange(len(sizes)), rng.randint(1, 9)
+            sizes[one] -= min(moved, sizes[one])
+            sizes[other] += moved
+            fields[name] = sizes.astype("<u2").tobytes()
+        else:
+            fields[name] = edit_bytes(value, rng, 2)
+    if rng.random() < 0.8:
+        _repair(fields)
+    part.data = b"".join(
+        value[0].to_bytes(value[1], "little") if isinstance(value, tuple) else value for value in fields.values()
+    )
+    return assemble(parts)
+
+
+def _fields(part: Part) -> dict[str, bytes | tuple[int, int]]:
+    """The payload of a valid section by field, in order: (number, bytes it takes), or bytes.
+
+    A field "size of NAME" holds the bytes of all fields whose names start with NAME.
+    """
+    if part.codec == 6:
+        return _points_fields(part.data)
+    if part.codec == 7:
+        return _channels_fields(part.data, 3 if part.type[:3] == b"COL" else 1)
+    if part.codec == 8:
+        return _groups_fields(part.data)
+    if part.codec == 4:
+        names = {"minimum": part.data[:4], "maximum": part.data[4:8], "bits": (part.data[8], 1)}
+        return names | _stream_fields(part.data[9:], "")
+    if part.codec != 3:
+        return {"numbers": part.data}
+    stages, columns, size = struct.unpack_from("<BBH", part.data)
+    end = 4 + 2 * stages * columns * size
+    fields = {"stages": (stages, 1), "columns": (columns, 1), "size": (size, 2), "codebooks": part.data[4:end]}
+    for stage in range(stages):
+        (length,) = struct.unpack_from("<Q", part.data, end)
+        fields[f"length {stage}"] = (length, 8)
+        fields |= _stream_fields(part.data[end + 8 : end + 8 + length], f" {stage}")
+        end += 8 + length
+    return fields
+
+
+def _points_fields(data: bytes) -> dict[str, bytes | tuple[int, int]]:
+    base, kinds, *sizes = struct.unpack_from("<BBII", data)
+    fields = {"base": (base, 1), "size of bits": (kinds, 1), "size of gaps": (sizes[0], 4)}
+    fields |= {"size of classes": (sizes[1], 4), "bits": data[10 : 10 + kinds]}
+    start = 10 + kinds
+    for name, size in zip(("gaps", "classes"), sizes, strict=True):
+        fields |= _integers_fields(data[start : start + size], name)
+        start += size
+    return fields | {"tails": data[start:]}
+
+
+def _channels_fields(data: bytes, columns: int) -> dict[str, bytes | tuple[int, int]]:
+    fields = {"basis": data[:36]} if columns == 3 else {}
+    start = len(fields) * 36
+    for column in range(columns):
+        _, weight, size, kinds = struct.unpack_from("<fBIB", data, start)
+        fields |= {f"mean {column}": data[start : start + 4], f"weight {column}": (weight, 1)}
+        fields |= {f"size of stream {column}": (size, 4), f"size of steps {column}": (kinds, 1)}
+        start += 10 + kinds
+        fields[f"steps {column}"] = data[start - kinds : start]
+        fields |= _integers_fields(data[start : start + size], f"stream {column}")
+        start += size
+    return fields
+
+
+def _groups_fields(data: bytes) -> dict[str, bytes | tuple[int, int]]:
+    first, second = struct.unpack_from("<II", data)
+    fields = {"size of steps": (first, 4), "size of models": (second, 4)}
+    fields |= _integers_fields(data[8 : 8 + first], "steps")
+    fields |= _integers_fields(data[8 + first : 8 + first + second], "models")
+    return fields | _integers_fields(data[8 + first + second :], "symbols")
+
+
+def _integers_fields(data: bytes, name: str) -> dict[str, bytes | tuple[int, int]]:
+    """A stream of integers: its first two numbers, and what they decide about."""
+    if len(data) < 2:
+        return {f"{name} rest": data}
+    return {f"{name} lanes": (data[0], 1), f"{name} alphabet": (data[1], 1), f"{name} rest": data[2:]}
+
+
+def _stream_fields(data: bytes, suffix: str) -> dict[str, bytes | tuple[int, int]]:
+    names = {"count": 8, "packed": 8, "leaves": 4, "end": 4, "width": 1, "wide": 1}
+    count, packed, leaves, _, width, wide = numbers = struct.unpack_from("<QQIIBB", data)
+    sizes = {"lengths": leaves, "symbols": max(leaves - 1, 0) * width}
+    sizes |= {"chunks": wide * -(-count // max(1024, 2 * -(-count // 2048))), "codes": packed}
+    fields = {name + suffix: (number, names[name]) for name, number in zip(names, numbers, strict=True)}
+    at = 26
+    for name, size in sizes.items():
+        fields[name + suffix] = data[at : at + size]
+        at += size
+    return fields
+
+
+def _repair(fields: dict) -> None:
+    """Make the lengths in the fields what the bytes beside them are."""
+    for name, value in fields.items():
+        if name.startswith("codes"):
+            fields["packed" + name[5:]] = (len(value), 8)
+        elif name.startswith("lengths"):
+            fields["leaves" + name[7:]] = (len(value), 4)
+    sizes = {name: value[1] if isinstance(value, tuple) else len(value) for name, value in fields.items()}
+    for name, value in fields.items():
+        if name.startswith("length "):
+            stream = [other for other in fields if other.split(" ")[1:] == name.split(" ")[1:]]
+            fields[name] = (sum(sizes[other] for other in stream) - 8, 8)
+        elif name.startswith("size of "):
+            total = sum(size for other, size in sizes.items() if f"{other} ".startswith(f"{name[8:]} "))
+            fields[name] = (total % 256 ** value[1], value[1])
+
+
+def _pick(rng: Random) -> tuple[Part, ...]:
+    return _disassembled(_seed(rng))
+
+
+# How inputs are made, and how often.
+KINDS: dict[str, tuple[int, Callable[[Random], bytes]]] = {
+    "flipped bits": (10, _flip_bits),
+    "damaged bytes": (10, _damage_bytes),
+    "truncated": (8, _truncate),
+    "extended": (4, _extend),
+    "spliced": (8, _splice),
+    "forged header": (10, _forge_header),
+    "forged sections": (10, _forge_sections),
+    "forged payload": (10, _forge_payload),
+    "forged metadata": (15, _forge_metadata),
+    "forged codec field": (15, _forge_fields),
+}
+
+
+def mutant(number: int, seed: int = 0) -> tuple[str, bytes]:
+    """The kind of input `number` of the run with this seed, and its bytes. Same numbers, same bytes."""
+    rng = Random(f"{seed}:{number}")
+    kind = rng.choices(list(KINDS), [weight for weight, _ in KINDS.values()])[0]
+    return kind, KINDS[kind][1](rng)

@@ -1,0 +1,93 @@
+"""Runs the Python of the documentation as written: each page from top to bottom, in a fresh interpreter and folder.
+
+    python -m tools.safety.run_docs                                docs/python-api.md and the README, all training steps
+    python -m tools.safety.run_docs --steps 20 docs/python-api.md  fewer steps: quick, worse pictures
+
+The folder has photos in photos/bonsai: those of --data (default mipnerf360_bonsai among the real sets), or a made-up
+scene where there are none. Pages' Python is what stands in blocks marked so, and in indented ones that import hyrfpack.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+from hyrfpack.demo.scene import write_demo_scene
+
+ROOT = Path(__file__).parents[2]
+PAGES = (ROOT / "docs" / "python-api.md", ROOT / "README.md")
+DATA = Path(os.environ.get("HYRFPACK_DATA") or ROOT.parent / "shared" / "data") / "mipnerf360_bonsai"
+BLOCK = re.compile(r"^```python\n(?P<fenced>.*?)^```$|(?P<indented>(?:^    [^\n]*\n|^\n)+)", re.MULTILINE | re.DOTALL)
+FEWER = """
+import runpy, sys
+from hyrfpack.train import TrainConfig
+whole = TrainConfig.__post_init__
+def fewer(config):
+    object.__setattr__(config, "steps", min(config.steps, {steps}))
+    whole(config)
+TrainConfig.__post_init__ = fewer
+runpy.run_path(sys.argv[1], run_name="__main__")
+"""
+
+
+def python_of(page: str) -> str:
+    """A page's Python, each line where it stands on the page, so that an error names the page's line."""
+    lines = [""] * (page.count("\n") + 1)
+    for block in BLOCK.finditer(page):
+        if block["fenced"] is None and "import hyrfpack" not in block["indented"]:
+            continue
+        kind = "fenced" if block["fenced"] is not None else "indented"
+        first = page.count("\n", 0, block.start(kind))
+        for number, line in enumerate(block[kind].splitlines(), start=first):
+            lines[number] = line[4:] if kind == "indented" else line
+    return "\n".join(lines)
+
+
+def run(page: Path, data: Path, steps: int | None) -> bool:
+    """Run one page; whether it ran to its end."""
+    code = python_of(page.read_text(encoding="utf-8"))
+    if not code.strip():
+        print(f"{page}: there is no Python on it")
+        return False
+    with tempfile.TemporaryDirectory(prefix="hyrfpack-docs-") as folder:
+        photos, script = Path(folder, "photos", "bonsai"), Path(folder, page.name)
+        if data.is_dir():
+            shutil.copytree(data, photos)
+        else:
+            write_demo_scene(photos)
+        script.write_text(code, encoding="utf-8")
+        fewer = [] if steps is None else ["-c", FEWER.format(steps=steps)]
+        return subprocess.run([sys.executable, *fewer, script], cwd=folder).returncode == 0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("pages", nargs="*", type=Path, default=PAGES)
+    parser.add_argument("--data", type=Path, default=DATA, help="a folder of photos and poses")
+    parser.add_argument("--steps", type=int, help="training steps at most; as the pages say when left out")
+    args = parser.parse_args()
+    packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "torch", "pycolmap"))
+    photos = args.data if args.data.is_dir() else f"a made-up scene, for there is no {args.data}"
+    steps = "as many steps as written" if args.steps is None else f"at most {args.steps} steps"
+    print(f"Python {platform.python_version()}, {packages}; {photos}; {steps}", flush=True)
+    broken = 0
+    for page in args.pages:
+        print(f"== {page}", flush=True)
+        began = time.perf_counter()
+        done = run(page, args.data, args.steps)
+        broken += not done
+        print(f"== {page}: {'ran as written' if done else 'FAILED'}, {time.perf_counter() - began:.0f} s", flush=True)
+    return min(broken, 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

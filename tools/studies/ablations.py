@@ -1,0 +1,231 @@
+"""The HyRF paper's ablations on real sets: what each part of the model is worth, beside what the paper says.
+
+    python -m tools.studies.ablations            trains every variant and prints the tables of docs/ablations.md
+    python -m tools.studies.ablations --reuse    trains only what --out does not hold yet
+
+Scores are on held-out views of the model as trained, not compressed. Frames are timed in turns with the full model's,
+geometry decoded beforehand. Each run leaves its numbers in --out as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import defaultdict
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
+from itertools import product
+from pathlib import Path
+from statistics import fmean, median
+from unittest.mock import patch
+
+import torch
+
+import hyrfpack
+from hyrfpack.data import PictureCache
+from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.format import encode_model, load, save
+from hyrfpack.measure.timing import take_turns
+from hyrfpack.model import HybridModel
+from hyrfpack.render import renderer
+from hyrfpack.scene import Scene, View, evenly_spaced
+from hyrfpack.train import TrainConfig
+from tools.studies.ablation_models import FULL, NO_CULLING, TRAINED, Variant, build_trainer
+from tools.studies.train_sets import study_arguments
+
+SETS = ("mipnerf360_bonsai", "gerrard_hall", "drone_caliterra")
+ROWS = (*TRAINED, NO_CULLING)
+TIMED_VIEWS, REPEATS = 6, 5
+
+Results = dict[tuple[str, str], list[dict]]  # (variant, set) -> a result for each seed
+
+
+def run(variant: Variant, scene: Scene, config: TrainConfig, full_path: Path, cache: PictureCache) -> dict:
+    """Train one variant and measure it; NO_CULLING measures the full model.
+
+    Args:
+        full_path: the full model of the same set and seed; FULL writes it.
+
+    Returns:
+        The numbers of one row, ready for JSON; {"failed": why} where it did not train.
+    """
+    if variant is NO_CULLING:
+        full = load(full_path).requires_grad_()  # its bytes are those that could be trained
+        return measure(variant, full, full, scene)
+    trainer = build_trainer(scene, config, variant, cache)
+    try:
+        with culling(variant):
+            trainer.run()
+        if not all(parameter.isfinite().all() for parameter in trainer.model.parameters()):
+            raise HyrfTrainingError("a parameter is not finite after the last step")
+    except HyrfTrainingError as error:
+        return {"failed": str(error)}
+    if variant is FULL:
+        save(trainer.model, full_path)
+    result = measure(variant, trainer.model, load(full_path), scene)
+    return {**result, "steps_per_second": config.steps / trainer.elapsed, "seconds": trainer.elapsed}
+
+
+@torch.no_grad()
+def measure(variant: Variant, model: HybridModel, full: HybridModel, scene: Scene) -> dict:
+    """Scores on held-out views, sizes, and frames per second also as a multiple of the full model's."""
+    with culling(variant):
+        scores = hyrfpack.evaluate(model, scene.test)
+    views = evenly_spaced(scene.test, TIMED_VIEWS)
+    frames_per_second, frames_ratio = time_frames(variant, model, full, views)
+    result = {
+        "psnr": scores.psnr,
+        "ssim": scores.ssim,
+        "gaussians": len(model),
+        "bytes": 4 * sum(parameter.numel() for parameter in model.parameters() if parameter.requires_grad),
+        "bytes_paper": len(encode_model(model, "paper")) if variant.saves else None,
+        "frames_per_second": frames_per_second,
+        "frames_ratio": frames_ratio,
+    }
+    if not variant.culling:
+        _, result["frames_ratio_decoding"] = time_frames(variant, model, full, views, keep_geometry=False)
+    return result
+
+
+@torch.no_grad()
+def time_frames(
+    variant: Variant, model: HybridModel, full: HybridModel, views: list[View], keep_geometry: bool = True
+) -> tuple[float, float]:
+    """Frames per second of a model, and as a multiple of the full model's on the same views: medians over views.
+
+    Args:
+        keep_geometry: geometry is decoded once for all views, not again for each.
+    """
+    decoded, decoded_full = (m.decode() if keep_geometry else None for m in (model, full))
+
+    def draw(view: View) -> None:
+        with culling(variant):
+            hyrfpack.render(model, view.camera, decoded=decoded)
+
+    def draw_full(view: View) -> None:
+        hyrfpack.render(full, view.camera, decoded=decoded_full)
+
+    times = [take_turns({"this": partial(draw, v), "full": partial(draw_full, v)}, REPEATS)[0] for v in views]
+    return 1000 / median(t["this"].ms for t in times), median(t["full"].ms / t["this"].ms for t in times)
+
+
+def culling(variant: Variant) -> AbstractContextManager:
+    """Where a variant renders: without its pre-culling, every Gaussian is decoded and projected, seen or not."""
+    if variant.culling:
+        return nullcontext()
+    return patch.object(renderer, "frustum_cull", lambda positions, *_: torch.arange(len(positions)))
+
+
+# -- tables --------------------------------------------------------------------------------------------------------
+
+
+def report(results: Results, sets: Sequence[str], variants: Sequence[Variant]) -> str:
+    """The tables of docs/ablations.md; the full model must be among the results."""
+    others = [variant for variant in variants if variant is not FULL]
+    parts = [quality_table(results, sets, others), cost_table(results, sets, others)]
+    return "\n\n".join(parts + [f"`{name}`\n\n{details_table(results, name, variants)}" for name in sets])
+
+
+def quality_table(results: Results, sets: Sequence[str], variants: Sequence[Variant]) -> str:
+    """PSNR lost by each variant, beside what it costs in the paper."""
+    columns = ("PSNR, dB", "paper", *(f"`{name}`" for name in sets), "mean", "sets that lose")
+    full = [_spread([r["psnr"] for r in results["full", name] if "failed" not in r], "") for name in sets]
+    rows = [("full", "24.07, 30.37", *full, "", "")]
+    for variant in variants:
+        cells, means = [], []
+        for name in sets:
+            pairs = _pairs(results, variant, name)
+            differences = [ours["psnr"] - full["psnr"] for ours, full in pairs]
+            means += [fmean(differences)] if pairs else []
+            failed = sum("failed" in result for result in results[variant.name, name])
+            cells.append(_spread(differences, "+") + (f" ({failed} did not train)" if failed and pairs else ""))
+        paper = "" if variant.paper_psnr is None else f"{variant.paper_psnr:+.2f}"
+        mean = f"{fmean(means):+.2f}" if means else ""
+        rows.append((variant.name, paper, *cells, mean, f"{sum(m < 0 for m in means)} of {len(means)}"))
+    return _markdown(columns, rows)
+
+
+def cost_table(results: Results, sets: Sequence[str], variants: Sequence[Variant]) -> str:
+    """Size and speed of each variant as a part of the full model's: means over sets and seeds."""
+
+    def ratio(variant: Variant, key: str, full_key: str | None = None) -> str:
+        pairs = [pair for name in sets for pair in _pairs(results, variant, name) if key in pair[0]]
+        return f"{fmean(ours[key] / (full[full_key] if full_key else 1) for ours, full in pairs):.2f}" if pairs else ""
+
+    columns = ("part of full", "size, paper", "size", "frames/s, paper", "frames/s", "steps/s")
+    rows = []
+    for variant in variants:
+        frames = ratio(variant, "frames_ratio")
+        if decoding := ratio(variant, "frames_ratio_decoding"):
+            frames += f"; {decoding} with geometry decoded for each frame"
+        size, speed = (f"{part:.2f}" if part else "" for part in (variant.paper_size, variant.paper_frames))
+        steps = ratio(variant, "steps_per_second", "steps_per_second")
+        rows.append((variant.name, size, ratio(variant, "bytes", "bytes"), speed, frames, steps))
+    return _markdown(columns, rows)
+
+
+def details_table(results: Results, name: str, variants: Sequence[Variant]) -> str:
+    """All numbers of one set: means over seeds."""
+    formats = {
+        "psnr": ".2f",
+        "ssim": ".3f",
+        "gaussians": ",.0f",
+        "bytes": ",.0f",
+        "bytes_paper": ",.0f",
+        "steps_per_second": ".1f",
+        "frames_per_second": ".1f",
+    }
+    columns = ("", "PSNR", "SSIM", "Gaussians", "float32 bytes", "`paper` file", "steps/s", "frames/s")
+    rows = []
+    for variant in variants:
+        trained = [result for result in results[variant.name, name] if "failed" not in result]
+        values = {key: [r[key] for r in trained if r.get(key) is not None] for key in formats}
+        cells = [format(fmean(values[key]), form) if values[key] else "" for key, form in formats.items()]
+        rows.append((variant.name, *(cells if trained else ("did not train", *cells[1:]))))
+    return _markdown(columns, rows)
+
+
+def _pairs(results: Results, variant: Variant, name: str) -> list[tuple[dict, dict]]:
+    """The variant's result and the full model's for each seed with which both trained."""
+    both = zip(results[variant.name, name], results[FULL.name, name], strict=True)
+    return [pair for pair in both if not any("failed" in result for result in pair)]
+
+
+def _spread(values: list[float], sign: str) -> str:
+    """The mean over seeds, and half the way from the lowest to the highest."""
+    return f"{fmean(values):{sign}.2f} ± {(max(values) - min(values)) / 2:.2f}" if values else "did not train"
+
+
+def _markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+def main() -> None:
+    parser = study_arguments(__doc__, steps=1000, sets=SETS, out=Path("runs/ablations"))
+    parser.add_argument("--reuse", action="store_true", help="keep results that --out holds for these steps")
+    args = parser.parse_args()
+    chosen = [v for v in ROWS if v is FULL or not args.only or any(part in v.name for part in args.only)]
+    out = args.out / str(args.steps)
+    out.mkdir(parents=True, exist_ok=True)
+    results: Results = defaultdict(list)
+    for seed, name in product(range(args.seeds), args.sets):
+        scene, cache = hyrfpack.load_scene(args.data / name), PictureCache()
+        for variant in chosen:
+            path = out / f"{name}-{seed}-{variant.name.replace(' ', '-')}.json"
+            if not (args.reuse and path.exists()):
+                config = TrainConfig(steps=args.steps, seed=seed)
+                result = run(variant, scene, config, out / f"{name}-{seed}.hyrf", cache)
+                path.write_text(json.dumps(result, indent=1))
+            result = json.loads(path.read_text())
+            results[variant.name, name].append(result)
+            said = result.get("failed") or f"{result['psnr']:.2f} dB, {result.get('seconds', 0):.0f} s"
+            print(f"{name}, seed {seed}, {variant.name}: {said}", file=sys.stderr, flush=True)
+            if variant is FULL and "failed" in result:
+                sys.exit("the full model did not train, so there is nothing to compare with")
+    print(report(results, args.sets, chosen))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,120 @@
+"""What leaving costs: bytes, time and loss of every format that a model can be exported to.
+
+    python -m tools.studies.export_table runs/bonsai/model.hyrf data/bonsai
+    python -m tools.studies.export_table runs/bonsai/model.hyrf data/bonsai --degrees 0 1 2 3 --formats ply spz
+
+Colours are fitted at the training cameras. Every file is read back by our own reader and drawn by our own rasteriser at
+the held-out views, beside the model's own pictures and the photos. The times are of packing and unpacking alone; what
+baking takes stands above the table. That other programs read the same numbers is what `tests/independent` checks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+import hyrfpack
+from hyrfpack.export.background import background_picture, background_splats
+from hyrfpack.export.bake import bake
+from hyrfpack.export.measure import Likeness, likeness
+from hyrfpack.export.run import page
+from hyrfpack.export.source import Source
+from hyrfpack.splats.files import WRITTEN, decode_splats, encode_splats
+from hyrfpack.splats.formats import spz
+from hyrfpack.splats.splats import Splats, concatenate
+from hyrfpack.web.html import decode_page
+
+Result = TypeVar("Result")
+
+CHECKED_BY = {
+    ".ply": "splat-transform, gsply, three.js",
+    ".splat": "splat-transform, three.js",
+    ".spz": "splat-transform, gsply, three.js",
+    ".spz v4": "splat-transform, gsply",
+    ".sog": "splat-transform, gsply",
+    ".glb": "three.js, gltf-validator",
+    ".usda": "omniverse-asset-validator, OpenUSD",
+    ".usdc": "omniverse-asset-validator, OpenUSD",
+    ".usdz": "omniverse-asset-validator, OpenUSD",
+    ".html": "Chromium",
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", type=Path, help="a .hyrf file")
+    parser.add_argument("data", type=Path, help="its photos")
+    parser.add_argument("--degrees", type=int, nargs="+", default=[3], help="of the spherical harmonics")
+    parser.add_argument("--formats", nargs="+", default=list(CHECKED_BY), help="which")
+    arguments = parser.parse_args()
+    formats = [name if name.startswith(".") else f".{name}" for name in arguments.formats]
+
+    source = Source.read(arguments.model, hyrfpack.load_scene(arguments.data))
+    degrees = sorted({0, *arguments.degrees})
+    baked, seconds = timed(lambda: bake(source.model, source.fitted, degrees))
+    print(f"{len(source.model):,} Gaussians, {len(source.measured)} views; baked in {seconds:.1f} s", end="")
+    behind, picture = None, None
+    if source.model.config.background:
+        behind, seconds = timed(lambda: background_splats(source.model, source.fitted))
+        picture = background_picture(source.model)
+        print(f", the background as {len(behind):,} more in {seconds:.1f} s", end="")
+    whole = {d: splats if behind is None else concatenate((splats, behind)) for d, splats in baked.items()}
+    own = score(source, {})["model"]
+    print(f"; the model itself: {arguments.model.stat().st_size:,} bytes, {own.photos:.2f} dB on photos\n")
+    print("| format | degree | bytes | write (s) | read (s) | dB, model | dB, photos | checked by |")
+    print("|---|---|---|---|---|---|---|---|")
+    for name in formats:
+        for degree in [0] if name == ".splat" else arguments.degrees:
+            row(source, name, degree, baked, whole, picture)
+
+
+def row(
+    source: Source,
+    name: str,
+    degree: int,
+    baked: dict[int, Splats],
+    whole: dict[int, Splats],
+    picture: np.ndarray | None,
+) -> None:
+    """Write, read, score and print one file."""
+    if name == ".html":
+        data, write = timed(lambda: page(source, baked[degree], picture, "scene"))
+        back, read = timed(lambda: decode_page(data, name))
+    else:
+        data, write = timed(lambda: pack(source, whole[degree], name))
+        back, read = timed(lambda: (decode_splats(data, name.split()[0], name), None))
+    file = score(source, {"file": back})["file"]
+    print(
+        f"| {name} | {degree} | {len(data):,} | {write:.2f} | {read:.2f} | {file.model:.2f} | {file.photos:.2f} "
+        f"| {CHECKED_BY[name]} |",
+        flush=True,
+    )
+
+
+def pack(source: Source, splats: Splats, name: str) -> bytes:
+    """The bytes of a file."""
+    if name == ".spz v4":
+        return spz.encode(splats, version=4)
+    assert name in WRITTEN
+    return encode_splats(splats, name, up=source.up, camera=source.cameras[0][1])
+
+
+def score(source: Source, contenders: dict[str, tuple[Splats, np.ndarray | None]]) -> dict[str, Likeness]:
+    """Of splats and what lies behind them, by name."""
+    return likeness(source.model, contenders, source.measured, sphere=source.model.config.background)
+
+
+def timed(action: Callable[[], Result]) -> tuple[Result, float]:
+    """What an action gives, and its seconds."""
+    start = time.perf_counter()
+    result = action()
+    return result, time.perf_counter() - start
+
+
+if __name__ == "__main__":
+    main()
