@@ -16,7 +16,7 @@ from torch import Tensor
 from hyrfpack.bench.rows import difference
 from hyrfpack.cameras.capture import stored_cameras
 from hyrfpack.cameras.paths import orbit, stored_viewpoint
-from hyrfpack.compress.run import default_noise
+from hyrfpack.compress.packer import default_noise
 from hyrfpack.data import load_scene
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.device import upload

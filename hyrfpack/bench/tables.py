@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from hyrfpack.bench.rows import Error, Row
-from hyrfpack.bench.run import BenchReport
+from hyrfpack.bench.suite import BenchReport
 from hyrfpack.errors import HyrfError
 from hyrfpack.measure.machine import machine_line
 from hyrfpack.measure.timing import Timing

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hyrfpack.cameras.camera_files import focal_length, side_length
+from hyrfpack.cameras.files import focal_length, side_length
 from hyrfpack.cameras.paths import orbit, stored_viewpoint
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hyrfpack.cameras.camera_files import focal_length, side_length
+from hyrfpack.cameras.files import focal_length, side_length
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera, rigid_pose
 

@@ -72,7 +72,7 @@ def import_(
     """
     loose = source.parent if source.name == "meta.json" else source  # a SOG is a folder, or a file
     Outputs(source, cameras, folder=loose, overwrite=overwrite).file(output, ".hyrf")
-    from hyrfpack.cameras.camera_files import cameras_from_json
+    from hyrfpack.cameras.files import cameras_from_json
     from hyrfpack.distill import DistillConfig, distill
 
     given = None if cameras is None else [camera for _, camera in cameras_from_json(cameras)]

@@ -24,7 +24,7 @@ def view(model: Path, degree: int, port: int, host: str, no_browser: bool) -> No
       hyrfpack view bonsai.hyrf
       hyrfpack view bonsai.hyrf --port 8000 --no-browser
     """
-    from hyrfpack.export.run import page_of
+    from hyrfpack.export.pipeline import page_of
     from hyrfpack.web.serve import serve
 
     note("making the page; press Ctrl-C to end")

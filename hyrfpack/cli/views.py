@@ -75,7 +75,7 @@ def render(
     """
     if sum(source is not None for source in (data, cameras, orbit)) > 1:
         raise click.UsageError("--data, --cameras and --orbit each say what to render; give one of them")
-    from hyrfpack.cameras.camera_files import cameras_from_json
+    from hyrfpack.cameras.files import cameras_from_json
     from hyrfpack.cameras.paths import orbit as orbit_around
     from hyrfpack.cameras.paths import stored_viewpoint
     from hyrfpack.format import describe, load

@@ -1,5 +1,5 @@
 """Compressing models for pictures: what matters is measured, what does not is left out."""
 
-from hyrfpack.compress.run import compress
+from hyrfpack.compress.packer import compress
 
 __all__ = ["compress"]

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.capture import stored_cameras
+from hyrfpack.compress.packer import NOISE, default_noise
 from hyrfpack.compress.report_page import FILES, PAGE, PLOT, SHOWN, Findings, Point, ShownView, page, picture_names
 from hyrfpack.compress.report_plot import draw
-from hyrfpack.compress.run import NOISE, default_noise
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import Evaluation, evaluate

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from scenes import ball_points, camera_at, ring, small_model
 
-from hyrfpack.cameras.camera_files import cameras_from_json, cameras_to_json
+from hyrfpack.cameras.files import cameras_from_json, cameras_to_json
 from hyrfpack.cameras.paths import frame_viewpoint, look_at, orbit, stored_viewpoint, viewpoint_hint
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.render import render

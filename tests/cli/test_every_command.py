@@ -169,7 +169,7 @@ def make_world(folder: Path) -> Path:
     """A folder with a set of photos of each layout, models, splats and files of others, as small as they work."""
     from explicit_balls import ball
 
-    from hyrfpack.cameras.camera_files import cameras_to_json
+    from hyrfpack.cameras.files import cameras_to_json
     from hyrfpack.data import load_scene
     from hyrfpack.demo.scene import write_demo_scene
     from hyrfpack.export.cameras import write_colmap

@@ -7,7 +7,7 @@ import pytest
 from commands import refused, succeeded
 from explicit_balls import ball
 
-from hyrfpack.cameras.camera_files import cameras_to_json
+from hyrfpack.cameras.files import cameras_to_json
 from hyrfpack.distill.views import Weighted, viewpoints
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.formats import ply

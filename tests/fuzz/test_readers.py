@@ -27,7 +27,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from hyrfpack.cameras.camera_files import cameras_from_json
+from hyrfpack.cameras.files import cameras_from_json
 from hyrfpack.cameras.paths import frame_viewpoint, orbit
 from hyrfpack.data import load_scene
 from hyrfpack.data.pictures import read_header, read_pixels

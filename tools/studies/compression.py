@@ -17,7 +17,7 @@ from pathlib import Path
 
 import hyrfpack
 from hyrfpack.compress.finetune import finetune
-from hyrfpack.compress.run import FINETUNED, default_noise
+from hyrfpack.compress.packer import FINETUNED, default_noise
 from hyrfpack.compress.search import coarsest
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.format import decode_model, encode_model

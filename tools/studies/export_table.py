@@ -22,7 +22,7 @@ import hyrfpack
 from hyrfpack.export.background import background_picture, background_splats
 from hyrfpack.export.bake import bake
 from hyrfpack.export.measure import Likeness, likeness
-from hyrfpack.export.run import page
+from hyrfpack.export.pipeline import page
 from hyrfpack.export.source import Source
 from hyrfpack.splats.files import WRITTEN, decode_splats, encode_splats
 from hyrfpack.splats.formats import spz

@@ -12,8 +12,8 @@ from scenes import ball_points, small_model
 
 import hyrfpack
 from hyrfpack.compress import compress
-from hyrfpack.compress import run as running
-from hyrfpack.compress.run import default_noise
+from hyrfpack.compress import packer as running
+from hyrfpack.compress.packer import default_noise
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
 from hyrfpack.format import describe, load, save

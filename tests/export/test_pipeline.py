@@ -17,12 +17,12 @@ from hyrfpack.cameras.capture import capture_of
 from hyrfpack.cameras.paths import viewpoint_hint
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
-from hyrfpack.export import ExportReport, export, run
+from hyrfpack.export import ExportReport, export, pipeline
 from hyrfpack.export.bake import bake
 from hyrfpack.export.choice import chosen
 from hyrfpack.export.kinds import ENDINGS, kind_of
 from hyrfpack.export.measure import likeness
-from hyrfpack.export.run import page_of
+from hyrfpack.export.pipeline import page_of
 from hyrfpack.export.source import Source
 from hyrfpack.format import load, save
 from hyrfpack.model import Frame
@@ -65,7 +65,7 @@ def sphere(tmp_path_factory):
 @pytest.fixture
 def no_bake(monkeypatch):
     """Fails the test when work begins."""
-    monkeypatch.setattr(run, "bake", lambda *arguments: pytest.fail("the bake began"))
+    monkeypatch.setattr(pipeline, "bake", lambda *arguments: pytest.fail("the bake began"))
 
 
 def read_back(path):
@@ -223,7 +223,7 @@ def test_the_psnr_is_that_of_the_file(ending, plain, tmp_path):
 
 
 def test_a_file_that_lost_something_scores_less(plain, tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "decode_splats", lambda *arguments: decode_splats(*arguments)[:20])
+    monkeypatch.setattr(pipeline, "decode_splats", lambda *arguments: decode_splats(*arguments)[:20])
     report = export(plain, tmp_path / "a.ply")
     assert report.psnr < report.by_degree[3] - 3
 
@@ -281,17 +281,19 @@ def test_rounding_that_photos_do_not_show_is_no_alarm(judged, tmp_path):
 
 def test_a_format_is_judged_by_the_photos_where_there_are_some():
     """Not by the model's own account, nor by how like the model's pictures those of the file are."""
-    cost = {"before": run.Likeness(60, 30.0, 1), "after": run.Likeness(20, 29.7, 1), "error": 1e-9}
-    assert run._cost(**cost) == pytest.approx(0.3)
-    cost["after"] = run.Likeness(20, None, 1)
-    assert run._cost(**cost) == pytest.approx(10 * np.log10((1e-9 + 1e-2) / (1e-9 + 1e-6)))
+    cost = {"before": pipeline.Likeness(60, 30.0, 1), "after": pipeline.Likeness(20, 29.7, 1), "error": 1e-9}
+    assert pipeline._cost(**cost) == pytest.approx(0.3)
+    cost["after"] = pipeline.Likeness(20, None, 1)
+    assert pipeline._cost(**cost) == pytest.approx(10 * np.log10((1e-9 + 1e-2) / (1e-9 + 1e-6)))
 
 
 def test_held_out_photos_score_the_model_and_the_file_and_are_not_fitted(plain, tmp_path, monkeypatch):
     photos = ball_scene(8).train
     scene = replace(ball_scene(8), train=photos[1::2], test=photos[::2])
     fitted = []
-    monkeypatch.setattr(run, "bake", lambda model, cameras, degrees: fitted.extend(cameras) or bake(model, [], degrees))
+    monkeypatch.setattr(
+        write, "bake", lambda model, cameras, degrees: fitted.extend(cameras) or bake(model, [], degrees)
+    )
     report = export(plain, tmp_path / "a.ply", data=scene)
     assert fitted == [view.camera for view in scene.train] and report.views == 4
     assert report.photos_model == pytest.approx(evaluate(load(plain), scene.test).psnr, abs=1e-6)
@@ -423,7 +425,7 @@ def test_what_goes_wrong_leaves_the_old_file_as_it_was(failing, sphere, tmp_path
     def fail(*arguments, **options):
         raise HyrfError("no")
 
-    monkeypatch.setattr(run, failing, fail)
+    monkeypatch.setattr(pipeline, failing, fail)
     (tmp_path / "a.ply").write_bytes(b"old")
     with pytest.raises(HyrfError, match="^no$"):
         export(sphere, tmp_path / "a.ply", degree=0)

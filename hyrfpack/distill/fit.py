@@ -18,7 +18,7 @@ from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.paths import viewpoint_hint
 from hyrfpack.checks import check_float, check_int, check_type
-from hyrfpack.compress.run import Packer, Trial
+from hyrfpack.compress.packer import Packer, Trial
 from hyrfpack.compress.search import coarsest
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.data import PictureCache
