@@ -1,0 +1,47 @@
+"""3D Gaussians of another program (.ply, .splat, .spz, .sog) to a small `.hyrf` file, and pictures of both side by side.
+
+    python examples/import_and_compare.py scene.ply scene.hyrf compare.png
+"""
+
+import argparse
+import os
+
+import numpy as np
+import torch
+from PIL import Image
+
+import hyrfpack
+from hyrfpack.cameras.paths import orbit, stored_viewpoint
+from hyrfpack.splats.draw import Drawable, draw
+from hyrfpack.splats.files import read_splats
+
+VIEWS = 3
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("splats", help="a file of 3D Gaussians")
+    parser.add_argument("model", help="the .hyrf file to write")
+    parser.add_argument("picture", help="the picture to write: left the Gaussians, right the model")
+    parser.add_argument("--steps", type=int, default=hyrfpack.DistillConfig.steps)
+    parser.add_argument("--psnr", type=float, default=hyrfpack.DistillConfig.psnr, help="dB to aim at")
+    args = parser.parse_args()
+
+    report = hyrfpack.distill(
+        args.splats, args.model, hyrfpack.DistillConfig(steps=args.steps, psnr=args.psnr), say=print
+    )
+    print(f"{report.bytes_source:,} -> {report.bytes_after:,} bytes, {report.psnr:.1f} dB against the Gaussians")
+
+    model = hyrfpack.load(args.model)
+    original = Drawable.of(read_splats(args.splats), model.config.frame)
+    rows = []
+    with torch.no_grad():
+        for camera in orbit(stored_viewpoint(hyrfpack.describe(args.model)), VIEWS):
+            pair = draw(original, camera).rgb, hyrfpack.render(model, camera, background=False).rgb
+            rows.append(np.concatenate([picture.clamp(0, 1).numpy() for picture in pair], axis=1))
+    Image.fromarray((np.concatenate(rows) * 255).round().astype(np.uint8)).save(args.picture)
+    print(f"{args.picture}: {os.path.getsize(args.picture):,} bytes, {VIEWS} views, left the Gaussians, right the model")
+
+
+if __name__ == "__main__":
+    main()

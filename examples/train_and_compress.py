@@ -1,0 +1,34 @@
+"""Photos with poses to a small file, with the numbers that say how small and how good.
+
+    python examples/train_and_compress.py photos/bonsai runs/bonsai --steps 3000
+"""
+
+import argparse
+from pathlib import Path
+
+import hyrfpack
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("photos", help="a folder of photos and poses: COLMAP, NeRF-synthetic, instant-ngp, nerfstudio")
+    parser.add_argument("out", type=Path, help="a folder for the run")
+    parser.add_argument("--steps", type=int, default=3000)
+    args = parser.parse_args()
+
+    scene = hyrfpack.load_scene(args.photos)
+    print(f"{len(scene.train)} photos to train on, {len(scene.test)} held out")
+    trained = hyrfpack.train(scene, args.out, hyrfpack.TrainConfig(steps=args.steps), overwrite=True)
+    if trained.model is None:
+        raise SystemExit(f"interrupted after {trained.step} steps; hyrfpack train --resume goes on")
+
+    small = args.out / "small.hyrf"
+    hyrfpack.compress(trained.model, small, data=scene)
+    for path in (trained.model, small):
+        scores = hyrfpack.evaluate(hyrfpack.load(path), scene.test)
+        size = hyrfpack.describe(path)["bytes"]
+        print(f"{path}: {size:,} bytes, PSNR {scores.psnr:.2f} dB, SSIM {scores.ssim:.3f} on held-out photos")
+
+
+if __name__ == "__main__":
+    main()
