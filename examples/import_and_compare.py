@@ -1,10 +1,9 @@
-"""3D Gaussians of another program (.ply, .splat, .spz, .sog) to a small `.hyrf` file, and pictures of both side by side.
+"""3D Gaussians of another program (.ply, .splat, .spz, .sog) to a small `.hyrf` file, and both side by side.
 
-    python examples/import_and_compare.py scene.ply scene.hyrf compare.png
+python examples/import_and_compare.py scene.ply scene.hyrf compare.png
 """
 
 import argparse
-import os
 
 import numpy as np
 import torch
@@ -40,7 +39,7 @@ def main() -> None:
             pair = draw(original, camera).rgb, hyrfpack.render(model, camera, background=False).rgb
             rows.append(np.concatenate([picture.clamp(0, 1).numpy() for picture in pair], axis=1))
     Image.fromarray((np.concatenate(rows) * 255).round().astype(np.uint8)).save(args.picture)
-    print(f"{args.picture}: {os.path.getsize(args.picture):,} bytes, {VIEWS} views, left the Gaussians, right the model")
+    print(f"{args.picture}: {VIEWS} views, left the Gaussians, right the model")
 
 
 if __name__ == "__main__":

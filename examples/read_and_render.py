@@ -1,6 +1,6 @@
-"""A `.hyrf` file to pictures around the scene. Needs torch and numpy, and Pillow to write PNG; no training code is loaded.
+"""A `.hyrf` file to pictures around the scene. Needs torch, numpy and Pillow; no training code is loaded.
 
-    python examples/read_and_render.py bonsai.hyrf frames --frames 24
+python examples/read_and_render.py bonsai.hyrf frames --frames 24
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """Photos with poses to a small file, with the numbers that say how small and how good.
 
-    python examples/train_and_compress.py photos/bonsai runs/bonsai --steps 3000
+python examples/train_and_compress.py photos/bonsai runs/bonsai --steps 3000
 """
 
 import argparse

@@ -15,7 +15,7 @@ from hyrfpack.errors import HyrfError
 try:
     import fcntl
 except ModuleNotFoundError:  # Windows
-    fcntl = None
+    fcntl = None  # type: ignore[assignment]
 
 PREFIX, SUFFIX = ".hyrfpack-", ".tmp"  # of temporary files; what is between is random
 

@@ -39,12 +39,12 @@ class _Commands(click.Group):
         except HyrfError as error:
             if is_verbose():
                 traceback.print_exc()
-            raise _failure(str(error)) from error
+            raise _Refusal(str(error)) from error
         except OSError as error:
             # Files are written by functions that raise HyrfError: what is left is printing onto a full disk.
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
-            raise _failure(f"what was to be said cannot be printed ({error.strerror}); lead it elsewhere") from error
+            raise _Refusal(f"the output cannot be printed ({error.strerror}); send it elsewhere") from error
         _tell_of_kernels()
         return result
 
@@ -62,10 +62,8 @@ def _tell_of_kernels() -> None:
         )
 
 
-def _failure(sentence: str) -> click.ClickException:
-    failure = click.ClickException(sentence)
-    failure.exit_code = 2
-    return failure
+class _Refusal(click.ClickException):
+    exit_code = 2
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})

@@ -63,7 +63,7 @@ def bench(
     from hyrfpack.measure.machine import machine_line
 
     picture_format(output)
-    scene = None if data is None else read_scene(data, reading, describe(model))
+    scene = None if data is None or model is None else read_scene(data, reading, describe(model))
     outputs = Outputs(model, scene=scene, overwrite=overwrite)
     outputs.file(output)
     if json_file not in (None, "-"):

@@ -64,7 +64,7 @@ def scene_options(command: Command) -> Command:
         reading = {"test_every": test_every, "images": images, "max_size": max_size, "layout": layout}
         return command(*args, reading={**reading, "model": colmap_model}, **others)
 
-    with_options = with_reading
+    with_options: Any = with_reading
     for option in (
         click.option(
             "--model",

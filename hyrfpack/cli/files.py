@@ -219,15 +219,15 @@ def _say(line: str) -> None:
 
 def _typed(context: click.Context) -> str:
     """The command as it was given, from its parameters."""
-    words = ["hyrfpack", context.info_name]
+    words = ["hyrfpack", str(context.info_name)]
     for parameter in context.command.params:
-        given = context.get_parameter_source(parameter.name) is click.core.ParameterSource.COMMANDLINE
+        given = context.get_parameter_source(str(parameter.name)) is click.core.ParameterSource.COMMANDLINE
         if not given or not parameter.expose_value:
             continue
-        value = context.params[parameter.name]
+        value = context.params[str(parameter.name)]
         if isinstance(parameter, click.Argument):
             words.append(str(value))
-        elif parameter.is_flag:
+        elif isinstance(parameter, click.Option) and parameter.is_flag:
             words.append((parameter.opts if value else parameter.secondary_opts)[-1])
         else:
             words += [parameter.opts[-1], str(value)]

@@ -93,5 +93,5 @@ def import_(
     )
 
 
-def _times(report: DistillReport, size: int) -> str:
-    return f"{size / report.bytes_after:.1f}x"
+def _times(report: DistillReport, size: int | None) -> str:
+    return "" if size is None else f"{size / report.bytes_after:.1f}x"

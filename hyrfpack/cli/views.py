@@ -91,23 +91,17 @@ def render(
     elif cameras is not None:
         named = cameras_from_json(cameras)
     else:
-        path = orbit_around(stored_viewpoint(describe(model, part)), orbit or DEFAULT_ORBIT)
-        named = [(f"{number:04d}", camera) for number, camera in enumerate(path)]
+        cameras_around = orbit_around(stored_viewpoint(describe(model, part)), orbit or DEFAULT_ORBIT)
+        named = [(f"{number:04d}", camera) for number, camera in enumerate(cameras_around)]
     film = output / "video.mp4" if video and has_ffmpeg() else None
     names = rendered_names([name for name, _ in named], depth)
     Outputs(model, cameras, scene=scene, overwrite=overwrite).folder(output, [*names, *([film.name] if film else [])])
 
     loaded = load(model, place, part)
     loaded.precision = precision
-    written = []
-    with click.progressbar(
-        render_files(loaded, named, output, depth=depth),
-        len(named),
-        "rendering",
-        file=sys.stderr,
-    ) as frames:
-        for path in frames:
-            written.append(path)
+    pictures = render_files(loaded, named, output, depth=depth)
+    with click.progressbar(pictures, len(named), "rendering", file=sys.stderr) as frames:
+        written = list(frames)
     if film:
         write_video(written, film)
     elif video:

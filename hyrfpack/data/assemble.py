@@ -246,7 +246,9 @@ def _see_through(photos: list[Photo], max_size: int) -> bool:
 
     def alpha(photo: Photo) -> np.ndarray:
         size = shrunk_size(*photo.header.size, max_size)
-        return read_pixels(photo.path, None if size == photo.header.size else size)[1]
+        pixels = read_pixels(photo.path, None if size == photo.header.size else size)[1]
+        assert pixels is not None  # only photos with an alpha channel are asked
+        return pixels
 
     candidates = [photo for photo in photos if photo.header.has_alpha]
     return any(alpha(photo).min() < 255 for photo in evenly_spaced(candidates, _ALPHA_LOOKED_AT))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
@@ -45,7 +45,7 @@ class PictureCache:
                     self.nbytes -= self._pictures.popitem(last=False)[1].nbytes
         return picture
 
-    def stream(self, views: Iterable[View], depth: int = 4) -> Iterator[tuple[View, Picture]]:
+    def stream(self, views: Iterable[View], depth: int = 4) -> Generator[tuple[View, Picture]]:
         """Yield each view with its picture, decoding up to `depth` of them ahead in one thread.
 
         Args:

@@ -135,16 +135,16 @@ def lens_from_colmap(model: str, width: int, height: int, params: np.ndarray) ->
         case "SIMPLE_PINHOLE":
             return Lens(width, height, p[0], p[0], p[1], p[2])
         case "PINHOLE":
-            return Lens(width, height, *p)
+            return Lens(width, height, p[0], p[1], p[2], p[3])
         case "SIMPLE_RADIAL" | "RADIAL":
             return Lens(width, height, p[0], p[0], p[1], p[2], "brown", brown(*p[3:]))
         case "OPENCV" | "FULL_OPENCV":
-            return Lens(width, height, *p[:4], "brown", brown(*p[4:]))
+            return Lens(width, height, p[0], p[1], p[2], p[3], "brown", brown(*p[4:]))
         case "SIMPLE_RADIAL_FISHEYE" | "RADIAL_FISHEYE":
             k1, k2 = (*p[3:], 0.0)[:2]
             return Lens(width, height, p[0], p[0], p[1], p[2], "fisheye", (k1, k2, 0.0, 0.0))
         case "OPENCV_FISHEYE":
-            return Lens(width, height, *p[:4], "fisheye", tuple(p[4:]))
+            return Lens(width, height, p[0], p[1], p[2], p[3], "fisheye", tuple(p[4:]))
     raise HyrfDataError(f"camera model {model} is not supported; undistort the photos with COLMAP first")
 
 
@@ -173,8 +173,8 @@ def _read_model(model: Path) -> tuple[dict[int, Lens], list, int, np.ndarray, np
         reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
         raise HyrfDataError(f"{model}: the model's tables do not fit together ({reason}); export it again") from error
     if kind == ".txt":
-        for table, count in zip(_TABLES, (len(cameras), len(images), len(points)), strict=True):
-            _check_text_count(model / f"{table}.txt", count)
+        for name, count in zip(_TABLES, (len(cameras), len(images), len(points)), strict=True):
+            _check_text_count(model / f"{name}.txt", count)
     unknown = next((name for name, camera_id, _ in posed if camera_id not in cameras), None)
     if unknown is not None:
         raise HyrfDataError(f"{model}: photo {unknown} has a camera that the model lacks; export the model again")

@@ -112,8 +112,7 @@ def read_header(path: Path) -> Header:
         HyrfDataError: the file is missing, empty, or no picture.
     """
     with _opened(path) as image:
-        has_alpha = _has_alpha(image)
-        return Header(*image.size, has_alpha)
+        return Header(image.width, image.height, _has_alpha(image))
 
 
 def read_pixels(path: Path, size: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray | None]:
@@ -168,7 +167,7 @@ def read_mask(path: Path, height: int, width: int, *, whole: bool = False) -> np
         (height, width) bool.
     """
     rgb, _ = read_pixels(path)
-    usable = rgb.any(axis=2)
+    usable = np.any(rgb, axis=2)
     if usable.shape == (height, width):
         return usable
     if whole and usable.shape[0] >= height and usable.shape[1] >= width:

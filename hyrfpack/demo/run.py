@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -136,8 +137,8 @@ def run_demo(
         path, compress_seconds = trained.model, None
         if profile != "raw":
             path = folder / PACKED[profile]
-            compress_seconds = _seconds(lambda path=path, profile=profile: compress(trained.model, path, profile))
-        decompress_seconds = _seconds(lambda path=path: repack(path, back))
+            compress_seconds = _seconds(partial(compress, trained.model, path, profile))
+        decompress_seconds = _seconds(partial(repack, path, back))
         scores = evaluate(load(back), scene.test)
         stored = path.stat().st_size
         profiles.append(ProfileResult(profile, scores.psnr, scores.ssim, stored, compress_seconds, decompress_seconds))

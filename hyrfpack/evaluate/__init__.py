@@ -106,7 +106,7 @@ def evaluate(
     decoded = model.decode()
     solid = np.array(model.config.solid, dtype=np.float32)
     device = model.gaussians.positions.device
-    drawn = picture_names(views, picture_count) if pictures is not None else {}
+    drawn = picture_names(views, picture_count)
 
     render(model, views[0].camera, settings, decoded=decoded)  # compiles kernels and fills caches
     scores: list[ViewScore] = []
@@ -128,15 +128,16 @@ def evaluate(
             distance = perceptual(seen, reference)
         score = ViewScore(view.name, psnr(image, reference, mask), ssim(image, reference, mask), distance)
         scores.append(score)
-        if number in drawn:
+        if pictures is not None and number in drawn:
             sheet = comparison(reference, image, mask, _caption(score))
             save_picture(Path(pictures, drawn[number]), sheet)
     if not scores:
         raise HyrfError("the masks of all views leave no pixel to score; check that white means 'use this pixel'")
+    distances = [score.lpips for score in scores if score.lpips is not None]
     return Evaluation(
         psnr=statistics.fmean(score.psnr for score in scores),
         ssim=statistics.fmean(score.ssim for score in scores),
-        lpips=None if perceptual is None else statistics.fmean(score.lpips for score in scores),
+        lpips=statistics.fmean(distances) if distances else None,
         lpips_reason=NO_LPIPS if perceptual is None else f"network {perceptual.name}",
         gaussians=len(model),
         seconds_per_frame=statistics.median(seconds),

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -139,7 +139,7 @@ def blank_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def save_figure(path: str | os.PathLike[str], figure: Figure, **options: object) -> None:
+def save_figure(path: str | os.PathLike[str], figure: Figure, **options: Any) -> None:
     """Write a figure in one step, making its folder; `options` as matplotlib's `savefig` takes them.
 
     Raises:
@@ -181,7 +181,7 @@ def _color_bar(
 ) -> None:
     """The scale of the error map, centred in `box` (left, top, width, height)."""
     left, top, width, height = box
-    length, thickness = width // 3, max(4, text.size // 2)
+    length, thickness = width // 3, max(4, int(text.size) // 2)
     middle = top + height // 2
     start = left + (width - length) // 2
     ramp = np.broadcast_to(np.linspace(0, ERROR_LIMIT, length), (thickness, length))

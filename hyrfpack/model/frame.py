@@ -54,8 +54,8 @@ class Frame:
                 "cameras and points all lie at one place, so the scene has no size; give views from different places"
             )
         half = np.maximum(half / scale, THINNEST_AXIS)
-        center = (low + high) / 2
-        return cls(tuple(map(float, center)), scale, tuple(map(float, half)))
+        (x, y, z), (a, b, c) = ((low + high) / 2).tolist(), half.tolist()
+        return cls((x, y, z), scale, (a, b, c))
 
     def to_local(self, points: np.ndarray) -> np.ndarray:
         """World positions (N, 3) to local ones, float64."""

@@ -28,6 +28,10 @@ class Gaussians(nn.Module):
 
     NAMES = ("positions", "color_logits", "scale_logits", "opacity_logits")
     WIDTHS = (3, 3, 1, 1)
+    positions: Tensor
+    color_logits: Tensor
+    scale_logits: Tensor
+    opacity_logits: Tensor
 
     def __init__(self, positions: Tensor, color_logits: Tensor, scale_logits: Tensor, opacity_logits: Tensor) -> None:
         super().__init__()

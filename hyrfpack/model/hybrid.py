@@ -116,7 +116,7 @@ class HybridModel(nn.Module):
         """The colour decoder with what of its first layer does not depend on the view worked out for all Gaussians."""
         field, explicit = self.radiance, self.gaussians
         places = field.grid.features
-        (weight, *weights), (bias, *biases) = self._color_layers()
+        (weight, w2, w3), (bias, b2, b3) = self._color_layers()
         rows = [
             mlp(field.grid(self.cube_coords(some)), [weight[:, :places]], [bias], mixed=self._mixed)
             for some in explicit.positions.split(SHADED_AT_ONCE)
@@ -125,8 +125,8 @@ class HybridModel(nn.Module):
         return Shading(
             first.bfloat16() if self._mixed else first,
             weight[:, places:].contiguous(),
-            tuple(weights),
-            tuple(biases),
+            (w2, w3),
+            (b2, b3),
             explicit.color_logits.detach(),
             self.config.direction_encoding,
             self._mixed,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numba
 from numba.core.caching import FunctionCache
@@ -31,7 +32,7 @@ def are_kept() -> bool:
     return True
 
 
-def compiled(**options: object) -> Callable[[Callable], Callable]:
+def compiled(**options: Any) -> Callable[[Callable], Callable]:
     """A decorator: `numba.njit(nogil=True, **options)`, with the machine code cached on the disk.
 
     Where nothing can be kept (disk full, no folder that may be written), the kernel is compiled anew by each process.

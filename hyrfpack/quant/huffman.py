@@ -189,11 +189,11 @@ class HuffmanStream:
         lengths, symbols, chunk_bits, payload = (
             data[start:stop] for start, stop in zip(edges, edges[1:], strict=False)
         )
-        symbols = np.frombuffer(symbols, f"<u{width}").astype(np.int32)
-        code = HuffmanCode(np.insert(symbols, end, END) if leaves else symbols, np.frombuffer(lengths, np.uint8))
+        alphabet = np.frombuffer(symbols, f"<u{width}").astype(np.int32)
+        code = HuffmanCode(np.insert(alphabet, end, END) if leaves else alphabet, np.frombuffer(lengths, np.uint8))
         code.check()
-        chunk_bits = np.frombuffer(chunk_bits, f"<u{wide}").astype(np.int64)
-        return cls(code, count, np.dtype(f"u{width}"), chunk_bits, bytes(payload))
+        bits = np.frombuffer(chunk_bits, f"<u{wide}").astype(np.int64)
+        return cls(code, count, np.dtype(f"u{width}"), bits, bytes(payload))
 
 
 def huffman_encode(symbols: np.ndarray, code: HuffmanCode | None = None) -> HuffmanStream:

@@ -230,7 +230,7 @@ def _thresholds_to_try(pairs: np.ndarray, most_classes: int) -> list[tuple[tuple
         pairs: how often each token follows each other one, (contexts, token before, token).
         most_classes: how many classes there may be.
     """
-    choices = {(): _promise(pairs.sum(axis=1))}
+    choices: dict[tuple[int, ...], int] = {(): _promise(pairs.sum(axis=1))}
     pooled = np.cumsum(pairs.sum(axis=(0, 1)))
     for classes in range(2, most_classes + 1):
         # As many tokens in each class, as far as whole tokens allow.
@@ -239,7 +239,7 @@ def _thresholds_to_try(pairs: np.ndarray, most_classes: int) -> list[tuple[tuple
         if len(pooled) > 1 and thresholds not in choices:
             counts = np.add.reduceat(pairs, [0, *thresholds], axis=1)
             choices[thresholds] = _promise(counts.reshape(-1, len(pooled)))
-    best = min(choices, key=choices.get)
+    best = min(choices, key=choices.__getitem__)
     return [(thresholds, choices[thresholds]) for thresholds in dict.fromkeys([(), best])]
 
 

@@ -47,7 +47,7 @@ def render_files(
             rendering = render(model, camera, settings, decoded=decoded, depth=depth)
         path = Path(folder) / f"{name}.png"
         save_picture(path, to_image(rendering.rgb))
-        if depth:
+        if rendering.depth is not None:
             save_picture(path.with_suffix(".depth.tiff"), Image.fromarray(rendering.depth.float().cpu().numpy()))
         yield path
 

@@ -40,6 +40,7 @@ def write_video(frames: Sequence[Path], path: str | os.PathLike[str], frames_per
         with subprocess.Popen(
             [*command, str(partial)], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
         ) as process:  # which waits for the program, also when a frame cannot be read
+            assert process.stdin is not None  # a pipe was asked for
             try:
                 for frame in frames:
                     process.stdin.write(frame.read_bytes())

@@ -66,7 +66,7 @@ class Optimizer:
                 states = [self._states[parameter] for parameter in some]
                 flag = flag + adam_step(
                     [parameter.detach() for parameter in some],
-                    [parameter.grad for parameter in some],
+                    [parameter.grad for parameter in some if parameter.grad is not None],
                     [state.exp_avg for state in states],
                     [state.exp_avg_sq for state in states],
                     step=count,
@@ -84,13 +84,15 @@ class Optimizer:
     def replace_gaussians(self, keep: Tensor, new: dict[str, Tensor]) -> None:
         """Keep the rows at `keep` (int64), with their moments, and append new rows with moments of zero."""
 
-        for name in Gaussians.NAMES:
-            rows = new[name]
+        def edit(name: str, rows: Tensor) -> None:
             self._edit(
                 name,
-                lambda values, rows=rows: torch.cat((values[keep], rows)),
-                lambda moment, rows=rows: torch.cat((moment[keep], torch.zeros_like(rows))),
+                lambda values: torch.cat((values[keep], rows)),
+                lambda moment: torch.cat((moment[keep], torch.zeros_like(rows))),
             )
+
+        for name in Gaussians.NAMES:
+            edit(name, new[name])
 
     def reset(self, name: str, values: Tensor) -> None:
         """Set one kind of Gaussian property and forget its moments."""
@@ -121,5 +123,5 @@ class Optimizer:
         for name, parameters in self.groups.items():
             for i, parameter in enumerate(parameters):
                 if (step := state.get(f"{name}.{i}.step")) is not None:
-                    moments = (state[f"{name}.{i}.{moment}"].to(parameter.device).clone() for moment in MOMENTS)
-                    self._states[parameter] = _State(*moments, int(step))
+                    first, second = (state[f"{name}.{i}.{moment}"].to(parameter.device).clone() for moment in MOMENTS)
+                    self._states[parameter] = _State(first, second, int(step))

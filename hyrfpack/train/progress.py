@@ -34,7 +34,8 @@ class ProgressLine:
         self.first = done
         self.start = self.last_log = self.warm = monotonic()
         self.warm_step = done
-        self.loss = self.mse = None
+        self.loss: float | None = None
+        self.mse: float | None = None
         self.quiet = quiet or sys.stderr is None
         self.advice = advice
         self.line = _Line({"steps": f"{done:,}/{steps:,}"}, done / steps)
@@ -71,7 +72,7 @@ class ProgressLine:
             self.mse = mse * weight + (self.mse or 0) * (1 - weight)
         now = monotonic()
         speed, left = self._pace(step, now)
-        if self.quiet or self.loss is None:
+        if self.quiet or self.loss is None or self.mse is None:
             return
         self._advise(step, now, left)
         due = self.live is not None or now - self.last_log >= LOG_EVERY or step == self.steps

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from hyrfpack.data import PictureCache
 from hyrfpack.device import upload, upload_array
@@ -159,12 +160,12 @@ class Trainer:
             broken = self.optimizer.step(self.step - 1, config.steps)
         with self._timed("loss"):
             # All that the host wants to know of this step, in one wait for the device.
-            mse = _mean_square(rendering.rgb.detach() - target, mask)
-            value, mse, *broken = torch.stack((loss.detach(), mse, *broken)).tolist()
+            error = _mean_square(rendering.rgb.detach() - target, mask)
+            value, mse, *flags = torch.stack((loss.detach(), error, *broken)).tolist()
         if not np.isfinite(value):
             self._refuse(view, "the loss is not finite", self._nonfinite_parameters())
-        if any(broken):
-            self._refuse(view, "a gradient is not finite", self.optimizer.names(broken))
+        if any(flags):
+            self._refuse(view, "a gradient is not finite", self.optimizer.names(flags))
         with self._timed("density"):
             self.density.act(self.step, self.model, self.optimizer)
         if np.isnan(mse):
@@ -205,7 +206,7 @@ class Trainer:
 
     def save(self, path: Path) -> None:
         """Write the run's state to `path`."""
-        tensors = {f"model.{name}": p for name, p in self.model.named_parameters()}
+        tensors: dict[str, Tensor] = {f"model.{name}": p for name, p in self.model.named_parameters()}
         tensors |= {f"adam.{name}": value for name, value in self.optimizer.state_dict().items()}
         tensors |= {"density.gradients": self.density.gradients, "density.views": self.density.views}
         progress = {"step": self.step, "records": self.records, "seconds": dict(self.seconds), "elapsed": self.elapsed}

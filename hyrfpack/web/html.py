@@ -114,7 +114,8 @@ def decode_page(data: bytes, name: str) -> tuple[Splats, np.ndarray | None]:
         HyrfDataError: it is no page of this version of hyrfpack, or is damaged.
     """
     try:
-        scene = json.loads(re.search(rb'<script type="text/plain" id="scene">([^<]*)</script>', data)[1])
+        (facts,) = re.findall(rb'<script type="text/plain" id="scene">([^<]*)</script>', data)
+        scene = json.loads(facts)
         blocks = re.findall(rb'<script type="text/plain" class="splats">([^<]*)</script>', data)
         packed = b"".join(base64.b64decode(block, validate=True) for block in blocks)
         middle, unit = np.array(scene["center"], np.float64), np.float64(scene["unit"])
@@ -177,4 +178,4 @@ def _text(name: str, text: str) -> str:
 
 def _part(name: str) -> str:
     """A file of `viewer/`."""
-    return files("hyrfpack.web").joinpath("viewer", name).read_text("utf-8")
+    return files("hyrfpack.web").joinpath("viewer").joinpath(name).read_text("utf-8")

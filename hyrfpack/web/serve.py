@@ -11,6 +11,7 @@ import webbrowser
 from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
 
 from hyrfpack.errors import HyrfError
 
@@ -48,10 +49,19 @@ def serve(
             server.serve_forever()
 
 
-def _server(host: str, port: int) -> ThreadingHTTPServer:
+class _Server(ThreadingHTTPServer):
+    page = b""
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):  # the browser went away
+            super().handle_error(request, client_address)
+
+
+def _server(host: str, port: int) -> _Server:
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
         timeout = 60  # s: a silent browser does not keep a thread for ever
+        server: _Server
 
         def do_GET(self) -> None:
             self._answer(with_body=True)
@@ -75,13 +85,8 @@ def _server(host: str, port: int) -> ThreadingHTTPServer:
         def log_message(self, format: str, *args: object) -> None:
             """Requests are nobody's news."""
 
-    class Server(ThreadingHTTPServer):
-        page = b""
+    class Server(_Server):
         address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
-
-        def handle_error(self, request: object, client_address: object) -> None:
-            if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):  # the browser went away
-                super().handle_error(request, client_address)
 
     if not host.strip():  # to the socket, this is every address
         raise HyrfError(f"'{host}' is no address to listen at; name {LOCAL}, or 0.0.0.0 to let others look")

@@ -276,7 +276,7 @@ def test_standard_output_on_a_full_disk_is_one_sentence(packed):
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, env=environment)
 
     assert done.returncode == 2
-    assert done.stderr.startswith("Error: what was to be said cannot be printed") and "Traceback" not in done.stderr
+    assert done.stderr.startswith("Error: the output cannot be printed") and "Traceback" not in done.stderr
 
 
 class FullLog(io.StringIO):
