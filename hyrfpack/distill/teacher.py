@@ -23,11 +23,14 @@ LEAST_ALPHA = 1e-6  # below it a pixel has no colour of its own
 def teaching_scene(name: str, drawable: Drawable, train: Sequence[Camera], test: Sequence[Camera]) -> Scene:
     """The original seen by cameras, as a scene of photos with coverage; drawn when they are asked for."""
     count = len(str(len(train) + len(test)))
-    views = [
-        [View(f"{kind}/{number:0{count}d}", camera, partial(photograph, drawable, camera)) for number, camera in parts]
-        for kind, parts in (("train", enumerate(train)), ("test", enumerate(test)))
-    ]
-    return Scene(name, "splats", *views, np.zeros((0, 3)), np.zeros((0, 3), np.float32), has_alpha=True)
+    taught, scored = (
+        [
+            View(f"{kind}/{number:0{count}d}", camera, partial(photograph, drawable, camera))
+            for number, camera in enumerate(cameras)
+        ]
+        for kind, cameras in (("train", train), ("test", test))
+    )
+    return Scene(name, "splats", taught, scored, np.zeros((0, 3)), np.zeros((0, 3), np.float32), has_alpha=True)
 
 
 def photograph(drawable: Drawable, camera: Camera) -> Picture:
@@ -35,8 +38,7 @@ def photograph(drawable: Drawable, camera: Camera) -> Picture:
     drawn = draw(drawable, camera)
     alpha = 1 - drawn.transmittance
     rgb = drawn.rgb / alpha.clamp_min(LEAST_ALPHA)[..., None]
-    rgb, alpha = ((values.clamp(0, 1) * 255).round().to(torch.uint8).numpy() for values in (rgb, alpha))
-    return Picture(rgb, alpha)
+    return Picture(*((values.clamp(0, 1) * 255).round().to(torch.uint8).numpy() for values in (rgb, alpha)))
 
 
 @torch_on_one_thread()
@@ -49,7 +51,8 @@ def light_of(drawable: Drawable, cameras: Sequence[Camera]) -> Tensor:
         size = camera.intrinsics, camera.width, camera.height
         index = frustum_cull(drawable.positions, pose, *size, settings.near, settings.cull_tolerance)
         parts = (drawable.positions, drawable.quats, drawable.scales, drawable.opacities)
-        light = sent_light(*(part[index] for part in parts), camera, pose, drawable.antialiased)
+        means, quats, scales, opacities = (part[index] for part in parts)
+        light = sent_light(means, quats, scales, opacities, camera, pose, drawable.antialiased)
         total.index_add_(0, index, light)
     return total / max(1, len(cameras))
 

@@ -66,10 +66,10 @@ def take_turns(tasks: Mapping[str, Callable[[], Any]], repeats: int) -> tuple[di
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in tasks}
     quick = set()
     for name, task in tasks.items():
-        results[name], *first = _measure(task)
-        if first[0] >= ENOUGH_SECONDS:
-            times[name].append(tuple(first))
-        elif first[0] < WARM_SECONDS:
+        results[name], wall, work = _measure(task)
+        if wall >= ENOUGH_SECONDS:
+            times[name].append((wall, work))
+        elif wall < WARM_SECONDS:
             quick.add(name)
     for _ in range(repeats):
         for name, task in tasks.items():
@@ -77,8 +77,8 @@ def take_turns(tasks: Mapping[str, Callable[[], Any]], repeats: int) -> tuple[di
                 end = perf_counter() + WARM_SECONDS
                 while name in quick and perf_counter() < end:
                     task()
-                _, *measured = _measure(task)
-                times[name].append(tuple(measured))
+                _, wall, work = _measure(task)
+                times[name].append((wall, work))
     return {name: _summary(measured) for name, measured in times.items()}, results
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import inf, isfinite
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -117,7 +118,7 @@ def render(
     on_cpu = positions.device.type == "cpu"
     _refuse_nonfinite(pose=pose_here)
     view = pose_here, camera.intrinsics, camera.width, camera.height
-    how = {
+    how: dict[str, Any] = {
         "near": settings.near,
         "antialiased": model.config.antialiased,
         "transmittance_min": settings.transmittance_min,

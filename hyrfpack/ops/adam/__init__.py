@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -60,10 +60,13 @@ def adam_step(
     if not tensors or step < 1:
         raise ValueError(f"{len(tensors)} tensors and step {step}; there must be a tensor, and steps count from 1")
     chosen = choose(implementation, ("reference", "cpu", "gpu"), *(tensor for group in tensors for tensor in group))
+    run: Callable[..., Tensor] = reference.adam_step
     if chosen == "gpu":
-        from hyrfpack.ops.adam import gpu as kernels
+        from hyrfpack.ops.adam import gpu
+
+        run = gpu.adam_step
     elif chosen == "cpu":
-        from hyrfpack.ops.adam import cpu as kernels
-    else:
-        kernels = reference
-    return kernels.adam_step(*map(list, zip(*tensors, strict=True)), step, rate, betas, eps)
+        from hyrfpack.ops.adam import cpu
+
+        run = cpu.adam_step
+    return run(*map(list, zip(*tensors, strict=True)), step, rate, betas, eps)

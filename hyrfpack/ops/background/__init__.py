@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -92,10 +92,11 @@ def background_grid(
     fits = fits and max(weight.shape[0] for weight in weights) <= WIDEST
     wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in field)
     available = ("reference", "gpu") if fits and not wanted else ("reference",)
+    run: Callable[..., Tensor] = reference.background_grid
     if choose(implementation, available, transmittance, *field) == "gpu":
-        from hyrfpack.ops.background.gpu import background_grid as run
-    else:
-        run = reference.background_grid
+        from hyrfpack.ops.background import gpu
+
+        run = gpu.background_grid
     return run(
         transmittance,
         threshold=threshold,

@@ -82,7 +82,7 @@ def hash_encode(coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log
     spans = torch.tensor([resolution - 1 for resolution in resolutions], dtype=coords.dtype, device=coords.device)
     high = coords[:, None, :] * spans[None, :, None] - cell
     sides = torch.stack([1 - high, high])  # (2, N, L, 3)
-    features = 0
+    features = table.new_zeros(())
     for corner in range(8):
         x, y, z = corner & 1, corner >> 1 & 1, corner >> 2
         weight = sides[x, ..., 0] * sides[y, ..., 1] * sides[z, ..., 2]

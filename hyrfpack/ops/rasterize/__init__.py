@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import isfinite
 
 from torch import Tensor
 
 from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.rasterize import reference
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
 
 __all__ = ["SHAPES", "Rasterization", "check", "rasterize"]
@@ -102,12 +103,15 @@ def rasterize(
         raise ValueError(f"absgrad is {absgrad.dtype} {tuple(absgrad.shape)}, expected {means.dtype} {(len(means), 2)}")
 
     chosen = choose(implementation, ("reference", "cpu", "gpu"), *inputs)
+    run: Callable[..., tuple] = reference.rasterize
     if chosen == "gpu":
-        from hyrfpack.ops.rasterize.gpu import rasterize as run
+        from hyrfpack.ops.rasterize import gpu
+
+        run = gpu.rasterize
     elif chosen == "cpu":
-        from hyrfpack.ops.rasterize.cpu import rasterize as run
-    else:
-        from hyrfpack.ops.rasterize.reference import rasterize as run
+        from hyrfpack.ops.rasterize import cpu
+
+        run = cpu.rasterize
     results = run(
         *inputs,
         camera_from_world,

@@ -220,12 +220,12 @@ def _blend_tile(
     transmittance_min: float,
 ) -> tuple[Tensor, Tensor]:
     """(h, w, C + 1) blended values and transmittance of one tile; (M,) which Gaussians reach alpha 1/255 in it."""
-    like = {"device": values.device, "dtype": values.dtype}
-    columns = torch.arange(left, right, **like) + 0.5
-    rows = torch.arange(top, bottom, **like) + 0.5
+    columns = torch.arange(left, right, device=values.device, dtype=values.dtype) + 0.5
+    rows = torch.arange(top, bottom, device=values.device, dtype=values.dtype) + 0.5
     pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).view(-1, 2)
 
     def add_absgrad(grad: Tensor) -> None:
+        assert absgrad is not None
         absgrad.index_add_(0, splats.index, grad.detach().abs().sum(0).to(absgrad.dtype))
 
     on_grad = None if absgrad is None else add_absgrad

@@ -127,4 +127,5 @@ class _GpuLoss(torch.autograd.Function):
     def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
         from hyrfpack.ops.ssim import gpu
 
-        return gpu.gradient(*ctx.saved_tensors, *ctx.weights, grad), None, None, None, None
+        (image, target, mask, derivatives, share), (l1, ssim) = ctx.saved_tensors, ctx.weights
+        return gpu.gradient(image, target, mask, derivatives, share, l1, ssim, grad), None, None, None, None
