@@ -1,0 +1,63 @@
+"""Every public function has an example in its docstring, and it says what happens."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import inspect
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import hyrfpack
+from hyrfpack import quant
+
+OPERATIONS = ("adam", "background", "contraction", "hash_encode", "mlp", "rasterize", "shade", "ssim")
+# Not for users: `background_grid` and `shade` take a whole decoder, which no short example makes.
+WITHOUT = {"background_colors", "background_grid", "check", "check_shading", "choose_for", "shade"}
+
+
+def public_functions() -> Iterator[tuple[str, object]]:
+    for name in hyrfpack.__all__:
+        if inspect.isfunction(getattr(hyrfpack, name)):
+            yield f"hyrfpack.{name}", getattr(hyrfpack, name)
+    modules = [importlib.import_module(f"hyrfpack.ops.{name}") for name in OPERATIONS]
+    for module in (*modules, quant):
+        for name, value in vars(module).items():
+            here = getattr(value, "__module__", "").startswith(module.__name__)
+            if inspect.isfunction(value) and here and not name.startswith("_") and name not in WITHOUT:
+                yield f"{module.__name__}.{name}", value
+
+
+FUNCTIONS = dict(public_functions())
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, data: Path) -> Path:
+    """Where the examples run: photos, a run of a few steps, its compressed file and its splats."""
+    root = tmp_path_factory.mktemp("examples")
+    (root / "photos").mkdir()
+    (root / "photos" / "bonsai").symlink_to(data)
+    scene = hyrfpack.load_scene(data)
+    hyrfpack.train(scene, root / "runs" / "bonsai", hyrfpack.TrainConfig(steps=20, max_gaussians=300), quiet=True)
+    hyrfpack.compress(root / "runs" / "bonsai" / "model.hyrf", root / "bonsai.hyrf")
+    hyrfpack.export(root / "bonsai.hyrf", root / "bonsai.ply", degree=0, background=False)
+    return root
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_the_example_of_a_public_function_runs(name, folder, monkeypatch, capsys):
+    function = FUNCTIONS[name]
+    known = {**vars(inspect.getmodule(function)), "np": np, "torch": torch}
+    found = doctest.DocTestFinder(recurse=False).find(function, name, globs=known)
+    examples = [example for test in found for example in test.examples]
+    partner = name.replace("decode", "encode").replace("unpack", "pack")
+    assert examples or (partner != name and ">>>" in FUNCTIONS[partner].__doc__), f"{name} has no example"
+    monkeypatch.chdir(folder)
+    runner = doctest.DocTestRunner(verbose=False)
+    for test in found:
+        runner.run(test, clear_globs=False)
+    assert runner.failures == 0, capsys.readouterr().out

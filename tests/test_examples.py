@@ -1,0 +1,49 @@
+"""The scripts in examples/ do what they say, on photos and Gaussians of a few pixels."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("examples")
+
+
+def run(script: str, folder: Path, *arguments: object) -> str:
+    command = [sys.executable, ROOT / "examples" / script, *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_scripts_go_from_photos_to_a_file_to_pictures_and_back_from_splats(folder, data):
+    said = run("train_and_compress.py", folder, data, "run", "--steps", 20)
+    assert "8 photos to train on, 2 held out" in said and "small.hyrf" in said
+
+    said = run("read_and_render.py", folder, "run/small.hyrf", "frames", "--frames", 2)
+    assert said.startswith("frames: 2 pictures of ")
+    assert [Image.open(folder / "frames" / f"{number:04d}.png").size for number in (0, 1)] == [(48, 48)] * 2
+
+    import hyrfpack
+
+    hyrfpack.export(folder / "run" / "small.hyrf", folder / "scene.ply", degree=0, background=False)
+    run("import_and_compare.py", folder, "scene.ply", "scene.hyrf", "compare.png", "--steps", 4, "--psnr", 15)
+    width, height = Image.open(folder / "compare.png").size
+    assert hyrfpack.describe(folder / "scene.hyrf")["gaussians"] > 0 and (width, height) > (0, 0)
+
+
+def test_every_script_says_how_it_is_used():
+    scripts = sorted(path.name for path in (ROOT / "examples").glob("*.py"))
+    assert scripts == ["import_and_compare.py", "read_and_render.py", "train_and_compress.py"]
+    for script in scripts:
+        assert f"python examples/{script} " in (ROOT / "examples" / script).read_text()

@@ -1,0 +1,55 @@
+"""What a type checker says to programs that use the library: nothing when they are right, and the line when not."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mypy", reason="mypy is not installed")
+ROOT = Path(__file__).parents[1]
+RIGHT = """
+import numpy as np
+import hyrfpack
+
+scene = hyrfpack.load_scene("photos")
+result: hyrfpack.TrainResult = hyrfpack.train(scene, "run", hyrfpack.TrainConfig(steps=10))
+report = hyrfpack.compress("run/model.hyrf", "small.hyrf", data=scene)
+size: int = report.bytes_after
+model: hyrfpack.HybridModel = hyrfpack.load("small.hyrf")
+rgb = hyrfpack.render(model, scene.test[0].camera).rgb.numpy()
+mean: float = hyrfpack.evaluate(model, scene.test).psnr
+written = hyrfpack.export("small.hyrf", "small.spz", degree=2).bytes
+imported: float = hyrfpack.distill("a.ply", "a.hyrf", hyrfpack.DistillConfig(steps=5)).psnr
+rows = hyrfpack.bench("small.hyrf").rows
+camera = hyrfpack.Camera(640, 480, 500.0, 500.0, 320.0, 240.0, np.eye(4))
+facts = hyrfpack.describe("small.hyrf")["profile"]
+hyrfpack.save(model, "copy.hyrf")
+"""
+# One mistake a line: what the checker must say of it.
+WRONG = {
+    'hyrfpack.load_scene("photos", every=8)': "call-arg",
+    'hyrfpack.train("photos", "run")': "arg-type",
+    "hyrfpack.TrainConfig(step=10)": "call-arg",
+    'hyrfpack.load("a.hyrf").gausians': "attr-defined",
+    'hyrfpack.render(hyrfpack.load("a.hyrf"), "camera")': "arg-type",
+    'hyrfpack.compress("a.hyrf", "b.hyrf").bytes': "attr-defined",
+    'hyrfpack.evaluate(hyrfpack.load("a.hyrf"), [], views=3)': "call-arg",
+    'size: str = hyrfpack.export("a.hyrf", "a.ply").bytes': "assignment",
+    "hyrfpack.redner": "attr-defined",
+}
+
+
+@pytest.mark.slow
+def test_a_right_program_passes_and_each_line_of_a_wrong_one_is_told(tmp_path):
+    (tmp_path / "right.py").write_text(RIGHT)
+    (tmp_path / "wrong.py").write_text("\n".join(["import hyrfpack", *WRONG]))
+    command = [sys.executable, "-m", "mypy", "--config-file", ROOT / "pyproject.toml", "--no-pretty"]
+    command += [tmp_path / "right.py", tmp_path / "wrong.py"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    told = re.findall(r"(\w+)\.py:(\d+): error: .*\[([\w-]+)\]$", done.stdout, re.MULTILINE)
+    expected = [("wrong", str(line), code) for line, code in enumerate(WRONG.values(), start=2)]
+    assert told == expected, done.stdout + done.stderr
