@@ -9,7 +9,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 PEERS := tests/node/node_modules/.ready
 
-.PHONY: help demo test test-newest test-oldest bench gpu speed sets choices ablations precision kill fuzz lint format clean
+.PHONY: help demo test test-newest test-oldest docs bench gpu speed sets choices ablations precision kill fuzz lint format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -35,7 +35,7 @@ $(PEERS): tests/node/package.json tests/node/package-lock.json
 demo: $(READY) ## train, compress and render a small made-up scene; results in demo/
 	$(BIN)/hyrfpack demo -o demo --overwrite
 
-test: lint $(PEERS) ## check style, then run all tests
+test: lint $(PEERS) ## check style and types, then run all tests
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 
 test-newest: ## run the tests with the newest versions, on each Python that is here (6 GB and ten minutes each)
@@ -43,6 +43,9 @@ test-newest: ## run the tests with the newest versions, on each Python that is h
 
 test-oldest: ## run the tests with the oldest versions that pyproject.toml allows, on Python 3.10
 	$(PYTHON) -m tools.safety.versions oldest
+
+docs: $(READY) ## write the documentation as a site to site/; a broken link is an error
+	$(BIN)/mkdocs build --quiet --strict
 
 bench: $(READY) ## time each hot operation at several sizes against its references
 	$(BIN)/python -m tools.bench
@@ -71,14 +74,15 @@ kill: $(READY) ## kill the commands at random moments and check what is left (te
 fuzz: $(READY) ## feed the .hyrf reader a million hostile files (ten minutes)
 	$(BIN)/python -m tools.safety.fuzz
 
-lint: $(READY) ## check style only
+lint: $(READY) ## check style and types only
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/mypy
 
 format: $(READY) ## rewrite the code in the house style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 clean: ## remove what was made here, but for .venv, node_modules and runs/
-	rm -rf build dist demo *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf build dist demo site *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find hyrfpack tests tools -name __pycache__ -type d -prune -exec rm -rf {} +

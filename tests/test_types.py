@@ -50,6 +50,6 @@ def test_a_right_program_passes_and_each_line_of_a_wrong_one_is_told(tmp_path):
     command = [sys.executable, "-m", "mypy", "--config-file", ROOT / "pyproject.toml", "--no-pretty"]
     command += [tmp_path / "right.py", tmp_path / "wrong.py"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    told = re.findall(r"(\w+)\.py:(\d+): error: .*\[([\w-]+)\]$", done.stdout, re.MULTILINE)
+    told = re.findall(r"(right|wrong)\.py:(\d+): error: .*\[([\w-]+)\]$", done.stdout, re.MULTILINE)
     expected = [("wrong", str(line), code) for line, code in enumerate(WRONG.values(), start=2)]
     assert told == expected, done.stdout + done.stderr
