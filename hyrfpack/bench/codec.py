@@ -21,8 +21,8 @@ from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import DEFAULT_PROFILE, PROFILES
 from hyrfpack.format.compact import make_plan
 from hyrfpack.format.container import read_container
-from hyrfpack.format.info import SECTIONS
 from hyrfpack.format.metadata import read_metadata
+from hyrfpack.format.sections import LAYERED, POSITIONS, SECTIONS
 from hyrfpack.measure.timing import take_turns
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render
@@ -38,7 +38,6 @@ KNOBS: dict[str, dict[str, tuple]] = {
     "compact": {"noise": (0.1, 0.3, 3.0, 10.0), "prune": (False, True)},
 }
 REFERENCE = "raw"
-PER_GAUSSIAN = ("POSI", "COLO", "SCAL", "OPAC")
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ def parameter_errors(before: HybridModel, after: HybridModel) -> dict[str, Error
     old, new = to_arrays(before), to_arrays(after)
     if len(before) == len(after):
         order = _order(old, new)
-        new |= {group: new[group][order] for group in PER_GAUSSIAN}
+        new |= {group: new[group][order] for group in LAYERED}
     return {
         SECTIONS[group]: difference(torch.from_numpy(new[group]), torch.from_numpy(values), SECTIONS[group])
         for group, values in old.items()
@@ -112,13 +111,13 @@ def parameter_errors(before: HybridModel, after: HybridModel) -> dict[str, Error
 
 def _order(old: dict[str, np.ndarray], new: dict[str, np.ndarray]) -> np.ndarray:
     """(N,) which of the new Gaussians is each old one."""
-    count = len(old["POSI"])
-    spread = np.linalg.norm(old["POSI"] - np.median(old["POSI"], axis=0), axis=1)
-    moved = np.linalg.norm(new["POSI"] - old["POSI"], axis=1)
+    count = len(old[POSITIONS])
+    spread = np.linalg.norm(old[POSITIONS] - np.median(old[POSITIONS], axis=0), axis=1)
+    moved = np.linalg.norm(new[POSITIONS] - old[POSITIONS], axis=1)
     if np.median(moved) <= 0.01 * np.median(spread):
         return np.arange(count)
     # All their numbers together tell apart those at one place; each column counts by its spread.
-    rows = [np.concatenate([arrays[group] for group in PER_GAUSSIAN], axis=1) for arrays in (old, new)]
+    rows = [np.concatenate([arrays[group] for group in LAYERED], axis=1) for arrays in (old, new)]
     size = rows[0].std(axis=0) + 1e-12
     return cKDTree(rows[1] / size).query(rows[0] / size)[1]
 

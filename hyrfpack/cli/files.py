@@ -267,11 +267,11 @@ def _print_report(path: Path, report: CompressionReport, scores: dict[str, float
 
 def _section_table(sections: list[dict], total: int, gaussians: int, shares: dict[str, float] | None = None) -> str:
     """Bytes of each section, all layers together, and what part of the loss comes from it where that is known."""
-    from hyrfpack.format.info import SECTIONS, SECTIONS_OF_LAYERS
+    from hyrfpack.format.sections import METADATA, SECTIONS, group_and_layer
 
     together: dict[str, list] = {}
     for part in sections:
-        type = SECTIONS_OF_LAYERS.get(part["type"], (part["type"], 0))[0]
+        type = group_and_layer(part["type"])[0]
         sizes = together.setdefault(type, [SECTIONS.get(type, part["holds"]), 0, 0])
         sizes[1] += part["before"]
         sizes[2] += part["after"]
@@ -279,7 +279,7 @@ def _section_table(sections: list[dict], total: int, gaussians: int, shares: dic
     parts.append(("", "header, table of contents, padding", "", total - sum(after for *_, after in parts)))
     rows, header = [], ["section", "unpacked bytes", "stored bytes", "share", "bits/Gaussian", "bits/number"]
     for type, holds, before, after in parts:
-        numbers = int(before.replace(",", "") or 0) / 4 if type not in ("META", "") else 0
+        numbers = int(before.replace(",", "") or 0) / 4 if type not in (METADATA, "") else 0
         rows.append(
             [
                 f"{type} {holds}".strip(),

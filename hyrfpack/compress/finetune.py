@@ -16,6 +16,7 @@ from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.format.arrays import GROUPS
 from hyrfpack.format.compact import Plan, Quantized, quantize
 from hyrfpack.format.compact.quantize import ERROR_PER_BIT
+from hyrfpack.format.sections import COLORS
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
@@ -136,7 +137,7 @@ def _add_rate(model: HybridModel, quantized: Quantized, plan: Plan, price: float
                 for layer, channels in zip(plan.layers, quantized.channels, strict=True)
             ]
         )
-        slopes[group] = values @ plan.basis.T.astype(np.float64) if group == "COLO" else values
+        slopes[group] = values @ plan.basis.T.astype(np.float64) if group == COLORS else values
     for group, chosen in quantized.groups.items():
         groups = plan.groups[group]
         slopes[group] = _slope(chosen.symbols, groups.index, groups.count, chosen.codes)

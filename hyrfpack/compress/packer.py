@@ -33,6 +33,7 @@ from hyrfpack.format.codec import (
 from hyrfpack.format.compact import Plan, Quantized, Sensitivity, make_plan, quantize
 from hyrfpack.format.compact.sections import opacity_error
 from hyrfpack.format.info import describe
+from hyrfpack.format.sections import COLORS, OPACITIES, POSITIONS, SCALES
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
@@ -248,15 +249,15 @@ def added_errors(planned: HybridModel, quantized: Quantized, plan: Plan) -> dict
     """What storing a planned model adds to the pictures' mean squared error, by section and by estimate."""
     wanted, stored, s = to_arrays(planned), quantized.arrays(plan), plan.sensitivity
     weights = {
-        "COLO": np.repeat(s.colors, 3),
-        "SCAL": s.scales,
+        COLORS: np.repeat(s.colors, 3),
+        SCALES: s.scales,
         **s.tables,
         **s.decoders,
     }
     bits = np.concatenate([layer.points.bits[layer.points.classes] for layer in plan.layers])  # anywhere in its cell
-    _, opacity = opacity_error(planned, wanted["OPAC"][:, 0].astype(np.float64), s.opacities)
-    errors = {"OPAC": float(opacity(slice(None), stored["OPAC"][:, 0]).sum())}
-    errors["POSI"] = float((s.positions * 3 / 12 * 4.0**-bits).sum())
+    _, opacity = opacity_error(planned, wanted[OPACITIES][:, 0].astype(np.float64), s.opacities)
+    errors = {OPACITIES: float(opacity(slice(None), stored[OPACITIES][:, 0]).sum())}
+    errors[POSITIONS] = float((s.positions * 3 / 12 * 4.0**-bits).sum())
     for group, weight in weights.items():
         difference = stored[group].ravel().astype(np.float64) - wanted[group].ravel()
         errors[group] = float((weight * difference**2).sum())

@@ -12,7 +12,7 @@ from hyrfpack.errors import printable
 from hyrfpack.evaluate import Evaluation
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
 from hyrfpack.format import CompressionReport
-from hyrfpack.format.info import SECTIONS_OF_LAYERS
+from hyrfpack.format.sections import METADATA, group_and_layer
 
 PLOT = "size_against_loss.png"
 SHOWN = 4  # views whose pictures stand on the page, at most
@@ -213,13 +213,13 @@ def _parts(report: CompressionReport) -> list[Element]:
     sizes: dict[str, list[int]] = {}
     names = {part.type: part.holds for part in report.sections}
     for part in report.sections:
-        size = sizes.setdefault(SECTIONS_OF_LAYERS.get(part.type, (part.type, 0))[0], [0, 0])
+        size = sizes.setdefault(group_and_layer(part.type)[0], [0, 0])
         size[0] += part.before
         size[1] += part.after
     header = ["part", "bytes before", "bytes after", "share of the file", "bits a number"]
     rows, total = [], report.bytes_after
     for type, (before, after) in sizes.items():
-        numbers = 0 if type == "META" else before // 4
+        numbers = 0 if type == METADATA else before // 4
         bits = f"{8 * after / numbers:.2f}" if numbers else ""
         loss = f"{report.shares[type]:.1%}" if type in report.shares else ""
         rows.append([names.get(type, type), f"{before:,}", f"{after:,}", f"{after / total:.1%}", bits, loss])

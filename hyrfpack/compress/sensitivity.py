@@ -10,6 +10,7 @@ import torch
 from hyrfpack.cameras.between import views_between
 from hyrfpack.format.arrays import GROUPS
 from hyrfpack.format.compact import Sensitivity
+from hyrfpack.format.sections import MLPS, TABLES
 from hyrfpack.model import HybridModel, expand
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, evenly_spaced
@@ -88,13 +89,13 @@ def _gathered(
         )
     fields = {
         group: np.concatenate([squares[name].double().cpu().numpy().ravel() for name in GROUPS[group]]) / field_pixels
-        for group in ("GTAB", "GMLP", "RTAB", "RMLP")
+        for group in (*TABLES, *MLPS)
     }
-    decoders = {group: fields[group] for group in ("GMLP", "RMLP")}
+    decoders = {group: fields[group] for group in MLPS}
     return Sensitivity(
         *explicit,
         # Both numbers of a row are read together.
-        tables={group: fields[group].reshape(-1, 2).mean(axis=1).repeat(2) for group in ("GTAB", "RTAB")},
+        tables={group: fields[group].reshape(-1, 2).mean(axis=1).repeat(2) for group in TABLES},
         decoders={group: np.maximum(values, LEAST * values.mean()) for group, values in decoders.items()},
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from hyrfpack.errors import HyrfError, HyrfFormatError
-from hyrfpack.format.info import SECTIONS
+from hyrfpack.format import sections
 from hyrfpack.model import BACKGROUND_RADIUS, DIRECTION_FEATURES
 from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.gaussians import Gaussians
@@ -32,14 +32,14 @@ def _decoder(field: str) -> tuple[str, ...]:
 
 # The parameters in each group, laid one after another, each row by row.
 GROUPS = {
-    "POSI": ("gaussians.positions",),
-    "COLO": ("gaussians.color_logits",),
-    "SCAL": ("gaussians.scale_logits",),
-    "OPAC": ("gaussians.opacity_logits",),
-    "GTAB": ("geometry.grid.table",),
-    "GMLP": _decoder("geometry"),
-    "RTAB": ("radiance.grid.table",),
-    "RMLP": _decoder("radiance"),
+    sections.POSITIONS: ("gaussians.positions",),
+    sections.COLORS: ("gaussians.color_logits",),
+    sections.SCALES: ("gaussians.scale_logits",),
+    sections.OPACITIES: ("gaussians.opacity_logits",),
+    sections.GEOMETRY_TABLE: ("geometry.grid.table",),
+    sections.GEOMETRY_DECODER: _decoder("geometry"),
+    sections.RADIANCE_TABLE: ("radiance.grid.table",),
+    sections.RADIANCE_DECODER: _decoder("radiance"),
 }
 
 
@@ -56,8 +56,8 @@ def to_arrays(model: HybridModel) -> dict[str, np.ndarray]:
         values = parts[0] if len(parts) == 1 else np.concatenate([part.ravel() for part in parts])[:, None]
         if wrong := int(np.count_nonzero(~np.isfinite(values))):
             raise HyrfError(
-                f"{wrong} of {values.size} numbers in the model's {SECTIONS[group]} are NaN or infinite; train it "
-                "again from an earlier checkpoint"
+                f"{wrong} of {values.size} numbers in the model's {sections.SECTIONS[group]} are NaN or infinite; "
+                "train it again from an earlier checkpoint"
             )
         matrices[group] = values
     return matrices
@@ -65,31 +65,30 @@ def to_arrays(model: HybridModel) -> dict[str, np.ndarray]:
 
 def group_shapes(config: ModelConfig, gaussians: int) -> dict[str, tuple[int, int]]:
     """(rows, columns) of each matrix of a model. Allocates nothing: what a file claims can be checked first."""
-    shapes = {group: (gaussians, width) for group, width in zip(GROUPS, Gaussians.WIDTHS, strict=False)}
-    for field, grid in grids(config).items():
-        shapes[field + "TAB"] = (grid.rows, FEATURES)
-        widths = decoder_widths(config)[field]
-        shapes[field + "MLP"] = (sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(widths)), 1)
-    return shapes
+    shapes = {group: (gaussians, width) for group, width in zip(sections.LAYERED, Gaussians.WIDTHS, strict=True)}
+    shapes |= {group: (grid.rows, FEATURES) for group, grid in grids(config).items()}
+    for group, widths in decoder_widths(config).items():
+        shapes[group] = (sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(widths)), 1)
+    return {group: shapes[group] for group in GROUPS}
 
 
 def grids(config: ModelConfig) -> dict[str, HashGridConfig]:
-    """The hash grid of each field by its letter: "G" geometry, "R" radiance."""
-    return {"G": config.geometry, "R": config.radiance}
+    """The hash grid of each field, by the section of its table."""
+    return {sections.GEOMETRY_TABLE: config.geometry, sections.RADIANCE_TABLE: config.radiance}
 
 
 def decoder_widths(config: ModelConfig) -> dict[str, tuple[int, int, int, int]]:
-    """Inputs, hidden, hidden and outputs of each field's decoder, by the field's letter."""
-    extra, outputs = {"G": 0, "R": DIRECTION_FEATURES[config.direction_encoding]}, {"G": 8, "R": 3}
+    """Inputs, hidden, hidden and outputs of each field's decoder, by its section."""
+    hidden, direction = (config.hidden, config.hidden), DIRECTION_FEATURES[config.direction_encoding]
     return {
-        field: (grid.levels * FEATURES + extra[field], config.hidden, config.hidden, outputs[field])
-        for field, grid in grids(config).items()
+        sections.GEOMETRY_DECODER: (config.geometry.levels * FEATURES, *hidden, 8),
+        sections.RADIANCE_DECODER: (config.radiance.levels * FEATURES + direction, *hidden, 3),
     }
 
 
 def to_model(config: ModelConfig, arrays: dict[str, np.ndarray]) -> HybridModel:
     """The inverse of `to_arrays`; shapes must be those of `group_shapes`."""
-    gaussians = Gaussians(*(torch.from_numpy(arrays[group]) for group in list(GROUPS)[: len(Gaussians.WIDTHS)]))
+    gaussians = Gaussians(*(torch.from_numpy(arrays[group]) for group in sections.LAYERED))
     with torch.device("meta"):  # shapes alone: nothing is drawn or allocated that would be thrown away
         model = HybridModel(config, gaussians)
     shapes = {name: value.shape for name, value in model.state_dict().items()}

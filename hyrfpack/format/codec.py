@@ -17,8 +17,9 @@ from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import compact, paper, raw
 from hyrfpack.format.arrays import RULES, check_rules, group_shapes, parse_config, to_model
 from hyrfpack.format.container import Container, read_container, write_container
-from hyrfpack.format.info import LAYERED, SECTIONS, SECTIONS_OF_LAYERS, SectionSize, layer_section, section_sizes
+from hyrfpack.format.info import SectionSize, section_sizes
 from hyrfpack.format.metadata import Metadata, read_metadata
+from hyrfpack.format.sections import LAYERED, METADATA, POSITIONS, SECTIONS, group_and_layer, layer_section
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.pool import run_tasks
@@ -72,7 +73,7 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
     if profile not in PROFILES:
         raise HyrfError(f"there is no profile '{profile}'; use one of: {', '.join(PROFILES)}")
     sections, used = PROFILES[profile](model, **settings)
-    counts = [section.raw_length // 12 for section in sections if section.type.startswith("POS")]
+    counts = [section.raw_length // 12 for section in sections if group_and_layer(section.type)[0] == POSITIONS]
     layers = counts if len(counts) > 1 else []
     metadata = Metadata(profile, sum(counts), model.config.to_dict(), RULES, used, provenance or {}, layers=layers)
     is_new = profile == "compact"  # all else is read by readers of version 1.0 too
@@ -127,7 +128,7 @@ def write_model(data: bytes, path: str | os.PathLike[str]) -> CompressionReport:
     write_atomic(path, data)
     container = read_container(data, SECTIONS)
     metadata, sizes = read_metadata(container), section_sizes(container)
-    before = sum(size.before for size in sizes if size.type != "META")
+    before = sum(size.before for size in sizes if size.type != METADATA)
     return CompressionReport(metadata.profile, metadata.gaussians, before, len(data), sizes)
 
 
@@ -196,7 +197,7 @@ def _decode(container: Container) -> HybridModel:
     there = 1
     while there < len(layers) and all(layer_section(group, there) in container for group in LAYERED):
         there += 1
-    wanted = [type for type in shapes if type not in SECTIONS_OF_LAYERS or SECTIONS_OF_LAYERS[type][1] < there]
+    wanted = [type for type in shapes if group_and_layer(type)[1] < there]
     if any(type not in container for type in wanted) and container.available < container.length:
         needed = max(container.entries[type].end for type in wanted)
         raise HyrfFormatError(
@@ -208,7 +209,7 @@ def _decode(container: Container) -> HybridModel:
     points = {}  # of each layer with positions on a lattice, on which other sections lean
 
     def decode_positions(layer: int) -> None:
-        type = layer_section("POSI", layer)
+        type = layer_section(POSITIONS, layer)
         if sections[type].codec == compact.CODEC_POINTS:
             with _naming(name, type):
                 arrays[type], points[layer] = compact.decode_positions(sections[type].data, layers[layer], config)
@@ -218,7 +219,7 @@ def _decode(container: Container) -> HybridModel:
 
     def decode(index: int) -> None:
         type = rest[index]
-        group, layer = SECTIONS_OF_LAYERS.get(type, (type, 0))
+        group, layer = group_and_layer(type)
         section = sections[type]
         with _naming(name, type):
             if section.codec in DECODERS:

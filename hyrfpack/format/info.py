@@ -6,32 +6,8 @@ import os
 from dataclasses import asdict, dataclass
 
 from hyrfpack.format.container import Container
-from hyrfpack.format.metadata import MAX_LAYERS, read_metadata
-
-# Section types and what they hold; every one is required.
-SECTIONS = {
-    "META": "metadata",
-    "POSI": "positions",
-    "COLO": "colour logits",
-    "SCAL": "scale logits",
-    "OPAC": "opacity logits",
-    "GTAB": "geometry hash table",
-    "GMLP": "geometry decoder",
-    "RTAB": "radiance hash table",
-    "RMLP": "radiance decoder",
-}
-# Gaussians may come in layers, the most important first: sections of the first, and of what further ones are called.
-LAYERED = ("POSI", "COLO", "SCAL", "OPAC")
-
-
-def layer_section(group: str, layer: int) -> str:
-    """What a section of LAYERED is called in a layer: "POSI", then "POS1", "POS2", ..."""
-    return f"{group[:3]}{layer}" if layer else group
-
-
-# Type -> group and layer.
-SECTIONS_OF_LAYERS = {layer_section(group, layer): (group, layer) for layer in range(MAX_LAYERS) for group in LAYERED}
-SECTIONS |= {type: f"{SECTIONS[group]}, layer {layer}" for type, (group, layer) in SECTIONS_OF_LAYERS.items() if layer}
+from hyrfpack.format.metadata import read_metadata
+from hyrfpack.format.sections import SECTIONS
 
 
 @dataclass(frozen=True)

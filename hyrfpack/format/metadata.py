@@ -11,13 +11,12 @@ from dataclasses import dataclass, field, fields
 import hyrfpack
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format.container import Container, Section
+from hyrfpack.format.sections import MAX_LAYERS, METADATA
 
-TYPE = "META"
 CODEC_JSON, CODEC_DEFLATED = 0, 5
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 64  # objects and lists within each other; what walks them calls itself once for each
 MAX_INTEGER = 1 << 63
-MAX_LAYERS = 8  # that Gaussians may come in
 
 # Types of the configuration's values, as JSON has them; a tuple is a list of that length. `ModelConfig` checks ranges.
 _GRID = {"log2_table_size": int, "levels": int, "base": int, "finest": int}
@@ -80,9 +79,9 @@ class Metadata:
             raise HyrfError(f"the metadata takes {len(text)} bytes and may take {MAX_BYTES}; shorten the provenance")
         data = text.encode("ascii")
         return (
-            Section(TYPE, CODEC_DEFLATED, zlib.compress(data, 9), len(data))
+            Section(METADATA, CODEC_DEFLATED, zlib.compress(data, 9), len(data))
             if deflate
-            else Section(TYPE, CODEC_JSON, data, len(data))
+            else Section(METADATA, CODEC_JSON, data, len(data))
         )
 
 
@@ -97,7 +96,7 @@ def read_metadata(container: Container) -> Metadata:
     Raises:
         HyrfFormatError: the section is absent, too long, not JSON, or a field is missing or of the wrong type.
     """
-    name, entry = container.name, container.entries.get(TYPE)
+    name, entry = container.name, container.entries.get(METADATA)
     if entry is not None and (entry.raw_length > MAX_BYTES or entry.codec not in (CODEC_JSON, CODEC_DEFLATED)):
         raise HyrfFormatError(
             f"{name}: the metadata has {entry.raw_length} bytes in codec {entry.codec}, and {MAX_BYTES} bytes at most "
@@ -108,7 +107,7 @@ def read_metadata(container: Container) -> Metadata:
             f"{name}: the metadata has {entry.length} bytes and says it decodes to {entry.raw_length}; the file is "
             "damaged, write it again"
         )
-    data = bytes(container[TYPE].data)
+    data = bytes(container[METADATA].data)
     if entry.codec == CODEC_DEFLATED:
         data = _inflate(data, entry.raw_length, name)
     try:

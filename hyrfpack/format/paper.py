@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 from hyrfpack.errors import HyrfError, HyrfFormatError, needs_package
+from hyrfpack.format import sections
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.container import Section
-from hyrfpack.format.info import SECTIONS
 from hyrfpack.format.raw import decode_plain
 from hyrfpack.model.gaussians import LOGIT_LIMIT
 from hyrfpack.model.hybrid import HybridModel
@@ -79,17 +79,17 @@ def encode(model: HybridModel, **settings: object) -> tuple[list[Section], dict]
         import dahuffman  # noqa: F401 - builds the Huffman codes; asked for here, before the work starts
     arrays = to_arrays(model)
     # First: what these refuse could overflow the field, which the opacities are cut by.
-    halves = {group: _encode_float16(group, arrays[group]) for group in ("POSI", "GMLP", "RMLP")}
-    arrays["OPAC"] = _without_tails(model, arrays["OPAC"])
+    halves = {group: _encode_float16(group, arrays[group]) for group in (sections.POSITIONS, *sections.MLPS)}
+    arrays[sections.OPACITIES] = _without_tails(model, arrays[sections.OPACITIES])
     return [
-        halves["POSI"],
-        _encode_residual_vq("COLO", arrays["COLO"], chosen.color, chosen.seed),
-        _encode_residual_vq("SCAL", arrays["SCAL"], chosen.scale, chosen.seed),
-        _encode_residual_vq("OPAC", arrays["OPAC"], chosen.opacity, chosen.seed),
-        _encode_min_max("GTAB", arrays["GTAB"]),
-        halves["GMLP"],
-        _encode_min_max("RTAB", arrays["RTAB"]),
-        halves["RMLP"],
+        halves[sections.POSITIONS],
+        _encode_residual_vq(sections.COLORS, arrays[sections.COLORS], chosen.color, chosen.seed),
+        _encode_residual_vq(sections.SCALES, arrays[sections.SCALES], chosen.scale, chosen.seed),
+        _encode_residual_vq(sections.OPACITIES, arrays[sections.OPACITIES], chosen.opacity, chosen.seed),
+        _encode_min_max(sections.GEOMETRY_TABLE, arrays[sections.GEOMETRY_TABLE]),
+        halves[sections.GEOMETRY_DECODER],
+        _encode_min_max(sections.RADIANCE_TABLE, arrays[sections.RADIANCE_TABLE]),
+        halves[sections.RADIANCE_DECODER],
     ], asdict(chosen)
 
 
@@ -112,7 +112,7 @@ def _check_half_range(type: str, values: np.ndarray) -> None:
     largest = np.abs(values).max(initial=0)
     if largest > FLOAT16_MAX:
         raise HyrfError(
-            f"numbers in the model's {SECTIONS[type]} reach {largest:.6g} and half precision ends at "
+            f"numbers in the model's {sections.SECTIONS[type]} reach {largest:.6g} and half precision ends at "
             f"{FLOAT16_MAX:.0f}; keep this model as profile raw, or train it again without such outliers"
         )
 

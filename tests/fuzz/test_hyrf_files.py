@@ -22,7 +22,7 @@ from scenes import small_model
 from hyrfpack.cli.files import info
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import encode_model, repack
-from hyrfpack.format.info import SECTIONS
+from hyrfpack.format.sections import SECTIONS
 from tools.safety.fuzz import allowance, check_file, check_model, decode
 from tools.safety.fuzz_mutate import GROUPS, KINDS, assemble, disassemble, mutant, seeds
 from tools.safety.plans import even_plan

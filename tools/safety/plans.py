@@ -6,6 +6,7 @@ measures instead.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from unittest.mock import patch
 
 import numpy as np
@@ -30,12 +31,12 @@ def drawn_sensitivity(model: HybridModel, seed: int = 0) -> Sensitivity:
     places = model.cube_coords(model.gaussians.positions.detach().double()).numpy()
     points = 2 * np.minimum(places * (1 << MAX_BITS), (1 << MAX_BITS) - 1).astype(np.int64) + 1
     tables, decoders = {}, {}
-    for field, grid in grids(model.config).items():
+    for group, grid in grids(model.config).items():
         usage = grid.usage(points, MAX_BITS + 1)
-        tables[f"{field}TAB"] = (TABLE * usage / max(usage.sum(), 1)).repeat(2)
-        widths = decoder_widths(model.config)[field]
-        count = sum((fan_in + 1) * fan_out for fan_in, fan_out in zip(widths, widths[1:], strict=False))
-        decoders[f"{field}MLP"] = DECODER / count * np.exp(SPREAD * rng.normal(size=count))
+        tables[group] = (TABLE * usage / max(usage.sum(), 1)).repeat(2)
+    for group, widths in decoder_widths(model.config).items():
+        count = sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(widths))
+        decoders[group] = DECODER / count * np.exp(SPREAD * rng.normal(size=count))
     return Sensitivity(POSITIONS * shares, *[LOGITS * shares] * 3, tables, decoders)
 
 

@@ -21,7 +21,7 @@ from hyrfpack.format.compact.plan import Plan, from_lattice, groups_of, make_pla
 from hyrfpack.format.compact.sections import CODEC_CHANNELS, CODEC_GROUPS, CODEC_POINTS, Quantized, quantize
 from hyrfpack.format.compact.sensitivity import Sensitivity
 from hyrfpack.format.container import Section
-from hyrfpack.format.info import LAYERED, layer_section
+from hyrfpack.format.sections import LAYERED, LOGITS, MLPS, POSITIONS, TABLES, layer_section
 from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.quant.points import Points, decode_points
@@ -40,9 +40,9 @@ __all__ = [
 
 # The sections that may have a codec.
 CODECS = {
-    CODEC_POINTS: ("POSI",),
-    CODEC_CHANNELS: ("COLO", "SCAL", "OPAC"),
-    CODEC_GROUPS: ("GTAB", "GMLP", "RTAB", "RMLP"),
+    CODEC_POINTS: (POSITIONS,),
+    CODEC_CHANNELS: LOGITS,
+    CODEC_GROUPS: (*TABLES, *MLPS),
 }
 
 
@@ -92,7 +92,7 @@ def decode_section(
     """
     if group not in CODECS[codec]:
         raise HyrfFormatError(f"it cannot have codec {codec}; the file is damaged, write it again")
-    if points is None and not group.endswith("MLP"):
+    if points is None and group not in MLPS:
         raise HyrfFormatError(f"codec {codec} needs positions of codec {CODEC_POINTS}; write the file again")
     if codec == CODEC_CHANNELS:
         return sections.decode_channels(data, points, shape[1])

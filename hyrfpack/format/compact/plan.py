@@ -13,6 +13,7 @@ from hyrfpack.format.compact.channels import LIMIT
 from hyrfpack.format.compact.groups import Groups
 from hyrfpack.format.compact.quantize import ERROR_PER_BIT
 from hyrfpack.format.compact.sensitivity import Sensitivity
+from hyrfpack.format.sections import COLORS, LOGITS, MLPS, POSITIONS, TABLES
 from hyrfpack.model import expand
 from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.frame import Frame
@@ -69,10 +70,10 @@ class Plan:
     def apply(self, model: HybridModel) -> HybridModel:
         """The part of a model that is stored: the Gaussians kept, in order, moved to the lattice."""
         arrays = to_arrays(model)
-        for group in ("COLO", "SCAL", "OPAC"):
+        for group in LOGITS:
             arrays[group] = arrays[group][self.kept]
         places = [from_lattice(layer.points, model.config.frame) for layer in self.layers]
-        arrays["POSI"] = np.concatenate(places)
+        arrays[POSITIONS] = np.concatenate(places)
         return to_model(model.config, arrays)
 
     @property
@@ -112,8 +113,8 @@ def make_plan(model: HybridModel, sensitivity: Sensitivity, noise: float, prune:
         order.append(members[index])
     order = np.concatenate(order)
     kept = kept[order]
-    basis = color_basis(to_arrays(model)["COLO"][kept])
-    groups = {group: groups_of(group, model.config, layers[0].points) for group in ("GTAB", "GMLP", "RTAB", "RMLP")}
+    basis = color_basis(to_arrays(model)[COLORS][kept])
+    groups = {group: groups_of(group, model.config, layers[0].points) for group in (*TABLES, *MLPS)}
     return Plan(kept, tuple(layers), basis, groups, sensitivity.of(order), distortion)
 
 
@@ -198,18 +199,17 @@ def color_basis(colors: np.ndarray) -> np.ndarray:
 
 
 def groups_of(group: str, config: ModelConfig, points: Points | None) -> Groups:
-    """Which numbers of a section "GTAB", "RTAB", "GMLP" or "RMLP" share a step.
+    """Which numbers of a table's or decoder's section share a step.
 
     Rows of a table by level and usage class: 0 if no Gaussian reads the row, else 1 + floor(log4 n), n being how many
     corners of cells with a Gaussian in them have this row. Numbers of a decoder by layer and output, biases of a layer
     together; that takes no points.
     """
-    field, kind = group[0], group[1:]
-    if kind == "MLP":
-        pairs = pairwise(decoder_widths(config)[field])
+    if group in MLPS:
+        pairs = pairwise(decoder_widths(config)[group])
         sizes = [size for inputs, outputs in pairs for size in (*[inputs] * outputs, outputs)]
         return Groups(np.repeat(np.arange(len(sizes)), sizes), len(sizes))
-    grid = grids(config)[field]
+    grid = grids(config)[group]
     every = max(1, -(-len(points.cells) // COUNTED))
     usage = grid.usage(points[::every].centers(), MAX_BITS + 1)
     index, count = np.empty((grid.rows, FEATURES), np.uint16), grid.levels * USAGE_CLASSES

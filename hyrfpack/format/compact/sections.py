@@ -22,7 +22,17 @@ from hyrfpack.format.compact.channels import (
 )
 from hyrfpack.format.compact.groups import GroupSymbols, encode_groups, quantize_groups
 from hyrfpack.format.compact.plan import Plan
-from hyrfpack.format.info import LAYERED, layer_section
+from hyrfpack.format.sections import (
+    COLORS,
+    LAYERED,
+    LOGITS,
+    MLPS,
+    OPACITIES,
+    POSITIONS,
+    SCALES,
+    TABLES,
+    layer_section,
+)
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.quant import DamagedDataError
@@ -30,7 +40,7 @@ from hyrfpack.quant.points import Points
 
 CODEC_POINTS, CODEC_CHANNELS, CODEC_GROUPS = 6, 7, 8
 SATURATED = 8.0  # an opacity's total logit beyond it looks like it: sigmoid is within 3.4e-4 of its end
-COLUMNS = {"COLO": 3, "SCAL": 1, "OPAC": 1}
+COLUMNS = {COLORS: 3, SCALES: 1, OPACITIES: 1}
 OPACITY_REACH = 4  # where opacity is near 0 or 1 logits may move far
 _BLOCK = 1 << 15  # numbers at once: few enough that temporaries stay in the caches
 
@@ -52,7 +62,7 @@ class Quantized:
     def arrays(self, plan: Plan) -> dict[str, np.ndarray]:
         """The numbers as they will be decoded: flat tables and decoders, (M, columns) explicit logits; float32."""
         arrays = {group: chosen.values for group, chosen in self.groups.items()}
-        for group in ("COLO", "SCAL", "OPAC"):
+        for group in LOGITS:
             layers = [[channel.values for channel in layer[group]] for layer in self.channels]
             arrays[group] = np.concatenate([_joined(values, plan.basis) for values in layers])
         return arrays
@@ -66,14 +76,14 @@ def quantize(model: HybridModel, plan: Plan, like: Quantized | None = None) -> Q
     """
     arrays = {group: values.astype(np.float64) for group, values in to_arrays(model).items()}
     sensitivity, d, reach = plan.sensitivity, plan.distortion, plan.reach
-    opacity, error = opacity_error(model, arrays["OPAC"][:, 0], sensitivity.opacities)
+    opacity, error = opacity_error(model, arrays[OPACITIES][:, 0], sensitivity.opacities)
     by_group = {**sensitivity.tables, **sensitivity.decoders}
     jobs = {
         group: partial(quantize_groups, arrays[group].ravel(), plan.groups[group], by_group[group], d, reach)
         for group in plan.groups
     }
     # Cut before it is turned: a colour far outside would come back as another.
-    colors = np.clip(arrays["COLO"], -LIMIT / 2, LIMIT / 2) @ plan.basis.astype(np.float64)
+    colors = np.clip(arrays[COLORS], -LIMIT / 2, LIMIT / 2) @ plan.basis.astype(np.float64)
     for layer, part in enumerate(plan.parts):
         classes, s = plan.layers[layer].points.classes, sensitivity.of(part)
 
@@ -81,9 +91,9 @@ def quantize(model: HybridModel, plan: Plan, like: Quantized | None = None) -> Q
             return error(places + part.start, candidates)
 
         parts = {
-            "COLO": (colors[part], s.colors, None, reach),
-            "SCAL": (arrays["SCAL"][part], s.scales, None, reach),
-            "OPAC": (opacity[part, None], s.opacities, opacity_cost, reach and OPACITY_REACH),
+            COLORS: (colors[part], s.colors, None, reach),
+            SCALES: (arrays[SCALES][part], s.scales, None, reach),
+            OPACITIES: (opacity[part, None], s.opacities, opacity_cost, reach and OPACITY_REACH),
         }
         for group, (values, weights, cost, far) in parts.items():
             for column, numbers in enumerate(values.T):
@@ -104,7 +114,7 @@ def encode(quantized: Quantized, plan: Plan) -> dict[str, tuple[int, bytes]]:
     a model if it holds the first layer and the fields."""
 
     def encode_channels(layer: int, group: str) -> tuple[int, bytes]:
-        basis = plan.basis.astype("<f4").tobytes() if group == "COLO" else b""
+        basis = plan.basis.astype("<f4").tobytes() if group == COLORS else b""
         classes = plan.layers[layer].points.classes
         channels = [encode_channel(channel, classes) for channel in quantized.channels[layer][group]]
         return CODEC_CHANNELS, basis + b"".join(channels)
@@ -117,8 +127,8 @@ def encode(quantized: Quantized, plan: Plan) -> dict[str, tuple[int, bytes]]:
         jobs |= {layer_section(group, layer): partial(encode_channels, layer, group) for group in COLUMNS}
     done = _together(jobs)
     for layer, points in enumerate(plan.layers):
-        done[layer_section("POSI", layer)] = CODEC_POINTS, points.positions
-    first = ["GMLP", "RMLP", *LAYERED, "GTAB", "RTAB"]
+        done[layer_section(POSITIONS, layer)] = CODEC_POINTS, points.positions
+    first = [*MLPS, *LAYERED, *TABLES]
     further = [layer_section(group, layer) for layer in range(1, len(plan.layers)) for group in LAYERED]
     return {type: done[type] for type in (*first, *further)}
 
