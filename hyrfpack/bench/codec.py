@@ -14,12 +14,12 @@ from torch import Tensor
 
 from hyrfpack.bench.rows import Error, Row, difference, in_words
 from hyrfpack.bench.subject import Subject
+from hyrfpack.compress.quantize import decide
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import DEFAULT_PROFILE, PROFILES
-from hyrfpack.format.compact import make_plan
 from hyrfpack.format.container import read_container
 from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.sections import LAYERED, POSITIONS, SECTIONS
@@ -28,14 +28,14 @@ from hyrfpack.model import HybridModel
 from hyrfpack.render import render
 
 # What is tried of each setting of a profile, one at a time; the profile's default joins them. A `seed` is no setting.
-# Of `noise` these are multiples of the default, which the model's own quality decides.
+# Of `distortion` these are multiples of the default, which the model's own quality decides.
 KNOBS: dict[str, dict[str, tuple]] = {
     "paper": {
         "color": ((1, 64), (1, 256), (2, 64), (2, 128), (2, 256), (3, 128), (4, 256)),
         "scale": ((1, 16), (1, 32), (1, 64), (1, 128), (1, 256), (2, 64), (2, 256)),
         "opacity": ((1, 8), (1, 16), (1, 32), (1, 64), (1, 256), (2, 64)),
     },
-    "compact": {"noise": (0.1, 0.3, 3.0, 10.0), "prune": (False, True)},
+    "compact": {"distortion": (0.1, 0.3, 3.0, 10.0), "prune": (False, True)},
 }
 REFERENCE = "raw"
 
@@ -129,7 +129,7 @@ def _cases(subject: Subject, profile: str, note: Callable[[str], None]) -> Itera
     yield itself
     for knob, values in KNOBS.get(profile, {}).items():
         default = defaults[knob]
-        if knob == "noise":
+        if knob == "distortion":
             values = [default * factor for factor in values]
         for value in sorted({*values, default}):
             if value == default:
@@ -156,11 +156,10 @@ def _compact(subject: Subject, note: Callable[[str], None]) -> tuple[Callable[..
         f"{perf_counter() - start:.1f} s; that is the same for all its settings and in none of the times"
     )
 
-    def encode(noise: float = subject.noise, prune: bool = True) -> bytes:
-        plan = make_plan(subject.model, sensitivity, noise, prune)
-        return encode_model(subject.model, "compact", plan=plan)
+    def encode(distortion: float = subject.distortion, prune: bool = True) -> bytes:
+        return encode_model(subject.model, "compact", quantized=decide(subject.model, sensitivity, distortion, prune))
 
-    return encode, {"noise": subject.noise, "prune": True}
+    return encode, {"distortion": subject.distortion, "prune": True}
 
 
 def _in_words(value: object) -> str:

@@ -16,7 +16,7 @@ from torch import Tensor
 from hyrfpack.bench.rows import difference
 from hyrfpack.cameras.capture import stored_cameras
 from hyrfpack.cameras.paths import orbit, stored_viewpoint
-from hyrfpack.compress.packer import default_noise
+from hyrfpack.compress.distortion import default_distortion
 from hyrfpack.data import load_scene
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.device import upload
@@ -42,7 +42,7 @@ class Subject:
         cameras: viewpoints.
         photos: for each viewpoint (H, W, 3) in [0, 1] and a mask (H, W) or None; None when there are no photos.
         capture: cameras that compression measures the model at: those of the photos it was trained on.
-        noise: mean squared error in pictures that compression aims at by itself.
+        distortion: mean squared error in pictures that compression aims at by itself.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Subject:
     cameras: list[Camera]
     photos: list[tuple[Tensor, Tensor | None]] | None
     capture: list[Camera]
-    noise: float
+    distortion: float
 
     def scores(self, pictures: Sequence[Tensor], exact: Sequence[Tensor]) -> tuple[float, float]:
         """PSNR and SSIM, means over views, against the photos, or against the `exact` pictures without photos."""
@@ -111,7 +111,7 @@ def read_subject(path: str | os.PathLike[str], scene: Scene | None) -> Subject:
         cameras = [view.camera for view in views]
     capture = stored_cameras(facts) if scene is None else [view.camera for view in scene.train]
     return Subject(
-        os.fspath(path), facts["profile"], model, cameras, photos, capture, default_noise(facts["provenance"])
+        os.fspath(path), facts["profile"], model, cameras, photos, capture, default_distortion(facts["provenance"])
     )
 
 

@@ -10,12 +10,14 @@ from copy import deepcopy
 import numpy as np
 import torch
 
+from hyrfpack.compress.quantize import quantize
+from hyrfpack.compress.rate_distortion import ERROR_PER_BIT
+from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.device import upload
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.format.arrays import GROUPS
-from hyrfpack.format.compact import Plan, Quantized, quantize
-from hyrfpack.format.compact.quantize import ERROR_PER_BIT
+from hyrfpack.format.compact import Plan, Quantized
 from hyrfpack.format.sections import COLORS
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.ssim import photometric_loss
@@ -40,6 +42,7 @@ LOSS_PER_ERROR = 40.0  # what the photometric loss rises by for a small mean squ
 def finetune(
     model: HybridModel,
     plan: Plan,
+    sensitivity: Sensitivity,
     views: Sequence[View],
     steps: int,
     *,
@@ -60,6 +63,7 @@ def finetune(
     Args:
         model: `plan.apply` of a trained model; not changed.
         plan: its plan.
+        sensitivity: that the plan was made by.
         views: photos to fit.
         steps: optimiser steps, one view each.
         seed: of the order of views.
@@ -67,12 +71,11 @@ def finetune(
         report: called after each step with its number, from 1, and the photometric loss.
 
     Returns:
-        The fitted model, to be quantised with `reach` 0 in the plan: its numbers sit where they shall be rounded to.
+        The fitted model, to be quantised with `reach` 0: its numbers sit where they shall be rounded to.
 
     Raises:
         HyrfTrainingError: the loss or a gradient is not finite.
     """
-    rounding = dataclasses.replace(plan, reach=0)
     tuned = deepcopy(model).requires_grad_(True)
     tuned.gaussians.positions.requires_grad_(False)
     share = min(1.0, steps / FULL_RATES)
@@ -82,9 +85,9 @@ def finetune(
     keep_freed_memory()
     with closing((cache or PictureCache()).stream(_order(views, steps, seed))) as pictures, torch_on_one_thread():
         for step, (view, picture) in enumerate(pictures):
-            quantized = quantize(tuned, rounding, quantized)
+            quantized = quantize(tuned, plan, sensitivity, reach=0, like=quantized)
             exact = {name: parameter.detach().clone() for name, parameter in tuned.named_parameters()}
-            _load(tuned, quantized.arrays(rounding))
+            _load(tuned, quantized.arrays())
             solid = None if tuned.config.background else np.array(tuned.config.solid, np.float32)
             target, mask = upload(picture, solid, tuned.gaussians.positions.device)
             loss = photometric_loss(render(tuned, view.camera).rgb, target, mask)
@@ -92,7 +95,7 @@ def finetune(
             with torch.no_grad():
                 for name, parameter in tuned.named_parameters():
                     parameter.copy_(exact[name])
-            _add_rate(tuned, quantized, rounding, LOSS_PER_ERROR * ERROR_PER_BIT * plan.distortion)
+            _add_rate(tuned, quantized, LOSS_PER_ERROR * ERROR_PER_BIT * plan.distortion_per_number)
             broken = optimizer.step(step, steps)
             if not torch.isfinite(loss) or broken.any():
                 raise HyrfTrainingError(
@@ -126,10 +129,9 @@ def _load(model: HybridModel, arrays: dict[str, np.ndarray]) -> None:
 
 
 @torch.no_grad()
-def _add_rate(model: HybridModel, quantized: Quantized, plan: Plan, price: float) -> None:
+def _add_rate(model: HybridModel, quantized: Quantized, price: float) -> None:
     """Add the gradient of price * bits to the parameters' gradients."""
-    parameters = dict(model.named_parameters())
-    slopes = {}
+    parameters, plan, slopes = dict(model.named_parameters()), quantized.plan, {}
     for group in quantized.channels[0]:
         values = np.concatenate(
             [

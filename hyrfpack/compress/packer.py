@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -12,13 +13,15 @@ import torch
 
 from hyrfpack.cameras.capture import stored_cameras
 from hyrfpack.checks import check_type
+from hyrfpack.compress.distortion import LIMITS, default_distortion
 from hyrfpack.compress.finetune import finetune
+from hyrfpack.compress.plan import make_plan
+from hyrfpack.compress.quantize import opacity_error, quantize
 from hyrfpack.compress.search import coarsest, finest
-from hyrfpack.compress.sensitivity import measure_sensitivity
+from hyrfpack.compress.sensitivity import Sensitivity, measure_sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import Evaluation, evaluate
-from hyrfpack.evaluate.metrics import stated_error
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import (
     DEFAULT_PROFILE,
@@ -30,8 +33,7 @@ from hyrfpack.format.codec import (
     without_cameras,
     write_model,
 )
-from hyrfpack.format.compact import Plan, Quantized, Sensitivity, make_plan, quantize
-from hyrfpack.format.compact.sections import opacity_error
+from hyrfpack.format.compact import Quantized
 from hyrfpack.format.info import describe
 from hyrfpack.format.sections import COLORS, OPACITIES, POSITIONS, SCALES
 from hyrfpack.model import HybridModel
@@ -39,11 +41,9 @@ from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 
-PSNR_DROP = 0.03  # dB that a file may cost, by estimate, unless told otherwise
-FINETUNED = 4.0  # times as much noise, which fine-tuning takes back
-NOISE = (1e-8, 1e-2)  # least and largest mean squared error that files are made for
+FINETUNED = 4.0  # times as much distortion, which fine-tuning takes back
 VERIFIED = 6  # cameras at which a file's pictures are compared with the model's
-TOLERATED, MENDED = 2.0, 4  # times the noise asked for, and how often a finer file is made where it is more
+TOLERATED, MENDED = 2.0, 4  # times the distortion asked for, and how often a finer file is made where it is more
 TRIALS, FINETUNED_TRIALS = 9, 4  # of a search
 
 
@@ -66,15 +66,15 @@ def compress(
     prune: bool = True,
     target_bytes: int | None = None,
     max_psnr_drop: float | None = None,
-    noise: float | None = None,
+    distortion: float | None = None,
     say: Callable[[str], None] = lambda sentence: None,
     **settings: object,
 ) -> CompressionReport:
     """Pack a `.hyrf` file into a smaller one.
 
     Profile "compact" measures what each number does to pictures, at the cameras of `data` or those that the file
-    keeps, and spends bits where they show. By itself it aims at PSNR_DROP, the rest is for when that is not what is
-    wanted. "paper" and "raw" do what they always do, and take none of it.
+    keeps, and spends bits where they show. By itself it aims at a loss of `distortion.PSNR_DROP`; the rest is for when
+    that is not what is wanted. "paper" and "raw" do what they always do, and take none of it.
 
     Args:
         source: a file of any profile, best "raw".
@@ -85,27 +85,30 @@ def compress(
         prune: leave out Gaussians that cost more in bytes than they give to pictures.
         target_bytes: make the file as good as can be within so many bytes.
         max_psnr_drop: make the file as small as can be for so many dB of mean PSNR on the held-out photos of `data`.
-        noise: mean squared error that pictures may get, by estimate; instead of a search.
+        distortion: mean squared error that pictures may get, by estimate; instead of a search.
         say: told what is going on.
-        settings: of "paper", see `hyrfpack.format.paper`.
+        settings: of "paper", see `hyrfpack.format.paper`; `noise` is the old word for `distortion`.
 
     Raises:
         HyrfError: a file cannot be read or written, the target is what is read, the options do not go together, or
             what is asked for cannot be had.
         TypeError: `data` is no Scene.
     """
+    if "noise" in settings:
+        warnings.warn("compress(noise=...) is now compress(distortion=...)", DeprecationWarning, stacklevel=2)
+        distortion = settings.pop("noise")
     if data is not None:
         check_type("data", data, Scene)
     Outputs(source, scene=data, overwrite=True).file(target)
     if profile != "compact":
-        if data is not None or finetune_steps or target_bytes or max_psnr_drop is not None or noise:
+        if data is not None or finetune_steps or target_bytes or max_psnr_drop is not None or distortion:
             raise HyrfError(f"profile '{profile}' has no settings to fit to photos, sizes or losses; use 'compact'")
         return repack(source, target, profile, **settings)
     if settings:
         raise HyrfError(f"profile 'compact' has no setting '{next(iter(settings))}'")
     if data is None and (finetune_steps or max_psnr_drop is not None):
         raise HyrfError("fine-tuning and limits on PSNR need photos; name their folder with --data")
-    if sum(option is not None for option in (target_bytes, max_psnr_drop, noise)) > 1:
+    if sum(option is not None for option in (target_bytes, max_psnr_drop, distortion)) > 1:
         raise HyrfError("a target size and a largest loss of PSNR each decide how fine the file is; give one of them")
     if data is not None and not data.train:
         raise HyrfError(
@@ -118,7 +121,7 @@ def compress(
     say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
     sensitivity = measure_sensitivity(model, cameras)
     packer = Packer(model, without_cameras(provenance), sensitivity, data, finetune_steps, prune, say)
-    start = noise or default_noise(provenance) * (FINETUNED if finetune_steps else 1)
+    start = distortion or default_distortion(provenance) * (FINETUNED if finetune_steps else 1)
     if target_bytes is not None:
         trial, found = packer.within_bytes(target_bytes, start)
     elif max_psnr_drop is not None:
@@ -157,14 +160,18 @@ class Packer:
     say: Callable[[str], None]
     cache: PictureCache = field(default_factory=PictureCache)
 
-    def attempt(self, noise: float) -> Trial:
+    def attempt(self, distortion: float) -> Trial:
         """A file that adds about so large a mean squared error to pictures."""
-        plan = make_plan(self.model, self.sensitivity, noise, self.prune)
-        if not self.finetune_steps:
-            return self._pack(self.model, plan)
-        self.say(f"fine-tuning for {self.finetune_steps:,} steps")
-        tuned = finetune(plan.apply(self.model), plan, self.scene.train, self.finetune_steps, cache=self.cache)
-        return self._pack(tuned, dataclasses.replace(plan.of_applied(), reach=0))
+        model = self.model
+        plan = make_plan(model, self.sensitivity, distortion, self.prune)
+        planned = plan.apply(model)
+        if self.finetune_steps:
+            self.say(f"fine-tuning for {self.finetune_steps:,} steps")
+            steps = self.finetune_steps
+            model = planned = finetune(planned, plan, self.sensitivity, self.scene.train, steps, cache=self.cache)
+        quantized = quantize(planned, plan, self.sensitivity, reach=0 if self.finetune_steps else 1)
+        data = encode_model(model, "compact", self.provenance, quantized=quantized)
+        return Trial(data, added_errors(planned, quantized, self.sensitivity), None)
 
     def verified(self, trial: Trial, wanted: float, cameras: Sequence[Camera]) -> Trial:
         """The trial, or a finer one where its pictures turn out to be further off than `wanted` says.
@@ -174,7 +181,7 @@ class Packer:
         """
         views = evenly_spaced(cameras, VERIFIED)
         pictures = _pictures(self.model, views)
-        noise = wanted
+        distortion = wanted
         for _ in range(MENDED):
             error = _difference(_pictures(decode_model(trial.data), views), pictures)
             if error <= TOLERATED * wanted:
@@ -183,55 +190,49 @@ class Packer:
                 self.prune = False
                 self.say(f"pictures are off by {error:.2g} instead of {wanted:.2g}: nothing is pruned")
             else:
-                noise *= max(wanted / error, 1 / 16)
-                self.say(f"pictures are off by {error:.2g} instead of {wanted:.2g}: finer, for {noise:.2g}")
-            trial = self.attempt(noise)
+                distortion *= max(wanted / error, 1 / 16)
+                self.say(f"pictures are off by {error:.2g} instead of {wanted:.2g}: finer, for {distortion:.2g}")
+            trial = self.attempt(distortion)
         return trial
 
     def within_bytes(self, limit: int, start: float) -> tuple[Trial, str]:
-        def attempt(noise: float) -> Trial:
-            trial = self.attempt(noise)
-            self.say(f"noise {noise:.2g}: {len(trial.data):,} bytes")
+        def attempt(distortion: float) -> Trial:
+            trial = self.attempt(distortion)
+            self.say(f"distortion {distortion:.2g}: {len(trial.data):,} bytes")
             return trial
 
-        answer = finest(attempt, lambda trial: len(trial.data) <= limit, start, self._trials(), NOISE)
+        answer = finest(attempt, lambda trial: len(trial.data) <= limit, start, self._trials(), LIMITS)
         if answer is None:
-            smallest = len(self.attempt(NOISE[1]).data)
+            smallest = len(self.attempt(LIMITS[1]).data)
             raise HyrfError(
                 f"the model does not fit into {limit:,} bytes, the least is about {smallest:,}; "
                 "ask for more, or train with fewer Gaussians (--max-gaussians)"
             )
-        noise, trial = answer
-        return trial, f"noise {noise:.2g} gives {len(trial.data):,} of {limit:,} bytes"
+        distortion, trial = answer
+        return trial, f"distortion {distortion:.2g} gives {len(trial.data):,} of {limit:,} bytes"
 
     def within_drop(self, limit: float, start: float) -> tuple[Trial, str]:
         views = self.scene.test or self.scene.train
         before = evaluate(self.model, views).psnr
 
-        def attempt(noise: float) -> Trial:
-            trial = self.attempt(noise)
+        def attempt(distortion: float) -> Trial:
+            trial = self.attempt(distortion)
             trial = dataclasses.replace(trial, scores=evaluate(decode_model(trial.data), views))
-            self.say(f"noise {noise:.2g}: {len(trial.data):,} bytes, {before - trial.scores.psnr:+.3f} dB lost")
+            lost = before - trial.scores.psnr
+            self.say(f"distortion {distortion:.2g}: {len(trial.data):,} bytes, {lost:+.3f} dB lost")
             return trial
 
-        answer = coarsest(attempt, lambda trial: before - trial.scores.psnr <= limit, start, self._trials(), NOISE)
+        answer = coarsest(attempt, lambda trial: before - trial.scores.psnr <= limit, start, self._trials(), LIMITS)
         if answer is None:
             raise HyrfError(
                 f"even the finest file loses more than {limit:g} dB of PSNR; allow more, or use profile 'raw'"
             )
-        noise, trial = answer
-        return trial, (
-            f"noise {noise:.2g} loses {before - trial.scores.psnr:+.3f} of {limit:g} dB on {len(views)} photos"
-        )
+        distortion, trial = answer
+        lost = before - trial.scores.psnr
+        return trial, f"distortion {distortion:.2g} loses {lost:+.3f} of {limit:g} dB on {len(views)} photos"
 
     def _trials(self) -> int:
         return FINETUNED_TRIALS if self.finetune_steps else TRIALS
-
-    def _pack(self, model: HybridModel, plan: Plan) -> Trial:
-        planned = plan.apply(model)
-        quantized = quantize(planned, plan)
-        data = encode_model(model, "compact", self.provenance, plan=plan, quantized=quantized)
-        return Trial(data, added_errors(planned, quantized, plan), None)
 
 
 @torch.no_grad()
@@ -245,16 +246,17 @@ def _difference(pictures: list[torch.Tensor], others: list[torch.Tensor]) -> flo
     return float(np.median([float((a - b).square().mean()) for a, b in zip(pictures, others, strict=True)]))
 
 
-def added_errors(planned: HybridModel, quantized: Quantized, plan: Plan) -> dict[str, float]:
+def added_errors(planned: HybridModel, quantized: Quantized, sensitivity: Sensitivity) -> dict[str, float]:
     """What storing a planned model adds to the pictures' mean squared error, by section and by estimate."""
-    wanted, stored, s = to_arrays(planned), quantized.arrays(plan), plan.sensitivity
+    wanted, stored, s = to_arrays(planned), quantized.arrays(), sensitivity.of(quantized.plan.kept)
     weights = {
         COLORS: np.repeat(s.colors, 3),
         SCALES: s.scales,
         **s.tables,
         **s.decoders,
     }
-    bits = np.concatenate([layer.points.bits[layer.points.classes] for layer in plan.layers])  # anywhere in its cell
+    # A point is anywhere in its cell.
+    bits = np.concatenate([layer.points.bits[layer.points.classes] for layer in quantized.plan.layers])
     _, opacity = opacity_error(planned, wanted[OPACITIES][:, 0].astype(np.float64), s.opacities)
     errors = {OPACITIES: float(opacity(slice(None), stored[OPACITIES][:, 0]).sum())}
     errors[POSITIONS] = float((s.positions * 3 / 12 * 4.0**-bits).sum())
@@ -262,8 +264,3 @@ def added_errors(planned: HybridModel, quantized: Quantized, plan: Plan) -> dict
         difference = stored[group].ravel().astype(np.float64) - wanted[group].ravel()
         errors[group] = float((weight * difference**2).sum())
     return errors
-
-
-def default_noise(provenance: dict) -> float:
-    """The mean squared error that costs PSNR_DROP: errors of photos and of quantising add up."""
-    return stated_error(provenance) * (10 ** (PSNR_DROP / 10) - 1)

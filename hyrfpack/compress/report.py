@@ -16,7 +16,8 @@ from torch import Tensor
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.capture import stored_cameras
-from hyrfpack.compress.packer import NOISE, default_noise
+from hyrfpack.compress.distortion import LIMITS, default_distortion
+from hyrfpack.compress.quantize import decide
 from hyrfpack.compress.report_page import FILES, PAGE, PLOT, SHOWN, Findings, Point, ShownView, page, picture_names
 from hyrfpack.compress.report_plot import draw
 from hyrfpack.compress.sensitivity import measure_sensitivity
@@ -30,7 +31,6 @@ from hyrfpack.format.codec import (
     load_with_provenance,
     without_cameras,
 )
-from hyrfpack.format.compact import make_plan
 from hyrfpack.format.info import describe
 from hyrfpack.measure.machine import machine, machine_line
 from hyrfpack.measure.timing import take_turns
@@ -40,7 +40,7 @@ from hyrfpack.render import render
 from hyrfpack.render.files import save_picture, to_image
 from hyrfpack.scene import Camera, Picture, Scene, View, evenly_spaced
 
-FACTORS = (1 / 16, 1 / 4, 1, 4, 16)  # of the file's noise, for the curve
+FACTORS = (1 / 16, 1 / 4, 1, 4, 16)  # of the file's distortion, for the curve
 LARGE = 200_000  # Gaussians from which on the curve takes the middle three alone
 PHOTOS, VIEWPOINTS = 24, 12  # scored at most
 VISIBLE = 0.4  # rms difference that the worst shown view is amplified to, at most
@@ -92,7 +92,7 @@ def write_report(
     curve = {}
     if len(model):
         cameras = stored_cameras(describe(source)) if scene is None else [view.camera for view in scene.train]
-        curve = _finer_and_coarser(model, provenance, cameras, _noise(facts, model, provenance))
+        curve = _finer_and_coarser(model, provenance, cameras, _distortion(facts, model, provenance))
     same = [name for name, other in curve.items() if other == data]  # the file itself, where it is on the curve
     files = {CHOSEN: data, **profiles, **{name: other for name, other in curve.items() if name not in same}}
     points, decoded = _measured(files, scored)
@@ -135,12 +135,12 @@ def _views(model: HybridModel, source: Path, scene: Scene | None) -> tuple[list[
     return chosen, f"{count} {kind} {'photo' if len(views) == 1 else 'photos'}"
 
 
-def _noise(facts: dict, model: HybridModel, provenance: dict) -> float:
+def _distortion(facts: dict, model: HybridModel, provenance: dict) -> float:
     """What the packed file allows pictures, as `make_plan` takes it; of other profiles the default."""
-    distortion = facts["settings"].get("distortion")
-    if not isinstance(distortion, float) or not distortion > 0:
-        return default_noise(provenance)
-    return distortion * sum(parameter.numel() for parameter in model.parameters())
+    each = facts["settings"].get("distortion")
+    if not isinstance(each, float) or not each > 0:
+        return default_distortion(provenance)
+    return each * sum(parameter.numel() for parameter in model.parameters())
 
 
 def _profiles(model: HybridModel, provenance: dict, done: str) -> dict[str, bytes]:
@@ -154,16 +154,16 @@ def _profiles(model: HybridModel, provenance: dict, done: str) -> dict[str, byte
 
 
 def _finer_and_coarser(
-    model: HybridModel, provenance: dict, cameras: Sequence[Camera], noise: float
+    model: HybridModel, provenance: dict, cameras: Sequence[Camera], distortion: float
 ) -> dict[str, bytes]:
     """The model in profile "compact", finest first."""
     sensitivity = measure_sensitivity(model, cameras)
     files = {}
     for factor in FACTORS if len(model) < LARGE else FACTORS[1:-1]:
-        share = f"{Fraction(factor)} of the noise" if factor < 1 else f"{factor} times the noise"
-        plan = make_plan(model, sensitivity, min(max(factor * noise, NOISE[0]), NOISE[1]))
-        name = "compact, the same noise" if factor == 1 else f"compact, {share}"
-        files[name] = encode_model(model, "compact", without_cameras(provenance), plan=plan)
+        share = f"{Fraction(factor)} of the distortion" if factor < 1 else f"{factor} times the distortion"
+        quantized = decide(model, sensitivity, float(np.clip(factor * distortion, *LIMITS)))
+        name = "compact, the same distortion" if factor == 1 else f"compact, {share}"
+        files[name] = encode_model(model, "compact", without_cameras(provenance), quantized=quantized)
     return files
 
 

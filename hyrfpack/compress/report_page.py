@@ -89,7 +89,7 @@ class Findings:
         before: the uncompressed model.
         chosen: the file that was written.
         profiles: the model in the other profiles that have no settings to choose.
-        curve: the model in profile "compact" at other levels of noise, finest first.
+        curve: the model in profile "compact" at other levels of distortion, finest first.
         shown: views to look at, the one that loses most first.
         amplified: how many times the difference pictures show the difference.
         gaussians: how many the uncompressed model has.
@@ -252,9 +252,9 @@ def _choices(findings: Findings) -> list[Element]:
     ]
     caption = (
         "Other files that the same model could be. The line joins those of profile compact at its defaults, without "
-        "fine-tuning, that allow pictures more or less noise; paper is the recipe of the HyRF paper, raw stores every "
-        "number exactly. Below: how long each takes to decode. For another file on the line ask for its size with "
-        "--target-size."
+        "fine-tuning, that allow pictures more or less distortion; paper is the recipe of the HyRF paper, raw stores "
+        "every number exactly. Below: how long each takes to decode. For another file on the line ask for its size "
+        "with --target-size."
     )
     return [
         _element(

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 Trial = TypeVar("Trial")
-FACTOR = 4.0  # that the noise is changed by until the answer is between two trials
+FACTOR = 4.0  # that the distortion is changed by until the answer is between two trials
 
 
 def coarsest(
@@ -16,34 +16,34 @@ def coarsest(
     trials: int,
     ends: tuple[float, float],
 ) -> tuple[float, Trial] | None:
-    """The largest noise whose trial fits, as far as a number of trials tells.
+    """The largest distortion whose trial fits, as far as a number of trials tells.
 
     Args:
-        attempt: noise -> trial; finer noise fits whenever coarser does.
+        attempt: distortion -> trial; a smaller one fits if a larger does.
         fits: whether a trial is fine enough.
-        start: noise to begin with.
+        start: distortion to begin with.
         trials: how many may be made, at least 2.
-        ends: least and largest noise.
+        ends: least and largest distortion.
 
     Returns:
-        The noise and its trial, None when not even the least noise fits.
+        The distortion and its trial, None when not even the least distortion fits.
     """
     low = high = None  # the coarsest that fits and the finest that does not
-    noise, best = min(max(start, ends[0]), ends[1]), None
+    distortion, best = min(max(start, ends[0]), ends[1]), None
     for _ in range(trials):
-        trial = attempt(noise)
+        trial = attempt(distortion)
         if fits(trial):
-            low, best = noise, (noise, trial)
+            low, best = distortion, (distortion, trial)
         else:
-            high = noise
+            high = distortion
         if low == ends[1] or high == ends[0]:
             break
         if high is None:
-            noise = min(low * FACTOR, ends[1])
+            distortion = min(low * FACTOR, ends[1])
         elif low is None:
-            noise = max(high / FACTOR, ends[0])
+            distortion = max(high / FACTOR, ends[0])
         else:
-            noise = (low * high) ** 0.5
+            distortion = (low * high) ** 0.5
     if best is None and high != ends[0] and fits(trial := attempt(ends[0])):
         best = ends[0], trial
     return best
@@ -56,6 +56,6 @@ def finest(
     trials: int,
     ends: tuple[float, float],
 ) -> tuple[float, Trial] | None:
-    """The least noise whose trial fits, where coarser noise fits whenever finer does; arguments as `coarsest`."""
+    """The least distortion whose trial fits, where a larger one fits if a smaller does; arguments as `coarsest`."""
     mirrored = coarsest(lambda inverse: attempt(1 / inverse), fits, 1 / start, trials, (1 / ends[1], 1 / ends[0]))
     return None if mirrored is None else (1 / mirrored[0], mirrored[1])

@@ -1,15 +1,15 @@
-"""How much each number of a model matters to pictures, measured on renders."""
+"""How much each number of a model matters to pictures, measured on renders: the weights of rate and distortion."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from hyrfpack.cameras.between import views_between
 from hyrfpack.format.arrays import GROUPS
-from hyrfpack.format.compact import Sensitivity
 from hyrfpack.format.sections import MLPS, TABLES
 from hyrfpack.model import HybridModel, expand
 from hyrfpack.render import render
@@ -22,6 +22,34 @@ TRUSTED = 8.0  # views that the guess from size, opacity and place counts for
 CELLS = 32  # of the cube, along each axis, in which guess and measurement are brought together
 NEAREST = 0.05  # local units
 LEAST = 1e-2  # of a decoder's number, against the mean of its decoder
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """Mean squared derivatives of pictures by each number of a model.
+
+    For a number x it is s = mean over views, pixels and channels of (d colour / d x)^2, so that an error e in x adds
+    about s e^2 to the pictures' mean squared error. All are float64, 0 or more.
+
+    Attributes:
+        positions: (N,) by a coordinate in the contracted cube, mean of the three axes.
+        colors: (N,) by a colour logit, mean of the three.
+        scales, opacities: (N,) by the explicit logits.
+        tables: (rows * 2,) by an entry of each hash table, by section.
+        decoders: (numbers,) by the numbers of each decoder, laid out as in the file, by section.
+    """
+
+    positions: np.ndarray
+    colors: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    tables: dict[str, np.ndarray]
+    decoders: dict[str, np.ndarray]
+
+    def of(self, index: np.ndarray | slice) -> Sensitivity:
+        """That of the Gaussians at `index` (n,) int64, and of all tables and decoders."""
+        parts = (getattr(self, name)[index] for name in ("positions", "colors", "scales", "opacities"))
+        return Sensitivity(*parts, self.tables, self.decoders)
 
 
 def measure_sensitivity(model: HybridModel, cameras: Sequence[Camera], seed: int = 0) -> Sensitivity:

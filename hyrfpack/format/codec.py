@@ -62,8 +62,8 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
         model: on any device.
         profile: "raw" (float32, exact), "paper" (see `hyrfpack.format.paper`) or "compact" (`hyrfpack.format.compact`).
         provenance: where the model comes from, any JSON object; kept for people.
-        settings: of the profile: the fields of `paper.PaperSettings`; for "compact" its `plan` and perhaps what
-            `compact.quantize` made of it; "raw" has none.
+        settings: of the profile: the fields of `paper.PaperSettings`; for "compact" what `hyrfpack.compress`
+            decided, its `quantized` numbers; "raw" has none.
 
     Raises:
         HyrfError: there is no such profile, or a parameter is NaN, infinite or too large for the profile.

@@ -28,7 +28,7 @@ from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.render import RenderSettings, render
 
 CAMERAS = ring(3, width=24, height=24)
-NOISE = 1e-5
+DISTORTION = 1e-5
 
 
 def model_of(count: int = 60, **settings):
@@ -37,7 +37,7 @@ def model_of(count: int = 60, **settings):
 
 
 def subject_of(model, photos=None) -> Subject:
-    return Subject("tiny", "raw", model, CAMERAS, photos, ring(8, width=24, height=24), NOISE)
+    return Subject("tiny", "raw", model, CAMERAS, photos, ring(8, width=24, height=24), DISTORTION)
 
 
 def ignore(sentence: str) -> None:
@@ -204,14 +204,14 @@ def test_every_knob_of_the_compact_profile_is_tried_with_its_default_marked():
     notes = []
     rows = by_setting(codec_rows(subject_of(model_of(300, scale_logits=-4.0)), 1, notes.append))
     itself = rows["profile"]["compact"]
-    for knob, count in (("noise", 5), ("prune", 2)):
+    for knob, count in (("distortion", 5), ("prune", 2)):
         values = rows[f"compact, {knob}"]
         (default,) = [row for row in values.values() if row.is_default]
         assert len(values) == count and default.bytes == itself.bytes
-    assert list(rows["compact, noise"]) == ["1e-06", "3e-06", "1e-05", "3e-05", "0.0001"]
-    noises = list(rows["compact, noise"].values())
-    assert [row.bytes for row in noises] == sorted((row.bytes for row in noises), reverse=True)
-    assert [row.error.rms for row in noises] == sorted(row.error.rms for row in noises)
+    assert list(rows["compact, distortion"]) == ["1e-06", "3e-06", "1e-05", "3e-05", "0.0001"]
+    distortions = list(rows["compact, distortion"].values())
+    assert [row.bytes for row in distortions] == sorted((row.bytes for row in distortions), reverse=True)
+    assert [row.error.rms for row in distortions] == sorted(row.error.rms for row in distortions)
     assert rows["compact, prune"]["no"].bytes >= rows["compact, prune"]["yes"].bytes
     assert 0 < itself.decode.ms and itself.decode_ratio.wall > 0
     assert itself.bytes < rows["profile"]["paper"].bytes

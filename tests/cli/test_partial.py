@@ -10,9 +10,9 @@ import pytest
 from commands import hyrfpack, refused, succeeded
 from scenes import small_model
 
+from hyrfpack.compress import plan
 from hyrfpack.format import describe, load
 from hyrfpack.format.arrays import to_arrays
-from hyrfpack.format.compact import plan
 from hyrfpack.format.container import read_container
 from tools.safety.plans import encode
 

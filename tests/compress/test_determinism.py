@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 from scenes import small_model
 
+from hyrfpack.compress.quantize import quantize
 from hyrfpack.format import encode_model
 from hyrfpack.model import HybridModel
-from tools.safety.plans import drawn_plan, encode
+from tools.safety.plans import drawn, drawn_sensitivity, encode
 
 ROOT = Path(__file__).parents[2]
 COUNT = 3000
@@ -44,26 +45,28 @@ sys.path += {paths!r}
 if {blocked}:
     sys.modules["numba"] = None
 from test_determinism import a_model, digest
+from hyrfpack.compress.quantize import quantize
 from hyrfpack.format import encode_model
 from hyrfpack.parallel import has_numba
 assert has_numba() != {blocked}
-plan = pickle.load(open({plan!r}, "rb"))
-print(digest(encode_model(a_model(), "compact", plan=plan)))
+plan, sensitivity = pickle.load(open({plan!r}, "rb"))
+model = a_model()
+print(digest(encode_model(model, "compact", quantized=quantize(plan.apply(model), plan, sensitivity))))
 """
 
 
 @pytest.mark.parametrize("blocked", [False, True], ids=["compiled", "numpy"])
 def test_compiled_kernels_and_numpy_write_the_same_bytes(blocked, tmp_path):
     model = a_model()
-    plan = drawn_plan(model, layered=True)
-    (tmp_path / "plan").write_bytes(pickle.dumps(plan))
+    quantized = drawn(model, layered=True)
+    (tmp_path / "plan").write_bytes(pickle.dumps((quantized.plan, drawn_sensitivity(model))))
     paths = [str(Path(__file__).parent), str(ROOT / "tests"), str(ROOT)]
     script = SCRIPT.format(paths=paths, blocked=blocked, plan=str(tmp_path / "plan"))
 
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=os.environ, check=False)
 
     assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == digest(encode_model(model, "compact", plan=plan))
+    assert done.stdout.strip() == digest(encode_model(model, "compact", quantized=quantized))
 
 
 @pytest.mark.parametrize("layered", [False, True])
@@ -81,7 +84,9 @@ def test_gaussians_in_another_order_give_the_same_file():
     order = np.random.default_rng(1).permutation(COUNT)
     for name in other.gaussians.NAMES:
         getattr(other.gaussians, name).data = getattr(model.gaussians, name).data[order]
-    plan = drawn_plan(model, prune=False)
-    moved = dataclasses.replace(plan, kept=np.argsort(order)[plan.kept])
+    quantized = drawn(model, prune=False)
+    moved = dataclasses.replace(quantized.plan, kept=np.argsort(order)[quantized.plan.kept])
 
-    assert encode_model(other, "compact", plan=moved) == encode_model(model, "compact", plan=plan)
+    again = quantize(moved.apply(other), moved, drawn_sensitivity(model).of(order))
+
+    assert encode_model(other, "compact", quantized=again) == encode_model(model, "compact", quantized=quantized)

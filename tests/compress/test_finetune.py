@@ -10,17 +10,19 @@ import torch
 from scenes import ball_scene
 
 from hyrfpack.compress.finetune import finetune
-from hyrfpack.compress.sensitivity import measure_sensitivity
+from hyrfpack.compress.plan import make_plan
+from hyrfpack.compress.quantize import decide, quantize
+from hyrfpack.compress.sensitivity import Sensitivity, measure_sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.evaluate import evaluate
 from hyrfpack.format import decode_model, encode_model
-from hyrfpack.format.compact import Plan, Sensitivity, make_plan
+from hyrfpack.format.compact import Plan
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Picture, Scene
 from hyrfpack.train import TrainConfig, Trainer
 
-NOISE = 2e-3  # 27 dB between pictures before and after: there is something to mend
+DISTORTION = 2e-3  # 27 dB between pictures before and after: there is something to mend
 
 
 @pytest.fixture(scope="module")
@@ -42,23 +44,25 @@ def sensitivity(trained, scene) -> Sensitivity:
 
 @pytest.fixture(scope="module")
 def plan(trained, sensitivity) -> Plan:
-    return make_plan(trained, sensitivity, NOISE)
+    return make_plan(trained, sensitivity, DISTORTION)
 
 
-def decoded(tuned: HybridModel, plan: Plan) -> tuple[HybridModel, int]:
+def decoded(tuned: HybridModel, plan: Plan, sensitivity: Sensitivity, reach: int = 0) -> tuple[HybridModel, int]:
     """A fine-tuned model as its file gives it back, and the bytes of that."""
-    data = encode_model(tuned, "compact", plan=dataclasses.replace(plan.of_applied(), reach=0))
+    data = encode_model(tuned, "compact", quantized=quantize(tuned, plan, sensitivity, reach=reach))
     return decode_model(data), len(data)
 
 
 def test_fine_tuning_is_worth_more_than_the_same_bytes_of_finer_steps(trained, plan, sensitivity, scene):
-    finer = encode_model(trained, "compact", plan=make_plan(trained, sensitivity, NOISE / 3))
+    finer = encode_model(trained, "compact", quantized=decide(trained, sensitivity, DISTORTION / 3))
     without = evaluate(decode_model(finer), scene.train).psnr
     steps = []
 
-    tuned = finetune(plan.apply(trained), plan, scene.train, 60, report=lambda step, loss: steps.append((step, loss)))
+    tuned = finetune(
+        plan.apply(trained), plan, sensitivity, scene.train, 60, report=lambda step, loss: steps.append((step, loss))
+    )
 
-    model, size = decoded(tuned, plan)
+    model, size = decoded(tuned, plan, sensitivity)
     after = evaluate(model, scene.train).psnr
     assert size < len(finer)
     assert after > without + 0.5
@@ -66,17 +70,17 @@ def test_fine_tuning_is_worth_more_than_the_same_bytes_of_finer_steps(trained, p
     assert np.mean([loss for _, loss in steps[-8:]]) < np.mean([loss for _, loss in steps[:8]])
 
 
-def test_positions_and_their_order_stay_and_the_model_given_is_not_touched(trained, plan, scene):
+def test_positions_and_their_order_stay_and_the_model_given_is_not_touched(trained, plan, sensitivity, scene):
     planned = plan.apply(trained)
     before = {name: value.clone() for name, value in planned.state_dict().items()}
 
-    tuned = finetune(planned, plan, scene.train, 5)
+    tuned = finetune(planned, plan, sensitivity, scene.train, 5)
 
     for name, value in planned.state_dict().items():
         assert torch.equal(value, before[name]), name
     assert all(parameter.grad is None for parameter in planned.parameters())
     assert torch.equal(tuned.gaussians.positions, planned.gaussians.positions)
-    model, _ = decoded(tuned, plan)
+    model, _ = decoded(tuned, plan, sensitivity)
     assert torch.equal(model.gaussians.positions, planned.gaussians.positions)
     moved = {name for name, value in tuned.state_dict().items() if not torch.equal(value, before[name])}
     for name in ("gaussians.color_logits", "gaussians.opacity_logits", "geometry.grid.table", "radiance.weights.0"):
@@ -84,41 +88,41 @@ def test_positions_and_their_order_stay_and_the_model_given_is_not_touched(train
     assert all(parameter.requires_grad for parameter in tuned.parameters())
 
 
-def test_what_is_decoded_is_the_nearest_to_the_fitted_numbers(trained, plan, scene):
+def test_what_is_decoded_is_the_nearest_to_the_fitted_numbers(trained, plan, sensitivity, scene):
     """Fitted numbers sit where they shall be rounded to: with `reach` 0 nothing is traded for bits any more."""
-    tuned = finetune(plan.apply(trained), plan, scene.train, 5)
+    tuned = finetune(plan.apply(trained), plan, sensitivity, scene.train, 5)
 
-    model, _ = decoded(tuned, plan)
+    model, _ = decoded(tuned, plan, sensitivity)
 
     for name in ("color_logits", "scale_logits"):
         off = getattr(model.gaussians, name) - getattr(tuned.gaussians, name)
-        traded = decode_model(encode_model(tuned, "compact", plan=plan.of_applied())).gaussians
+        traded = decoded(tuned, plan, sensitivity, reach=1)[0].gaussians
         assert off.abs().mean() < (getattr(traded, name) - getattr(tuned.gaussians, name)).abs().mean()
 
 
-def test_the_same_seed_gives_the_same_model_and_another_another(trained, plan, scene):
+def test_the_same_seed_gives_the_same_model_and_another_another(trained, plan, sensitivity, scene):
     planned = plan.apply(trained)
 
-    first, again, other = (finetune(planned, plan, scene.train, 6, seed=seed) for seed in (0, 0, 1))
+    first, again, other = (finetune(planned, plan, sensitivity, scene.train, 6, seed=seed) for seed in (0, 0, 1))
 
     pairs = list(zip(first.parameters(), again.parameters(), other.parameters(), strict=True))
     assert all(torch.equal(a, b) for a, b, _ in pairs)
     assert not all(torch.equal(a, c) for a, _, c in pairs)
 
 
-def test_each_epoch_takes_every_view_once(trained, plan, scene):
+def test_each_epoch_takes_every_view_once(trained, plan, sensitivity, scene):
     seen = []
 
     def watched(view):
         return dataclasses.replace(view, load=lambda: seen.append(view.name) or view.load())
 
-    finetune(plan.apply(trained), plan, [watched(view) for view in scene.train], 16, cache=PictureCache(0))
+    finetune(plan.apply(trained), plan, sensitivity, [watched(view) for view in scene.train], 16, cache=PictureCache(0))
 
     names = {view.name for view in scene.train}
     assert set(seen[:8]) == set(seen[8:16]) == names
 
 
-def test_a_photo_of_nan_stops_it_with_the_step_and_the_view(trained, plan, scene):
+def test_a_photo_of_nan_stops_it_with_the_step_and_the_view(trained, plan, sensitivity, scene):
     class Broken(Picture):
         def composite(self, solid=None):
             return np.full((32, 32, 3), np.nan, np.float32)
@@ -126,10 +130,10 @@ def test_a_photo_of_nan_stops_it_with_the_step_and_the_view(trained, plan, scene
     view = dataclasses.replace(scene.train[2], load=lambda: Broken(np.zeros((32, 32, 3), np.uint8)))
 
     with pytest.raises(HyrfTrainingError, match="stopped at step 1 on view '002.png'.*without --finetune"):
-        finetune(plan.apply(trained), plan, [view], 3)
+        finetune(plan.apply(trained), plan, sensitivity, [view], 3)
 
 
-def test_a_model_that_was_loaded_is_fitted_too(trained, plan, scene):
+def test_a_model_that_was_loaded_is_fitted_too(trained, plan, sensitivity, scene):
     loaded = decode_model(encode_model(plan.apply(trained)))
-    tuned = finetune(loaded, plan, scene.train, 1)
+    tuned = finetune(loaded, plan, sensitivity, scene.train, 1)
     assert not torch.equal(tuned.gaussians.color_logits, loaded.gaussians.color_logits)

@@ -13,7 +13,7 @@ from scenes import ball_points, small_model
 import hyrfpack
 from hyrfpack.compress import compress
 from hyrfpack.compress import packer as running
-from hyrfpack.compress.packer import default_noise
+from hyrfpack.compress.distortion import default_distortion
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
 from hyrfpack.format import describe, load, save
@@ -94,14 +94,14 @@ def test_the_report_is_of_the_file_and_its_estimate_of_the_pictures(trained, com
     assert report.error / 4 < measured < 4 * report.error
 
 
-def test_the_noise_that_is_asked_for_is_about_what_pictures_get(trained, scene, tmp_path):
+def test_the_distortion_that_is_asked_for_is_about_what_pictures_get(trained, scene, tmp_path):
     cameras = [view.camera for view in scene.train]
     sizes, errors = [], []
-    for noise in (1e-4, 1e-5, 1e-6):
-        report = compress(trained, tmp_path / "small.hyrf", data=scene, noise=noise)
+    for distortion in (1e-4, 1e-5, 1e-6):
+        report = compress(trained, tmp_path / "small.hyrf", data=scene, distortion=distortion)
         errors.append(squared_error(trained, tmp_path / "small.hyrf", cameras))
         sizes.append(report.bytes_after)
-        assert noise / 4 < errors[-1] < 4 * noise
+        assert distortion / 4 < errors[-1] < 4 * distortion
 
     assert sizes == sorted(sizes) and errors == sorted(errors, reverse=True)
 
@@ -137,8 +137,8 @@ def test_fine_tuning_keeps_to_limits(limit, trained, scene, tmp_path):
 def test_pruning_leaves_out_gaussians_and_bytes_and_not_pruning_keeps_all(trained, scene, tmp_path):
     every = len(load(trained))
 
-    kept = compress(trained, tmp_path / "all.hyrf", data=scene, noise=1e-4, prune=False)
-    pruned = compress(trained, tmp_path / "fewer.hyrf", data=scene, noise=1e-4)
+    kept = compress(trained, tmp_path / "all.hyrf", data=scene, distortion=1e-4, prune=False)
+    pruned = compress(trained, tmp_path / "fewer.hyrf", data=scene, distortion=1e-4)
 
     assert kept.gaussians == every > pruned.gaussians > every / 4
     assert pruned.bytes_after < kept.bytes_after
@@ -194,8 +194,16 @@ def test_a_compressed_file_can_be_compressed_again_and_unpacked_exactly(paper, c
     [(30.0, 6.93e-6), (20.0, 6.93e-5), (None, 6.93e-6), ("good", 6.93e-6), (0.0, 6.93e-6), (1e400, 6.93e-6)],
 )
 def test_by_itself_it_aims_at_three_hundredths_of_a_dB(told, expected):
-    """Errors add up: 10 lg((e + noise) / e) = 0.03 at e = 10^(-psnr / 10)."""
-    assert default_noise({} if told is None else {"psnr": told}) == pytest.approx(expected, rel=0.01)
+    """Errors add up: 10 lg((e + distortion) / e) = 0.03 at e = 10^(-psnr / 10)."""
+    assert default_distortion({} if told is None else {"psnr": told}) == pytest.approx(expected, rel=0.01)
+
+
+def test_the_old_word_for_distortion_is_taken_with_a_warning(trained, tmp_path):
+    compress(trained, tmp_path / "new.hyrf", distortion=1e-4)
+    with pytest.warns(DeprecationWarning, match="distortion"):
+        compress(trained, tmp_path / "old.hyrf", noise=1e-4)
+
+    assert (tmp_path / "old.hyrf").read_bytes() == (tmp_path / "new.hyrf").read_bytes()
 
 
 # -- refused ---------------------------------------------------------------------------------------------------------
@@ -206,9 +214,9 @@ def test_by_itself_it_aims_at_three_hundredths_of_a_dB(told, expected):
     [
         ({"finetune_steps": 5}, "need photos"),
         ({"max_psnr_drop": 0.1}, "need photos"),
-        ({"target_bytes": 10_000, "noise": 1e-5}, "give one of them"),
+        ({"target_bytes": 10_000, "distortion": 1e-5}, "give one of them"),
         ({"color": (2, 64)}, "no setting 'color'"),
-        ({"profile": "paper", "noise": 1e-5}, "profile 'paper' has no settings"),
+        ({"profile": "paper", "distortion": 1e-5}, "profile 'paper' has no settings"),
         ({"profile": "raw", "finetune_steps": 5}, "profile 'raw' has no settings"),
         ({"profile": "zip"}, "no profile 'zip'"),
         ({"target_bytes": 500}, "does not fit into 500 bytes"),

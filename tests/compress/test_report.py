@@ -107,7 +107,7 @@ def reported(
 
 @pytest.fixture(scope="module")
 def with_photos(source, scene, tmp_path_factory) -> tuple[Path, CompressionReport, Page]:
-    return reported(source, tmp_path_factory.mktemp("photos"), scene=scene, noise=1e-4)
+    return reported(source, tmp_path_factory.mktemp("photos"), scene=scene, distortion=1e-4)
 
 
 # -- the page as a file ----------------------------------------------------------------------------------------------
@@ -181,12 +181,18 @@ def test_layers_of_a_section_are_one_part(source, tmp_path):
     assert row[:3] == ["positions", f"{positions.before:,}", f"{positions.after:,}"]
 
 
-def test_curve_gets_smaller_as_it_is_allowed_more_noise(with_photos):
+def test_curve_gets_smaller_as_it_is_allowed_more_distortion(with_photos):
     _, _, page = with_photos
     header, *rows = page.tables[1]
     assert header[:3] == ["file", "bytes", "PSNR lost (dB)"]
     by_name = {row[0]: (int(row[1].replace(",", "")), float(row[2])) for row in rows}
-    names = ("1/16 of the noise", "1/4 of the noise", None, "4 times the noise", "16 times the noise")
+    names = (
+        "1/16 of the distortion",
+        "1/4 of the distortion",
+        None,
+        "4 times the distortion",
+        "16 times the distortion",
+    )
     curve = [by_name["this file" if name is None else f"compact, {name}"] for name in names]
     assert [size for size, _ in curve] == sorted((size for size, _ in curve), reverse=True)
     assert curve[-1][1] > curve[0][1]
@@ -195,9 +201,9 @@ def test_curve_gets_smaller_as_it_is_allowed_more_noise(with_photos):
 
 
 def test_a_file_off_the_curve_stands_beside_it(source, scene, tmp_path):
-    _, _, page = reported(source, tmp_path, scene=scene, noise=3e-3, finetune_steps=2)
+    _, _, page = reported(source, tmp_path, scene=scene, distortion=3e-3, finetune_steps=2)
     names = [row[0] for row in page.tables[1]]
-    assert "this file" in names and "compact, the same noise" in names
+    assert "this file" in names and "compact, the same distortion" in names
 
 
 def test_difference_pictures_are_amplified_as_the_page_says(with_photos):
@@ -224,7 +230,7 @@ def test_views_go_from_the_one_that_loses_most_to_the_one_that_loses_least(with_
 
 
 def test_without_photos_renders_are_compared_with_the_uncompressed_model(source, tmp_path):
-    _, _, page = reported(source, tmp_path, noise=1e-4)
+    _, _, page = reported(source, tmp_path, distortion=1e-4)
     assert "dB between pictures before and after" in page.texts["h1"][0]
     assert "against the photo" not in page.words
     assert "what the uncompressed model shows from 6 viewpoints" in page.words
@@ -251,7 +257,7 @@ def test_a_model_that_half_precision_cannot_hold_has_a_page_without_paper(tmp_pa
     with torch.no_grad():
         model.gaussians.positions[0, 0] = 1e5
     save(model, tmp_path / "far.hyrf", provenance={"cameras": capture_of(ring(2))})
-    _, _, page = reported(tmp_path / "far.hyrf", tmp_path, noise=1e-4)
+    _, _, page = reported(tmp_path / "far.hyrf", tmp_path, distortion=1e-4)
     assert "paper" not in [row[0] for row in page.tables[1]]
 
 

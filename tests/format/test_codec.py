@@ -20,7 +20,7 @@ from hyrfpack.format import decode_model, describe, encode_model, load, repack, 
 from hyrfpack.format.container import Section, read_container, write_container
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
-from tools.safety.plans import drawn_plan, encode
+from tools.safety.plans import drawn, encode
 
 PROFILES = ("raw", "paper", "compact")
 
@@ -199,12 +199,12 @@ def test_encoding_leaves_model_and_random_state_alone(profile):
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_save_refuses_numbers_that_are_not_finite_and_names_the_group(tmp_path, profile, parameter, holds, value):
     model = make_model()
-    settings = {"plan": drawn_plan(model)} if profile == "compact" else {}
+    planned = drawn(model).plan.apply if profile == "compact" else None
     with torch.no_grad():
         model.state_dict()[parameter].view(-1)[-1] = value
 
     with pytest.raises(HyrfError, match=f"1 of [0-9]+ numbers in the model's {holds} "):
-        save(model, tmp_path / "model.hyrf", profile, **settings)
+        save(model, tmp_path / "model.hyrf", profile) if planned is None else planned(model)
 
     assert not list(tmp_path.iterdir())
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from scenes import small_model
 
+from hyrfpack.compress import plan
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import decode_model
 from hyrfpack.format.arrays import to_arrays
-from hyrfpack.format.compact import plan
 from hyrfpack.format.container import read_container, write_container
 from hyrfpack.quant.integers import encode_integers
 from tools.safety import minimal_reader

@@ -14,11 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import small_model
 
+from hyrfpack.compress import plan
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import decode_model, describe, load
 from hyrfpack.format.arrays import RULES, to_arrays
 from hyrfpack.format.codec import repack
-from hyrfpack.format.compact import plan
 from hyrfpack.format.container import Container, Section, read_container, write_container
 from hyrfpack.format.metadata import Metadata, read_metadata
 from hyrfpack.model import HybridModel

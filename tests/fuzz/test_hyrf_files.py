@@ -25,7 +25,7 @@ from hyrfpack.format import encode_model, repack
 from hyrfpack.format.sections import SECTIONS
 from tools.safety.fuzz import allowance, check_file, check_model, decode
 from tools.safety.fuzz_mutate import GROUPS, KINDS, assemble, disassemble, mutant, seeds
-from tools.safety.plans import even_plan
+from tools.safety.plans import even
 
 CORPUS = Path(__file__).parent / "corpus"
 
@@ -142,7 +142,7 @@ def test_gaussians_that_are_all_alike_take_next_to_no_bytes_and_little_memory():
     """Equal symbols are free in codecs 6 to 8: what bounds their number is what a file of its length may declare."""
     count = 200_000
     model = small_model(np.zeros((count, 3)))
-    data = encode_model(model, "compact", plan=even_plan(model, 0.01))
+    data = encode_model(model, "compact", quantized=even(model, 0.01))
     assert len(data) < 5000
 
     tracemalloc.start()

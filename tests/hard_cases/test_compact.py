@@ -10,16 +10,17 @@ from scenes import ball_points, ring, small_model
 from hyrfpack import compress, load, save
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
+from hyrfpack.format.compact import Quantized
 from hyrfpack.format.container import read_container
 from hyrfpack.model import HybridModel
-from tools.safety.plans import drawn_plan, even_plan
+from tools.safety.plans import drawn, even
 
 STEP = 2.0**-10
-WIDEST = STEP * 16 / 15  # of the steps that `even_plan` may come to
+WIDEST = STEP * 16 / 15  # of the steps that `even` may come to
 
 
-def through(model: HybridModel, plan) -> HybridModel:
-    return decode_model(encode_model(model, "compact", plan=plan))
+def through(model: HybridModel, quantized: Quantized) -> HybridModel:
+    return decode_model(encode_model(model, "compact", quantized=quantized))
 
 
 def opacities(model: HybridModel) -> np.ndarray:
@@ -32,16 +33,17 @@ def cube(model: HybridModel) -> np.ndarray:
         return model.cube_coords(model.gaussians.positions.double()).numpy()
 
 
-def drawn(*shape: int) -> torch.Tensor:
+def normal(*shape: int) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(4))
 
 
 def test_coincident_gaussians_keep_their_own_numbers_and_one_place():
-    colors, sizes = drawn(1000, 3), drawn(1000, 1)
+    colors, sizes = normal(1000, 3), normal(1000, 1)
     model = small_model(np.tile([0.3, -0.4, 0.2], (1000, 1)), color_logits=colors, scale_logits=sizes)
-    plan = even_plan(model, STEP)
+    quantized = even(model, STEP)
+    plan = quantized.plan
 
-    data = encode_model(model, "compact", plan=plan)
+    data = encode_model(model, "compact", quantized=quantized)
     decoded = decode_model(data)
 
     assert len(decoded.gaussians.positions.unique(dim=0)) == 1
@@ -58,9 +60,10 @@ def test_gaussians_far_out_keep_their_direction_and_cost_the_others_nothing(dist
     inner = ball_points(100)[0]
     outer = distance * np.array([[1.0, 0.0, 0.0], [-1.0, 1.0, -1.0], [0.0, -0.5, 1.0]])
     model = small_model(np.vstack([inner, outer]))
-    plan = even_plan(model, STEP)
+    quantized = even(model, STEP)
+    plan = quantized.plan
 
-    decoded = through(model, plan)
+    decoded = through(model, quantized)
 
     before, after = cube(model)[plan.kept], cube(decoded)
     assert np.abs(after - before).max() <= WIDEST / 2 + 1e-6
@@ -74,7 +77,7 @@ def test_gaussians_far_out_keep_their_direction_and_cost_the_others_nothing(dist
 def test_constant_channels_are_exact_and_take_no_bytes():
     model = small_model(ball_points(5000)[0], color_logits=0.3, scale_logits=-3.3, opacity_logits=1.7)
 
-    data = encode_model(model, "compact", plan=even_plan(model, STEP))
+    data = encode_model(model, "compact", quantized=even(model, STEP))
     decoded = decode_model(data).gaussians
 
     for section, bytes_of_all in (("COLO", 200), ("SCAL", 60), ("OPAC", 60)):
@@ -90,7 +93,7 @@ def test_tables_and_decoders_of_one_value_keep_it():
             if not name.startswith("gaussians"):
                 parameter.fill_(-0.7)
 
-    decoded = through(model, even_plan(model, STEP))
+    decoded = through(model, even(model, STEP))
 
     for name, parameter in decoded.named_parameters():
         if not name.startswith("gaussians"):
@@ -100,11 +103,12 @@ def test_tables_and_decoders_of_one_value_keep_it():
 @pytest.mark.parametrize("size", [12.0, 80.0, 1e4, 1e30])
 def test_saturated_opacities_and_colours_stay_saturated(size):
     """Logits beyond 4096 are cut, and opacities earlier; what they look like does not change."""
-    signs = drawn(400, 1).sign()
+    signs = normal(400, 1).sign()
     model = small_model(ball_points(400)[0], opacity_logits=signs * size, color_logits=signs * size, fields=0.3)
-    plan = even_plan(model, STEP)
+    quantized = even(model, STEP)
+    plan = quantized.plan
 
-    decoded = through(model, plan)
+    decoded = through(model, quantized)
 
     assert np.abs(opacities(decoded) - opacities(model)[plan.kept]).max() <= 3.4e-4 + 4.5 * 0.25 * WIDEST
     colors = decoded.gaussians.color_logits.detach(), model.gaussians.color_logits.detach()[plan.kept]
@@ -115,7 +119,7 @@ def test_saturated_opacities_and_colours_stay_saturated(size):
 def test_no_gaussian_gives_a_file_of_none(prune):
     model = small_model(np.zeros((0, 3)), background=True)
 
-    decoded = through(model, drawn_plan(model, prune=prune))
+    decoded = through(model, drawn(model, prune=prune))
 
     assert len(decoded) == 0 and decoded.config == model.config
 
@@ -153,14 +157,14 @@ def test_a_model_that_cannot_be_rendered_is_refused_in_one_sentence(tmp_path):
 
 def test_gaussians_that_no_camera_sees_survive():
     """Behind and beside all cameras their sensitivity is a floor, not zero: they are coarse, but they are there."""
+    from hyrfpack.compress.quantize import decide
     from hyrfpack.compress.sensitivity import measure_sensitivity
-    from hyrfpack.format.compact import make_plan
 
     model = small_model(np.vstack([ball_points(50)[0], [[0.0, 0.0, 40.0], [300.0, 300.0, 300.0]]]), scale_logits=-2.0)
     cameras = ring(4, width=24, height=24)
 
-    plan = make_plan(model, measure_sensitivity(model, cameras), 1e-6, prune=False)
-    decoded = through(model, plan)
+    quantized = decide(model, measure_sensitivity(model, cameras), 1e-6, prune=False)
+    plan, decoded = quantized.plan, through(model, quantized)
 
     assert set(plan.kept) >= {50, 51}
     assert np.abs(cube(decoded) - cube(model)[plan.kept]).max() < 0.3

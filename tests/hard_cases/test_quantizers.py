@@ -6,6 +6,7 @@ import dataclasses
 import tracemalloc
 from collections.abc import Callable
 from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ from hyrfpack.quant import (
 )
 from hyrfpack.quant.huffman import MAX_LENGTH
 from hyrfpack.render import render
-from tools.safety.plans import even_plan
+from tools.safety.plans import even
 
 LARGEST = float(np.finfo(np.float32).max)
 SMALLEST = 2.0**-149
@@ -339,14 +340,14 @@ def test_models_of_hardly_any_gaussians_survive_and_render(profile, fill, count)
     model = small_model(np.random.default_rng(count).normal(size=(count, 3)), fields=1.0, background=True)
     with torch.no_grad():
         FILLS[fill](model)
-    settings = {"plan": even_plan(model, STEP)} if profile == "compact" else {}
+    settings = {"quantized": even(model, STEP)} if profile == "compact" else {}
 
     data = encode_model(model, profile, **settings)
     decoded = decode_model(data)
 
     assert len(decoded) == count and encode_model(model, profile, **settings) == data
     if profile == "compact":
-        check_compact(model, decoded, settings["plan"])
+        check_compact(model, decoded, settings["quantized"].plan)
     for name, expected in model.state_dict().items() if profile != "compact" else ():
         got = decoded.state_dict()[name]
         if profile == "raw":
@@ -366,9 +367,9 @@ def test_models_of_hardly_any_gaussians_survive_and_render(profile, fill, count)
 def test_one_number_that_is_not_finite_is_refused_in_every_group(profile, value):
     for name in small_model(np.zeros((2, 3))).state_dict():
         model = small_model(np.zeros((2, 3)))
-        settings = {"plan": even_plan(model, STEP)} if profile == "compact" else {}
+        write = even(model, STEP).plan.apply if profile == "compact" else partial(encode_model, profile=profile)
         with torch.no_grad():
             model.state_dict()[name].view(-1)[-1] = value
 
         with pytest.raises(HyrfError, match="^1 of [0-9]+ numbers in the model's [a-z ]+ are NaN or infinite; "):
-            encode_model(model, profile, **settings)
+            write(model)

@@ -16,9 +16,13 @@ from unittest import mock
 import numpy as np
 import torch
 
+from hyrfpack.compress.plan import make_plan
+from hyrfpack.compress.quantize import quantize
+from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.format.arrays import to_arrays, to_model
 from hyrfpack.format.codec import decode_model, encode_model
-from hyrfpack.format.compact import Plan, Sensitivity, make_plan
+from hyrfpack.format.compact import Plan
+from hyrfpack.format.sections import LOGITS, MLPS, TABLES
 from hyrfpack.measure.timing import take_turns
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
@@ -26,7 +30,7 @@ from hyrfpack.parallel import has_numba
 
 SIZES = ((100_000, 14), (1_000_000, 17))  # Gaussians, log2 of the radiance table; that of geometry is half as large
 REPEATS = 3
-NOISE = 2e-6
+DISTORTION = 2e-6
 
 
 def drawn_model(count: int, log2_table_size: int) -> HybridModel:
@@ -41,7 +45,7 @@ def drawn_model(count: int, log2_table_size: int) -> HybridModel:
     gaussians = Gaussians(torch.from_numpy(places).float(), logits[:, :3], logits[:, 3:4], logits[:, 4:])
     model = HybridModel(config, gaussians, torch.Generator().manual_seed(0))
     arrays = to_arrays(model)
-    for group in ("GTAB", "RTAB"):
+    for group in TABLES:
         arrays[group] = rng.normal(0, 0.1, arrays[group].shape).astype(np.float32)
     return to_model(config, arrays)
 
@@ -60,8 +64,8 @@ def drawn_sensitivity(model: HybridModel) -> Sensitivity:
         gaussian,
         gaussian / 2,
         2 * gaussian,
-        {group: spread(sizes[group], 1e-8) for group in ("GTAB", "RTAB")},
-        {group: spread(sizes[group], 1e-4) for group in ("GMLP", "RMLP")},
+        {group: spread(sizes[group], 1e-8) for group in TABLES},
+        {group: spread(sizes[group], 1e-4) for group in MLPS},
     )
 
 
@@ -78,14 +82,15 @@ def bench() -> list[dict]:
 def _bench_model(count: int, log2_table_size: int) -> list[dict]:
     model = drawn_model(count, log2_table_size)
     sensitivity = drawn_sensitivity(model)
-    plan = make_plan(model, sensitivity, NOISE, prune=False)
+    make = partial(make_plan, model, sensitivity, DISTORTION, prune=False)
+    plan = make()
     ways = {"compact (cpu)": True, "compact (numpy)": False} if has_numba() else {"compact (numpy)": False}
 
-    planning, _ = take_turns({"plan": partial(make_plan, model, sensitivity, NOISE, prune=False)}, REPEATS)
-    encoders = {"raw": partial(encode_model, model)}
-    encoders |= {
-        way: _with_numba(fast, partial(encode_model, model, "compact", plan=plan)) for way, fast in ways.items()
-    }
+    def encode() -> bytes:
+        return encode_model(model, "compact", quantized=quantize(plan.apply(model), plan, sensitivity))
+
+    planning, _ = take_turns({"plan": make}, REPEATS)
+    encoders = {"raw": partial(encode_model, model), **{way: _with_numba(fast, encode) for way, fast in ways.items()}}
     encoding, files = take_turns(encoders, REPEATS)
     if len({files[way] for way in ways}) > 1:
         raise AssertionError("the bytes depend on whether there is Numba")
@@ -137,8 +142,7 @@ def _error(decoded: HybridModel, model: HybridModel, plan: Plan | None) -> float
     """Root mean square error of the explicit logits, of the worst group."""
     order = slice(None) if plan is None else plan.kept
     after, before = to_arrays(decoded), to_arrays(model)
-    groups = ("COLO", "SCAL", "OPAC")
-    return max(float(np.sqrt(np.square(after[group] - before[group][order]).mean())) for group in groups)
+    return max(float(np.sqrt(np.square(after[group] - before[group][order]).mean())) for group in LOGITS)
 
 
 def main() -> None:

@@ -141,7 +141,7 @@ def seeds() -> tuple[tuple[bytes, ...], tuple[float, ...]]:
     files = [(encode(model, profile), 1 if len(model) == 200 else 10) for profile in PROFILES for model in models]
     files += [(file.read_bytes(), 10) for file in sorted(GOLDEN.glob("*.hyrf"))]
     files.append((encode_model(models[2], "paper", color=(3, 8), scale=(2, 4), opacity=(1, 16)), 10))
-    files.append((encode(models[3], "compact", noise=1e-9, prune=False), 2))
+    files.append((encode(models[3], "compact", distortion=1e-9, prune=False), 2))
     files.append((encode(_alike(models[3]), "compact", prune=False), 10))
     files += [(encode(model, "compact", prune=False, layered=True), 10) for model in (models[2], _model(40))]
     mixed = [models[1], _model(5), _model(6), models[2], models[3], _model(2500)]

@@ -26,8 +26,8 @@ PROVENANCE = {"preset": "standard", "steps": 100, "why": {"geometry": "one entry
 FILES = {
     "v1.0_raw": ("raw", {}),
     "v1.0_paper": ("paper", {"color": (3, 8), "scale": (2, 4), "opacity": (1, 16)}),
-    "v1.1_compact": ("compact", {"noise": 5e-4}),
-    "v1.1_compact_layers": ("compact", {"noise": 1e-5, "layered": True}),
+    "v1.1_compact": ("compact", {"distortion": 5e-4}),
+    "v1.1_compact_layers": ("compact", {"distortion": 1e-5, "layered": True}),
 }
 
 

@@ -1,4 +1,4 @@
-"""Plans of profile `compact` without renders: how much each number matters is drawn, or the same for all.
+"""Decisions of profile `compact` without renders: how much each number matters is drawn, or the same for all.
 
 For golden files, recorded sizes, hostile files and tests: no picture decides about their bytes. `hyrfpack.compress`
 measures instead.
@@ -11,14 +11,17 @@ from unittest.mock import patch
 
 import numpy as np
 
+from hyrfpack.compress import plan as planning
+from hyrfpack.compress.quantize import decide
+from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.format import encode_model
 from hyrfpack.format.arrays import decoder_widths, grids, to_arrays
-from hyrfpack.format.compact import Plan, Sensitivity, make_plan
-from hyrfpack.format.compact import plan as planning
+from hyrfpack.format.compact import Quantized
+from hyrfpack.format.sections import MLPS, TABLES
 from hyrfpack.model import HybridModel
 from hyrfpack.quant.morton import MAX_BITS
 
-NOISE = 1e-5
+DISTORTION = 1e-5
 # Sums over all numbers of a kind, as they are in trained models, about.
 POSITIONS, LOGITS, TABLE, DECODER = 300.0, 0.01, 0.01, 1.0
 SPREAD = 1.5  # standard deviation of the logarithms
@@ -40,23 +43,23 @@ def drawn_sensitivity(model: HybridModel, seed: int = 0) -> Sensitivity:
     return Sensitivity(POSITIONS * shares, *[LOGITS * shares] * 3, tables, decoders)
 
 
-def drawn_plan(model: HybridModel, noise: float = NOISE, prune: bool = True, layered: bool = False) -> Plan:
-    """The plan that `drawn_sensitivity` leads to; with `layered` in layers however few the Gaussians are."""
+def drawn(model: HybridModel, distortion: float = DISTORTION, prune: bool = True, layered: bool = False) -> Quantized:
+    """What `drawn_sensitivity` leads to; with `layered` in layers however few the Gaussians are."""
     with patch.object(planning, "LEAST_OF_LAYER", (2, 100) if layered else planning.LEAST_OF_LAYER):
-        return make_plan(model, drawn_sensitivity(model), noise, prune)
+        return decide(model, drawn_sensitivity(model), distortion, prune)
 
 
-def even_plan(model: HybridModel, step: float) -> Plan:
+def even(model: HybridModel, step: float) -> Quantized:
     """All Gaussians, and all numbers, those that nobody reads included, in steps within 1/15 of `step`."""
     arrays = to_arrays(model)
     ones = {group: np.ones(values.size) for group, values in arrays.items()}
-    tables, decoders = ({group: ones[group] for group in groups} for groups in (("GTAB", "RTAB"), ("GMLP", "RMLP")))
-    noise = step**2 / 12 * sum(values.size for values in arrays.values())
-    return make_plan(model, Sensitivity(*np.ones((4, len(model))), tables, decoders), noise, prune=False)
+    tables, decoders = ({group: ones[group] for group in groups} for groups in (TABLES, MLPS))
+    distortion = step**2 / 12 * sum(values.size for values in arrays.values())
+    return decide(model, Sensitivity(*np.ones((4, len(model))), tables, decoders), distortion, prune=False)
 
 
 def encode(model: HybridModel, profile: str, provenance: dict | None = None, **settings: object) -> bytes:
-    """`encode_model` with any profile; settings of "compact" are those of its drawn plan."""
+    """`encode_model` with any profile; settings of "compact" are those of `drawn`."""
     if profile == "compact":
-        settings = {"plan": drawn_plan(model, **settings)}
+        settings = {"quantized": drawn(model, **settings)}
     return encode_model(model, profile, provenance, **settings)

@@ -16,13 +16,12 @@ import time
 from pathlib import Path
 
 import hyrfpack
-from hyrfpack.compress.finetune import finetune
-from hyrfpack.compress.packer import FINETUNED, default_noise
+from hyrfpack.compress.distortion import default_distortion
+from hyrfpack.compress.packer import FINETUNED, Packer
 from hyrfpack.compress.search import coarsest
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.codec import load_with_provenance, without_cameras
-from hyrfpack.format.compact import make_plan
 from tools.studies.train_sets import DATA
 
 ENDS = (1e-7, 1e-2)
@@ -32,7 +31,7 @@ ENDS = (1e-7, 1e-2)
 class Made:
     """A file that was made and what it loses: dB of PSNR and SSIM, mean over held-out photos."""
 
-    noise: float
+    distortion: float
     bytes: int
     drop: float
     ssim_drop: float
@@ -52,38 +51,34 @@ class Set:
         self.sensitivity = measure_sensitivity(self.model, [view.camera for view in self.scene.train])
         self.measuring = time.perf_counter() - start
 
-    def made(self, data: bytes, noise: float, start: float) -> Made:
+    def made(self, data: bytes, distortion: float, start: float) -> Made:
         seconds = time.perf_counter() - start
         scores = hyrfpack.evaluate(decode_model(data), self.scene.test)
-        return Made(noise, len(data), self.raw.psnr - scores.psnr, self.raw.ssim - scores.ssim, seconds)
+        return Made(distortion, len(data), self.raw.psnr - scores.psnr, self.raw.ssim - scores.ssim, seconds)
 
     def paper(self) -> Made:
         start = time.perf_counter()
         return self.made(encode_model(self.model, "paper", self.provenance), 0, start)
 
-    def compact(self, noise: float, steps: int = 0) -> Made:
+    def compact(self, distortion: float, steps: int = 0) -> Made:
         start = time.perf_counter()
-        plan = make_plan(self.model, self.sensitivity, noise)
-        model = self.model
-        if steps:
-            model = finetune(plan.apply(model), plan, self.scene.train, steps)
-            plan = dataclasses.replace(plan.of_applied(), reach=0)
-        return self.made(encode_model(model, "compact", self.provenance, plan=plan), noise, start)
+        packer = Packer(self.model, self.provenance, self.sensitivity, self.scene, steps, True, lambda sentence: None)
+        return self.made(packer.attempt(distortion).data, distortion, start)
 
     def measure(self, steps: int) -> dict:
         """The row of this set."""
-        noise = default_noise(self.provenance)
-        paper, default = self.paper(), self.compact(noise)
+        distortion = default_distortion(self.provenance)
+        paper, default = self.paper(), self.compact(distortion)
         row = {"set": self.name, "gaussians": len(self.model), "psnr": self.raw.psnr, "ssim": self.raw.ssim}
         row |= {"measuring": self.measuring, "paper": paper, "default": default}
 
         def fits(made: Made) -> bool:
             return made.drop <= paper.drop and made.ssim_drop <= paper.ssim_drop
 
-        found = coarsest(self.compact, fits, noise, 9, ENDS)
+        found = coarsest(self.compact, fits, distortion, 9, ENDS)
         row["matched"] = found and found[1]
         if steps:
-            found = coarsest(lambda noise: self.compact(noise, steps), fits, FINETUNED * noise, 3, ENDS)
+            found = coarsest(lambda value: self.compact(value, steps), fits, FINETUNED * distortion, 3, ENDS)
             row["finetuned"] = found and found[1]
         return {key: dataclasses.asdict(value) if isinstance(value, Made) else value for key, value in row.items()}
 

@@ -49,7 +49,7 @@ OURS: dict[str, list[dict]] = {
         {"color": (1, 128), "scale": (1, 32), "opacity": (1, 16)},
         {"color": (3, 256), "scale": (2, 128), "opacity": (2, 32)},
     ],
-    "compact": [{}, *({"noise": noise} for noise in (2e-6, 8e-6, 8e-5, 3e-4))],
+    "compact": [{}, *({"distortion": value} for value in (2e-6, 8e-6, 8e-5, 3e-4))],
 }
 REFERENCES = ("raw",)  # profiles that do not compress
 

@@ -5,8 +5,7 @@ colour, scale, opacity logits      a step for each class of Gaussians, predictio
 hash tables                        a step by how often a row is read, rANS                  section codec 8
 decoders (MLPs)                    a step for each output, rANS                             section codec 8
 
-`Sensitivity` says how much each number matters to pictures, `make_plan` decides from it what is stored and how finely,
-`encode` does it.
+`hyrfpack.compress` decides what is stored and how finely; here what it quantised becomes bytes, and bytes numbers.
 """
 
 from __future__ import annotations
@@ -15,11 +14,16 @@ import numpy as np
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.arrays import group_shapes
-from hyrfpack.format.compact import sections
 from hyrfpack.format.compact.groups import decode_groups
-from hyrfpack.format.compact.plan import Plan, from_lattice, groups_of, make_plan
-from hyrfpack.format.compact.sections import CODEC_CHANNELS, CODEC_GROUPS, CODEC_POINTS, Quantized, quantize
-from hyrfpack.format.compact.sensitivity import Sensitivity
+from hyrfpack.format.compact.plan import Plan, from_lattice, groups_of
+from hyrfpack.format.compact.quantized import (
+    CODEC_CHANNELS,
+    CODEC_GROUPS,
+    CODEC_POINTS,
+    Quantized,
+    decode_channels,
+    encode_sections,
+)
 from hyrfpack.format.container import Section
 from hyrfpack.format.sections import LAYERED, LOGITS, MLPS, POSITIONS, TABLES, layer_section
 from hyrfpack.model.config import ModelConfig
@@ -30,12 +34,9 @@ __all__ = [
     "Quantized",
     "CODEC_POINTS",
     "Plan",
-    "Sensitivity",
     "decode_positions",
     "decode_section",
     "encode",
-    "make_plan",
-    "quantize",
 ]
 
 # The sections that may have a codec.
@@ -46,23 +47,18 @@ CODECS = {
 }
 
 
-def encode(model: HybridModel, plan: Plan, quantized: Quantized | None = None) -> tuple[list[Section], dict]:
+def encode(model: HybridModel, quantized: Quantized) -> tuple[list[Section], dict]:
     """Sections for a model, and what was decided, for people.
 
     Args:
-        model: the model that the plan was made for.
-        plan: from `make_plan`.
-        quantized: `quantize(plan.apply(model), plan)` where it is at hand.
-
-    Raises:
-        HyrfError: a parameter is NaN or infinite.
+        model: what was quantised, for its configuration.
+        quantized: its numbers, from `hyrfpack.compress.quantize`.
     """
-    coded = sections.encode(quantized or quantize(plan.apply(model), plan), plan)
-    shapes = {}
+    coded, plan, shapes = encode_sections(quantized), quantized.plan, {}
     for layer, points in enumerate(plan.layers):
         for group, shape in group_shapes(model.config, len(points.points.classes)).items():
             shapes.setdefault(layer_section(group, layer) if group in LAYERED else group, shape)
-    settings = {"distortion": plan.distortion, "gaussians_before": len(model)}
+    settings = {"distortion": plan.distortion_per_number, "gaussians_before": len(model)}
     return [
         Section(type, codec, data, 4 * shapes[type][0] * shapes[type][1]) for type, (codec, data) in coded.items()
     ], settings
@@ -95,5 +91,5 @@ def decode_section(
     if points is None and group not in MLPS:
         raise HyrfFormatError(f"codec {codec} needs positions of codec {CODEC_POINTS}; write the file again")
     if codec == CODEC_CHANNELS:
-        return sections.decode_channels(data, points, shape[1])
+        return decode_channels(data, points, shape[1])
     return decode_groups(data, groups_of(group, config, points)).reshape(shape)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrfpack.format.compact.quantize import best_steps, cheapest, code_bits
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.integers import decode_integers, encode_integers
 from hyrfpack.quant.steps import NOT_CODED, ONE, step_of
@@ -20,13 +19,17 @@ from hyrfpack.quant.steps import NOT_CODED, ONE, step_of
 MODELS = 8  # of the entropy coder
 LARGEST = 1 << 24  # steps from zero
 _PART = 1 << 15
-_FLOOR = 0.01  # least sensitivity of a number against the mean of its group
 _HEADER = struct.Struct("<II")
 
 
+def parts(count: int) -> Iterator[slice]:
+    """Consecutive parts of a list of numbers, few enough in each that temporaries stay in the caches."""
+    return (slice(first, first + _PART) for first in range(0, count, _PART))
+
+
 @dataclass(frozen=True)
-class Groups:
-    """Which number is in which group.
+class StepGroups:
+    """Which numbers have a step in common.
 
     Attributes:
         index: (n,) integers of any width, 0 to count - 1.
@@ -39,7 +42,7 @@ class Groups:
     def spread(self, values: np.ndarray) -> np.ndarray:
         """(n,) the value of each number's group, of `values` (count,)."""
         result = np.empty(len(self.index), values.dtype)
-        for part in _parts(len(result)):
+        for part in parts(len(result)):
             result[part] = values.take(self.index[part])
         return result
 
@@ -61,43 +64,7 @@ class GroupSymbols:
     values: np.ndarray
 
 
-def quantize_groups(
-    values: np.ndarray, groups: Groups, sensitivity: np.ndarray, distortion: float, reach: int = 1
-) -> GroupSymbols:
-    """Choose the steps and the symbols.
-
-    Args:
-        values: (n,) float.
-        sensitivity: (n,) s of each number; groups without any are stored as zeros.
-        distortion: D, see `quantize`.
-        reach: how many steps from the nearest are tried; 0 takes the nearest, without counting bits.
-    """
-    index, count = groups.index, groups.count
-    members = np.maximum(np.bincount(index, minlength=count), 1)
-    mean = np.bincount(index, sensitivity, count) / members
-    codes = np.where(mean > 0, best_steps(np.where(mean > 0, mean, 1), distortion), NOT_CODED).astype(np.uint8)
-    steps, unread = step_of(codes) / ONE, codes == NOT_CODED
-    symbols = np.empty(len(values), np.int64)
-    for part in _parts(len(values)):
-        nearest = np.rint(values[part] / steps[index[part]])
-        symbols[part] = np.where(unread[index[part]], 0, np.clip(nearest, -LARGEST, LARGEST))
-    models = _models(np.bincount(index, np.abs(symbols), count) / members)
-    if reach:
-        contexts = groups.spread(models)
-        bits = code_bits(symbols, contexts, MODELS, reach)
-        for part in _parts(len(values)):
-            weights, step = np.maximum(sensitivity[part], (_FLOOR * mean)[index[part]]), steps[index[part]]
-
-            def error(candidates: np.ndarray, weights=weights, step=step, wanted=values[part]) -> np.ndarray:
-                return weights * (candidates * step - wanted) ** 2
-
-            chosen = cheapest(symbols[part], error, contexts[part], bits, distortion, reach)
-            symbols[part] = np.where(unread[index[part]], 0, np.clip(chosen, -LARGEST, LARGEST))
-    codes[np.bincount(index, np.abs(symbols), count) == 0] = NOT_CODED
-    return GroupSymbols(codes, models, symbols, (symbols * groups.spread(steps)).astype(np.float32))
-
-
-def encode_groups(chosen: GroupSymbols, groups: Groups) -> bytes:
+def encode_groups(chosen: GroupSymbols, groups: StepGroups) -> bytes:
     """The bytes of numbers in groups."""
     coded = groups.spread(chosen.codes != NOT_CODED)
     codes = encode_integers(chosen.codes)
@@ -106,7 +73,7 @@ def encode_groups(chosen: GroupSymbols, groups: Groups) -> bytes:
     return _HEADER.pack(len(codes), len(models)) + codes + models + symbols
 
 
-def decode_groups(data: memoryview, groups: Groups) -> np.ndarray:
+def decode_groups(data: memoryview, groups: StepGroups) -> np.ndarray:
     """The numbers (n,) float32.
 
     Raises:
@@ -133,18 +100,8 @@ def decode_groups(data: memoryview, groups: Groups) -> np.ndarray:
         raise DamagedDataError(f"a number is more than {LARGEST} steps; it is damaged")
     values = np.zeros(len(groups.index), np.float32)
     steps, place = step_of(codes) / ONE, 0
-    for part in _parts(len(values)):
+    for part in parts(len(values)):
         index = groups.index[part][coded[part]]
         values[part][coded[part]] = symbols[place : place + len(index)] * steps[index]
         place += len(index)
     return values
-
-
-def _models(magnitude: np.ndarray) -> np.ndarray:
-    """The model for groups of these mean magnitudes in steps, (count,) uint8: they double from 1/16 to 4."""
-    return np.clip(np.floor(np.log2(np.maximum(magnitude, 1e-9))) + 5, 0, MODELS - 1).astype(np.uint8)
-
-
-def _parts(count: int) -> Iterator[slice]:
-    """Consecutive parts of a list of numbers, few enough in each that temporaries stay in the caches."""
-    return (slice(first, first + _PART) for first in range(0, count, _PART))

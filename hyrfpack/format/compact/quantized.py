@@ -1,4 +1,4 @@
-"""A planned model as quantised numbers, these as sections, and sections as numbers."""
+"""A model's quantised numbers as sections, and sections as numbers."""
 
 from __future__ import annotations
 
@@ -8,19 +8,9 @@ from functools import partial
 from typing import TypeVar
 
 import numpy as np
-import torch
-from scipy.special import expit
 
-from hyrfpack.format.arrays import to_arrays
-from hyrfpack.format.compact.channels import (
-    LIMIT,
-    Channel,
-    ErrorModel,
-    decode_channel,
-    encode_channel,
-    quantize_channel,
-)
-from hyrfpack.format.compact.groups import GroupSymbols, encode_groups, quantize_groups
+from hyrfpack.format.compact.channels import Channel, decode_channel, encode_channel
+from hyrfpack.format.compact.groups import GroupSymbols, encode_groups
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.sections import (
     COLORS,
@@ -33,15 +23,12 @@ from hyrfpack.format.sections import (
     TABLES,
     layer_section,
 )
-from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.points import Points
 
 CODEC_POINTS, CODEC_CHANNELS, CODEC_GROUPS = 6, 7, 8
-SATURATED = 8.0  # an opacity's total logit beyond it looks like it: sigmoid is within 3.4e-4 of its end
 COLUMNS = {COLORS: 3, SCALES: 1, OPACITIES: 1}
-OPACITY_REACH = 4  # where opacity is near 0 or 1 logits may move far
 _BLOCK = 1 << 15  # numbers at once: few enough that temporaries stay in the caches
 
 T = TypeVar("T")
@@ -52,66 +39,28 @@ class Quantized:
     """A model's numbers as they will be stored.
 
     Attributes:
-        channels: of each layer "COLO" (3, in the plan's basis), "SCAL" (1) and "OPAC" (1).
-        groups: of "GTAB", "GMLP", "RTAB" and "RMLP".
+        plan: which they are.
+        channels: of each layer colour (3, in the plan's basis), scale (1) and opacity logits (1), by section.
+        groups: of the hash tables and decoders, by section.
     """
 
+    plan: Plan
     channels: list[dict[str, list[Channel]]]
     groups: dict[str, GroupSymbols]
 
-    def arrays(self, plan: Plan) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, np.ndarray]:
         """The numbers as they will be decoded: flat tables and decoders, (M, columns) explicit logits; float32."""
         arrays = {group: chosen.values for group, chosen in self.groups.items()}
         for group in LOGITS:
             layers = [[channel.values for channel in layer[group]] for layer in self.channels]
-            arrays[group] = np.concatenate([_joined(values, plan.basis) for values in layers])
+            arrays[group] = np.concatenate([_joined(values, self.plan.basis) for values in layers])
         return arrays
 
 
-def quantize(model: HybridModel, plan: Plan, like: Quantized | None = None) -> Quantized:
-    """Quantise a planned model (`plan.apply`) by rate and distortion.
-
-    Args:
-        like: an earlier result of the same plan, whose weights of predictions are taken over.
-    """
-    arrays = {group: values.astype(np.float64) for group, values in to_arrays(model).items()}
-    sensitivity, d, reach = plan.sensitivity, plan.distortion, plan.reach
-    opacity, error = opacity_error(model, arrays[OPACITIES][:, 0], sensitivity.opacities)
-    by_group = {**sensitivity.tables, **sensitivity.decoders}
-    jobs = {
-        group: partial(quantize_groups, arrays[group].ravel(), plan.groups[group], by_group[group], d, reach)
-        for group in plan.groups
-    }
-    # Cut before it is turned: a colour far outside would come back as another.
-    colors = np.clip(arrays[COLORS], -LIMIT / 2, LIMIT / 2) @ plan.basis.astype(np.float64)
-    for layer, part in enumerate(plan.parts):
-        classes, s = plan.layers[layer].points.classes, sensitivity.of(part)
-
-        def opacity_cost(places: np.ndarray, candidates: np.ndarray, part: slice = part) -> np.ndarray:
-            return error(places + part.start, candidates)
-
-        parts = {
-            COLORS: (colors[part], s.colors, None, reach),
-            SCALES: (arrays[SCALES][part], s.scales, None, reach),
-            OPACITIES: (opacity[part, None], s.opacities, opacity_cost, reach and OPACITY_REACH),
-        }
-        for group, (values, weights, cost, far) in parts.items():
-            for column, numbers in enumerate(values.T):
-                weight = None if like is None else like.channels[layer][group][column].weight
-                jobs[f"{group} {layer} {column}"] = partial(
-                    quantize_channel, numbers, classes, weights, d, cost, far, weight
-                )
-    done = _together(jobs)
-    channels = [
-        {group: [done[f"{group} {layer} {column}"] for column in range(count)] for group, count in COLUMNS.items()}
-        for layer in range(len(plan.layers))
-    ]
-    return Quantized(channels, {group: done[group] for group in plan.groups})
-
-
-def encode(quantized: Quantized, plan: Plan) -> dict[str, tuple[int, bytes]]:
+def encode_sections(quantized: Quantized) -> dict[str, tuple[int, bytes]]:
     """Codec and stored bytes of each section but the metadata, in file order: a part of the file from its start on is
     a model if it holds the first layer and the fields."""
+    plan = quantized.plan
 
     def encode_channels(layer: int, group: str) -> tuple[int, bytes]:
         basis = plan.basis.astype("<f4").tobytes() if group == COLORS else b""
@@ -125,7 +74,7 @@ def encode(quantized: Quantized, plan: Plan) -> dict[str, tuple[int, bytes]]:
     jobs = {group: partial(encode_numbers, group) for group in plan.groups}
     for layer in range(len(plan.layers)):
         jobs |= {layer_section(group, layer): partial(encode_channels, layer, group) for group in COLUMNS}
-    done = _together(jobs)
+    done = run_jobs(jobs)
     for layer, points in enumerate(plan.layers):
         done[layer_section(POSITIONS, layer)] = CODEC_POINTS, points.positions
     first = [*MLPS, *LAYERED, *TABLES]
@@ -169,7 +118,7 @@ def _joined(channels: list[np.ndarray], basis: np.ndarray) -> np.ndarray:
     return joined
 
 
-def _together(jobs: dict[str, Callable[[], T]]) -> dict[str, T]:
+def run_jobs(jobs: dict[str, Callable[[], T]]) -> dict[str, T]:
     """What independent jobs return; they run side by side."""
     names, done = list(jobs), {}
 
@@ -178,16 +127,3 @@ def _together(jobs: dict[str, Callable[[], T]]) -> dict[str, T]:
 
     run_tasks(run, len(names))
     return {name: done[name] for name in names}
-
-
-@torch.no_grad()
-def opacity_error(model: HybridModel, logits: np.ndarray, sensitivity: np.ndarray) -> tuple[np.ndarray, ErrorModel]:
-    """Opacity logits (M,) without tails that nobody sees, and the error of candidates, counted in opacity."""
-    neural = model.geometry(model.cube_coords(model.gaussians.positions))[:, 0].double().cpu().numpy()
-    opacities = expit(neural + logits)
-    weights = sensitivity / np.maximum(opacities * (1 - opacities), 1e-4) ** 2
-
-    def error(places: np.ndarray, candidates: np.ndarray) -> np.ndarray:
-        return weights[places] * (expit(neural[places] + candidates) - opacities[places]) ** 2
-
-    return np.clip(logits, -SATURATED - neural, SATURATED - neural), error

@@ -1,0 +1,125 @@
+"""What is stored of a model, and how finely: the decisions that come before any number is quantised."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from hyrfpack.compress.rate_distortion import ERROR_PER_BIT
+from hyrfpack.compress.sensitivity import Sensitivity
+from hyrfpack.format.arrays import to_arrays
+from hyrfpack.format.compact.channels import LIMIT
+from hyrfpack.format.compact.plan import Layer, Plan, groups_of
+from hyrfpack.format.sections import COLORS, MLPS, TABLES
+from hyrfpack.model import HybridModel
+from hyrfpack.quant.morton import MAX_BITS
+from hyrfpack.quant.points import Points, encode_points
+
+CLASSES = 6
+CLASS_WIDTH = 3.0  # log2 of sensitivity that a class spans: classes much narrower or wider cost more
+ABOVE_MEAN = 2  # classes for what matters more than the mean
+BITS_OF_A_GAUSSIAN = 16  # that pruning counts as saved: those it takes are cheap ones
+LEAST_OF_LAYER = 5000, 8  # Gaussians of a layer: at least so many, and so much of all; smaller ones cost over 1 %
+
+
+def make_plan(model: HybridModel, sensitivity: Sensitivity, distortion: float, prune: bool = True) -> Plan:
+    """Decide what is stored, and how finely, so that pictures get about `distortion` mean squared error.
+
+    Args:
+        distortion: of colours in [0, 1]; 1e-5 is 50 dB between pictures before and after.
+        prune: leave out Gaussians that cost more in bytes than they give to pictures.
+
+    Raises:
+        HyrfError: a parameter is NaN or infinite.
+    """
+    with torch.no_grad():
+        cube = model.cube_coords(model.gaussians.positions.double()).cpu().numpy()
+    each = distortion / sum(parameter.numel() for parameter in model.parameters())
+    kept = np.arange(len(cube))
+    if prune:
+        with torch.no_grad():
+            opacities = model.decode_geometry().opacities.double().cpu().numpy()
+        kept = np.flatnonzero(~negligible(sensitivity.opacities, opacities, each))
+    of_kept = sensitivity.of(kept)
+    classes = importance_classes(of_kept)
+    bits = position_bits(of_kept.positions, classes, each)
+    layers, order = [], []
+    for kinds in _layer_classes(np.bincount(classes, minlength=CLASSES)):
+        members = np.flatnonzero(np.isin(classes, kinds))
+        layer, index = _layer(cube[kept[members]], classes[members], bits)
+        layers.append(layer)
+        order.append(members[index])
+    kept = kept[np.concatenate(order)]
+    basis = color_basis(to_arrays(model)[COLORS][kept])
+    groups = {group: groups_of(group, model.config, layers[0].points) for group in (*TABLES, *MLPS)}
+    return Plan(kept, tuple(layers), basis, groups, each)
+
+
+def _layer(cube: np.ndarray, classes: np.ndarray, bits: np.ndarray) -> tuple[Layer, np.ndarray]:
+    """A layer of the points (n, 3) of the cube, and which of them comes at each place."""
+    while True:
+        side = (1 << bits)[classes][:, None]
+        cells = np.clip(np.floor(cube * side), 0, side - 1).astype(np.int64)
+        data, order, points = encode_points(Points(cells, classes, bits))
+        # A class coarser than all share was made finer: its points are placed anew, in the middle of their cells.
+        if (points.bits == bits).all():
+            return Layer(points, data), order
+        bits = points.bits
+
+
+def _layer_classes(members: np.ndarray) -> list[list[int]]:
+    """The classes of each layer, from the numbers of their members: in order, and no layer with few Gaussians."""
+    fewest, share = LEAST_OF_LAYER
+    least = max(fewest, members.sum() / share)
+    layers: list[list[int]] = [[]]
+    for kind in range(len(members)):
+        if members[layers[-1]].sum() >= least and members[kind:].sum() >= least:
+            layers.append([])
+        layers[-1].append(kind)
+    return layers
+
+
+def importance_classes(sensitivity: Sensitivity) -> np.ndarray:
+    """(N,) uint8, 0 for the Gaussians that matter most: by the geometric mean of the sensitivities of all 8 numbers."""
+    logs = np.zeros(len(sensitivity.positions))
+    for values, numbers in (
+        (sensitivity.positions, 3),
+        (sensitivity.colors, 3),
+        (sensitivity.scales, 1),
+        (sensitivity.opacities, 1),
+    ):
+        if len(values):
+            logs += numbers / 8 * np.log2(np.maximum(values, 1e-300) / max(float(values.mean()), 1e-300))
+    return np.clip(np.round(-logs / CLASS_WIDTH) + ABOVE_MEAN, 0, CLASSES - 1).astype(np.uint8)
+
+
+def position_bits(sensitivity: np.ndarray, classes: np.ndarray, distortion: float) -> np.ndarray:
+    """(CLASSES,) bits of an axis for each class: the lattice step nearest to sqrt(12 D / s)."""
+    bits = np.ones(CLASSES, np.int64)
+    for kind in np.unique(classes):
+        step = np.sqrt(12 * distortion / max(float(sensitivity[classes == kind].mean()), 1e-300))
+        bits[kind] = np.clip(np.round(-np.log2(max(step, 2.0**-MAX_BITS))), 1, MAX_BITS)
+    return bits
+
+
+def negligible(sensitivity: np.ndarray, opacities: np.ndarray, distortion: float) -> np.ndarray:
+    """(N,) bool: Gaussians whose removal adds less error than their bits are worth.
+
+    Args:
+        sensitivity: (N,) by the opacity logits; by the opacity o itself it is s / (o (1 - o))^2.
+        opacities: (N,) in [0, 1].
+    """
+    by_opacity = sensitivity / np.maximum(opacities * (1 - opacities), 1e-4) ** 2
+    return by_opacity * opacities**2 < ERROR_PER_BIT * distortion * BITS_OF_A_GAUSSIAN
+
+
+def color_basis(colors: np.ndarray) -> np.ndarray:
+    """The eigenvectors of the covariance of colour logits (N, 3), as columns (3, 3) float32, most varied first.
+
+    In it the channels do not repeat each other (Karhunen-Loeve transform).
+    """
+    if len(colors) < 2:
+        return np.eye(3, dtype=np.float32)
+    within = np.clip(colors.T.astype(np.float64), -LIMIT / 2, LIMIT / 2)
+    basis = np.linalg.eigh(np.cov(within))[1][:, ::-1]
+    return (basis * np.where(basis.sum(axis=0) < 0, -1, 1)).astype(np.float32)

@@ -1,0 +1,90 @@
+"""A model's numbers as they will be stored: what is decided, by rate and distortion, before any byte is written."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import torch
+from scipy.special import expit
+
+from hyrfpack.compress.channels import ErrorModel, quantize_channel
+from hyrfpack.compress.groups import quantize_groups
+from hyrfpack.compress.plan import make_plan
+from hyrfpack.compress.sensitivity import Sensitivity
+from hyrfpack.format.arrays import to_arrays
+from hyrfpack.format.compact.channels import LIMIT
+from hyrfpack.format.compact.plan import Plan
+from hyrfpack.format.compact.quantized import COLUMNS, Quantized, run_jobs
+from hyrfpack.format.sections import COLORS, OPACITIES, SCALES
+from hyrfpack.model import HybridModel
+
+SATURATED = 8.0  # an opacity's total logit beyond it looks like it: sigmoid is within 3.4e-4 of its end
+OPACITY_REACH = 4  # where opacity is near 0 or 1 logits may move far
+
+
+def decide(model: HybridModel, sensitivity: Sensitivity, distortion: float, prune: bool = True) -> Quantized:
+    """Plan a model and quantise it, ready to be encoded. Arguments as `make_plan`."""
+    plan = make_plan(model, sensitivity, distortion, prune)
+    return quantize(plan.apply(model), plan, sensitivity)
+
+
+def quantize(
+    model: HybridModel, plan: Plan, sensitivity: Sensitivity, *, reach: int = 1, like: Quantized | None = None
+) -> Quantized:
+    """Quantise a planned model (`plan.apply`) by rate and distortion.
+
+    Args:
+        sensitivity: that the plan was made by.
+        reach: how many steps from the nearest symbol are tried; 0 takes the nearest.
+        like: an earlier result of the same plan, whose weights of predictions are taken over.
+
+    Raises:
+        HyrfError: a parameter is NaN or infinite.
+    """
+    arrays = {group: values.astype(np.float64) for group, values in to_arrays(model).items()}
+    sensitivity, d = sensitivity.of(plan.kept), plan.distortion_per_number
+    opacity, error = opacity_error(model, arrays[OPACITIES][:, 0], sensitivity.opacities)
+    by_group = {**sensitivity.tables, **sensitivity.decoders}
+    jobs = {
+        group: partial(quantize_groups, arrays[group].ravel(), plan.groups[group], by_group[group], d, reach)
+        for group in plan.groups
+    }
+    # Cut before it is turned: a colour far outside would come back as another.
+    colors = np.clip(arrays[COLORS], -LIMIT / 2, LIMIT / 2) @ plan.basis.astype(np.float64)
+    for layer, part in enumerate(plan.parts):
+        classes, s = plan.layers[layer].points.classes, sensitivity.of(part)
+
+        def opacity_cost(places: np.ndarray, candidates: np.ndarray, part: slice = part) -> np.ndarray:
+            return error(places + part.start, candidates)
+
+        parts = {
+            COLORS: (colors[part], s.colors, None, reach),
+            SCALES: (arrays[SCALES][part], s.scales, None, reach),
+            OPACITIES: (opacity[part, None], s.opacities, opacity_cost, reach and OPACITY_REACH),
+        }
+        for group, (values, weights, cost, far) in parts.items():
+            for column, numbers in enumerate(values.T):
+                weight = None if like is None else like.channels[layer][group][column].weight
+                jobs[f"{group} {layer} {column}"] = partial(
+                    quantize_channel, numbers, classes, weights, d, cost, far, weight
+                )
+    done = run_jobs(jobs)
+    channels = [
+        {group: [done[f"{group} {layer} {column}"] for column in range(count)] for group, count in COLUMNS.items()}
+        for layer in range(len(plan.layers))
+    ]
+    return Quantized(plan, channels, {group: done[group] for group in plan.groups})
+
+
+@torch.no_grad()
+def opacity_error(model: HybridModel, logits: np.ndarray, sensitivity: np.ndarray) -> tuple[np.ndarray, ErrorModel]:
+    """Opacity logits (M,) without tails that nobody sees, and the error of candidates, counted in opacity."""
+    neural = model.geometry(model.cube_coords(model.gaussians.positions))[:, 0].double().cpu().numpy()
+    opacities = expit(neural + logits)
+    weights = sensitivity / np.maximum(opacities * (1 - opacities), 1e-4) ** 2
+
+    def error(places: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+        return weights[places] * (expit(neural[places] + candidates) - opacities[places]) ** 2
+
+    return np.clip(logits, -SATURATED - neural, SATURATED - neural), error

@@ -1,0 +1,374 @@
+"""What is decided of a model: what is stored and how finely, and every number of it quantised."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import small_model
+
+from hyrfpack.compress.plan import (
+    ABOVE_MEAN,
+    BITS_OF_A_GAUSSIAN,
+    CLASS_WIDTH,
+    CLASSES,
+    color_basis,
+    importance_classes,
+    make_plan,
+    negligible,
+    position_bits,
+)
+from hyrfpack.compress.quantize import decide, quantize
+from hyrfpack.compress.sensitivity import Sensitivity
+from hyrfpack.format import decode_model, encode_model
+from hyrfpack.format.arrays import GROUPS, group_shapes, to_arrays, to_model
+from hyrfpack.format.compact import Plan, Quantized, encode
+from hyrfpack.format.compact.plan import from_lattice
+from hyrfpack.format.compact.quantized import encode_sections
+from hyrfpack.model import Frame, HybridModel, contract
+from hyrfpack.quant.steps import NOT_CODED, ONE, step_of
+
+EXPLICIT = ("COLO", "SCAL", "OPAC")
+FIELDS = ("GTAB", "GMLP", "RTAB", "RMLP")
+DISTORTION = 1e-5
+
+
+def a_model(count: int = 300, seed: int = 0) -> HybridModel:
+    rng = np.random.default_rng(seed)
+    return small_model(
+        rng.normal(size=(count, 3)) * 0.7,
+        frame=Frame((1.0, 2.0, 3.0), 5.0, (1.0, 0.5, 0.8)),
+        fields=0.3,
+        color_logits=rng.normal(size=(count, 3)) @ np.array([[1, 0.8, 0.6], [0, 0.3, -0.2], [0, 0, 0.1]]),
+        scale_logits=rng.normal(size=(count, 1)) - 4,
+        opacity_logits=4 * rng.normal(size=(count, 1)),
+        seed=seed,
+    )
+
+
+def a_sensitivity(model: HybridModel, spread: float = 2.0, seed: int = 0) -> Sensitivity:
+    """Log-normal; the four of a Gaussian go together, as they do in pictures."""
+    rng = np.random.default_rng(seed)
+
+    def draw(count: int) -> np.ndarray:
+        return 1e-4 * np.exp(spread * rng.normal(size=count))
+
+    sizes = {group: math.prod(shape) for group, shape in group_shapes(model.config, len(model)).items()}
+    together = draw(len(model))
+    explicit = [together * np.exp(rng.normal(size=len(model)) / 4) for _ in range(4)]
+    return Sensitivity(
+        *explicit,
+        tables={group: draw(sizes[group]) for group in ("GTAB", "RTAB")},
+        decoders={group: draw(sizes[group]) for group in ("GMLP", "RMLP")},
+    )
+
+
+def a_plan(model: HybridModel, distortion: float = DISTORTION, **settings) -> Plan:
+    return make_plan(model, a_sensitivity(model), distortion, **settings)
+
+
+def decided(model: HybridModel, distortion: float = DISTORTION, **settings) -> Quantized:
+    return decide(model, a_sensitivity(model), distortion, **settings)
+
+
+def cube_of(model: HybridModel) -> np.ndarray:
+    with torch.no_grad():
+        positions = model.gaussians.positions.double()
+        return contract(positions / positions.new_tensor(model.config.frame.half_extent)).numpy()
+
+
+# The decisions.
+
+
+def test_without_pruning_every_gaussian_is_stored_once() -> None:
+    assert sorted(a_plan(a_model(), prune=False).kept.tolist()) == list(range(300))
+
+
+def test_sensitivities_and_classes_follow_the_gaussians_stored() -> None:
+    model = a_model()
+    sensitivity = a_sensitivity(model)
+
+    plan = make_plan(model, sensitivity, 1e-4)
+
+    assert 0 < len(plan.kept) < 300 and len(set(plan.kept.tolist())) == len(plan.kept)
+    of_stored = sensitivity.of(plan.kept)
+    for name in ("positions", "colors", "scales", "opacities"):
+        np.testing.assert_array_equal(getattr(of_stored, name), getattr(sensitivity, name)[plan.kept])
+    np.testing.assert_array_equal(plan.layers[0].points.classes, importance_classes(of_stored))
+
+
+def test_the_planned_model_is_that_part_of_the_model_on_the_lattice() -> None:
+    model = a_model()
+    plan = a_plan(model)
+    original, frame = to_arrays(model), model.config.frame
+
+    planned = plan.apply(model)
+
+    arrays = to_arrays(planned)
+    for group in GROUPS:
+        expected = original[group][plan.kept] if group in EXPLICIT else original[group]
+        if group != "POSI":
+            np.testing.assert_array_equal(arrays[group], expected)
+    np.testing.assert_array_equal(arrays["POSI"], from_lattice(plan.layers[0].points, frame))
+    # In the cube each is back at its cell's centre, up to float32 of a local position.
+    centers = plan.layers[0].points.centers() / 2**19
+    assert np.abs(cube_of(planned) - centers).max() < 1e-6
+
+
+def position_errors(distortion: float) -> tuple[np.ndarray, np.ndarray]:
+    """How far Gaussians are moved in the cube (N, 3), and the lattice step meant for each (N, 1)."""
+    model = a_model(2000)
+    sensitivity = a_sensitivity(model, spread=4.0)
+    plan = make_plan(model, sensitivity, distortion, prune=False)
+    classes = importance_classes(sensitivity)
+    steps = 2.0 ** -position_bits(sensitivity.positions, classes, plan.distortion_per_number)[classes][:, None]
+    return np.abs(plan.layers[0].points.centers() / 2**19 - cube_of(model)[plan.kept]), steps[plan.kept]
+
+
+def test_positions_move_by_half_a_lattice_step_at_most() -> None:
+    moved, steps = position_errors(1e-6)
+
+    assert (moved <= steps / 2 + 1e-12).all()
+
+
+def test_positions_coarser_than_the_base_move_by_half_a_lattice_step_at_most() -> None:
+    moved, steps = position_errors(0.1)
+
+    assert (moved <= steps / 2 + 1e-12).all()
+
+
+def test_less_distortion_asked_for_takes_more_bits_everywhere() -> None:
+    model = a_model()
+
+    def size(distortion: float) -> int:
+        quantized = decided(model, distortion, prune=False)
+        return sum(len(data) for _, data in encode_sections(quantized).values())
+
+    sizes = [size(distortion) for distortion in (1e-8, 1e-6, 1e-4, 1e-2)]
+
+    assert sizes == sorted(sizes, reverse=True) and sizes[0] > 2 * sizes[-1]
+
+
+def test_pruning_takes_exactly_the_gaussians_that_cost_more_than_they_give() -> None:
+    rng = np.random.default_rng(3)
+    sensitivity = 10.0 ** rng.uniform(-14, -2, 3000)
+    opacities = np.concatenate(
+        [rng.random(1000), 10.0 ** rng.uniform(-12, 0, 1000), 1 - 10.0 ** rng.uniform(-12, 0, 1000)]
+    )
+
+    taken = negligible(sensitivity, opacities, 1e-9)
+
+    for s, o, is_taken in zip(sensitivity.tolist(), opacities.tolist(), taken, strict=True):
+        slope = max(o * (1 - o), 1e-4)  # of the opacity by its logit
+        error_of_removal = s / slope**2 * o**2
+        assert is_taken == (error_of_removal < 2 * math.log(2) * 1e-9 * BITS_OF_A_GAUSSIAN)
+    assert 300 < taken.sum() < 2700
+
+
+def test_a_plan_leaves_out_what_is_negligible() -> None:
+    model = a_model()
+    sensitivity = a_sensitivity(model)
+
+    plan = make_plan(model, sensitivity, 1e-4)
+
+    with torch.no_grad():
+        opacities = model.decode_geometry().opacities.double().numpy()
+    expected = np.flatnonzero(~negligible(sensitivity.opacities, opacities, plan.distortion_per_number))
+    assert sorted(plan.kept.tolist()) == expected.tolist()
+    parameters = sum(array.size for array in to_arrays(model).values())
+    assert plan.distortion_per_number == pytest.approx(1e-4 / parameters)
+
+
+def test_more_distortion_allowed_prunes_more() -> None:
+    model = a_model()
+
+    counts = [len(a_plan(model, distortion).kept) for distortion in (1e-30, 1e-6, 1e-4, 1e-2, 1e9)]
+
+    assert counts == sorted(counts, reverse=True)
+    assert counts[0] == 300 and counts[-1] == 0
+
+
+@given(st.lists(st.tuples(*[st.floats(1e-12, 1e3)] * 4), min_size=1, max_size=40))
+@settings(max_examples=80, deadline=None)
+def test_classes_fall_with_the_mean_sensitivity(rows: list[tuple[float, ...]]) -> None:
+    positions, colors, scales, opacities = np.array(rows).T
+    sensitivity = Sensitivity(positions, colors, scales, opacities, {}, {})
+
+    classes = importance_classes(sensitivity)
+
+    assert classes.dtype == np.uint8 and classes.max() < CLASSES
+    weights = np.array([3, 3, 1, 1]) / 8
+    logs = (np.log2(rows) - np.log2(np.mean(rows, axis=0))) @ weights
+    order = np.argsort(-logs)
+    assert (np.diff(classes[order].astype(int))[np.diff(logs[order]) < -1e-9] >= 0).all()
+    # Classes are equally wide in octaves, the mean lies in the middle of one, and the ends are open.
+    exact = ABOVE_MEAN - logs / CLASS_WIDTH
+    expected = np.clip(np.round(exact), 0, CLASSES - 1)
+    unclear = np.abs(exact - np.floor(exact) - 0.5) < 1e-9
+    np.testing.assert_array_equal(classes[~unclear], expected[~unclear])
+
+
+def test_unseen_gaussians_are_in_the_last_class() -> None:
+    seen = np.where(np.arange(50) < 25, 0.0, 1e-3)
+
+    with np.errstate(divide="ignore"):
+        classes = importance_classes(Sensitivity(seen, seen, seen, seen, {}, {}))
+
+    assert (classes[:25] == CLASSES - 1).all() and (classes[25:] < CLASSES - 1).all()
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.floats(1e-12, 1e6)), max_size=30), st.floats(1e-16, 1.0))
+@settings(max_examples=80, deadline=None)
+def test_bits_make_the_lattice_as_fine_as_positions_matter(pairs: list[tuple[int, float]], distortion: float) -> None:
+    classes = np.array([kind for kind, _ in pairs], np.uint8)
+    sensitivity = np.array([value for _, value in pairs])
+
+    bits = position_bits(sensitivity, classes, distortion)
+
+    for kind in range(CLASSES):
+        members = [value for of, value in pairs if of == kind]
+        if not members:
+            assert bits[kind] == 1
+            continue
+        exact = 0.5 * math.log2(sum(members) / len(members) / (12 * distortion))
+        assert abs(bits[kind] - min(max(exact, 1), 18)) <= 0.5 + 1e-9
+
+
+def test_the_basis_is_orthonormal_and_takes_correlation_away() -> None:
+    colors = to_arrays(a_model(2000))["COLO"].astype(np.float64)
+
+    basis = color_basis(colors)
+
+    assert basis.dtype == np.float32
+    np.testing.assert_allclose(basis.T @ basis, np.eye(3), atol=1e-6)
+    covariance = np.cov((colors @ basis).T)
+    assert np.abs(covariance - np.diag(np.diag(covariance))).max() < 1e-5 * covariance.max()
+    assert (np.diff(np.diag(covariance)) < 0).all()
+
+
+@pytest.mark.parametrize("colors", [np.zeros((0, 3)), np.ones((1, 3)), np.ones((9, 3)), np.diag([1e-30] * 3)])
+def test_few_and_equal_colors_have_a_basis_too(colors: np.ndarray) -> None:
+    basis = color_basis(colors.astype(np.float32))
+
+    np.testing.assert_allclose(basis.T @ basis, np.eye(3), atol=1e-6)
+
+
+# The whole.
+
+
+@pytest.mark.parametrize("reach", [0, 1])
+@pytest.mark.parametrize("distortion", [1e-9, DISTORTION, 1e-2])
+@pytest.mark.parametrize("count", [0, 1, 2, 300])
+def test_the_decoder_gets_what_the_encoder_said_it_would(count: int, distortion: float, reach: int) -> None:
+    model = a_model(count)
+    plan = a_plan(model, distortion)
+    planned = plan.apply(model)
+    quantized = quantize(planned, plan, a_sensitivity(model), reach=reach)
+
+    arrays = to_arrays(decode_model(encode_model(model, "compact", quantized=quantized)))
+
+    np.testing.assert_array_equal(arrays["POSI"], to_arrays(planned)["POSI"])
+    said = quantized.arrays()
+    assert arrays.keys() == group_shapes(model.config, 0).keys() and said.keys() == arrays.keys() - {"POSI"}
+    for group, expected in said.items():
+        assert arrays[group].dtype == np.float32
+        np.testing.assert_array_equal(arrays[group], expected.reshape(arrays[group].shape), err_msg=group)
+    assert len(to_model(model.config, arrays)) == len(plan.kept)
+
+
+def test_without_reach_every_number_is_half_a_step_away_at_most() -> None:
+    model = a_model()
+    plan = a_plan(model)
+    planned = to_arrays(plan.apply(model))
+
+    quantized = quantize(plan.apply(model), plan, a_sensitivity(model), reach=0)
+
+    for group, chosen in quantized.groups.items():
+        steps = step_of(chosen.codes)[plan.groups[group].index] / ONE
+        values = planned[group].ravel()
+        off = np.abs(chosen.values - values)
+        coded = chosen.codes[plan.groups[group].index] != NOT_CODED
+        assert (off <= steps / 2 + np.abs(values) * 2**-22)[coded].all() and coded.any()
+    turned = planned["COLO"] @ plan.basis.astype(np.float64)
+    for channel, values in zip(
+        [*quantized.channels[0]["COLO"], *quantized.channels[0]["SCAL"]],
+        [*turned.T, planned["SCAL"][:, 0]],
+        strict=True,
+    ):
+        steps = step_of(channel.codes)[plan.layers[0].points.classes] / ONE
+        assert (np.abs(channel.values - values) <= steps / 2 + 1e-6).all()
+
+
+def test_finer_plans_come_nearer_to_the_model() -> None:
+    model = a_model()
+
+    def errors(distortion: float) -> dict[str, float]:
+        quantized = decided(model, distortion, prune=False)
+        planned, decoded = to_arrays(quantized.plan.apply(model)), quantized.arrays()
+        return {group: np.abs(decoded[group].ravel() - planned[group].ravel()).mean() for group in decoded}
+
+    coarse, fine = errors(1e-3), errors(1e-7)
+
+    for group in ("COLO", "SCAL", *FIELDS):
+        assert fine[group] < coarse[group] / 10
+
+
+def test_opacities_are_kept_and_not_their_tails() -> None:
+    model = a_model()
+    with torch.no_grad():
+        model.gaussians.opacity_logits[::3] = 300.0
+        model.gaussians.opacity_logits[1::3] = -300.0
+        before = model.decode_geometry().opacities.double().numpy()
+    quantized = decided(model, 1e-9, prune=False)
+    plan, planned = quantized.plan, quantized.plan.apply(model)
+
+    arrays = {**to_arrays(planned), **{"OPAC": quantized.arrays()["OPAC"]}}
+
+    assert np.abs(arrays["OPAC"]).max() < 30
+    with torch.no_grad():
+        after = to_model(model.config, arrays).decode_geometry().opacities.double().numpy()
+        exact = planned.decode_geometry().opacities.double().numpy()
+    assert np.abs(after - exact).max() < 0.01
+    assert (after[before[plan.kept] > 0.999] > 0.99).all() and (after[before[plan.kept] < 0.001] < 0.01).all()
+
+
+def test_the_same_model_gives_the_same_bytes() -> None:
+    written = []
+    for _ in range(2):
+        model = a_model()
+        made, settings = encode(model, decided(model))
+        written.append([(section.type, section.codec, bytes(section.data)) for section in made] + [settings])
+
+    assert written[0] == written[1]
+
+
+def test_encoding_changes_neither_the_model_nor_the_plan() -> None:
+    model = a_model()
+    plan, sensitivity = a_plan(model), a_sensitivity(model)
+    before, positions = to_arrays(model), plan.layers[0].positions
+    before = {group: values.copy() for group, values in before.items()}
+    cells = plan.layers[0].points.cells.copy()
+
+    encode(model, quantize(plan.apply(model), plan, sensitivity))
+
+    for group, values in to_arrays(model).items():
+        np.testing.assert_array_equal(values, before[group])
+    assert plan.layers[0].positions == positions
+    np.testing.assert_array_equal(plan.layers[0].points.cells, cells)
+
+
+def test_sections_say_how_many_bytes_they_decode_to() -> None:
+    model = a_model()
+    quantized = decided(model, 1e-4)
+
+    made, settings = encode(model, quantized)
+
+    shapes = group_shapes(model.config, len(quantized.plan.kept))
+    assert {section.type: section.raw_length for section in made} == {
+        group: 4 * math.prod(shape) for group, shape in shapes.items()
+    }
+    assert settings["gaussians_before"] == 300
