@@ -115,13 +115,13 @@ def read_subject(path: str | os.PathLike[str], scene: Scene | None) -> Subject:
     )
 
 
-def built_in_subject(report: Callable[[str], None]) -> Subject:
+def built_in_subject(say: Callable[[str], None]) -> Subject:
     """The demo's scene, trained for a short while in a temporary folder: the same model every time.
 
     Args:
-        report: called with a sentence before it starts.
+        say: told what is going on.
     """
-    report(f"training the built-in model: {BUILT_IN_STEPS:,} steps on a made-up scene, about a minute on two cores")
+    say(f"training the built-in model: {BUILT_IN_STEPS:,} steps on a made-up scene, about a minute on two cores")
     with tempfile.TemporaryDirectory(prefix="hyrfpack-bench-") as folder:
         scene = load_scene(write_demo_scene(Path(folder) / "scene", views=BUILT_IN_PHOTOS, size=BUILT_IN_SIDE))
         trained = train(scene, Path(folder) / "run", TrainConfig(steps=BUILT_IN_STEPS), quiet=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from copy import deepcopy
 
@@ -27,6 +27,7 @@ from hyrfpack.render import render
 from hyrfpack.scene import View
 from hyrfpack.train.config import LearningRates
 from hyrfpack.train.optimizer import Optimizer
+from hyrfpack.train.trainer import shuffled
 
 RATES = LearningRates(
     positions=(1e-9, 1e-9),  # they stay where they are
@@ -83,7 +84,8 @@ def finetune(
     optimizer = Optimizer(tuned, LearningRates(**rates))
     quantized: Quantized | None = None
     keep_freed_memory()
-    with closing((cache or PictureCache()).stream(_order(views, steps, seed))) as pictures, torch_on_one_thread():
+    order = shuffled(views, seed, range(steps))
+    with closing((cache or PictureCache()).stream(order)) as pictures, torch_on_one_thread():
         for step, (view, picture) in enumerate(pictures):
             quantized = quantize(tuned, plan, sensitivity, reach=0, like=quantized)
             exact = {name: parameter.detach().clone() for name, parameter in tuned.named_parameters()}
@@ -105,15 +107,6 @@ def finetune(
             report(step + 1, float(loss.detach()))
     tuned.gaussians.positions.requires_grad_(True)
     return tuned
-
-
-def _order(views: Sequence[View], steps: int, seed: int) -> Iterator[View]:
-    """Views for the steps: each epoch a permutation of its own."""
-    for step in range(steps):
-        epoch, place = divmod(step, len(views))
-        if place == 0:
-            order = np.random.default_rng((seed, epoch)).permutation(len(views))
-        yield views[order[place]]
 
 
 @torch.no_grad()

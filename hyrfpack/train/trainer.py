@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 
@@ -29,6 +29,15 @@ from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.setup import build_model
 
 RECORDS = 200  # points on the training curve
+
+
+def shuffled(views: Sequence[View], seed: int, steps: range) -> Iterator[View]:
+    """The view of each of these steps, counted from 0: each epoch is a permutation of its own."""
+    for step in steps:
+        epoch, place = divmod(step, len(views))
+        if place == 0 or step == steps.start:
+            order = np.random.default_rng((seed, epoch)).permutation(len(views))
+        yield views[order[place]]
 
 
 class Trainer:
@@ -125,13 +134,8 @@ class Trainer:
         return True
 
     def _order(self) -> Iterator[View]:
-        """Views in the order of the steps still to come: each epoch a permutation of its own."""
-        count = len(self.scene.train)
-        for step in range(self.step, self.config.steps):
-            epoch, place = divmod(step, count)
-            if place == 0 or step == self.step:
-                order = np.random.default_rng((self.config.seed, epoch)).permutation(count)
-            yield self.scene.train[order[place]]
+        """Views in the order of the steps still to come."""
+        return shuffled(self.scene.train, self.config.seed, range(self.step, self.config.steps))
 
     def _train_step(self, view: View, picture: Picture) -> tuple[float, float]:
         config = self.config
