@@ -1,4 +1,4 @@
-"""Two float32 in one 64-bit word, which halves the number of loads and stores: device functions."""
+"""Pairs of float32 as one 64-bit word each, which halves the number of loads and stores: device functions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import triton.language as tl
 
 @triton.jit
 def pack(first, second):
-    """Two float32 in one 64-bit word."""
+    """A pair of float32 as a 64-bit word."""
     low = first.to(tl.uint32, bitcast=True).to(tl.uint64)
     high = second.to(tl.uint32, bitcast=True).to(tl.uint64)
     return (low | (high << 32)).to(tl.int64, bitcast=True)
@@ -16,5 +16,5 @@ def pack(first, second):
 
 @triton.jit
 def unpack(word):
-    """The two float32 of a 64-bit word."""
+    """The pair of float32 in a 64-bit word."""
     return word.to(tl.int32).to(tl.float32, bitcast=True), (word >> 32).to(tl.int32).to(tl.float32, bitcast=True)

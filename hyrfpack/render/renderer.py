@@ -63,7 +63,7 @@ class Rendering:
         rgb: (H, W, 3) display-referred colour, background included; within [0, 1] up to rounding.
         alpha: (H, W) coverage by Gaussians, 1 - transmittance.
         depth: (H, W) expected depth along the view axis in world units, 0 where nothing is hit; None unless asked.
-        decoded: (n,) indices of the Gaussians that were decoded.
+        indices: (n,) of the Gaussians that were decoded.
         visible: (n,) bool, which of these touched the picture.
         absgrad: (n, 2) sums over pixels of |dL/d mean2d| in pixels; zero until backward has run; None unless asked.
         pairs: Gaussian-tile pairs blended.
@@ -73,7 +73,7 @@ class Rendering:
     rgb: Tensor
     alpha: Tensor
     depth: Tensor | None
-    decoded: Tensor
+    indices: Tensor
     visible: Tensor
     absgrad: Tensor | None
     pairs: int
@@ -158,7 +158,7 @@ def render(
         rgb=rgb,
         alpha=1 - raster.transmittance,
         depth=None if raster.depth is None else raster.depth * model.config.frame.scale,
-        decoded=index,
+        indices=index,
         visible=raster.visible,
         absgrad=gradients,
         pairs=raster.pairs,

@@ -65,8 +65,8 @@ class DensityControl:
         # To pick the visible would make the host wait for the device: zeros are added instead.
         ndc = rendering.absgrad * tensor_like((width / 2, height / 2), rendering.absgrad)
         lengths = torch.where(rendering.visible, torch.linalg.vector_norm(ndc, dim=-1), 0)
-        self.gradients.index_add_(0, rendering.decoded, lengths.to(self.gradients.dtype))
-        self.views.index_add_(0, rendering.decoded, rendering.visible.to(self.views.dtype))
+        self.gradients.index_add_(0, rendering.indices, lengths.to(self.gradients.dtype))
+        self.views.index_add_(0, rendering.indices, rendering.visible.to(self.views.dtype))
 
     def act(self, step: int, model: HybridModel, optimizer: Optimizer) -> None:
         """Run a round or a reset if one is due after this step (counted from 1)."""

@@ -180,7 +180,7 @@ def test_what_a_writer_nests_too_deep_to_be_read_is_not_written():
 
 
 def test_seeds_reach_every_group_and_codec():
-    met = {(part.type.decode(), part.codec) for data in seeds()[0] for part in disassemble(data)[1:]}
+    met = {(part.tag.decode(), part.codec) for data in seeds()[0] for part in disassemble(data)[1:]}
 
     groups = {group for group, _ in met}
     assert groups >= {*GROUPS, "POS1", "COL1", "SCA1", "OPA2"} and groups < set(SECTIONS)

@@ -1,4 +1,8 @@
-"""docs/numerics.md and the tests: what it cites exists, and it cites every hard case."""
+"""docs/numerics.md and the tests: what it cites exists, and it cites every hard case.
+
+Hard cases lie together in this folder, not each with the module that it strains, because together they are what that
+page promises: every test here is one of its rows, and what one row asks for often runs through several rooms.
+"""
 
 from __future__ import annotations
 

@@ -6,23 +6,9 @@ import torch
 from scenes import camera_at, look_at
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.model import Frame, contract
+from hyrfpack.model import Frame
 from hyrfpack.model.frame import THINNEST_AXIS
 from hyrfpack.scene import Camera
-
-
-def contract_float64(u: np.ndarray) -> np.ndarray:
-    """The contraction as the paper defines it (with + 0.5), in numpy; the norm by hypot, which cannot overflow."""
-    u = u.astype(np.float64)
-    radius = np.hypot(np.hypot(u[:, 0], u[:, 1]), u[:, 2])[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        outside = 0.25 * (2 - 1 / radius) * u / radius + 0.5
-    return np.where(radius <= 1, 0.25 * u + 0.5, outside)
-
-
-def random_directions(count: int, seed: int = 0) -> np.ndarray:
-    vectors = np.random.default_rng(seed).normal(size=(count, 3))
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def a_camera(position=(3.0, -2.0, 1.0), target=(0.1, 0.2, 0.3)) -> Camera:
@@ -33,71 +19,6 @@ def project(points: np.ndarray, pose: np.ndarray, camera: Camera) -> np.ndarray:
     """(N, 3): column, row and depth, by the pinhole formula."""
     x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).T
     return np.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, z), axis=1)
-
-
-@pytest.mark.parametrize("radius", [0.0, 1e-20, 1e-3, 0.5, 0.999999, 1.0, 1.000001, 2.0, 100.0, 1e8, 1e20, 1e30])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_contract_matches_the_formula(radius, dtype):
-    u = torch.from_numpy(radius * random_directions(200)).to(dtype)
-
-    cube = contract(u)
-
-    expected = contract_float64(u.double().numpy())
-    np.testing.assert_allclose(cube.numpy(), expected, rtol=0, atol=1e-6 if dtype == torch.float32 else 1e-14)
-
-
-def test_contract_stays_finite_and_inside_for_float32_up_to_1e30():
-    generator = np.random.default_rng(1)
-    u = np.float32(10.0 ** generator.uniform(-30, 30, (50_000, 1)) * random_directions(50_000))
-    u[:1000] = np.diag([1e30, -1e30, 1e30]).astype(np.float32)[generator.integers(3, size=1000)]  # on the axes
-
-    cube = contract(torch.from_numpy(u))
-
-    assert torch.isfinite(cube).all()
-    assert cube.min() >= 0 and cube.max() <= 1
-
-
-def test_contract_keeps_the_inner_ball_in_the_inner_half():
-    u = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 0, 0.5], [0, 0, 0]])
-    expected = torch.tensor([[0.75, 0.5, 0.5], [0.25, 0.5, 0.5], [0.5, 0.5, 0.625], [0.5, 0.5, 0.5]])
-    assert torch.equal(contract(u), expected)
-
-
-def test_contract_keeps_directions_and_orders_radii():
-    radii = torch.logspace(-3, 6, 200, dtype=torch.float64)
-    direction = torch.tensor([0.48, -0.6, 0.64], dtype=torch.float64)
-
-    offsets = contract(radii[:, None] * direction) - 0.5
-
-    lengths = torch.linalg.vector_norm(offsets, dim=1)
-    assert (lengths.diff() > 0).all() and lengths[-1] < 0.5
-    torch.testing.assert_close(offsets / lengths[:, None], direction.expand(200, 3))
-
-
-def test_contract_is_c1_at_the_unit_sphere():
-    directions = torch.from_numpy(random_directions(50, seed=2))
-    step = 1e-7
-
-    def jacobians(radius: float) -> torch.Tensor:
-        return torch.stack([torch.autograd.functional.jacobian(contract, radius * d) for d in directions])
-
-    below, above = jacobians(1 - step), jacobians(1 + step)
-
-    torch.testing.assert_close(contract((1 - step) * directions), contract((1 + step) * directions), rtol=0, atol=1e-7)
-    torch.testing.assert_close(below, above, rtol=0, atol=1e-6)
-    torch.testing.assert_close(below, 0.25 * torch.eye(3).double().expand(50, 3, 3), rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("radius", [0.3, 0.9, 1.1, 3.0, 40.0])
-def test_contract_passes_gradcheck(radius):
-    u = torch.from_numpy(radius * random_directions(6, seed=3)).requires_grad_()
-    assert torch.autograd.gradcheck(contract, (u,), eps=1e-6, atol=1e-7)
-
-
-def test_contract_gradient_is_finite_at_hard_points():
-    u = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 1], [1e30, 1e30, -1e30], [1e-38, 0, 0]], requires_grad=True)
-    contract(u).sum().backward()
-    assert torch.isfinite(u.grad).all()
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e6])

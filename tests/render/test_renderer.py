@@ -127,7 +127,7 @@ def test_the_near_plane_is_in_local_units(depth, seen):
     model = small_model([on_axis], frame=FRAME, scale_logits=-6.0)
     with torch.no_grad():
         rendering = render(model, camera, RenderSettings(near=0.01))
-    assert len(rendering.decoded) == rendering.visible.sum() == seen
+    assert len(rendering.indices) == rendering.visible.sum() == seen
     assert bool(rendering.alpha.max() > 0) == seen
 
 
@@ -324,8 +324,8 @@ def test_statistics_describe_the_picture():
     model, camera = ball_model(), camera_at((0, -3.0, 0), (0.5, 0, 0), focal=60.0)
     with torch.no_grad():
         rendering = render(model, camera)
-    assert 0 < len(rendering.decoded) < len(model)  # the camera sees a part
-    assert 0 < rendering.visible.sum() <= len(rendering.decoded)
+    assert 0 < len(rendering.indices) < len(model)  # the camera sees a part
+    assert 0 < rendering.visible.sum() <= len(rendering.indices)
     assert rendering.pairs >= rendering.visible.sum()
     assert {"cull", "decode", "background"} < set(rendering.seconds)
     assert all(seconds >= 0 for seconds in rendering.seconds.values())

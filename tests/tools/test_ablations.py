@@ -209,8 +209,8 @@ def test_without_pre_culling_every_gaussian_is_decoded():
     with ablations.culling(ablation_models.NO_CULLING):
         everything = render(model, camera)
 
-    assert len(everything.decoded) == len(model)
-    assert len(render(model, camera).decoded) < len(model)
+    assert len(everything.indices) == len(model)
+    assert len(render(model, camera).indices) < len(model)
 
 
 @pytest.mark.parametrize("steps", [1, 3], ids=["in the last step", "midway"])

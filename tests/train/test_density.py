@@ -317,8 +317,8 @@ def test_short_runs_have_a_schedule_too(steps):
     assert 1 <= len(model) <= 30
 
 
-def seen_by(decoded, visible, absgrad) -> SimpleNamespace:
-    return SimpleNamespace(decoded=torch.tensor(decoded), visible=torch.tensor(visible), absgrad=torch.tensor(absgrad))
+def seen_by(indices, visible, absgrad) -> SimpleNamespace:
+    return SimpleNamespace(indices=torch.tensor(indices), visible=torch.tensor(visible), absgrad=torch.tensor(absgrad))
 
 
 def test_views_add_gradients_in_ndc_for_what_was_visible():
@@ -336,7 +336,7 @@ def test_views_add_gradients_in_ndc_for_what_was_visible():
 
 def test_views_without_gradients_leave_no_trace():
     _, _, density = set_up(gradients=0.25)
-    density.observe(SimpleNamespace(decoded=torch.tensor([3]), visible=torch.tensor([True]), absgrad=None), 10, 10)
+    density.observe(SimpleNamespace(indices=torch.tensor([3]), visible=torch.tensor([True]), absgrad=None), 10, 10)
     assert (density.gradients == 0.25).all() and (density.views == 1).all()
 
 

@@ -43,7 +43,7 @@ RANGES = {"log2_table_size": (3, 25), "levels": (0, 33), "base": (1, 70), "fines
 class Part:
     """A section to be written: fields of its line in the table of contents, and its bytes."""
 
-    type: bytes
+    tag: bytes
     codec: int
     flags: int
     data: bytes
@@ -60,7 +60,7 @@ def assemble(parts: list[Part]) -> bytes:
     toc, payloads = [], []
     for part in parts:
         stored, crc = len(part.data), zlib.crc32(part.data)
-        fields = (part.type, part.codec & 0xFFFF, part.flags & 0xFFFF, offset, stored, part.raw_length % 2**64, crc, 0)
+        fields = (part.tag, part.codec & 0xFFFF, part.flags & 0xFFFF, offset, stored, part.raw_length % 2**64, crc, 0)
         toc.append(struct.pack("<4sHHQQQII", *fields))
         payloads.append(part.data + bytes(-stored % 8))
         offset += stored + -stored % 8
@@ -152,9 +152,9 @@ def seeds() -> tuple[tuple[bytes, ...], tuple[float, ...]]:
             arrays, parts = to_arrays(decode_model(data)), disassemble(data)
             for part in parts[1:]:
                 # Other sections need the lattice of codec 6.
-                if rng.random() < exchanged and (profile == "raw" or part.type != b"POSI"):
+                if rng.random() < exchanged and (profile == "raw" or part.tag != b"POSI"):
                     part.codec = rng.choice((2, 3, 3, 4, 4))
-                    part.data = _codec(arrays[part.type.decode()], part.codec, rng)
+                    part.data = _codec(arrays[part.tag.decode()], part.codec, rng)
             files.append((assemble(parts), weight))
     return tuple(zip(*files, strict=True))
 
@@ -272,7 +272,7 @@ def _forge_sections(rng: Random) -> bytes:
         elif kind == 7:
             parts[one].flags = rng.choice((0, 1, 2, 65535))
         else:
-            parts[one].type = rng.choice(
+            parts[one].tag = rng.choice(
                 (b"NEW_", b"posi", b"\0\0\0\0", b"\xff\n\x1b ", b"META", b"POSI", b"POS1", b"COL3")
             )
     return assemble(parts)
@@ -283,7 +283,7 @@ def _forge_payload(rng: Random) -> bytes:
     parts = [replace(part) for part in _pick(rng)]
     part = rng.choice(parts)
     part.data = edit_bytes(part.data, rng)
-    if part.type == b"META" and part.codec == 0:
+    if part.tag == b"META" and part.codec == 0:
         part.raw_length = len(part.data)
     return assemble(parts)
 
@@ -327,7 +327,7 @@ def _forge_metadata(rng: Random) -> bytes:
         try:
             shapes = group_shapes(parse_config(values["config"]), int(values["gaussians"]))
             for part in parts[1:]:
-                rows, columns = shapes[part.type.decode()]
+                rows, columns = shapes[part.tag.decode()]
                 part.raw_length = 4 * rows * columns
         except Exception:  # the metadata is no longer sane, and need not be
             pass
@@ -397,7 +397,7 @@ def _fields(part: Part) -> dict[str, bytes | tuple[int, int]]:
     if part.codec == 6:
         return _points_fields(part.data)
     if part.codec == 7:
-        return _channels_fields(part.data, 3 if part.type[:3] == b"COL" else 1)
+        return _channels_fields(part.data, 3 if part.tag[:3] == b"COL" else 1)
     if part.codec == 8:
         return _groups_fields(part.data)
     if part.codec == 4:

@@ -21,12 +21,12 @@ from hyrfpack.ops.rasterize import reference
 from hyrfpack.ops.rasterize.gpu_ellipse import TILE, UNIT, ellipse, tile_columns, tile_rows
 from hyrfpack.ops.shade.directions import viewpoint_of
 
-# One record of a projected Gaussian: 16 float32, read and written two at a time as one 64-bit word, which halves the
-# number of loads. With Sigma = its 2D covariance and d = pixel - mean,
+# One record of a projected Gaussian: 16 float32, read and written in pairs, see gpu_pairs. With Sigma = its 2D
+# covariance and d = pixel - mean,
 #     u = U_X (x - REF_X) + U_Y (y - REF_Y) + U_0,  v = V_X (x - REF_X) + V_0,  d^T Sigma^-1 d = 2 ln 2 (u^2 + v^2)
 # so that alpha = 2^(LOG_OPACITY - u^2 - v^2). Squares of a triangular form lose nothing to cancellation on long
 # needles, and are never negative. REF is the mean, or the picture's point next to it: the form of a needle whose mean
-# is far outside is exact where it is seen. Word by word:
+# is far outside is exact where it is seen. Pair by pair:
 #     REF_X REF_Y | U_0 V_0 | U_X U_Y | V_X LOG_OPACITY | RED GREEN | BLUE DEPTH | MEAN_X MEAN_Y | COV_XX COV_YY
 REFERENCE, OFFSET, U_SLOPES, V_SLOPE_OPACITY, RED_GREEN, BLUE_DEPTH, MEAN, COVARIANCE = map(tl.constexpr, range(8))
 WORDS = tl.constexpr(8)
