@@ -11,7 +11,7 @@ import torch
 from scenes import ball_points, ball_scene, ring, small_model
 
 import hyrfpack
-from hyrfpack.bench import GROUPS, bench, operations, rendering, subject
+from hyrfpack.bench import GROUPS, bench, rendering, subject
 from hyrfpack.bench.codec import KNOBS, codec_rows, parameter_errors
 from hyrfpack.bench.operations import hash_encode_rows, mlp_rows, rasterize_rows
 from hyrfpack.bench.rendering import EXACT, SWEEPS, render_rows
@@ -22,6 +22,7 @@ from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.paper import PaperSettings
 from hyrfpack.measure import timing
+from hyrfpack.model import calls
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.rasterize import rasterize
@@ -266,7 +267,7 @@ def test_a_result_that_is_not_finite_stops_the_measurement():
 
 @pytest.mark.parametrize(
     ("measure", "module", "operation"),
-    [(hash_encode_rows, operations, "hash_encode"), (render_rows, rendering, "render")],
+    [(hash_encode_rows, calls, "hash_encode"), (render_rows, rendering, "render")],
 )
 def test_time_to_compile_kernels_is_nobodys_time(monkeypatch, measure, module, operation):
     now, compiled, run = [0.0], [], getattr(module, operation)

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from hyrfpack.model.calls import Call
 from hyrfpack.ops.dispatch import has_triton
 from hyrfpack.ops.rasterize.reference import project
 from tools.gpu import check as gpu_check
@@ -21,7 +22,7 @@ from tools.gpu import report as gpu_report
 from tools.gpu import roofline as gpu_roofline
 from tools.gpu import tests as gpu_tests
 from tools.gpu import timing as gpu_timing
-from tools.gpu.compare import Call, checked
+from tools.gpu.compare import checked
 from tools.gpu.rows import goal
 from tools.gpu.scene import make_cameras, make_model, splats_of
 from tools.gpu.setup import Setup, find_set

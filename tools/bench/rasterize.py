@@ -15,7 +15,9 @@ from time import perf_counter, process_time
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.measure.error import difference, relative_difference, worst
+from hyrfpack.model.calls import cotangent, rasterize_call
+from hyrfpack.ops.rasterize import SHAPES, rasterize
 from hyrfpack.parallel.pool import thread_count
 
 WORKLOADS = {"A": (50_000, 320, 240, 1.75), "B": (200_000, 800, 800, 2.6)}  # Gaussians, width, height, sigma in px
@@ -24,8 +26,8 @@ REFERENCE_TURNS = (1, 4)  # enough for what takes seconds
 STAGES = ("project", "sort", "bin", "blend", "forward", "backward")
 
 
-def workload(name: str) -> tuple[list[Tensor], tuple]:
-    """Gaussians (means, quats, scales, opacities, colors) spread over the picture at depths 2 to 8, and the camera."""
+def workload(name: str) -> tuple[dict[str, Tensor], tuple]:
+    """Gaussians as `rasterize` takes them, spread over the picture at depths 2 to 8, and the camera."""
     count, width, height, sigma = WORKLOADS[name]
     generator = torch.Generator().manual_seed(0)
     focal = 1.2 * width
@@ -38,25 +40,22 @@ def workload(name: str) -> tuple[list[Tensor], tuple]:
     opacities = torch.sigmoid(1.5 * torch.randn(count, generator=generator) - 1)
     colors = torch.rand(count, 3, generator=generator)
     camera = torch.eye(4, dtype=torch.float64), (focal, focal, width / 2, height / 2), width, height
-    return [means, quats, scales, opacities, colors], camera
+    return dict(zip(SHAPES, (means, quats, scales, opacities, colors), strict=True)), camera
 
 
-def run(inputs: list[Tensor], camera: tuple, implementation: str) -> tuple[dict[str, float], list[Tensor]]:
-    """One forward and one backward: milliseconds of each stage and of processor time; picture, T and gradients."""
-    inputs = [tensor.detach().clone().requires_grad_() for tensor in inputs]
-    absgrad = torch.zeros(len(inputs[0]), 2, dtype=inputs[0].dtype)
-    generator = torch.Generator().manual_seed(1)
+def run(inputs: dict[str, Tensor], camera: tuple, implementation: str) -> dict[str, float]:
+    """Milliseconds of each stage of one forward and one backward pass, and of processor time."""
+    leaves = [tensor.detach().clone().requires_grad_() for tensor in inputs.values()]
+    absgrad = torch.zeros(len(leaves[0]), 2)
     width, height = camera[2:]
-    cotangents = [torch.randn(height, width, 3, generator=generator), torch.randn(height, width, generator=generator)]
-    cotangents = [tensor.to(inputs[0].dtype) for tensor in cotangents]
+    upstream = cotangent(torch.empty(height, width, 3)), cotangent(torch.empty(height, width))
     started, work = perf_counter(), process_time()
-    picture = rasterize(*inputs, *camera, absgrad=absgrad, implementation=implementation)
+    picture = rasterize(*leaves, *camera, absgrad=absgrad, implementation=implementation)
     between, work_between = perf_counter(), process_time()
-    torch.autograd.backward([picture.rgb, picture.transmittance], cotangents)
+    torch.autograd.backward([picture.rgb, picture.transmittance], upstream)
     times = {**picture.seconds, "forward": between - started, "backward": perf_counter() - between}
     times |= {"forward_work": work_between - work, "backward_work": process_time() - work_between}
-    outputs = [picture.rgb.detach(), picture.transmittance.detach(), *(tensor.grad for tensor in inputs)]
-    return {"pairs": picture.pairs, **{stage: 1e3 * seconds for stage, seconds in times.items()}}, outputs
+    return {"pairs": picture.pairs, **{stage: 1e3 * seconds for stage, seconds in times.items()}}
 
 
 def bench() -> list[dict]:
@@ -68,11 +67,11 @@ def bench() -> list[dict]:
     for turn in range(REPEATS):
         for key, call in calls.items():
             if key[1] == "cpu":
-                times[key].append(run(*call, "cpu")[0])
+                times[key].append(run(*call, "cpu"))
             elif turn in REFERENCE_TURNS:
                 threads = torch.get_num_threads()
                 torch.set_num_threads(1)
-                times[key].append(run(*call, "reference")[0])
+                times[key].append(run(*call, "reference"))
                 torch.set_num_threads(threads)
 
     rows = []
@@ -88,19 +87,19 @@ def bench() -> list[dict]:
     return [rows[0] | errors(*calls["A", "cpu"]), *rows[1:]]
 
 
-def errors(inputs: list[Tensor], camera: tuple) -> dict[str, float]:
-    """Of picture and transmittance, at most; and of the gradients, relative to their length, the worst of the five.
+def errors(inputs: dict[str, Tensor], camera: tuple) -> dict[str, float]:
+    """Of picture and transmittance, at most; and of the gradients, relative to their rms, the worst of the five.
 
     A few pixels are off by more than rounding, where alpha or T falls on the other side of its threshold; the share of
     those beyond 1e-5 is told apart.
     """
-    ours = run(inputs, camera, "cpu")[1]
-    exact = run([tensor.double() for tensor in inputs], camera, "reference")[1]
-    values = torch.cat([(a - b).abs().flatten() for a, b in zip(ours[:2], exact[:2], strict=True)])
+    call = rasterize_call(inputs, *camera)
+    (values, gradients), (exact, slopes) = call.both("cpu")(), call.both("reference", torch.float64)()
+    pairs = zip(call.wanted, gradients, slopes, strict=True)
     return {
-        "value_error": float(values.max()),
-        "share_beyond_1e-5": float((values > 1e-5).double().mean()),
-        "gradient_error": max(float((a - b).norm() / b.norm()) for a, b in zip(ours[2:], exact[2:], strict=True)),
+        "value_error": difference(values, exact, "picture").max,
+        "share_beyond_1e-5": float(((values - exact).abs() > 1e-5).double().mean()),
+        "gradient_error": worst([relative_difference(found, right, name) for name, found, right in pairs]).rms,
     }
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hyrfpack.measure.error import difference, relative_difference
 from hyrfpack.measure.timing import take_turns
-from hyrfpack.ops.ssim import photometric_loss
+from hyrfpack.model.calls import loss_call
 
 REPEATS = 7
 SIZES = ((200, 200), (240, 320), (800, 800))  # height, width
@@ -21,26 +22,18 @@ def pictures(height: int, width: int) -> tuple[Tensor, Tensor]:
     return (smooth + noise).clamp(0, 1), smooth.contiguous()
 
 
-def value_and_gradient(image: Tensor, target: Tensor, mask: Tensor | None, implementation: str) -> tuple[float, Tensor]:
-    image = image.clone().requires_grad_()
-    loss = photometric_loss(image, target, mask, implementation=implementation)
-    loss.backward()
-    return loss.item(), image.grad
-
-
 def compare(image: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, float]:
     """Times of loss and gradient together, and errors against float64 (the gradient's over its largest value)."""
-    tasks = {way: lambda way=way: value_and_gradient(image, target, mask, way) for way in ("cpu", "reference")}
-    times, _ = take_turns(tasks, REPEATS)
-    value, gradient = tasks["cpu"]()
-    expected, slope = value_and_gradient(image.double(), target.double(), mask, "reference")
+    call = loss_call(image, target, mask)
+    times, results = take_turns({way: call.both(way) for way in ("cpu", "reference")}, REPEATS)
+    (value, gradients), (exact, slopes) = results["cpu"], call.both("reference", torch.float64)()
     return {
         "ms": times["cpu"].ms,
         "ns_a_pixel": 1e6 * times["cpu"].ms / image[..., 0].numel(),
         "reference_ms": times["reference"].ms,
-        "times_faster": times["reference"].ms / times["cpu"].ms,
-        "value_error": abs(value - expected),
-        "gradient_error": ((gradient - slope).abs().max() / slope.abs().max()).item(),
+        "times_faster": times["reference"].over(times["cpu"]).wall,
+        "value_error": difference(value, exact, "loss").max,
+        "gradient_error": relative_difference(*gradients, *slopes, "gradient").max,
     }
 
 

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import gc
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from hyrfpack.model import HybridModel
+from hyrfpack.model.calls import Call
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.render import render
 from hyrfpack.scene import Camera
 from tools.gpu.rows import Row, goal, kernel_rows
 from tools.gpu.scene import Splats, count_blended, disturb, make_cameras, make_model, make_scene, splats_of
 from tools.gpu.setup import GOAL_GAUSSIANS, Setup
-from tools.gpu.timing import kernel_times, synchronize, take_turns
+from tools.gpu.timing import kernel_times, median_ms, peak_mb, reset_peak, synchronize
 
 GOAL_FRAMES, GOAL_SPEED = 300.0, 0.8
 GSPLAT_TRANSMITTANCE_MIN = 1e-4  # where gsplat finishes a pixel; ours goes on as far when the two are compared
@@ -71,7 +72,7 @@ def _statistics(splats: Splats, model: HybridModel) -> Row:
 def _frames(model: HybridModel, count: int, cameras: list[Camera], setup: Setup) -> Iterator[Row]:
     """Frames a second over all cameras, by the wall clock with the device waited for at the end."""
     device = setup.torch_device
-    _reset_peak(device)
+    reset_peak(device)
     with torch.no_grad():
         decoded = model.decode()
         ways: dict[str, Callable[[Camera], object]] = {
@@ -86,7 +87,7 @@ def _frames(model: HybridModel, count: int, cameras: list[Camera], setup: Setup)
                 "model": name,
                 "frames/s": 1e3 / ms,
                 "ms": ms,
-                "peak MB": _peak(device),
+                "peak MB": peak_mb(device),
             }
             if name == "decoded once" and count == GOAL_GAUSSIANS:
                 yield goal(f"frames of {count:,} Gaussians", 1e3 / ms, GOAL_FRAMES, "frames/s", at_least=True)
@@ -111,14 +112,16 @@ def _frame_ms(draw: Callable[[Camera], object], cameras: list[Camera], setup: Se
 
 def _rasterizer(splats: Splats, count: int, setup: Setup) -> Iterator[Row]:
     """The rasteriser alone, and gsplat's on the same Gaussians; forward alone and with all gradients."""
-    tasks = _passes("hyrfpack", lambda inputs: _ours(inputs, splats))
+    draws = {"hyrfpack": partial(_ours, splats)}
     row = {"table": "Rasterising against gsplat", "Gaussians": f"{count:,}"}
     try:
-        tasks |= _passes("gsplat", _gsplat(splats))
+        draws["gsplat"] = _gsplat(splats)
     except Exception as error:  # not there, or not for this torch: whatever it is, ours is measured
         yield {**row, "status": "left out", "note": f"gsplat's rasteriser cannot be compared: {str(error)[:200]}"}
-    tasks = {name: (lambda run=run: run(splats.inputs)) for name, run in tasks.items()}
-    times = take_turns(tasks, setup.repeats, setup.torch_device)
+    calls = {name: Call(draw, splats.inputs, tuple(splats.inputs)) for name, draw in draws.items()}
+    tasks = {f"{name} forward": call.forward("auto") for name, call in calls.items()}
+    tasks |= {f"{name} forward and backward": call.both("auto") for name, call in calls.items()}
+    times = median_ms(tasks, setup.repeats, setup.torch_device)
     for way in ("forward", "forward and backward"):
         ours, theirs = times[f"hyrfpack {way}"], times.get(f"gsplat {way}")
         cells = {"pass": way, "ms": ours, "gsplat ms": theirs}
@@ -127,23 +130,12 @@ def _rasterizer(splats: Splats, count: int, setup: Setup) -> Iterator[Row]:
             yield goal(f"rasterising {count:,}, {way}", theirs / ours, GOAL_SPEED, "of gsplat's speed", at_least=True)
 
 
-def _passes(name: str, draw: Callable[[dict[str, Tensor]], Tensor]) -> dict[str, Callable]:
-    def forward(inputs: dict[str, Tensor]) -> Tensor:
-        with torch.no_grad():
-            return draw(inputs)
-
-    def both(inputs: dict[str, Tensor]) -> tuple[Tensor, ...]:
-        leaves = {key: tensor.detach().requires_grad_() for key, tensor in inputs.items()}
-        return torch.autograd.grad(draw(leaves).sum(), list(leaves.values()))
-
-    return {f"{name} forward": forward, f"{name} forward and backward": both}
+def _ours(splats: Splats, implementation: str, **inputs: Tensor) -> Tensor:
+    how = {"transmittance_min": GSPLAT_TRANSMITTANCE_MIN, "implementation": implementation}
+    return rasterize(*inputs.values(), *splats.view, **how).rgb
 
 
-def _ours(inputs: dict[str, Tensor], splats: Splats) -> Tensor:
-    return rasterize(*inputs.values(), *splats.view, transmittance_min=GSPLAT_TRANSMITTANCE_MIN).rgb
-
-
-def _gsplat(splats: Splats) -> Callable[[dict[str, Tensor]], Tensor]:
+def _gsplat(splats: Splats) -> Callable[..., Tensor]:
     """gsplat's rasteriser with the rules of ours, as far as it has them."""
     from gsplat import rasterization
 
@@ -152,19 +144,8 @@ def _gsplat(splats: Splats) -> Callable[[dict[str, Tensor]], Tensor]:
     intrinsics = view.new_tensor([[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]])
     size = splats.camera.width, splats.camera.height
 
-    def draw(inputs: dict[str, Tensor]) -> Tensor:
+    def draw(implementation: str, **inputs: Tensor) -> Tensor:
         return rasterization(*inputs.values(), view, intrinsics, *size, near_plane=0.01, packed=False)[0]
 
-    draw(splats.inputs)  # builds its extension, or fails here
+    draw("auto", **splats.inputs)  # builds its extension, or fails here
     return draw
-
-
-def _reset_peak(device: torch.device) -> None:
-    gc.collect()  # what training held
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
-
-
-def _peak(device: torch.device) -> float | None:
-    """Most memory that tensors took since, in MB."""
-    return torch.cuda.max_memory_allocated(device) / 1e6 if device.type == "cuda" else None

@@ -11,22 +11,28 @@ import torch
 from torch import Tensor
 
 from hyrfpack.model import HybridModel
-from hyrfpack.model.field import Field
+from hyrfpack.model.calls import (
+    Call,
+    decoder_inputs,
+    fields,
+    hash_encode_call,
+    loss_call,
+    mlp_call,
+    picture,
+    rasterize_call,
+)
 from hyrfpack.ops.adam import adam_step
-from hyrfpack.ops.hash_encode import hash_encode
-from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.rasterize import Rasterization, rasterize
 from hyrfpack.ops.rasterize.shaded import rasterize_shaded
-from hyrfpack.ops.shade import Shading, encode_directions, shade
-from hyrfpack.ops.ssim import photometric_loss
+from hyrfpack.ops.shade import Shading, shade
 from hyrfpack.render import RenderSettings
 from tools.gpu import roofline as roofline
-from tools.gpu.compare import Call, checked, passes, relative_error, within
+from tools.gpu.compare import checked, relative_error, within
 from tools.gpu.roofline import Work
 from tools.gpu.rows import Row
 from tools.gpu.scene import Splats, count_blended, make_cameras, make_model, splats_of
 from tools.gpu.setup import Setup
-from tools.gpu.timing import group_kernels, kernel_times, measure_rates, take_turns
+from tools.gpu.timing import group_kernels, kernel_times, measure_rates, median_ms
 
 TABLE = "Kernels"
 # Words in the names of the GPU's kernels that tell which stage of the rasteriser they are; the rest of a forward pass,
@@ -56,7 +62,7 @@ def rates_rows(setup: Setup) -> Iterator[Row]:
 def rasterize_rows(setup: Setup) -> Iterator[Row]:
     """The whole rasteriser, forward and backward; the error is that of a part of the picture."""
     splats = _splats(setup)
-    call, crop = _rasterize_call(splats), _rasterize_call(cropped(splats, setup.crop))
+    call, crop = (rasterize_call(some.inputs, *some.view) for some in (splats, cropped(splats, setup.crop)))
     drawn = rasterize(*splats.inputs.values(), *splats.view, implementation=setup.implementation)
     pairs, pixels, count = int(drawn.pairs), setup.width * setup.height, len(splats.inputs["means"])
     blended, reached = count_blended(splats)
@@ -74,7 +80,7 @@ def rasterize_rows(setup: Setup) -> Iterator[Row]:
     }
     totals = (sum(works.values(), Work(0, 0)), sum(back.values(), Work(0, 0)))
     yield from _timed("rasterize", size, call, totals, setup, crop)
-    forward, backward = passes(call, setup.implementation)
+    forward, backward = call.passes(setup.implementation)
     for way, task, parts in (("forward", forward, works), ("backward", backward, back)):
         measured = kernel_times(task, 5, setup.torch_device)
         for stage, ms in group_kernels(measured, STAGES, "bin" if way == "forward" else "other").items():
@@ -90,16 +96,11 @@ def hash_encode_rows(setup: Setup) -> Iterator[Row]:
     """Both fields' features of all Gaussians; gradients reach the table, as in training."""
     model = _model(setup)
     coords = model.cube_coords(model.gaussians.positions).detach()
-    for name, field in _fields(model):
+    for name, field in fields(model):
         grid = field.grid.config
-
-        def look_up(implementation: str, coords: Tensor, table: Tensor, grid=grid) -> Tensor:
-            return hash_encode(coords, table, grid.resolutions, grid.log2_table_size, implementation=implementation)
-
         # The table as trained ones are: numbers about 0.1, not the 1e-4 that training starts from.
-        table = 1e3 * field.grid.table.detach()
-        call = Call(look_up, {"coords": coords, "table": table}, ("table",))
-        part = Call(look_up, {"coords": _sample(coords, setup), "table": table}, ("table",))
+        numbers = 1e3 * field.grid.table.detach(), grid.resolutions, grid.log2_table_size
+        call, part = (hash_encode_call(points, *numbers) for points in (coords, _sample(coords, setup)))
         sizes = len(coords), grid.levels, grid.rows
         works = roofline.hash_encode(*sizes), roofline.hash_encode_backward(*sizes)
         size = f"{len(coords):,} points, {grid.levels} levels, {grid.rows:,} rows"
@@ -108,27 +109,9 @@ def hash_encode_rows(setup: Setup) -> Iterator[Row]:
 
 def mlp_rows(mixed: bool, setup: Setup) -> Iterator[Row]:
     """Both fields' decoders on all Gaussians."""
-    model = _model(setup)
-    positions = model.gaussians.positions.detach()
-    directions = torch.nn.functional.normalize(positions, dim=-1)
-    extra = {"geometry": None, "radiance": encode_directions(directions, model.config.direction_encoding)}
-    for name, field in _fields(model):
-        layers = len(field.weights)
-
-        def decode(implementation: str, x: Tensor, layers: int = layers, **parameters: Tensor) -> Tensor:
-            numbers = list(parameters.values())
-            return mlp(x, numbers[:layers], numbers[layers:], mixed=mixed, implementation=implementation)
-
-        with torch.no_grad():
-            x = field.features(model.cube_coords(positions), extra[name])
-            x += 0.5 * torch.randn(x.shape, generator=torch.Generator().manual_seed(0)).to(x.device)
-        parameters = {f"weight {layer}": tensor.detach() for layer, tensor in enumerate(field.weights)}
-        parameters |= {f"bias {layer}": tensor.detach() for layer, tensor in enumerate(field.biases)}
-        wanted = ("x", *parameters)
-        # A hidden number on the edge between two bfloat16 is rounded one way here and the other way there.
-        bounds = (3e-3, 1e-2) if mixed else (1e-4, 1e-3)
-        call = Call(decode, {"x": x, **parameters}, wanted, bounds)
-        part = Call(decode, {"x": _sample(x, setup), **parameters}, wanted, bounds)
+    for name, field, x in decoder_inputs(_model(setup), torch.zeros(3)):
+        x += 0.5 * torch.randn(x.shape, generator=torch.Generator().manual_seed(0)).to(x.device)
+        call, part = (mlp_call(rows, field.weights, field.biases, mixed) for rows in (x, _sample(x, setup)))
         widths = [x.shape[1], *(weight.shape[0] for weight in field.weights)]
         works = roofline.mlp(len(x), widths, mixed), roofline.mlp_backward(len(x), widths, mixed)
         precision = "mixed" if mixed else "float32"
@@ -153,8 +136,8 @@ def decode_rows(setup: Setup) -> Iterator[Row]:
         "geometry": lambda: model.decode_geometry(),
         "radiance": lambda: model.decode_colors(viewpoint),
     }
-    times = take_turns(tasks, setup.repeats, setup.torch_device)
-    for (name, field), (values, reference) in zip(_fields(model), (geometry, colors), strict=True):
+    times = median_ms(tasks, setup.repeats, setup.torch_device)
+    for (name, field), (values, reference) in zip(fields(model), (geometry, colors), strict=True):
         widths = [field.weights[0].shape[1], *(weight.shape[0] for weight in field.weights)]
         mixed = model.precision == "mixed"
         work = roofline.decode(len(model), widths, field.grid.config.levels, field.grid.config.rows, mixed)
@@ -172,7 +155,7 @@ def shade_rows(setup: Setup) -> Iterator[Row]:
     ours = setup.implementation
     for precision, shading in _shadings(model).items():
         task = {"shade": lambda shading=shading: shade(positions, viewpoint, shading, implementation=ours)}
-        ms = take_turns(task, setup.repeats, setup.torch_device)["shade"]
+        ms = median_ms(task, setup.repeats, setup.torch_device)["shade"]
         part, exact = _shading_sample(shading, setup), _shading_sample(shading, setup, torch.float64)
         some = _sample(positions, setup)
         error = relative_error(
@@ -238,14 +221,14 @@ def rasterize_shaded_rows(setup: Setup) -> Iterator[Row]:
 
         drawn = draw()
         pairs, seen = int(drawn.pairs), int(drawn.visible.sum())
-        ms = take_turns({"draw": draw}, setup.repeats, setup.torch_device)["draw"]
+        ms = median_ms({"draw": draw}, setup.repeats, setup.torch_device)["draw"]
         project = roofline.project_shaded(len(model), seen, _widths(shading), shading.mixed)
         # The decoder's arithmetic is left to the row of its stage: it is of other units than the blending's.
         whole = Work(project.bytes, 0) + roofline.bin_pairs(seen, pairs, tiles)
         whole += roofline.blend(pairs, pixels, reached, blended)
         view = cropped(splats, setup.crop).view
         wanted = rasterize_shaded(*exact, _cast(shading, torch.float64), *view, implementation="reference")
-        error = relative_error(_picture(draw(view)), _picture(wanted))
+        error = relative_error(picture(draw(view)), picture(wanted))
         size = f"{len(model):,} Gaussians, {seen:,} visible, {pairs:,} pairs, {setup.width} x {setup.height}"
         row = _row(f"rasterize shaded, {precision}", "forward", size, ms, whole, setup)
         yield row | {"value error": error} | within(error, 3e-3 if shading.mixed else 1e-3)
@@ -275,7 +258,7 @@ def background_rows(setup: Setup) -> Iterator[Row]:
         mixed = on_gpu and precision == "mixed"
         found = model.background_grid(light, *view, **how)
         task = {"grid": lambda: model.background_grid(light, *view, **how)}
-        ms = take_turns(task, setup.repeats, setup.torch_device)["grid"]
+        ms = median_ms(task, setup.repeats, setup.torch_device)["grid"]
         work = roofline.background(light.numel(), nodes, needed, widths, grid.levels, grid.rows, mixed)
         error = relative_error(found, wanted)
         row = _row(f"background, {'mixed' if mixed else 'float32'}", "forward", size, ms, work, setup)
@@ -291,16 +274,8 @@ def ssim_rows(setup: Setup) -> Iterator[Row]:
     noise = 0.05 * torch.randn(*size, 3, generator=generator)
     pictures = [tensor.contiguous().to(setup.device) for tensor in ((smooth + noise).clamp(0, 1), smooth)]
 
-    def loss(implementation: str, image: Tensor, target: Tensor) -> Tensor:
-        return photometric_loss(image, target, implementation=implementation)
-
-    call = Call(loss, dict(zip(("image", "target"), pictures, strict=True)), ("image",))
-    image = pictures[0].clone().requires_grad_()
-
-    def both() -> Tensor:
-        return torch.autograd.grad(loss(setup.implementation, image, pictures[1]), image)[0]
-
-    ms = take_turns({"both": both}, setup.repeats, setup.torch_device)["both"]
+    call = loss_call(*pictures)
+    ms = median_ms({"both": call.both(setup.implementation)}, setup.repeats, setup.torch_device)["both"]
     words = f"{setup.width} x {setup.height}"
     work = roofline.photometric_loss(setup.width * setup.height)
     yield _row("SSIM and L1 loss", "both", words, ms, work, setup) | checked(call, setup.implementation)
@@ -321,15 +296,15 @@ def adam_rows(setup: Setup) -> Iterator[Row]:
     error = relative_error(*results)
     groups = [[state.to(setup.device)] for state in states]
     task = {"step": lambda: adam_step(*groups, **settings, implementation=setup.implementation)}
-    ms = take_turns(task, setup.repeats, setup.torch_device)["step"]
+    ms = median_ms(task, setup.repeats, setup.torch_device)["step"]
     row = _row("Adam", "step", f"{count:,} numbers", ms, roofline.adam(count), setup)
     yield row | {"value error": error} | within(error, 1e-5)
 
 
 def _timed(name: str, size: str, call: Call, works: Works, setup: Setup, part: Call) -> Iterator[Row]:
     """Rows of both passes of a call; the error is that of `part`."""
-    tasks = dict(zip(("forward", "backward"), passes(call, setup.implementation), strict=True))
-    times = take_turns(tasks, setup.repeats, setup.torch_device)
+    tasks = dict(zip(("forward", "backward"), call.passes(setup.implementation), strict=True))
+    times = median_ms(tasks, setup.repeats, setup.torch_device)
     found = checked(part, setup.implementation)
     values, gradients = found.pop("value error"), found.pop("gradient error")
     yield _row(name, "forward", size, times["forward"], works[0], setup) | {"value error": values} | found
@@ -355,19 +330,6 @@ def _row(name: str, way: str, size: str, ms: float, work: Work, setup: Setup) ->
     }
 
 
-def _rasterize_call(splats: Splats) -> Call:
-    def draw(implementation: str, **tensors: Tensor) -> Tensor:
-        return _picture(rasterize(*tensors.values(), *splats.view, implementation=implementation))
-
-    # A few pixels' alpha or T falls on the other side of its threshold; their share of the length is below this.
-    return Call(draw, splats.inputs, tuple(splats.inputs), (1e-3, 1e-2))
-
-
-def _picture(drawn: Rasterization) -> Tensor:
-    """(H, W, 4) colours and transmittance."""
-    return torch.cat((drawn.rgb, drawn.transmittance[..., None]), dim=-1)
-
-
 def cropped(splats: Splats, side: int) -> Splats:
     """The middle of the picture, at most side x side pixels."""
     camera = splats.camera
@@ -386,10 +348,6 @@ def _model(setup: Setup) -> HybridModel:
 
 def _splats(setup: Setup) -> Splats:
     return splats_of(_model(setup), make_cameras(setup.views, setup.width, setup.height)[1])
-
-
-def _fields(model: HybridModel) -> list[tuple[str, Field]]:
-    return [("geometry", model.geometry), ("radiance", model.radiance)]
 
 
 def _sample(rows: Tensor, setup: Setup) -> Tensor:

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.model import Frame, Geometry, HashGridConfig, HybridModel, ModelConfig, viewpoint_of
+from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig, viewpoint_of
+from hyrfpack.model.calls import splat_inputs
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.ops.rasterize.reference import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, project
 from hyrfpack.render import render
@@ -99,19 +100,11 @@ class Splats:
         return self.pose, self.camera.intrinsics, self.camera.width, self.camera.height
 
 
-@torch.no_grad()
 def splats_of(model: HybridModel, camera: Camera) -> Splats:
     """All Gaussians of the model, decoded for one view."""
-    geometry: Geometry = model.decode_geometry()
     pose = torch.as_tensor(model.config.frame.local_pose(camera))
-    inputs = {
-        "means": model.gaussians.positions,
-        "quats": geometry.quats,
-        "scales": geometry.scales,
-        "opacities": geometry.opacities,
-        "colors": model.decode_colors(viewpoint_of(pose).to(model.gaussians.positions)),
-    }
-    return Splats({name: tensor.detach().contiguous() for name, tensor in inputs.items()}, pose, camera)
+    inputs = splat_inputs(model, viewpoint_of(pose))
+    return Splats({name: tensor.contiguous() for name, tensor in inputs.items()}, pose, camera)
 
 
 @torch.no_grad()

@@ -12,11 +12,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.hash_encode import hash_encode, level_offsets, level_resolutions
-from hyrfpack.ops.mlp import mlp
-from hyrfpack.ops.rasterize import rasterize
-from hyrfpack.ops.ssim import photometric_loss
-from tools.gpu.compare import Call, checked
+from hyrfpack.model.calls import Call, hash_encode_call, loss_call, mlp_call, rasterize_call
+from hyrfpack.ops.hash_encode import level_offsets, level_resolutions
+from tools.gpu.compare import checked
 from tools.gpu.rows import Row
 from tools.gpu.setup import Setup
 
@@ -72,13 +70,7 @@ def _rasterize(count: int, width: int, height: int, size: float, **options: obje
             "colors": torch.sigmoid(_normal(4, count, 3)),
         }
         view = (torch.eye(4, dtype=torch.float64), (width, width, width / 2, height / 2), width, height)
-
-        def draw(implementation: str, **tensors: Tensor) -> Tensor:
-            drawn = rasterize(*tensors.values(), *view, implementation=implementation, **options)
-            return torch.cat((drawn.rgb, drawn.transmittance[..., None]), dim=-1)
-
-        inputs = {name: tensor.to(device) for name, tensor in inputs.items()}
-        return Call(draw, inputs, tuple(inputs), (1e-3, 1e-2))
+        return rasterize_call({name: tensor.to(device) for name, tensor in inputs.items()}, *view, **options)
 
     return make
 
@@ -86,33 +78,21 @@ def _rasterize(count: int, width: int, height: int, size: float, **options: obje
 def _hash_encode(points: int, log2: int, wanted: tuple[str, ...]) -> Callable[[torch.device], Call]:
     def make(device: torch.device) -> Call:
         resolutions = level_resolutions(16, 8, 512)
-
-        def look_up(implementation: str, coords: Tensor, table: Tensor) -> Tensor:
-            return hash_encode(coords, table, resolutions, log2, implementation=implementation)
-
         # Numbers of 16 bits: a point lies in the same cell, at the same place, in every precision.
         coords = torch.randint(0, 1 << 16, (points, 3), generator=torch.Generator().manual_seed(0)) / (1 << 16)
         table = _normal(1, level_offsets(resolutions, log2)[-1], 2)
-        return Call(look_up, {"coords": coords.to(device), "table": table.to(device)}, wanted)
+        return hash_encode_call(coords.to(device), table.to(device), resolutions, log2, wanted)
 
     return make
 
 
 def _mlp(rows: int, widths: tuple[int, ...], mixed: bool) -> Callable[[torch.device], Call]:
     def make(device: torch.device) -> Call:
-        layers = len(widths) - 1
-        inputs = {"x": _normal(0, rows, widths[0])}
-        for layer, (i, o) in enumerate(zip(widths, widths[1:], strict=False)):
-            inputs[f"weight {layer}"] = _normal(layer + 1, o, i) / i**0.5
-        for layer, width in enumerate(widths[1:]):
-            inputs[f"bias {layer}"] = 0.1 * _normal(layer + 9, width)
-
-        def decode(implementation: str, x: Tensor, **parameters: Tensor) -> Tensor:
-            numbers = list(parameters.values())
-            return mlp(x, numbers[:layers], numbers[layers:], mixed=mixed, implementation=implementation)
-
-        inputs = {name: tensor.to(device) for name, tensor in inputs.items()}
-        return Call(decode, inputs, tuple(inputs), (3e-3, 1e-2) if mixed else (1e-4, 1e-3))
+        x = _normal(0, rows, widths[0]).to(device)
+        shapes = enumerate(zip(widths[1:], widths, strict=False))
+        weights = [(_normal(layer + 1, o, i) / i**0.5).to(device) for layer, (o, i) in shapes]
+        biases = [(0.1 * _normal(layer + 9, width)).to(device) for layer, width in enumerate(widths[1:])]
+        return mlp_call(x, weights, biases, mixed)
 
     return make
 
@@ -122,11 +102,7 @@ def _loss(height: int, width: int, share: float | None) -> Callable[[torch.devic
         target = torch.sigmoid(_normal(0, height, width, 3))
         image = (target + 0.1 * _normal(1, height, width, 3)).clamp(0, 1)
         mask = None if share is None else (_normal(2, height, width).sigmoid() < share).to(device)
-
-        def loss(implementation: str, image: Tensor, target: Tensor) -> Tensor:
-            return photometric_loss(image, target, mask, implementation=implementation)
-
-        return Call(loss, {"image": image.to(device), "target": target.to(device)}, ("image",))
+        return loss_call(image.to(device), target.to(device), mask)
 
     return make
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import time
+import gc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from statistics import median
 
 import torch
+
+from hyrfpack.measure.timing import Clock, take_turns
 
 # Written before each measurement: more than any L2 cache holds, so that each starts cold, and so much that the host has
 # queued a short task before it begins.
@@ -36,45 +37,45 @@ def synchronize(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def take_turns(
-    tasks: Mapping[str, Callable[[], object]], repeats: int, device: torch.device, seconds: float = 10.0
-) -> dict[str, float]:
+def median_ms(tasks: Mapping[str, Callable[[], object]], repeats: int, device: torch.device) -> dict[str, float]:
     """Median milliseconds of each task; they take turns.
 
-    On a GPU between two events of the stream, warm and each after a cache flush; elsewhere by the wall clock.
-
-    Args:
-        repeats: turns, at least 1.
-        seconds: no further turn is begun after this long.
+    On a GPU between two events of the stream, warm and each after a cache flush; elsewhere by the processor's clocks.
     """
-    flushed = torch.empty(FLUSHED_BYTES, dtype=torch.uint8, device=device) if device.type == "cuda" else None
-    if flushed is not None:
-        for task in tasks.values():
-            for _ in range(WARM_RUNS):
-                task()
-        synchronize(device)
-    times: dict[str, list[float]] = {name: [] for name in tasks}
-    began = time.perf_counter()
-    for turn in range(repeats):
-        if turn and time.perf_counter() - began > seconds:
-            break
-        for name, task in tasks.items():
-            times[name].append(_measure(task, flushed))
-    return {name: median(measured) for name, measured in times.items()}
+    clock = None
+    if device.type == "cuda":
+        clock = event_clock(device)
+        for task in WARM_RUNS * list(tasks.values()):  # the first builds kernels
+            task()
+    return {name: time.ms for name, time in take_turns(tasks, repeats, clock)[0].items()}
 
 
-def _measure(task: Callable[[], object], flushed: torch.Tensor | None) -> float:
-    if flushed is None:
-        start = time.perf_counter()
+def event_clock(device: torch.device) -> Clock:
+    """What times a task on a GPU by events."""
+    flushed = torch.empty(FLUSHED_BYTES, dtype=torch.uint8, device=device)
+
+    def measure(task: Callable[[], object]) -> tuple[None, float, float]:
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        flushed.zero_()
+        start.record()
         task()
-        return 1e3 * (time.perf_counter() - start)
-    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-    flushed.zero_()
-    start.record()
-    task()
-    end.record()
-    end.synchronize()
-    return start.elapsed_time(end)
+        end.record()
+        end.synchronize()
+        return None, 1e-3 * start.elapsed_time(end), 0.0
+
+    return measure
+
+
+def reset_peak(device: torch.device) -> None:
+    """Let `peak_mb` begin anew."""
+    gc.collect()  # what training held
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+
+
+def peak_mb(device: torch.device) -> float | None:
+    """Most memory that tensors took since `reset_peak`, in MB; None where nobody counts it."""
+    return torch.cuda.max_memory_allocated(device) / 1e6 if device.type == "cuda" else None
 
 
 @cache
@@ -89,7 +90,7 @@ def measure_rates(device: torch.device) -> Rates:
     tf32 = torch.backends.cuda.matmul.allow_tf32
     torch.backends.cuda.matmul.allow_tf32 = False
     try:
-        times = take_turns(
+        times = median_ms(
             {
                 "copy": lambda: target.copy_(source),
                 "bf16": lambda: half @ half,

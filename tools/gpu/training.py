@@ -12,11 +12,9 @@ from hyrfpack.model import HybridModel
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, Trainer
 from hyrfpack.train.config import FULL_STEPS
-from hyrfpack.train.density import DensityControl
-from hyrfpack.train.optimizer import Optimizer
 from tools.gpu.rows import Row, goal, kernel_rows
 from tools.gpu.setup import GOAL_GAUSSIANS, Setup
-from tools.gpu.timing import kernel_times, synchronize
+from tools.gpu.timing import kernel_times, peak_mb, reset_peak, synchronize
 
 GOAL_MINUTES = 10.0
 PROFILED_STEPS = 5
@@ -60,18 +58,16 @@ class Training:
 def timed_training(scene: Scene, model: HybridModel, setup: Setup) -> Training:
     """Train `model` on the scene for a while: warm-up, timed steps, then a few under the profiler."""
     device, count = setup.torch_device, len(model)
-    trainer = continued(scene, model, TrainConfig(steps=FULL_STEPS, max_gaussians=count), device)
+    trainer = Trainer(scene, TrainConfig(steps=FULL_STEPS, max_gaussians=count), device=device, model=model)
     errors: list[float] = []
     advance(trainer, setup.warm_steps, setup.step_seconds / 3, errors)
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
+    reset_peak(device)
     synchronize(device)
     first, start, stages = trainer.step, time.perf_counter(), dict(trainer.seconds)
     advance(trainer, setup.steps, setup.step_seconds, errors)
     synchronize(device)
-    seconds, steps = time.perf_counter() - start, trainer.step - first
+    seconds, steps, peak = time.perf_counter() - start, trainer.step - first, peak_mb(device)
     stages = {name: value - stages.get(name, 0.0) for name, value in trainer.seconds.items()}
-    peak = torch.cuda.max_memory_allocated(device) / 1e6 if device.type == "cuda" else None
     kernels = kernel_times(lambda: advance(trainer, PROFILED_STEPS, setup.step_seconds, []), 1, device)
     return Training(
         model=trainer.model,
@@ -83,16 +79,6 @@ def timed_training(scene: Scene, model: HybridModel, setup: Setup) -> Training:
         peak=peak,
         kernels={name: ms / PROFILED_STEPS for name, ms in kernels.items()},
     )
-
-
-def continued(scene: Scene, model: HybridModel, config: TrainConfig, device: torch.device) -> Trainer:
-    """A trainer at the start of a run that goes on with `model`."""
-    trainer = Trainer(scene, config, device=device)
-    model.precision = config.precision
-    trainer.model = model
-    trainer.optimizer = Optimizer(model, config.learning_rates)
-    trainer.density = DensityControl(config.density, config.steps, trainer.budget, len(model), config.seed, device)
-    return trainer
 
 
 def advance(trainer: Trainer, steps: int, seconds: float, errors: list[float]) -> None:
