@@ -12,7 +12,7 @@ from hyrfpack.bench.rows import Row
 from hyrfpack.bench.subject import Subject
 from hyrfpack.measure.error import difference, relative_difference, worst
 from hyrfpack.measure.timing import take_turns
-from hyrfpack.model import HybridModel, viewpoint_of
+from hyrfpack.model import HybridModel
 from hyrfpack.model.calls import (
     Call,
     decoder_inputs,
@@ -22,6 +22,7 @@ from hyrfpack.model.calls import (
     rasterize_call,
     splat_inputs,
 )
+from hyrfpack.ops.poses import camera_center
 from hyrfpack.scene import Camera
 
 
@@ -56,7 +57,7 @@ DEFAULT_WAY = "cpu"
 def rasterize_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
     """Draw the model's Gaussians as one view sees them; antialiased and not, forward and with all gradients."""
     model, camera, pose = _one_view(subject)
-    inputs = splat_inputs(model, viewpoint_of(pose))
+    inputs = splat_inputs(model, camera_center(pose))
     for antialiased in (False, True):
         call = rasterize_call(inputs, pose, camera.intrinsics, camera.width, camera.height, antialiased=antialiased)
         name = "antialiased, " if antialiased else ""
@@ -75,7 +76,7 @@ def hash_encode_rows(subject: Subject, repeats: int, note: Callable[[str], None]
 def mlp_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
     """Run both fields' decoders on the features of all Gaussians; the radiance field's as one view sees them."""
     model, _, pose = _one_view(subject)
-    for name, part, features in decoder_inputs(model, viewpoint_of(pose)):
+    for name, part, features in decoder_inputs(model, camera_center(pose)):
         call = mlp_call(features, part.weights, part.biases)
         yield from _compare("mlp", f"{name}, ", call, MLP_WAYS, relative_difference, repeats)
 

@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from hyrfpack.model import HashGridConfig, HybridModel, ModelConfig, viewpoint_of
+from hyrfpack.model import HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.hybrid import scale_bounds
+from hyrfpack.ops.poses import camera_center
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable
@@ -144,7 +145,7 @@ def _fit(
             errors = errors + SIZE_WEIGHT * (made.sizes + typical - shapes.sizes[some]).square()
             errors = errors + SIZE_WEIGHT * raw[:, 0].square()
             if poses:
-                viewpoint = viewpoint_of(poses[int(torch.randint(0, len(poses), (1,), generator=generator))])
+                viewpoint = camera_center(poses[int(torch.randint(0, len(poses), (1,), generator=generator))])
                 wanted = drawable.colors_from(viewpoint, some).clamp(0, 1)
                 errors = errors + COLOR_WEIGHT * (model.decode_colors(viewpoint, some) - wanted).square().sum(1)
             (weights[some] * errors).mean().backward()

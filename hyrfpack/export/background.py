@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from hyrfpack.export.bake import refuse_nonfinite, small_camera
-from hyrfpack.model import BACKGROUND_RADIUS, Frame, Geometry, HybridModel, viewpoint_of
+from hyrfpack.model import BACKGROUND_RADIUS, Frame, Geometry, HybridModel
 from hyrfpack.ops.background import pixel_directions, sphere_points
+from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.shade import encode_directions
@@ -167,7 +168,7 @@ def _seen(model: HybridModel, cameras: Sequence[Camera]) -> tuple[np.ndarray, fl
             points = torch.stack((columns, rows), -1) * STRIDE + 0.5
             colors = model.decode_background(points, camera.intrinsics, pose)
             refuse_nonfinite("background", colors)
-            places = sphere_points(viewpoint_of(pose), pixel_directions(points, camera.intrinsics, pose))
+            places = sphere_points(camera_center(pose), pixel_directions(points, camera.intrinsics, pose))
             add(places, colors, light[rows, columns].double().square().numpy())
             narrow = math.atan(min(camera.width / camera.fx, camera.height / camera.fy) / 2)
             largest = min(largest, LARGEST_CELL * narrow)

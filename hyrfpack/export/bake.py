@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.model import Geometry, HybridModel, viewpoint_of
+from hyrfpack.model import Geometry, HybridModel
+from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import ALPHA_MIN
 from hyrfpack.ops.shade import Shading, shade
@@ -113,7 +114,7 @@ def _view(model: HybridModel, geometry: Geometry, camera: Camera) -> _View:
     received, all_drawn = light(positions[drawn], geometry[drawn]), light(positions, geometry)
     all_drawn[drawn] = 0
     lit, left_out = received > 0, torch.nonzero(all_drawn).squeeze(-1)
-    return _View(viewpoint_of(pose), drawn[lit], received[lit], left_out, all_drawn[left_out])
+    return _View(camera_center(pose), drawn[lit], received[lit], left_out, all_drawn[left_out])
 
 
 def small_camera(camera: Camera, longest: int = LONGEST_SIDE) -> Camera:

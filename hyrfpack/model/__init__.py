@@ -6,7 +6,7 @@ from hyrfpack.model.hash_grid import HashGridConfig
 from hyrfpack.model.hybrid import Decoded, Geometry, HybridModel
 from hyrfpack.ops.background import RADIUS as BACKGROUND_RADIUS
 from hyrfpack.ops.contraction import contract, expand
-from hyrfpack.ops.shade import DIRECTION_FEATURES, viewpoint_of
+from hyrfpack.ops.shade import DIRECTION_FEATURES
 
 __all__ = [
     "BACKGROUND_RADIUS",
@@ -19,5 +19,4 @@ __all__ = [
     "ModelConfig",
     "contract",
     "expand",
-    "viewpoint_of",
 ]

@@ -14,8 +14,9 @@ from torch import Tensor
 
 from hyrfpack.checks import check_float, check_int, check_type
 from hyrfpack.errors import HyrfError
-from hyrfpack.model import Decoded, HybridModel, viewpoint_of
+from hyrfpack.model import Decoded, HybridModel
 from hyrfpack.model.gaussians import take_rows
+from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
@@ -137,7 +138,7 @@ def render(
             index = frustum_cull(positions, pose, *view[1:], settings.near, settings.cull_tolerance)
         with _timed(seconds, "decode"):
             geometry = model.decode_geometry(index) if decoded is None else decoded.geometry[index]
-            colors = model.decode_colors(viewpoint_of(pose), index)
+            colors = model.decode_colors(camera_center(pose), index)
         gradients = positions.new_zeros(len(index), 2) if absgrad else None
         explicit = take_rows(positions, index), geometry.quats, geometry.scales, geometry.opacities
         raster = rasterize(*explicit, colors, *view, absgrad=gradients, **how)

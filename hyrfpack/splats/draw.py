@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.model import Frame, viewpoint_of
+from hyrfpack.model import Frame
+from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import Rasterization, rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.parallel.pool import torch_on_one_thread
@@ -82,7 +83,7 @@ def draw(
         drawable.quats[index],
         drawable.scales[index],
         drawable.opacities[index],
-        drawable.colors_from(viewpoint_of(pose), index).clamp_min(0),
+        drawable.colors_from(camera_center(pose), index).clamp_min(0),
         pose,
         *size,
         near=settings.near,

@@ -15,9 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig, viewpoint_of
+from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.calls import splat_inputs
 from hyrfpack.model.gaussians import Gaussians, logit
+from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize.reference import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, project
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, Picture, Scene, View
@@ -103,7 +104,7 @@ class Splats:
 def splats_of(model: HybridModel, camera: Camera) -> Splats:
     """All Gaussians of the model, decoded for one view."""
     pose = torch.as_tensor(model.config.frame.local_pose(camera))
-    inputs = splat_inputs(model, viewpoint_of(pose))
+    inputs = splat_inputs(model, camera_center(pose))
     return Splats({name: tensor.contiguous() for name, tensor in inputs.items()}, pose, camera)
 
 

@@ -33,8 +33,9 @@ import hyrfpack
 from hyrfpack.evaluate.figures import blank_figure, save_figure
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.format.codec import PROFILES
-from hyrfpack.model import Geometry, HybridModel, viewpoint_of
+from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.gaussians import logit
+from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.render import RenderSettings, render
@@ -116,7 +117,7 @@ def bake(model: HybridModel, cameras: Sequence[Camera]) -> dict[tuple[int, float
         normal = torch.zeros(len(index), 16, 16, dtype=torch.float64)
         target = torch.zeros(len(index), 16, 3, dtype=torch.float64)
         for row, pose in zip(weights, poses, strict=True):
-            viewpoint = viewpoint_of(pose)
+            viewpoint = camera_center(pose)
             directions = torch.nn.functional.normalize(positions[index] - viewpoint, dim=-1, eps=1e-12)
             basis = harmonics_basis(directions.double())
             weighted = (row[index, None] * basis)[..., None]
@@ -202,7 +203,7 @@ def draw(splats: Splats, view: HeldOut, model: HybridModel) -> Tensor:
     positions, log_scales, quats, opacity_logits, harmonics = (
         torch.from_numpy(np.ascontiguousarray(values, np.float32))[index] for values in vars(splats).values()
     )
-    directions = torch.nn.functional.normalize(positions - viewpoint_of(pose), dim=-1, eps=1e-12)
+    directions = torch.nn.functional.normalize(positions - camera_center(pose), dim=-1, eps=1e-12)
     basis = harmonics_basis(directions)[:, : harmonics.shape[1]]
     raster = rasterize(
         positions,

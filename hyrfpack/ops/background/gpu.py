@@ -20,7 +20,7 @@ from hyrfpack.ops.background.reference import RADIUS, grid_size
 from hyrfpack.ops.gpu_pairs import unpack
 from hyrfpack.ops.hash_encode.gpu import axis_vertices, level_numbers, vertex_row, whole_rows
 from hyrfpack.ops.mlp.tiles import factor, precision, product, relu_factor
-from hyrfpack.ops.shade.directions import viewpoint_of
+from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.shade.gpu_directions import encode_block
 
 _BLOCK_ROWS = tl.constexpr(8)
@@ -231,7 +231,7 @@ def _rays(pose: Tensor, intrinsics: tuple[float, float, float, float], stride: i
     pose = pose.detach().cpu().double()
     seen = [[(0.5 - cx) / fx, (0.5 - cy) / fy, 1], [stride / fx, 0, 0], [0, stride / fy, 0]]
     rays = torch.tensor(seen, dtype=torch.float64) @ pose[:3, :3]
-    return torch.cat((rays.reshape(-1), viewpoint_of(pose))).tolist()
+    return torch.cat((rays.reshape(-1), camera_center(pose))).tolist()
 
 
 def _padded(width: int) -> int:

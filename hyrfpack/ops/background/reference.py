@@ -10,7 +10,8 @@ from torch import Tensor
 from hyrfpack.ops.contraction import contract
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
-from hyrfpack.ops.shade.directions import encode_directions, viewpoint_of
+from hyrfpack.ops.poses import camera_center
+from hyrfpack.ops.shade.directions import encode_directions
 from hyrfpack.ops.transfer import tensor_like
 
 RADIUS = 100.0  # local units, around the frame's centre
@@ -73,7 +74,7 @@ def background_colors(
     """
     pose = pose.to(table, non_blocking=table.is_cuda)
     directions = pixel_directions(points, intrinsics, pose)
-    u = sphere_points(viewpoint_of(pose), directions) / tensor_like(half_extent, table)
+    u = sphere_points(camera_center(pose), directions) / tensor_like(half_extent, table)
     features = hash_encode(contract(u), table, resolutions, log2_table_size)
     # Hash features are stored by columns, and joined so.
     inputs = torch.cat((features.T, encode_directions(directions, encoding).T)).T

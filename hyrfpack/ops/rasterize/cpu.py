@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hyrfpack.ops.rasterize import cpu_bin, cpu_blend, cpu_project
-from hyrfpack.ops.rasterize.reference import TILE
+from hyrfpack.ops.rasterize.reference import TILE, jacobian_limits
 from hyrfpack.parallel.pool import run_ranges, run_tasks, thread_count
 
 
@@ -66,14 +66,11 @@ def rasterize(
     absgrad: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, int, dict[str, float]]:
     """Arguments and results (a tuple in the order of the fields) as in `hyrfpack.ops.rasterize.rasterize`."""
-    fx, fy, cx, cy = intrinsics
-    slack_x, slack_y = 0.15 * width / fx, 0.15 * height / fy
-    limits = -cx / fx - slack_x, (width - cx) / fx + slack_x, -cy / fy - slack_y, (height - cy) / fy + slack_y
     camera = camera_from_world.detach().double().tolist()[:3]
     view = _View(
         axes=tuple(tuple(row[:3]) for row in camera),
         shift=tuple(row[3] for row in camera),
-        lens=tuple(float(number) for number in (*intrinsics, *limits)),
+        lens=tuple(float(number) for number in (*intrinsics, *jacobian_limits(intrinsics, width, height))),
         width=int(width),
         height=int(height),
         near=float(near),

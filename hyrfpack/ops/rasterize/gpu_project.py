@@ -17,9 +17,9 @@ import triton.language as tl
 from torch import Tensor
 
 from hyrfpack.ops.gpu_pairs import pack
+from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import reference
 from hyrfpack.ops.rasterize.gpu_ellipse import TILE, UNIT, ellipse, tile_columns, tile_rows
-from hyrfpack.ops.shade.directions import viewpoint_of
 
 # One record of a projected Gaussian: 16 float32, read and written in pairs, see gpu_pairs. With Sigma = its 2D
 # covariance and d = pixel - mean,
@@ -108,13 +108,12 @@ def camera_numbers(
     """
     fx, fy, cx, cy = (float(number) for number in intrinsics)
     pose = camera_from_world.detach().to("cpu", torch.float64)
-    slack_x, slack_y = 0.15 * width / fx, 0.15 * height / fy
     margin_x, margin_y = tolerance * width / 2, tolerance * height / 2
     numbers = [
         *pose[:3, :3].flatten().tolist(), *pose[:3, 3].tolist(), fx, fy, cx, cy, near,
-        -cx / fx - slack_x, (width - cx) / fx + slack_x, -cy / fy - slack_y, (height - cy) / fy + slack_y,
+        *reference.jacobian_limits((fx, fy, cx, cy), width, height),
         -margin_x - cx, width + margin_x - cx, -margin_y - cy, height + margin_y - cy,
-        *viewpoint_of(pose).tolist(),
+        *camera_center(pose).tolist(),
     ]  # fmt: skip
     # Not blocking: so small a copy is taken over at once, and a blocking one would wait for the device.
     return torch.tensor(numbers, dtype=torch.float64).to(device, non_blocking=True)

@@ -50,6 +50,18 @@ class Projected:
         return Projected(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
 
+def jacobian_limits(
+    intrinsics: tuple[float, float, float, float], width: int, height: int
+) -> tuple[float, float, float, float]:
+    """The x/z (least, most) and y/z (least, most) that the projection's Jacobian is taken at, at most.
+
+    It is the field of view widened by 0.15 of its size on each side (the 3DGS rule, about the principal point).
+    """
+    fx, fy, cx, cy = intrinsics
+    slack_x, slack_y = 0.15 * width / fx, 0.15 * height / fy
+    return -cx / fx - slack_x, (width - cx) / fx + slack_x, -cy / fy - slack_y, (height - cy) / fy + slack_y
+
+
 def project(
     means: Tensor,
     quats: Tensor,
@@ -65,8 +77,7 @@ def project(
     """Project 3D Gaussians to 2D Gaussians (EWA splatting).
 
     With p = R m + t the mean in the camera and J the Jacobian of the pinhole projection at p, the picture's
-    covariance is J R Q diag(s^2) Q^T R^T J^T + 0.3 I. J is taken with x/z and y/z clamped to the field of view
-    widened by 0.15 of its size on each side (the 3DGS rule, about the principal point).
+    covariance is J R Q diag(s^2) Q^T R^T J^T + 0.3 I. J is taken with x/z and y/z clamped to `jacobian_limits`.
     Gaussians at z <= near are dropped. Arguments as in `hyrfpack.ops.rasterize.rasterize`.
     """
     fx, fy, cx, cy = intrinsics
@@ -78,9 +89,8 @@ def project(
     x, y, z = seen[index].to(means.dtype).unbind(-1)
     x_z, y_z = x / z, y / z
 
-    slack_x, slack_y = 0.15 * width / fx, 0.15 * height / fy
-    clamped_x = x_z.clamp(-cx / fx - slack_x, (width - cx) / fx + slack_x)
-    clamped_y = y_z.clamp(-cy / fy - slack_y, (height - cy) / fy + slack_y)
+    left, right, top, bottom = jacobian_limits(intrinsics, width, height)
+    clamped_x, clamped_y = x_z.clamp(left, right), y_z.clamp(top, bottom)
     zero = torch.zeros_like(z)
     jacobian = torch.stack([fx / z, zero, -fx * clamped_x / z, zero, fy / z, -fy * clamped_y / z], -1).view(-1, 2, 3)
     half = jacobian @ camera[:3, :3].to(means.dtype) @ _rotations(quats[index]) * scales[index, None, :]

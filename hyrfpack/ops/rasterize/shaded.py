@@ -7,10 +7,11 @@ import dataclasses
 import torch
 from torch import Tensor
 
+from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import Rasterization, check, rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
-from hyrfpack.ops.shade import Shading, check_shading, choose_for, shade, viewpoint_of
+from hyrfpack.ops.shade import Shading, check_shading, choose_for, shade
 
 
 @torch.no_grad()
@@ -78,7 +79,7 @@ def rasterize_shaded(
     seen = dataclasses.replace(
         shading, first_layer=shading.first_layer[index], color_logits=shading.color_logits[index]
     )
-    colors = shade(means[index], viewpoint_of(pose), seen)
+    colors = shade(means[index], camera_center(pose), seen)
     drawn = rasterize(
         means[index],
         quats[index],

@@ -17,7 +17,6 @@ from hyrfpack.ops.shade.directions import (
     encode_directions,
     frequency_encoding,
     spherical_harmonics,
-    viewpoint_of,
 )
 
 __all__ = [
@@ -30,7 +29,6 @@ __all__ = [
     "frequency_encoding",
     "shade",
     "spherical_harmonics",
-    "viewpoint_of",
 ]
 
 

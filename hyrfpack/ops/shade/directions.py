@@ -1,4 +1,4 @@
-"""Where a camera looks from, and what a decoder sees of a viewing direction."""
+"""What a decoder sees of a viewing direction."""
 
 from __future__ import annotations
 
@@ -9,11 +9,6 @@ from torch import Tensor
 
 FREQUENCY_OCTAVES = 4
 DIRECTION_FEATURES = {"sh": 9, "frequency": 6 * FREQUENCY_OCTAVES}
-
-
-def viewpoint_of(pose: Tensor) -> Tensor:
-    """Where a camera stands (3,), by its pose camera_from_world (4, 4): -R^T t."""
-    return -(pose[:3, :3].T @ pose[:3, 3])
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
