@@ -40,6 +40,16 @@ def ring(count: int, radius: float = 3.0, elevation: float = 1.0, **options) -> 
     return [camera_at((radius * np.cos(a), radius * np.sin(a), elevation), **options) for a in angles]
 
 
+def moved(cameras, offset) -> list[Camera]:
+    """The cameras, each as far away as `offset` (3,)."""
+    result = []
+    for camera in cameras:
+        pose = camera.camera_from_world.copy()
+        pose[:3, 3] -= pose[:3, :3] @ np.asarray(offset)
+        result.append(Camera(camera.width, camera.height, *camera.intrinsics, pose))
+    return result
+
+
 def photograph(camera: Camera, *, scale: float = 1.0, offset=(0, 0, 0), alpha: bool = False) -> Picture:
     """Ray-cast the balls, lit from above, under an even sky (or with no coverage there)."""
     columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)

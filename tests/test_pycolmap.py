@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from scenes import BALL_CENTERS, ball_scene, small_model
 
-from hyrfpack.cameras.capture import capture_of
+from hyrfpack.cameras.capture import kept_cameras
 from hyrfpack.format import save
 from hyrfpack.splats.splats import quaternion_of
 
@@ -63,7 +63,7 @@ def folder(tmp_path_factory) -> Path:
     (tables / "images.txt").write_text("".join(images))
     points = [(number, *point, 255, 128, 0, 0) for number, point in enumerate(scene.points, start=1)]
     (tables / "points3D.txt").write_text("".join(" ".join(map(str, point)) + "\n" for point in points))
-    cameras = capture_of([view.camera for view in scene.train])
+    cameras = kept_cameras([view.camera for view in scene.train])
     save(small_model(BALL_CENTERS, scale_logits=0.0), folder / "model.hyrf", provenance={"cameras": cameras})
     return folder
 

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from hyrfpack.bench.rows import difference
-from hyrfpack.cameras.capture import stored_cameras
-from hyrfpack.cameras.paths import orbit, stored_viewpoint
+from hyrfpack.cameras.capture import Capture
+from hyrfpack.cameras.paths import orbit
 from hyrfpack.compress.distortion import default_distortion
 from hyrfpack.data import load_scene
 from hyrfpack.demo.scene import write_demo_scene
@@ -104,14 +104,20 @@ def read_subject(path: str | os.PathLike[str], scene: Scene | None) -> Subject:
     facts, model = describe(path), load(path)
     if len(model) == 0:
         raise HyrfError(f"{path}: the model has no Gaussians, so there is nothing to measure; name another")
+    capture = Capture(facts, scene)
     if scene is None:
-        cameras, photos = orbit(stored_viewpoint(facts), VIEWS), None
+        cameras, photos = orbit(capture.viewpoint, VIEWS), None
     else:
         views, photos = _photos(scene, model)
         cameras = [view.camera for view in views]
-    capture = stored_cameras(facts) if scene is None else [view.camera for view in scene.train]
     return Subject(
-        os.fspath(path), facts["profile"], model, cameras, photos, capture, default_distortion(facts["provenance"])
+        os.fspath(path),
+        facts["profile"],
+        model,
+        cameras,
+        photos,
+        capture.cameras,
+        default_distortion(facts["provenance"]),
     )
 
 

@@ -1,4 +1,4 @@
-"""Where a model is looked at from when it is measured what its numbers do to pictures."""
+"""Where a model is looked at from to measure what its parts do to pictures: between its cameras, in small pictures."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from hyrfpack.scene import Camera
 
+LONGEST_SIDE = 512  # pixels of pictures in which light is measured
 WIDER = 1.4  # sides of the pictures between the cameras: what lies just outside the photos is seen too
 _NEAREST = 3  # neighbours that a camera is moved towards
 _TURN = 10.0  # what a turn by a radian counts as in finding them, in median distances between neighbours
@@ -38,6 +39,16 @@ def views_between(cameras: Sequence[Camera], seed: int = 0) -> list[Camera]:
         pose[:3, 3] = -turn @ ((1 - share) * places[index] + share * places[other])
         made.append(_wider(dataclasses.replace(camera, camera_from_world=pose)))
     return made
+
+
+def small_camera(camera: Camera, longest: int = LONGEST_SIDE) -> Camera:
+    """The same view in a picture of at most `longest` pixels a side: enough to learn what can be seen from there."""
+    shrink = min(1.0, longest / max(camera.width, camera.height))
+    width, height = max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink))
+    x, y = width / camera.width, height / camera.height
+    return dataclasses.replace(
+        camera, width=width, height=height, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y
+    )
 
 
 def _wider(camera: Camera) -> Camera:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
-import numpy as np
-
-from hyrfpack.cameras.files import focal_length, side_length
-from hyrfpack.cameras.paths import orbit, stored_viewpoint
+from hyrfpack.cameras.files import camera_from_numbers, camera_to_numbers
+from hyrfpack.cameras.paths import Viewpoint, orbit
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 
@@ -15,66 +14,86 @@ KEPT = 128  # cameras that a trained model keeps
 ORBIT = 48  # cameras around a model that kept none
 
 
-def capture_of(cameras: Sequence[Camera]) -> list[list[float]]:
-    """Up to KEPT of the cameras, evenly spread, as JSON: [width, height, fx, fy, cx, cy, 3 x 4 camera_from_world]."""
-    return [
-        [c.width, c.height, *map(_rounded, (*c.intrinsics, *c.camera_from_world[:3].ravel()))]
-        for c in evenly_spaced(cameras, KEPT)
-    ]
+def kept_cameras(cameras: Sequence[Camera]) -> list[list[float]]:
+    """Up to KEPT of the cameras, evenly spread, as the "cameras" of a provenance: see `camera_to_numbers`."""
+    return [camera_to_numbers(camera) for camera in evenly_spaced(cameras, KEPT)]
 
 
-def _rounded(number: float) -> float:
-    """To nine digits, or where these are not six behind the point, as with map coordinates, to six."""
-    return float(f"{number:.9g}") if abs(number) < 1000 else round(float(number), 6)
+def kept_of(scene: Scene) -> dict:
+    """What the provenance of a model trained on a scene keeps of it, for `Capture`.
 
-
-def stored_cameras(facts: dict) -> list[Camera]:
-    """The cameras that a model keeps, or else an orbit about what it shows.
-
-    Args:
-        facts: from `hyrfpack.describe`.
-
-    Raises:
-        HyrfDataError: they make no sense.
+    `max_size` is left out where reading the photos again with DEFAULT_MAX_SIZE gives the same pictures: a model of
+    small photos is the same file, byte for byte, whether or not there is such a limit.
     """
-    capture = facts["provenance"].get("cameras")
-    if not capture:
-        return orbit(stored_viewpoint(facts), ORBIT)
-    try:
-        return [
-            Camera(
-                side_length(width),
-                side_length(height),
-                focal_length(fx),
-                focal_length(fy),
-                float(cx),
-                float(cy),
-                np.reshape(pose, (3, 4)),
-            )
-            for width, height, fx, fy, cx, cy, *pose in capture
-        ]
-    except (TypeError, ValueError, ArithmeticError) as error:
-        raise HyrfDataError(
-            f"the cameras that the file keeps make no sense ({error!s:.160}); name the photos with --data"
-        ) from error
-
-
-def max_size_of(scene: Scene) -> int | None:
-    """The limit on the size of photos that a model trained on a scene keeps as "max_size" of its provenance.
-
-    None, for nothing, where reading them again with DEFAULT_MAX_SIZE gives the same pictures: a model of small photos
-    is the same file, byte for byte, whether or not there is such a limit.
-    """
+    cameras = [view.camera for view in scene.train]
+    kept = {"viewpoint": Viewpoint.of(cameras).to_json(), "cameras": kept_cameras(cameras)}
     small = all(max(view.camera.width, view.camera.height) < DEFAULT_MAX_SIZE for view in scene.views)
-    return None if small and scene.max_size == DEFAULT_MAX_SIZE else scene.max_size
+    needless = scene.max_size is None or (small and scene.max_size == DEFAULT_MAX_SIZE)
+    return kept if needless else {**kept, "max_size": scene.max_size}
 
 
-def stored_max_size(facts: dict) -> int:
-    """The `max_size` of `load_scene` that gives photos the size which a model was trained at.
+@dataclass(frozen=True)
+class Capture:
+    """How a model was photographed, by its file or by photos at hand. Nothing is read of it before it is asked for.
 
-    Args:
-        facts: from `hyrfpack.describe`. DEFAULT_MAX_SIZE where they say nothing of use.
+    Attributes:
+        facts: from `hyrfpack.describe`, which lies floors above: the caller asks it.
+        scene: photos of the same; without photos to train on it counts for nothing.
     """
-    stored = facts["provenance"].get("max_size")
-    usable = isinstance(stored, int) and not isinstance(stored, bool) and stored >= 0
-    return stored if usable else DEFAULT_MAX_SIZE
+
+    facts: dict
+    scene: Scene | None = None
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Those of the photos to train on, or else those that the file keeps, or else an orbit about what it shows.
+
+        Raises:
+            HyrfDataError: what the file says makes no sense.
+        """
+        if self._photographed:
+            return self._photographed
+        if self.made_up:
+            return orbit(self.viewpoint, ORBIT)
+        try:
+            return [camera_from_numbers(numbers) for numbers in self.facts["provenance"]["cameras"]]
+        except (TypeError, ValueError, ArithmeticError) as error:
+            raise HyrfDataError(
+                f"the cameras that the file keeps make no sense ({error!s:.160}); name the photos with --data"
+            ) from error
+
+    @property
+    def made_up(self) -> bool:
+        """Whether `cameras` is an orbit, because no camera is known."""
+        return not (self._photographed or self.facts["provenance"].get("cameras"))
+
+    @property
+    def viewpoint(self) -> Viewpoint:
+        """The one that the file keeps, or else one that follows from the model's frame alone.
+
+        Raises:
+            HyrfDataError: what the file says makes no sense.
+        """
+        stored, frame = self.facts["provenance"].get("viewpoint"), self.facts["config"]["frame"]
+        try:
+            if stored is None:
+                return Viewpoint.of_frame(frame["center"], frame["scale"])
+            return Viewpoint.from_json(stored)
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise HyrfDataError(
+                f"the model's viewpoint cannot be used ({error}); render with --data or --cameras instead"
+            ) from error
+
+    @property
+    def max_size(self) -> int:
+        """The `max_size` of `load_scene` that gives photos the size which the model was trained at.
+
+        DEFAULT_MAX_SIZE where the file says nothing of use.
+        """
+        stored = self.facts["provenance"].get("max_size")
+        usable = isinstance(stored, int) and not isinstance(stored, bool) and stored >= 0
+        return stored if usable else DEFAULT_MAX_SIZE
+
+    @property
+    def _photographed(self) -> list[Camera]:
+        return [] if self.scene is None else [view.camera for view in self.scene.train]

@@ -1,11 +1,11 @@
-"""Cameras to render from, in JSON files."""
+"""Cameras in JSON: every file that holds some holds them in a layout of these, and is checked here."""
 
 from __future__ import annotations
 
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,26 +15,46 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera, rigid_pose
 
 MAX_SIDE = 16384  # pixels; more is a mistake in the file
+LENS = ("width", "height", "fx", "fy", "cx", "cy")
+
+
+def camera_to_json(camera: Camera) -> dict[str, Any]:
+    """A camera as an object of "width", "height", "fx", "fy", "cx", "cy" and "camera_from_world" (4 rows)."""
+    numbers = dict(zip(LENS, (camera.width, camera.height, *camera.intrinsics), strict=True))
+    return {**numbers, "camera_from_world": camera.camera_from_world.tolist()}
+
+
+def camera_from_json(item: Mapping[str, Any]) -> Camera:
+    """The inverse of `camera_to_json`, for what anyone may have written.
+
+    Without "fy" it is "fx", without "cx" or "cy" that is the picture's middle; other keys are passed over.
+
+    Raises:
+        KeyError: something else is missing.
+        TypeError, ValueError, OverflowError: something makes no sense.
+    """
+    width, height, fx = _side_length(item["width"]), _side_length(item["height"]), _focal_length(item["fx"])
+    fy = _focal_length(item.get("fy", fx))
+    cx, cy = _finite(item.get("cx", width / 2)), _finite(item.get("cy", height / 2))
+    return Camera(width, height, fx, fy, cx, cy, item["camera_from_world"])
+
+
+def camera_to_numbers(camera: Camera) -> list[float]:
+    """A camera as a short list: width, height, fx, fy, cx, cy and the 3 x 4 camera_from_world, rounded."""
+    pose = camera.camera_from_world[:3].ravel()
+    return [camera.width, camera.height, *map(_rounded, (*camera.intrinsics, *pose))]
+
+
+def camera_from_numbers(numbers: Sequence[Any]) -> Camera:
+    """The inverse of `camera_to_numbers`, but for the rounding. Raises what `camera_from_json` does."""
+    width, height, fx, fy, cx, cy, *pose = numbers
+    lens = dict(zip(LENS, (width, height, fx, fy, cx, cy), strict=True))
+    return camera_from_json({**lens, "camera_from_world": np.reshape(pose, (3, 4))})
 
 
 def cameras_to_json(cameras: Sequence[tuple[str, Camera]]) -> str:
     """Named cameras as the JSON text that `cameras_from_json` reads."""
-    return json.dumps(
-        [
-            {
-                "name": name,
-                "width": camera.width,
-                "height": camera.height,
-                "fx": camera.fx,
-                "fy": camera.fy,
-                "cx": camera.cx,
-                "cy": camera.cy,
-                "camera_from_world": camera.camera_from_world.tolist(),
-            }
-            for name, camera in cameras
-        ],
-        indent=1,
-    )
+    return json.dumps([{"name": name, **camera_to_json(camera)} for name, camera in cameras], indent=1)
 
 
 def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
@@ -82,39 +102,16 @@ def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
 
 
 def _from_ours(item: dict[str, Any], name: str) -> tuple[str, Camera]:
-    width, height = side_length(item["width"]), side_length(item["height"])
-    fx = focal_length(item["fx"])
-    fy = focal_length(item.get("fy", fx))
-    cx, cy = _finite(item.get("cx", width / 2)), _finite(item.get("cy", height / 2))
-    return str(item.get("name", name)), Camera(width, height, fx, fy, cx, cy, item["camera_from_world"])
+    return str(item.get("name", name)), camera_from_json(item)
 
 
 def _from_transforms(item: dict[str, Any], name: str) -> tuple[str, Camera]:
-    width, height = side_length(item["w"]), side_length(item["h"])
-    if "fl_x" in item:
-        fx = focal_length(item["fl_x"])
-    else:
-        fx = focal_length(width / (2 * math.tan(_finite(item["camera_angle_x"]) / 2)))
-    fy = focal_length(item.get("fl_y", fx))
-    cx, cy = _finite(item.get("cx", width / 2)), _finite(item.get("cy", height / 2))
+    width, height = item["w"], item["h"]
+    fx = item["fl_x"] if "fl_x" in item else width / (2 * math.tan(_finite(item["camera_angle_x"]) / 2))
     world_from_camera = rigid_pose(item["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
-    name = str(item.get("file_path", name))
-    return name, Camera(width, height, fx, fy, cx, cy, np.linalg.inv(world_from_camera))
-
-
-def side_length(value: Any) -> int:
-    """A picture side in whole pixels. Raises ValueError unless it can be rendered."""
-    if value != int(value) or not 1 <= value <= MAX_SIDE:
-        raise ValueError(f"a side of {value} pixels; 1 to {MAX_SIDE} can be rendered")
-    return int(value)
-
-
-def focal_length(value: Any) -> float:
-    """A focal length in pixels. Raises ValueError unless it is positive and finite."""
-    value = _finite(value)
-    if not value > 0:
-        raise ValueError(f"a focal length of {value} pixels")
-    return value
+    size = {"width": width, "height": height, "fx": fx, "fy": item.get("fl_y", fx)}
+    camera = camera_from_json({**item, **size, "camera_from_world": np.linalg.inv(world_from_camera)})
+    return str(item.get("file_path", name)), camera
 
 
 def _finite(value: Any) -> float:
@@ -122,3 +119,22 @@ def _finite(value: Any) -> float:
     if not math.isfinite(value):
         raise ValueError(f"the number {value}")
     return value
+
+
+def _side_length(value: Any) -> int:
+    """A picture side in whole pixels that can be rendered."""
+    if value != int(value) or not 1 <= value <= MAX_SIDE:
+        raise ValueError(f"a side of {value} pixels; 1 to {MAX_SIDE} can be rendered")
+    return int(value)
+
+
+def _focal_length(value: Any) -> float:
+    value = _finite(value)
+    if not value > 0:
+        raise ValueError(f"a focal length of {value} pixels")
+    return value
+
+
+def _rounded(number: float) -> float:
+    """To nine digits, or where these are not six behind the point, as with map coordinates, to six."""
+    return float(f"{number:.9g}") if abs(number) < 1000 else round(float(number), 6)

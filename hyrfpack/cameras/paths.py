@@ -3,130 +3,136 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from hyrfpack.cameras.files import focal_length, side_length
-from hyrfpack.errors import HyrfDataError
-from hyrfpack.scene import Camera, rigid_pose
+from hyrfpack.cameras.files import LENS, camera_from_json
+from hyrfpack.scene import Camera
 
 WHOLE_CIRCLE = 270.0  # degrees of azimuth; cameras that cover more are taken to stand all around
 LEVEL_RIGHTS = 0.05  # mean squared sine of the cameras' roll up to which they count as held level
 SPREAD_RIGHTS = 0.02  # and of their heading, from which on that tells which way is up
 NARROWEST_SWING = 20.0  # degrees of an orbit about a scene photographed from nearly one direction
+SAME_WAY = 0.9  # length of the mean viewing direction from which cameras count as looking the same way
 
 
-def viewpoint_hint(cameras: Sequence[Camera]) -> dict:
-    """Sum up a capture so that a model alone can be orbited: what it looks at, which way is up, from how far.
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """What is looked at, and from where. Equal to itself alone: compare what `to_json` gives.
 
-    - `center` (3,): the point nearest to all viewing axes (least squares). Where the axes are nearly parallel or
-      point away from it, as on a drive or in a room seen from its middle, a point in front of the typical camera.
-    - `up` (3,): unit length; the axis that the pictures' rows are level about, or where that is open (all look the
-      same way, or many are turned) the mean of the cameras' up axes, or the typical camera's own.
-    - `camera_from_world` (4, 4), `intrinsics` [fx, fy, cx, cy], `width`, `height`: the typical camera, the one that
-      stands nearest to the capture's median distance and height.
-    - `arc` [first, last]: degrees of azimuth about `up`, relative to that camera, that the capture covers;
-      [0, 360] when it goes all around.
+    Attributes:
+        center: (3,) float64, what is looked at, world units.
+        up: (3,) float64, which way is up; any length but none.
+        camera: the typical camera.
+        arc: the first and the last degree of azimuth about `up`, relative to that camera, that photos cover; (0, 360)
+            when they go all around.
 
-    Args:
-        cameras: the training cameras, world units; at least one.
-
-    Returns:
-        A dictionary ready for JSON, for `orbit`.
+    Raises:
+        ValueError: a number is not finite, or too large for cameras about it to be, or `up` is no direction.
     """
-    positions = np.array([camera.position for camera in cameras])
-    forwards = np.array([camera.forward for camera in cameras])
-    up = _up_axis(np.array([camera.rotation for camera in cameras]))
-    center = _common_focus(positions, forwards)
-    if center is not None:
-        offsets = positions - center
-        heights = offsets @ up
-        radii = np.linalg.norm(offsets - np.outer(heights, up), axis=1)
-        typical = _nearest_to_median(np.stack((radii, heights), axis=1))
-        arc = _arc(offsets, up, typical)
-    else:
-        typical = _nearest_to_median(positions)
-        spread = float(np.median(np.linalg.norm(positions - positions[typical], axis=1)))
-        center = positions[typical] + forwards[typical] * (2 * spread or 1.0)
-        up = -cameras[typical].rotation[1]  # swings sideways, whatever the camera looks at
-        arc = [-NARROWEST_SWING / 2, NARROWEST_SWING / 2]
-    camera = cameras[typical]
-    return {
-        "center": center.tolist(),
-        "up": up.tolist(),
-        "camera_from_world": camera.camera_from_world.tolist(),
-        "intrinsics": list(camera.intrinsics),
-        "width": camera.width,
-        "height": camera.height,
-        "arc": arc,
-    }
+
+    center: np.ndarray
+    up: np.ndarray
+    camera: Camera
+    arc: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        others = *self.camera.position, self.camera.cx, self.camera.cy, *self.arc
+        # Cameras about it shall be finite in float32.
+        if self.center.shape != (3,) or not (np.abs([*self.center, *others]) < 1e37).all():
+            raise ValueError("a number is missing or not finite")
+        if self.up.shape != (3,) or not 0 < np.linalg.norm(self.up) < np.inf:
+            raise ValueError("'up' is no direction")
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera]) -> Viewpoint:
+        """Sum up a capture, of at least one camera.
+
+        - `center`: the point nearest to all viewing axes (least squares). Where the axes are nearly parallel or
+          point away from it, as on a drive or in a room seen from its middle, a point in front of the typical camera.
+        - `up`, of unit length: the axis that the pictures' rows are level about, or where that is open (all look the
+          same way, or many are turned) the mean of the cameras' up axes, or the typical camera's own.
+        - `camera`: the one that stands nearest to the capture's median distance and height.
+        """
+        positions = np.array([camera.position for camera in cameras])
+        forwards = np.array([camera.forward for camera in cameras])
+        up = _up_axis(np.array([camera.rotation for camera in cameras]))
+        center = _common_focus(positions, forwards)
+        if center is not None:
+            offsets = positions - center
+            heights = offsets @ up
+            radii = np.linalg.norm(offsets - np.outer(heights, up), axis=1)
+            typical = _nearest_to_median(np.stack((radii, heights), axis=1))
+            arc = _arc(offsets, up, typical)
+        else:
+            typical = _nearest_to_median(positions)
+            spread = float(np.median(np.linalg.norm(positions - positions[typical], axis=1)))
+            center = positions[typical] + forwards[typical] * (2 * spread or 1.0)
+            up = -cameras[typical].rotation[1]  # swings sideways, whatever the camera looks at
+            arc = -NARROWEST_SWING / 2, NARROWEST_SWING / 2
+        return cls(center, up, cameras[typical], arc)
+
+    @classmethod
+    def of_frame(cls, center: Sequence[float], scale: float) -> Viewpoint:
+        """A viewpoint for a model that does not say how it was photographed.
+
+        Looks slightly down at the frame's centre from 2.5 times its longest half-axis away, 800 x 600 with 50 degrees
+        across; up is -y, as in most reconstructions.
+        """
+        center, up = np.asarray(center, np.float64), np.array([0.0, -1.0, 0.0])
+        position = center + 2.5 * scale * np.array([0.0, -math.sin(math.radians(20)), -math.cos(math.radians(20))])
+        focal = 400 / math.tan(math.radians(25))
+        camera = Camera(800, 600, focal, focal, 400.0, 300.0, look_at(position, center, up))
+        return cls(center, up, camera, (0.0, 360.0))
+
+    def to_json(self) -> dict[str, Any]:
+        """A dictionary ready for JSON: the "viewpoint" of a file's provenance."""
+        return {
+            "center": self.center.tolist(),
+            "up": self.up.tolist(),
+            "camera_from_world": self.camera.camera_from_world.tolist(),
+            "intrinsics": list(self.camera.intrinsics),
+            "width": self.camera.width,
+            "height": self.camera.height,
+            "arc": list(self.arc),
+        }
+
+    @classmethod
+    def from_json(cls, stored: Mapping[str, Any]) -> Viewpoint:
+        """The inverse of `to_json`, for what anyone may have written.
+
+        Raises:
+            KeyError, TypeError, ValueError, OverflowError: it is incomplete or makes no sense.
+        """
+        center, up = np.array(stored["center"], np.float64), np.array(stored["up"], np.float64)
+        camera = camera_from_json({**stored, **dict(zip(LENS[2:], stored["intrinsics"], strict=True))})
+        first, last = (float(value) for value in stored["arc"])
+        return cls(center, up, camera, (first, last))
 
 
-def stored_viewpoint(facts: dict) -> dict:
-    """The viewpoint in a file's provenance, or one that follows from its frame alone.
-
-    Args:
-        facts: from `hyrfpack.describe`.
-    """
-    viewpoint = facts["provenance"].get("viewpoint")
-    if viewpoint is not None:
-        return viewpoint
-    frame = facts["config"]["frame"]
-    return frame_viewpoint(frame["center"], frame["scale"])
+def common_direction(cameras: Sequence[Camera]) -> np.ndarray | None:
+    """The direction (3,) that cameras look in, unit length, or None where they look different ways."""
+    mean = np.mean([camera.forward for camera in cameras], axis=0)
+    agreement = np.linalg.norm(mean)
+    return mean / agreement if agreement >= SAME_WAY else None
 
 
-def frame_viewpoint(center: Sequence[float], scale: float) -> dict:
-    """A viewpoint for a model that does not say how it was photographed.
-
-    Looks slightly down at the frame's centre from 2.5 times its longest half-axis away, 800 x 600 with 50 degrees
-    across; up is -y, as in most reconstructions.
-    """
-    center, up = np.asarray(center, np.float64), np.array([0.0, -1.0, 0.0])
-    position = center + 2.5 * scale * np.array([0.0, -math.sin(math.radians(20)), -math.cos(math.radians(20))])
-    focal = 400 / math.tan(math.radians(25))
-    return {
-        "center": center.tolist(),
-        "up": up.tolist(),
-        "camera_from_world": look_at(position, center, up).tolist(),
-        "intrinsics": [focal, focal, 400.0, 300.0],
-        "width": 800,
-        "height": 600,
-        "arc": [0.0, 360.0],
-    }
-
-
-def orbit(viewpoint: dict, frames: int) -> list[Camera]:
+def orbit(viewpoint: Viewpoint, frames: int) -> list[Camera]:
     """Cameras on a circle about a scene, all looking at its centre.
 
     The circle keeps the typical camera's distance and height. Where the photos do not stand all around, the camera
     swings to and fro over the arc that they cover. Either way the path closes: the frame after the last is the first.
 
     Args:
-        viewpoint: from `viewpoint_hint` or `frame_viewpoint`.
+        viewpoint: what to go about, and from where.
         frames: how many cameras; at least 1.
-
-    Raises:
-        HyrfDataError: the viewpoint is incomplete or makes no sense.
     """
-    try:
-        center, up = np.array(viewpoint["center"], np.float64), np.array(viewpoint["up"], np.float64)
-        pose = rigid_pose(viewpoint["camera_from_world"])
-        fx, fy, cx, cy = (float(value) for value in viewpoint["intrinsics"])
-        fx, fy = focal_length(fx), focal_length(fy)
-        width, height = side_length(viewpoint["width"]), side_length(viewpoint["height"])
-        first, last = (float(value) for value in viewpoint["arc"])
-        # The squares of larger numbers overflow.
-        if center.shape != (3,) or not (np.abs([*center, *pose.flat, cx, cy, first, last]) < 1e150).all():
-            raise ValueError("a number is missing or not finite")
-        if up.shape != (3,) or not 0 < np.linalg.norm(up) < np.inf:
-            raise ValueError("'up' is no direction")
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise HyrfDataError(
-            f"the model's viewpoint cannot be used ({error}); render with --data or --cameras instead"
-        ) from error
-    up = up / np.linalg.norm(up)
-    offset = -pose[:3, :3].T @ pose[:3, 3] - center
+    center, up, camera = viewpoint.center, viewpoint.up / np.linalg.norm(viewpoint.up), viewpoint.camera
+    first, last = viewpoint.arc
+    offset = camera.position - center
     radius = np.linalg.norm(offset - (offset @ up) * up)
     if not radius > 1e-9 * np.linalg.norm(offset):  # straight above: the circle would be a point
         offset = offset + 0.5 * max(np.linalg.norm(offset), 1e-6) * _perpendicular(up)
@@ -136,7 +142,7 @@ def orbit(viewpoint: dict, frames: int) -> list[Camera]:
     else:
         angles = (first + last) / 2 + (last - first) / 2 * np.sin(2 * math.pi * turns)
     return [
-        Camera(width, height, fx, fy, cx, cy, look_at(center + _rotate(offset, up, math.radians(angle)), center, up))
+        replace(camera, camera_from_world=look_at(center + _rotate(offset, up, math.radians(angle)), center, up))
         for angle in angles
     ]
 
@@ -179,7 +185,7 @@ def _common_focus(positions: np.ndarray, forwards: np.ndarray) -> np.ndarray | N
     return center if in_front.mean() > 0.75 else None
 
 
-def _arc(offsets: np.ndarray, up: np.ndarray, typical: int) -> list[float]:
+def _arc(offsets: np.ndarray, up: np.ndarray, typical: int) -> tuple[float, float]:
     """Degrees of azimuth that the cameras cover, relative to the typical one: all but the widest gap between two."""
     axis = _perpendicular(up)
     side = np.cross(up, axis)
@@ -188,14 +194,14 @@ def _arc(offsets: np.ndarray, up: np.ndarray, typical: int) -> list[float]:
     gaps = np.diff(relative, append=relative[0] + 360)
     widest = int(np.argmax(gaps))
     if 360 - gaps[widest] >= WHOLE_CIRCLE:
-        return [0.0, 360.0]
+        return 0.0, 360.0
     first, last = float(relative[(widest + 1) % len(relative)]), float(relative[widest])
     if first > 0:  # the typical camera, at 0, lies on the arc
         first -= 360
     if last < 0:
         last += 360
     short = max(0.0, NARROWEST_SWING - (last - first)) / 2
-    return [first - short, last + short]
+    return first - short, last + short
 
 
 def _nearest_to_median(rows: np.ndarray) -> int:

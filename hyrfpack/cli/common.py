@@ -135,17 +135,12 @@ def read_scene(path: Path, reading: dict[str, Any], model: dict | None = None) -
         model: facts of the model file (`hyrfpack.describe`) that the photos are of, if any: it says how large they
             are wanted where --max-size does not.
     """
+    from hyrfpack.cameras.capture import Capture
     from hyrfpack.data import load_scene
     from hyrfpack.scene import DEFAULT_MAX_SIZE
 
     if reading["max_size"] is None:
-        if model is None:
-            max_size = DEFAULT_MAX_SIZE
-        else:
-            from hyrfpack.cameras.capture import stored_max_size
-
-            max_size = stored_max_size(model)
-        reading = {**reading, "max_size": max_size}
+        reading = {**reading, "max_size": DEFAULT_MAX_SIZE if model is None else Capture(model).max_size}
     scene = load_scene(path, **reading)
     for sentence in scene.notes:
         note(sentence)

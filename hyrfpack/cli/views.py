@@ -75,9 +75,9 @@ def render(
     """
     if sum(source is not None for source in (data, cameras, orbit)) > 1:
         raise click.UsageError("--data, --cameras and --orbit each say what to render; give one of them")
+    from hyrfpack.cameras.capture import Capture
     from hyrfpack.cameras.files import cameras_from_json
     from hyrfpack.cameras.paths import orbit as orbit_around
-    from hyrfpack.cameras.paths import stored_viewpoint
     from hyrfpack.format import describe, load
     from hyrfpack.render.files import render_files, rendered_names
     from hyrfpack.render.video import has_ffmpeg, write_video
@@ -91,7 +91,7 @@ def render(
     elif cameras is not None:
         named = cameras_from_json(cameras)
     else:
-        cameras_around = orbit_around(stored_viewpoint(describe(model, part)), orbit or DEFAULT_ORBIT)
+        cameras_around = orbit_around(Capture(describe(model, part)).viewpoint, orbit or DEFAULT_ORBIT)
         named = [(f"{number:04d}", camera) for number, camera in enumerate(cameras_around)]
     film = output / "video.mp4" if video and has_ffmpeg() else None
     names = rendered_names([name for name, _ in named], depth)

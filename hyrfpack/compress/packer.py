@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from hyrfpack.cameras.capture import stored_cameras
+from hyrfpack.cameras.capture import Capture
 from hyrfpack.checks import check_type
 from hyrfpack.compress.distortion import LIMITS, default_distortion
 from hyrfpack.compress.finetune import finetune
@@ -117,7 +117,7 @@ def compress(
     model, provenance = load_with_provenance(source)
     if len(model) == 0:
         raise HyrfError(f"{source}: there is no Gaussian in it, so there is nothing to measure; use profile 'paper'")
-    cameras = [view.camera for view in data.train] if data is not None else stored_cameras(describe(source))
+    cameras = Capture(describe(source), data).cameras
     say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
     sensitivity = measure_sensitivity(model, cameras)
     packer = Packer(model, without_cameras(provenance), sensitivity, data, finetune_steps, prune, say)

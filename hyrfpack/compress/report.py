@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.atomic import write_atomic
-from hyrfpack.cameras.capture import stored_cameras
+from hyrfpack.cameras.capture import Capture
 from hyrfpack.compress.distortion import LIMITS, default_distortion
 from hyrfpack.compress.quantize import decide
 from hyrfpack.compress.report_page import FILES, PAGE, PLOT, SHOWN, Findings, Point, ShownView, page, picture_names
@@ -91,7 +91,7 @@ def write_report(
     profiles = _profiles(model, provenance, report.profile)
     curve = {}
     if len(model):
-        cameras = stored_cameras(describe(source)) if scene is None else [view.camera for view in scene.train]
+        cameras = Capture(describe(source), scene).cameras
         curve = _finer_and_coarser(model, provenance, cameras, _distortion(facts, model, provenance))
     same = [name for name, other in curve.items() if other == data]  # the file itself, where it is on the curve
     files = {CHOSEN: data, **profiles, **{name: other for name, other in curve.items() if name not in same}}
@@ -122,7 +122,7 @@ def _views(model: HybridModel, source: Path, scene: Scene | None) -> tuple[list[
     if scene is None:
         with torch.no_grad():
             decoded = model.decode()
-            cameras = evenly_spaced(stored_cameras(describe(source)), VIEWPOINTS)
+            cameras = evenly_spaced(Capture(describe(source)).cameras, VIEWPOINTS)
             renders = [to_image(render(model, camera, decoded=decoded).rgb) for camera in cameras]
         views = [
             View(f"viewpoint {number}", camera, partial(Picture, np.asarray(picture)))

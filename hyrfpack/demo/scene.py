@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from hyrfpack.atomic import write_atomic
+from hyrfpack.cameras.paths import look_at
 from hyrfpack.errors import needs_package
 
 _FAR = np.float32(1e9)
@@ -116,11 +117,8 @@ def _place_camera(index: int, views: int, size: int, rng: np.random.Generator) -
     ring = math.cos(elevation)
     position = radius * np.array([ring * math.cos(azimuth), ring * math.sin(azimuth), math.sin(elevation)])
     target = np.array([0, 0, 0.4]) + rng.uniform(-0.12, 0.12, 3)
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, (0, 0, 1))
-    right /= np.linalg.norm(right)
     pose = np.eye(4)
-    pose[:3] = np.stack([right, np.cross(forward, right), forward, position], axis=1)
+    pose[:3] = np.stack([*look_at(position, target, np.array([0.0, 0.0, 1.0]))[:3, :3], position], axis=1)
     return pose, size * _FOCAL * rng.uniform(0.97, 1.03)
 
 

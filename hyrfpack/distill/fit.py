@@ -16,7 +16,8 @@ import torch
 
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
-from hyrfpack.cameras.paths import viewpoint_hint
+from hyrfpack.cameras.between import small_camera
+from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.checks import check_float, check_int, check_type
 from hyrfpack.compress.packer import Packer, Trial
 from hyrfpack.compress.search import coarsest
@@ -26,7 +27,6 @@ from hyrfpack.distill.start import initial_model
 from hyrfpack.distill.teacher import light_of, likeness, teaching_scene
 from hyrfpack.distill.views import Weighted, viewpoints
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.export.bake import small_camera
 from hyrfpack.format.codec import decode_model
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
@@ -199,8 +199,8 @@ def distill_splats(
     unpacked = _mean(likeness(model, original, test))
     say(f"{unpacked:.2f} dB before packing")
     imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
-    provenance = {"steps": config.steps, "seed": config.seed, "viewpoint": viewpoint_hint(train), "psnr": unpacked}
-    provenance["choices"] = {"imported": imported}
+    provenance = {"steps": config.steps, "seed": config.seed, "psnr": unpacked, "choices": {"imported": imported}}
+    provenance["viewpoint"] = Viewpoint.of(train).to_json()
     _pack(model, target, scene, original, provenance, config, cache, say)
     decoded = hyrf_format.load(target)
     scores = likeness(decoded, original, test)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hyrfpack.cameras.between import small_camera
 from hyrfpack.cameras.paths import look_at
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.export.bake import small_camera
 from hyrfpack.model import Frame
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.export.bake import refuse_nonfinite, small_camera
+from hyrfpack.cameras.between import small_camera
+from hyrfpack.export.bake import refuse_nonfinite
 from hyrfpack.model import BACKGROUND_RADIUS, Frame, Geometry, HybridModel
 from hyrfpack.ops.background import pixel_directions, sphere_points
 from hyrfpack.ops.poses import camera_center

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from hyrfpack.cameras.between import small_camera
 from hyrfpack.errors import HyrfError
 from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.ops.poses import camera_center
@@ -21,7 +22,6 @@ from hyrfpack.splats.draw import sent_light
 from hyrfpack.splats.harmonics import fibonacci_sphere, harmonics_basis, terms_of
 from hyrfpack.splats.splats import Splats, normalized_quats
 
-LONGEST_SIDE = 512  # pixels of the pictures in which light is measured
 SPHERE_DIRECTIONS = 32
 SPHERE_WEIGHT = 3e-3  # of all these together, against 1 for all cameras
 RIDGE = 1e-5
@@ -115,16 +115,6 @@ def _view(model: HybridModel, geometry: Geometry, camera: Camera) -> _View:
     all_drawn[drawn] = 0
     lit, left_out = received > 0, torch.nonzero(all_drawn).squeeze(-1)
     return _View(camera_center(pose), drawn[lit], received[lit], left_out, all_drawn[left_out])
-
-
-def small_camera(camera: Camera, longest: int = LONGEST_SIDE) -> Camera:
-    """The same view in a picture of at most `longest` pixels a side: enough to learn what can be seen from there."""
-    shrink = min(1.0, longest / max(camera.width, camera.height))
-    width, height = max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink))
-    x, y = width / camera.width, height / camera.height
-    return replace(
-        camera, width=width, height=height, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y
-    )
 
 
 def _fit(model: HybridModel, views: Sequence[_View], light: Tensor, degrees: Iterable[int]) -> dict[int, Tensor]:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hyrfpack.cameras.capture import stored_cameras
-from hyrfpack.cameras.paths import look_at, orbit, stored_viewpoint
+from hyrfpack.cameras.capture import Capture
+from hyrfpack.cameras.paths import Viewpoint, common_direction, look_at, orbit
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.evaluate.metrics import stated_error
 from hyrfpack.format import describe, load
@@ -21,8 +21,7 @@ MEASURED = 12  # views at most that a loss is measured at
 HELD_OUT = 8  # every so many of the cameras that a file keeps are not fitted, but measured at
 FEW = 16  # cameras, of which none can be spared
 RING, LIFTS = 24, (-0.2, 0.0, 0.2)  # cameras around what kept none: in rings, raised by so much of their distance
-# Lengths of mean unit vectors: from where on cameras look the same way, and up to where their pictures' sides do not.
-SAME_WAY, TURNED = 0.9, 0.5
+TURNED = 0.5  # length of the mean downward direction up to which pictures count as turned against each other
 
 
 @dataclass(frozen=True)
@@ -57,37 +56,39 @@ class Source:
         facts, model = describe(path), load(path)
         if not len(model):
             raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to export; train it again")
-        viewpoint = stored_viewpoint(facts)
-        up, center = _up_and_center(viewpoint, path)
+        capture = Capture(facts, data)
+        try:
+            viewpoint = capture.viewpoint
+        except HyrfDataError as error:  # photos are no way round it here
+            why = error.__cause__
+            raise HyrfDataError(f"{path}: its viewpoint cannot be used ({why!s:.160}); train the model again") from why
+        up, center = viewpoint.up / math.hypot(*viewpoint.up), viewpoint.center
         error = stated_error(facts["provenance"])
+        cameras = capture.cameras
         if data is not None and data.train:
             named = [(view.name, view.camera) for view in data.train]
             measured = [(view.camera, view) for view in evenly_spaced(data.test, MEASURED)]
-            cameras = [camera for _, camera in named]
             fitted = evenly_spaced(cameras, FITTED)
             return cls(model, named, fitted, measured, _up_of(cameras, up), center, error)
-        stored = stored_cameras(facts)
-        if not facts["provenance"].get("cameras"):
-            between = evenly_spaced(stored[1::2], MEASURED)  # of an orbit with twice as many cameras as RING
+        if capture.made_up:
+            between = evenly_spaced(cameras[1::2], MEASURED)  # of an orbit with twice as many cameras as RING
             measured = [(camera, None) for camera in between]
             return cls(model, [], _around(viewpoint, center, up), measured, up, center, error)
-        named = [(f"{number:04d}.png", camera) for number, camera in enumerate(stored)]
-        spare = stored[::HELD_OUT] if len(stored) >= FEW else stored
-        fitted = [c for number, c in enumerate(stored) if number % HELD_OUT] if len(stored) >= FEW else stored
+        named = [(f"{number:04d}.png", camera) for number, camera in enumerate(cameras)]
+        spare = cameras[::HELD_OUT] if len(cameras) >= FEW else cameras
+        fitted = [c for number, c in enumerate(cameras) if number % HELD_OUT] if len(cameras) >= FEW else cameras
         measured = [(camera, None) for camera in evenly_spaced(spare, MEASURED)]
-        return cls(model, named, fitted, measured, _up_of(stored, up), center, error)
+        return cls(model, named, fitted, measured, _up_of(cameras, up), center, error)
 
 
 def _up_of(cameras: list[Camera], up: np.ndarray) -> np.ndarray:
     """Which way is up, unit length: for cameras that look down on a flat scene and turn, as drones do, against them."""
-    forward = np.mean([camera.forward for camera in cameras], axis=0)
+    forward = common_direction(cameras)
     downward = np.mean([camera.rotation[1] for camera in cameras], axis=0)
-    if np.linalg.norm(forward) > SAME_WAY and np.linalg.norm(downward) < TURNED:
-        return -forward / np.linalg.norm(forward)
-    return up
+    return up if forward is None or np.linalg.norm(downward) >= TURNED else -forward
 
 
-def _around(viewpoint: dict, center: np.ndarray, up: np.ndarray) -> list[Camera]:
+def _around(viewpoint: Viewpoint, center: np.ndarray, up: np.ndarray) -> list[Camera]:
     """Where a scene may have been photographed from: rings about it, at several heights."""
     cameras = []
     for camera in orbit(viewpoint, RING):
@@ -96,15 +97,3 @@ def _around(viewpoint: dict, center: np.ndarray, up: np.ndarray) -> list[Camera]
             pose = look_at(camera.position + lift * distance * up, center, up)
             cameras.append(replace(camera, camera_from_world=pose))
     return cameras
-
-
-def _up_and_center(viewpoint: dict, path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Which way is up, unit length, and what is looked at; HyrfDataError where they make no sense."""
-    try:
-        up, center = (np.array(viewpoint[name], np.float64) for name in ("up", "center"))
-        length = math.hypot(*up)
-        if not (up.shape == center.shape == (3,) and 0 < length < math.inf and np.isfinite(center).all()):
-            raise ValueError("'up' is no direction or 'center' no point")
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise HyrfDataError(f"{path}: its viewpoint cannot be used ({error!s:.160}); train the model again") from error
-    return up / length, center

@@ -16,8 +16,7 @@ import torch
 
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
-from hyrfpack.cameras.capture import capture_of, max_size_of
-from hyrfpack.cameras.paths import viewpoint_hint
+from hyrfpack.cameras.capture import kept_of
 from hyrfpack.checks import check_type
 from hyrfpack.data import PictureCache
 from hyrfpack.device import choose_device, describe_device
@@ -132,13 +131,9 @@ def _finish(trainer: Trainer, out: Path) -> dict:
         "steps": config.steps,
         "seed": config.seed,
         "choices": trainer.choices,
-        "viewpoint": viewpoint_hint([view.camera for view in scene.train]),
-        "cameras": capture_of([view.camera for view in scene.train]),
+        **kept_of(scene),
         "psnr": statistics.median(record["psnr"] for record in trainer.records[-len(trainer.records) // 10 :]),
     }
-    max_size = max_size_of(scene)
-    if max_size is not None:
-        provenance["max_size"] = max_size
     report = hyrf_format.save(model, path, profile="raw", provenance=provenance)
     metrics = {
         "settings": config.to_dict(),

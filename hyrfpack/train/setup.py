@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from hyrfpack.cameras.paths import common_direction
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
@@ -26,7 +27,6 @@ SYNTHETIC_HALF_BOX = 1.3  # NeRF-synthetic objects lie in [-1.3, 1.3]^3
 PER_PHOTO_PIXEL, PER_PIXEL = 0.85, 1 / 240
 LEAST_BUDGET = 5_000
 GAUSSIANS_PER_ROW = 20  # for each row and level of the radiance table; the paper's models have 8 to 20
-SAME_WAY = 0.9  # length of the mean viewing direction from which cameras count as looking the same way
 INITIAL_OPACITY = 0.1
 INITIAL_SIZE = (1e-5, 0.5)  # local units over S(p)
 FARTHEST = 1e4  # local units per axis; to pull in what is farther turns it by 2e-4 radians at most, seen from the box
@@ -45,12 +45,9 @@ def detect_preset(scene: Scene) -> tuple[str, str]:
     if scene.has_alpha or scene.layout == "blender":
         return "synthetic", "the photos have transparency" if scene.has_alpha else "the layout is NeRF-synthetic's"
     cameras = [view.camera for view in scene.train]
-    mean_forward = np.mean([camera.forward for camera in cameras], axis=0)
-    agreement = float(np.linalg.norm(mean_forward))
-    if agreement < SAME_WAY or len(scene.points) == 0:
-        why = "the cameras look in different directions" if agreement < SAME_WAY else "the scene has no points"
-        return "standard", why
-    axis = mean_forward / agreement
+    axis = common_direction(cameras)
+    if axis is None or len(scene.points) == 0:
+        return "standard", "the cameras look in different directions" if axis is None else "the scene has no points"
     positions = np.array([camera.position for camera in cameras])
     offsets = positions - positions.mean(0)
     along = float(np.ptp(offsets @ axis))

@@ -17,6 +17,7 @@ import numpy as np
 from PIL import Image
 
 import hyrfpack
+from hyrfpack.cameras.files import camera_to_json
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
@@ -82,7 +83,7 @@ def encode_page(
         "up": np.asarray(up, np.float64).tolist(),
         "target": np.asarray(center, np.float64).tolist(),
         "solid": list(solid),
-        "cameras": [_camera(camera) for camera in cameras],
+        "cameras": [camera_to_json(camera) for camera in cameras],
     }
     texts = [_text("scene", json.dumps(scene).replace("<", "\\u003c"))]
     texts += [_text(name, _part(name)) for name in TEXTS]
@@ -137,12 +138,6 @@ def _frame(splats: Splats) -> tuple[np.ndarray, float]:
     low, high = splats.positions.min(0), splats.positions.max(0)
     least = max(float((high - low).max()) / 2 / FARTHEST, float(splats.scales.max()) / LARGEST)
     return (low + high) / 2, 2.0 ** math.ceil(math.log2(least)) if least > 0 else 1.0
-
-
-def _camera(camera: Camera) -> dict:
-    fx, fy, cx, cy = camera.intrinsics
-    size = {"width": camera.width, "height": camera.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
-    return {**size, "camera_from_world": np.asarray(camera.camera_from_world, np.float64).tolist()}
 
 
 def _webp(picture: np.ndarray) -> str:

@@ -17,8 +17,8 @@ from click.testing import CliRunner
 from commands import hyrfpack, refused, succeeded
 from scenes import ring, small_model
 
-from hyrfpack.cameras.capture import capture_of
-from hyrfpack.cameras.paths import viewpoint_hint
+from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.cli import main
 from hyrfpack.format import save
 from hyrfpack.splats.files import read_splats
@@ -30,7 +30,7 @@ POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
 def model(tmp_path_factory):
     """Forty Gaussians before a background sphere, and four cameras around them."""
     path, cameras = tmp_path_factory.mktemp("models") / "model.hyrf", ring(4)
-    kept = {"cameras": capture_of(cameras), "viewpoint": viewpoint_hint(cameras)}
+    kept = {"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json()}
     save(small_model(POSITIONS, fields=2.0, background=True), path, provenance=kept)
     return path
 
@@ -56,7 +56,7 @@ def test_the_report_is_one_json_object(model, tmp_path):
 
 
 def test_identical_pictures_are_json_too(tmp_path):
-    provenance = {"cameras": capture_of(ring(1))}
+    provenance = {"cameras": kept_cameras(ring(1))}
     save(small_model([[0, 0, 0]], opacity_logits=-80.0), tmp_path / "unseen.hyrf", provenance=provenance)
     report = json.loads(succeeded("export", tmp_path / "unseen.hyrf", "-o", tmp_path / "a.ply", "--json").stdout)
     assert report["psnr"] == report["by_degree"]["3"] == 100

@@ -9,7 +9,7 @@ import pytest
 from commands import hyrfpack, succeeded
 from PIL import Image
 
-from hyrfpack.cameras.capture import stored_max_size
+from hyrfpack.cameras.capture import Capture
 from hyrfpack.format import describe
 
 
@@ -77,5 +77,5 @@ def test_photos_kept_as_they_are_leave_a_word(data, tmp_path):
 
 @pytest.mark.parametrize("stored", [None, -1, True, 1.5, "800", [800], {}])
 def test_a_limit_that_makes_no_sense_is_as_none(stored):
-    assert stored_max_size({"provenance": {"max_size": stored}}) == 1600
-    assert stored_max_size({"provenance": {"max_size": 0}}) == 0
+    assert Capture({"provenance": {"max_size": stored}}).max_size == 1600
+    assert Capture({"provenance": {"max_size": 0}}).max_size == 0

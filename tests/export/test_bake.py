@@ -8,10 +8,9 @@ from hypothesis import strategies as st
 from scenes import camera_at, ring, small_model
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.export.bake import LONGEST_SIDE, bake, small_camera
+from hyrfpack.export.bake import bake
 from hyrfpack.model import Frame
 from hyrfpack.render import RenderSettings, render
-from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.harmonics import BAND_0, harmonics_basis
 
@@ -106,14 +105,6 @@ def test_gaussians_that_cameras_draw_keep_their_opacity():
     model = shiny_model()
     with torch.no_grad():
         assert np.array_equal(bake(model, ring(4))[3].opacities, model.decode_geometry().opacities)
-
-
-def test_large_pictures_are_measured_in_small_ones_of_the_same_view():
-    large = Camera(4000, 3000, 3500.0, 3400.0, 2100.0, 1400.0, np.eye(4))
-    small = small_camera(large)
-    assert (small.width, small.height) == (LONGEST_SIDE, LONGEST_SIDE * 3 // 4)
-    assert np.allclose(np.array(small.intrinsics) * 4000 / LONGEST_SIDE, large.intrinsics)
-    assert small_camera(small) == small
 
 
 def test_a_model_without_gaussians_bakes_to_nothing():

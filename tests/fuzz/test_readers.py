@@ -27,8 +27,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.files import cameras_from_json
-from hyrfpack.cameras.paths import frame_viewpoint, orbit
+from hyrfpack.cameras.paths import Viewpoint, orbit
 from hyrfpack.data import load_scene
 from hyrfpack.data.pictures import read_header, read_pixels
 from hyrfpack.errors import HyrfDataError, HyrfError
@@ -263,11 +264,12 @@ def test_what_a_camera_file_says_is_quoted_in_short(tmp_path):
 @settings(max_examples=300, deadline=None)
 @given(rng=numbers)
 def test_a_forged_viewpoint_is_followed_or_refused(rng):
-    viewpoint = json.loads(json.dumps(frame_viewpoint((0, 0, 0), 1.0)))
+    viewpoint = json.loads(json.dumps(Viewpoint.of_frame((0, 0, 0), 1.0).to_json()))
     node, key = rng.choice(places(viewpoint))
     node[key] = rng.choice((*HOSTILE_JSON, 1e160, [1e200] * 3, [5e-324] * 3))
 
-    check(lambda: orbit(viewpoint, 3))  # a camera refuses to be made of NaN
+    facts = {"provenance": {"viewpoint": viewpoint}, "config": {"frame": None}}
+    check(lambda: orbit(Capture(facts).viewpoint, 3))  # a camera refuses to be made of NaN
 
 
 # --- points ---

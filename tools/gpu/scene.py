@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hyrfpack.cameras.paths import look_at
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.calls import splat_inputs
 from hyrfpack.model.gaussians import Gaussians, logit
@@ -55,7 +56,7 @@ def make_cameras(count: int, width: int, height: int) -> list[Camera]:
         target = np.array([-0.5 * math.cos(angle + 0.5), -0.4 * math.sin(angle + 0.5), -0.2])
         if number % 4 == 0:
             position, target = np.array([-0.9, 0.1 * number / count, 0.1]), np.array([1.5, -0.05, 0.05])
-        cameras.append(_look_at(position, target, width, height))
+        cameras.append(_camera(position, target, width, height))
     return cameras
 
 
@@ -202,11 +203,6 @@ def _unit(count: int, generator: torch.Generator) -> Tensor:
     return torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
 
 
-def _look_at(position: np.ndarray, target: np.ndarray, width: int, height: int) -> Camera:
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, (0, 0, 1))
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ position
+def _camera(position: np.ndarray, target: np.ndarray, width: int, height: int) -> Camera:
+    pose = look_at(position, target, np.array([0.0, 0.0, 1.0]))
     return Camera(width, height, FOCAL * width, FOCAL * width, width / 2, height / 2, pose)

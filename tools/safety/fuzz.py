@@ -40,7 +40,9 @@ from pathlib import Path
 
 import torch
 
-from hyrfpack.cameras.paths import frame_viewpoint, orbit
+from hyrfpack.cameras.between import small_camera
+from hyrfpack.cameras.capture import Capture
+from hyrfpack.cameras.paths import orbit
 from hyrfpack.cli.files import info
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import decode_model, describe, encode_model, load
@@ -169,11 +171,9 @@ def check_file(data: bytes, outcome: HybridModel | str, folder: Path) -> None:
 def check_picture(model: HybridModel) -> None:
     """Render; a frame that no camera can be placed by, and numbers that overflow, are refused in a sentence."""
     with contextlib.suppress(HyrfError), torch.no_grad():
-        (camera,) = orbit(frame_viewpoint(model.config.frame.center, model.config.frame.scale) | SMALL, 1)
-        render(model, camera)
-
-
-SMALL = {"width": 16, "height": 12, "intrinsics": [14.0, 14.0, 8.0, 6.0]}
+        facts = {"provenance": {}, "config": {"frame": vars(model.config.frame)}}
+        (camera,) = orbit(Capture(facts).viewpoint, 1)
+        render(model, small_camera(camera, 16))
 
 
 def examine(number: int, seed: int, tally: Tally, folder: Path) -> None:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 import hyrfpack
 from hyrfpack.atomic import check_writable, make_folder
-from hyrfpack.cameras.paths import viewpoint_hint
+from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.gaussians import logit
 from hyrfpack.scene import Scene
@@ -129,7 +129,7 @@ def main() -> None:
         "max_gaussians": f"{args.gaussians:,}: trained to {trained:,}, split by tools/studies/densify_model.py "
         f"in {GROWING} steps (seed {args.seed}), settled in {args.settle}",
     }
-    provenance["viewpoint"] = viewpoint_hint([view.camera for view in scene.train])
+    provenance["viewpoint"] = Viewpoint.of([view.camera for view in scene.train]).to_json()
     written = hyrfpack.save(model, args.out / MODEL, profile="raw", provenance=provenance)
     print(f"{args.out / MODEL}: {written.bytes_after:,} bytes")
 

@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scenes import ring
+
+from hyrfpack.cameras.between import LONGEST_SIDE, WIDER, small_camera, views_between
+from hyrfpack.scene import Camera
+
+CAMERAS = ring(48, elevation=1.2, width=16, height=16)
+
+
+def test_views_between_lie_between_neighbours_that_look_the_same_way():
+    """On a ring of 48 no neighbour is farther than two places: a view is within the chord, and looks inwards too."""
+    chord = 3 * 2 * np.sin(np.pi * 2 / 48)  # to the second next, of a ring of radius 3
+
+    for camera, view in zip(CAMERAS, views_between(CAMERAS), strict=True):
+        moved = np.linalg.norm(view.position - camera.position)
+        assert 0.2 * chord / 2 < moved < chord
+        assert view.rotation[2] @ camera.rotation[2] > np.cos(2 * np.pi * 2 / 48)
+        np.testing.assert_allclose(view.rotation @ view.rotation.T, np.eye(3), atol=1e-12)
+        assert (view.width, view.height) == (round(WIDER * camera.width), round(WIDER * camera.height))
+        assert (view.fx, view.fy) == (camera.fx, camera.fy)
+        assert view.cx - view.width / 2 == pytest.approx(camera.cx - camera.width / 2)
+
+
+def test_one_camera_has_no_neighbour_and_stays():
+    assert views_between(CAMERAS[:1]) == CAMERAS[:1]
+    assert views_between([]) == []
+
+
+def test_cameras_at_one_place_have_views_between_them():
+    views = views_between([CAMERAS[0]] * 3)
+
+    assert all(np.allclose(view.position, CAMERAS[0].position) for view in views)
+    assert all(np.isfinite(view.camera_from_world).all() for view in views)
+
+
+def test_large_pictures_are_measured_in_small_ones_of_the_same_view():
+    large = Camera(4000, 3000, 3500.0, 3400.0, 2100.0, 1400.0, np.eye(4))
+    small = small_camera(large)
+    assert (small.width, small.height) == (LONGEST_SIDE, LONGEST_SIDE * 3 // 4)
+    assert np.allclose(np.array(small.intrinsics) * 4000 / LONGEST_SIDE, large.intrinsics)
+    assert small_camera(small) == small

@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import ball_scene, ring
+
+from hyrfpack.cameras.capture import KEPT, ORBIT, Capture, kept_cameras, kept_of
+from hyrfpack.cameras.paths import Viewpoint, orbit
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.scene import Camera
+
+
+def facts(**provenance) -> dict:
+    """What is said of a file with a provenance."""
+    return {"provenance": provenance, "config": {"frame": {"center": [0.0, 0.0, 0.0], "scale": 1.0}}}
+
+
+def test_files_keep_the_layout_that_they_have_always_had():
+    pose = [[0.0, 0.0, 1.0, 12345678.1234567], [0.0, 1.0, 0.0, 1 / 3], [-1.0, 0.0, 0.0, -2.0]]
+    row = [800, 600, 700.123457, 650.0, 400.5, 300.0, 0.0, 0.0, 1.0, 12345678.123457]
+    row += [0.0, 1.0, 0.0, 0.333333333, -1.0, 0.0, 0.0, -2.0]
+    assert json.dumps(kept_cameras([Camera(800, 600, 700.1234567, 650.0, 400.5, 300.0, pose)])) == json.dumps([row])
+
+
+def test_what_a_model_keeps_of_a_scene_comes_back():
+    scene = replace(ball_scene(5), max_size=700)
+    capture = Capture(facts(**json.loads(json.dumps(kept_of(scene)))))
+    photographed = [view.camera for view in scene.train]
+    assert capture.max_size == 700 and not capture.made_up
+    assert capture.viewpoint.to_json() == Viewpoint.of(photographed).to_json()
+    assert kept_cameras(capture.cameras) == kept_cameras(photographed)
+
+
+def test_of_many_cameras_some_are_kept():
+    assert len(kept_cameras(ring(KEPT + 9))) == KEPT
+
+
+def test_photos_come_before_the_cameras_that_are_kept_and_these_before_an_orbit():
+    scene, kept = ball_scene(5), {"cameras": kept_cameras(ring(3))}
+    assert Capture(facts(**kept), scene).cameras == [view.camera for view in scene.train]
+    held_out = replace(scene, train=[], test=scene.train)
+    for capture in (Capture(facts(**kept)), Capture(facts(**kept), held_out)):
+        assert len(capture.cameras) == 3 and not capture.made_up
+    assert Capture(facts()).made_up and len(Capture(facts()).cameras) == ORBIT
+    assert not Capture(facts(), scene).made_up
+
+
+def test_a_viewpoint_that_is_not_asked_for_is_not_looked_at():
+    assert len(Capture(facts(cameras=kept_cameras(ring(3)), viewpoint=7)).cameras) == 3
+
+
+@pytest.mark.parametrize("cameras", [7, [[1, 2, 3]], [[32, 32, 0, 1, 1, 1, *range(12)]], {"a": 1}])
+def test_cameras_without_sense_are_one_sentence(cameras):
+    with pytest.raises(HyrfDataError, match=r"cameras that the file keeps make no sense [^\n]*--data$"):
+        _ = Capture(facts(cameras=cameras)).cameras
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"center": [0, 0]},
+        {"center": "here"},
+        {"up": [0, 0, 0]},
+        {"up": None},
+        {"intrinsics": [0, 1, 2, 3]},
+        {"intrinsics": [1, 2, 3]},
+        {"width": 0},
+        {"height": 1e9},
+        {"arc": [0, math.inf]},
+        {"camera_from_world": [[1, 2], [3, 4]]},
+        {"camera_from_world": (2 * np.eye(4)).tolist()},
+    ],
+)
+def test_a_forged_viewpoint_is_an_error_of_the_files(change):
+    with pytest.raises(HyrfDataError, match="viewpoint"):
+        orbit(Capture(facts(viewpoint={**Viewpoint.of(ring(3)).to_json(), **change})).viewpoint, 2)

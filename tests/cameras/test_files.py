@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+import json
+import math
+import os
+
+import numpy as np
+import pytest
+from hypothesis import given
+from made_up_cameras import cameras
+from scenes import ring
+
+from hyrfpack.cameras.files import (
+    camera_from_json,
+    camera_from_numbers,
+    camera_to_json,
+    camera_to_numbers,
+    cameras_from_json,
+    cameras_to_json,
+)
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.scene import Camera
+
+POSE = [[1.0, 0.0, 0.0, 0.5], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+def test_cameras_survive_json_exactly(tmp_path):
+    cameras = [("a", ring(3)[1]), ("b/c", Camera(40, 30, 50.5, 51.25, 19.0, 16.0, ring(3)[2].camera_from_world))]
+    (tmp_path / "cameras.json").write_text(cameras_to_json(cameras))
+    for (name, camera), (read_name, read) in zip(cameras, cameras_from_json(tmp_path / "cameras.json"), strict=True):
+        assert (name, camera.width, camera.height, camera.intrinsics) == (
+            read_name,
+            read.width,
+            read.height,
+            read.intrinsics,
+        )
+        np.testing.assert_array_equal(read.camera_from_world, camera.camera_from_world)
+
+
+def test_a_camera_without_principal_point_or_fy_is_centred_and_square(tmp_path):
+    (tmp_path / "c.json").write_text(
+        json.dumps([{"width": 40, "height": 30, "fx": 25, "camera_from_world": np.eye(4).tolist()}])
+    )
+    ((name, camera),) = cameras_from_json(tmp_path / "c.json")
+    assert (name, camera.intrinsics) == ("0000", (25.0, 25.0, 20.0, 15.0))
+
+
+def test_transforms_json_gives_the_cameras_of_the_scene_reader(shared_data):
+    from hyrfpack.data import load_scene
+
+    folder = shared_data / "shiny_can_nerfstudio"
+    read = dict(cameras_from_json(folder / "transforms.json"))
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    assert len(read) == len(frames)
+    poses = {os.path.basename(name): camera.camera_from_world for name, camera in read.items()}
+    views = load_scene(folder, layout="nerfstudio").views
+    assert views
+    for view in views:
+        np.testing.assert_allclose(poses[os.path.basename(view.name)], view.camera.camera_from_world, atol=1e-5)
+
+
+def test_transforms_json_takes_the_angle_and_intrinsics_of_one_frame(tmp_path):
+    pose = np.eye(4).tolist()
+    (tmp_path / "t.json").write_text(
+        json.dumps(
+            {
+                "w": 100,
+                "h": 50,
+                "camera_angle_x": math.pi / 2,
+                "frames": [
+                    {"file_path": "images/a.png", "transform_matrix": pose},
+                    {"transform_matrix": pose, "fl_x": 70, "fl_y": 71, "cx": 3, "cy": 4, "w": 60},
+                ],
+            }
+        )
+    )
+    (name, first), (_, second) = cameras_from_json(tmp_path / "t.json")
+    assert name == "images/a.png"
+    assert first.intrinsics == pytest.approx((50, 50, 50, 25))
+    np.testing.assert_array_equal(first.camera_from_world, np.diag([1.0, -1, -1, 1]))
+    assert (second.width, second.intrinsics) == (60, (70, 71, 3, 4))
+
+
+GOOD = {"width": 40, "height": 30, "fx": 25, "camera_from_world": np.eye(4).tolist()}
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        ("{", "not JSON"),
+        ("3", "neither a list"),
+        ('{"cameras": []}', "neither a list"),
+        ("[]", "no camera"),
+        ("[7]", "camera 0"),
+        (json.dumps([GOOD, {**GOOD, "fx": -1}]), "camera 1 makes no sense"),
+        (json.dumps([{**GOOD, "fx": "wide"}]), "camera 0 makes no sense"),
+        (json.dumps([{**GOOD, "width": 0}]), "camera 0 makes no sense"),
+        (json.dumps([{**GOOD, "width": 10**7}]), "camera 0 makes no sense"),
+        (json.dumps([{**GOOD, "height": 30.5}]), "camera 0 makes no sense"),
+        (json.dumps([{**GOOD, "height": None}]), "camera 0 makes no sense"),
+        (json.dumps([{**GOOD, "cx": math.nan}]), "camera 0 makes no sense"),
+        (json.dumps([{**GOOD, "width": math.inf}]), "camera 0 makes no sense"),
+        (json.dumps([{**GOOD, "camera_from_world": [1, 2]}]), "camera 0 makes no sense"),
+        (json.dumps([{**GOOD, "camera_from_world": np.diag([1, 1, -1, 1]).tolist()}]), "camera 0 makes no sense"),
+        (json.dumps([{"width": 3}]), "camera 0 has no"),
+        (json.dumps({"frames": [{"transform_matrix": np.eye(4).tolist()}]}), "camera 0 has no 'w'"),
+    ],
+)
+def test_a_broken_camera_file_is_one_sentence(content, complaint, tmp_path):
+    (tmp_path / "c.json").write_text(content)
+    with pytest.raises(HyrfDataError, match=complaint):
+        cameras_from_json(tmp_path / "c.json")
+
+
+def test_a_missing_camera_file_is_named(tmp_path):
+    with pytest.raises(HyrfDataError, match=r"none\.json"):
+        cameras_from_json(tmp_path / "none.json")
+
+
+# -- one camera --------------------------------------------------------------------------------------------------------
+
+
+def test_a_camera_is_written_as_camera_files_and_pages_have_always_had_it():
+    text = json.dumps(camera_to_json(Camera(800, 600, 700.0, 650.5, 400.0, 300.25, POSE)))
+    size = '"width": 800, "height": 600, "fx": 700.0, "fy": 650.5, "cx": 400.0, "cy": 300.25'
+    assert text == f'{{{size}, "camera_from_world": {json.dumps(POSE)}}}'
+
+
+@given(camera=cameras())
+def test_a_camera_survives_json_exactly(camera):
+    assert camera_from_json(json.loads(json.dumps(camera_to_json(camera)))) == camera
+
+
+@given(camera=cameras())
+def test_numbers_are_rounded_once(camera):
+    numbers = json.loads(json.dumps(camera_to_numbers(camera)))
+    back = camera_from_numbers(numbers)
+    assert camera_to_numbers(back) == numbers
+    np.testing.assert_allclose(back.camera_from_world, camera.camera_from_world, rtol=1e-8, atol=1e-6)
+    np.testing.assert_allclose(back.intrinsics, camera.intrinsics, rtol=1e-8, atol=1e-6)
+    assert (back.width, back.height) == (camera.width, camera.height)
+
+
+@pytest.mark.parametrize("count", [0, 5, 17, 19])
+def test_too_few_numbers_or_too_many_are_refused(count):
+    with pytest.raises(ValueError):
+        camera_from_numbers([*camera_to_numbers(Camera(4, 3, 2.0, 2.0, 2.0, 1.5, POSE)), 0.0][:count])

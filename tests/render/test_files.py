@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import os
+import stat
+import sys
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scenes import ball_points, ring, small_model
+
+from hyrfpack.errors import HyrfError
+from hyrfpack.render import render
+from hyrfpack.render.files import file_names, render_files, save_picture
+from hyrfpack.render.video import write_video
+
+
+@pytest.mark.parametrize(
+    ("names", "files"),
+    [
+        (["b.JPG", "left/0001.png"], ["b", "left/0001"]),
+        (["a.jpg", "a.png"], ["a.jpg", "a.png"]),
+        (["frame.0001", "frame.0002"], ["frame.0001", "frame.0002"]),
+        (["../../etc/passwd", "/abs/x.png", "..\\y.png"], ["etc/passwd", "abs/x", "y"]),
+        (["", ".."], ["0000_view", "0001_view"]),
+        (["same", "same"], ["0000_same", "0001_same"]),
+        (["a\0b:c"], ["a_b_c"]),
+    ],
+)
+def test_pictures_are_named_after_photos_and_stay_in_the_folder(names, files):
+    assert file_names(names) == files
+
+
+def test_rendered_files_hold_the_rounded_render_and_exact_depth(tmp_path):
+    points, _ = ball_points(60)
+    model, camera = small_model(points, scale_logits=-2.0), ring(1)[0]
+    (path,) = render_files(model, [("deep/down/a.jpg", camera)], tmp_path / "out", depth=True)
+    with torch.no_grad():
+        expected = render(model, camera, depth=True)
+    assert path == tmp_path / "out" / "deep" / "down" / "a.png"
+    saved = np.asarray(Image.open(path)).astype(np.float64)
+    np.testing.assert_allclose(saved, 255 * expected.rgb.clamp(0, 1).numpy(), atol=0.501)
+    np.testing.assert_array_equal(np.asarray(Image.open(path.with_suffix(".depth.tiff"))), expected.depth.numpy())
+    assert expected.depth.max() > 0
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(HyrfError, match="cannot be made"):
+        save_picture(tmp_path / "file" / "a.png", Image.new("RGB", (2, 2)))
+
+
+# -- video ------------------------------------------------------------------------------------------------------------
+
+
+def stand_in_ffmpeg(folder, monkeypatch, body: str) -> None:
+    """Put a Python script named ffmpeg first on the PATH."""
+    script = folder / "bin" / "ffmpeg"
+    script.parent.mkdir()
+    script.write_text(f"#!{sys.executable}\nimport sys\n{body}\n")
+    script.chmod(script.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("PATH", f"{script.parent}{os.pathsep}{os.environ['PATH']}")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs executable scripts")
+def test_video_gets_all_frames_in_order(tmp_path, monkeypatch):
+    stand_in_ffmpeg(tmp_path, monkeypatch, "open(sys.argv[-1], 'wb').write(sys.stdin.buffer.read())")
+    frames = [tmp_path / name for name in ("b.png", "a.png")]
+    for frame in frames:
+        frame.write_bytes(frame.name.encode() * 40_000)
+    write_video(frames, tmp_path / "video.mp4")
+    assert (tmp_path / "video.mp4").read_bytes() == b"b.png" * 40_000 + b"a.png" * 40_000
+    assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs executable scripts")
+def test_failing_ffmpeg_is_quoted_and_leaves_the_old_video(tmp_path, monkeypatch):
+    body = "open(sys.argv[-1], 'wb').write(b'half')\nprint('no such encoder', file=sys.stderr)\nsys.exit(1)"
+    stand_in_ffmpeg(tmp_path, monkeypatch, body)
+    (tmp_path / "frame.png").write_bytes(bytes(3_000_000))
+    (tmp_path / "video.mp4").write_bytes(b"old")
+    with pytest.raises(HyrfError, match="no such encoder"):
+        write_video([tmp_path / "frame.png"], tmp_path / "video.mp4")
+    assert (tmp_path / "video.mp4").read_bytes() == b"old"
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_video_without_ffmpeg_says_so(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(HyrfError, match="no ffmpeg program"):
+        write_video([], tmp_path / "video.mp4")
