@@ -19,7 +19,8 @@ from hyrfpack.errors import HyrfError
 if TYPE_CHECKING:
     from hyrfpack.scene import Scene
 
-PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif", ".dng")
+READABLE = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")  # pictures that are taken for photos
+PICTURES = (*READABLE, ".bmp", ".heic", ".heif", ".avif", ".dng")  # and those that people keep photos as, too
 TABLES = tuple(f"{table}{kind}" for table in ("cameras", "images", "points3D") for kind in (".bin", ".txt"))
 POSES = ("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json")
 MODELS = ("sparse", "colmap/sparse")  # folders of COLMAP models

@@ -14,9 +14,10 @@ import numpy as np
 
 from hyrfpack.data.undistort import Lens, undistort
 from hyrfpack.errors import HyrfDataError, needs_package
+from hyrfpack.outputs import READABLE
 from hyrfpack.scene import Picture
 
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp", ".tif", ".tiff")
+_SUFFIXES = (*READABLE, *map(str.upper, READABLE))
 _SIXTEEN_BIT = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 _DRAFT = 2  # times the size asked for that a JPEG is decoded at, at least: 49 dB and more from decoding all of it
 
@@ -77,7 +78,7 @@ def find_picture(path: Path) -> Path | None:
 
 def is_picture_name(name: str) -> bool:
     """Whether a file is called like a picture."""
-    return name.lower().endswith(_SUFFIXES) and not name.startswith(".")
+    return name.lower().endswith(READABLE) and not name.startswith(".")
 
 
 def mask_folder(root: Path, picture_folder: str) -> Path:

@@ -33,8 +33,12 @@ def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
         dB; `IDENTICAL_PSNR` at most.
     """
     squares = (image.double() - reference.double()) ** 2
-    mean = float(squares.mean() if mask is None else squares[mask].mean())
-    return min(-10 * math.log10(mean), IDENTICAL_PSNR) if mean > 0 else IDENTICAL_PSNR
+    return decibels(float(squares.mean() if mask is None else squares[mask].mean()))
+
+
+def decibels(mse: float) -> float:
+    """The PSNR of a mean squared error of colours in [0, 1]: dB, `IDENTICAL_PSNR` at most."""
+    return min(-10 * math.log10(mse), IDENTICAL_PSNR) if mse > 0 else IDENTICAL_PSNR
 
 
 def stated_error(provenance: dict) -> float:

@@ -13,10 +13,9 @@ from torch import Tensor
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.model import HybridModel
+from hyrfpack.outputs import PICTURES
 from hyrfpack.render.renderer import RenderSettings, render
 from hyrfpack.scene import Camera
-
-PICTURE_SUFFIXES = {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
 
 
 def render_files(
@@ -70,7 +69,7 @@ def file_names(names: Sequence[str]) -> list[str]:
     """
     full = [_safe(name) for name in names]
     bare = [
-        str(PurePosixPath(name).with_suffix("")) if PurePosixPath(name).suffix.lower() in PICTURE_SUFFIXES else name
+        str(PurePosixPath(name).with_suffix("")) if PurePosixPath(name).suffix.lower() in PICTURES else name
         for name in full
     ]
     chosen = bare if len(set(bare)) == len(bare) else full

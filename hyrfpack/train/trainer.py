@@ -16,6 +16,7 @@ from torch import Tensor
 from hyrfpack.data import PictureCache
 from hyrfpack.device import upload, upload_array
 from hyrfpack.errors import HyrfError, HyrfTrainingError
+from hyrfpack.evaluate.metrics import decibels
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.ssim import photometric_loss
@@ -175,7 +176,7 @@ class Trainer:
         if np.isnan(mse):
             return value, mse
         if self.step % max(1, config.steps // RECORDS) == 0 or self.step == config.steps:
-            self.records.append({"step": self.step, "loss": value, "psnr": _psnr(mse), "gaussians": len(self.model)})
+            self.records.append({"step": self.step, "loss": value, "psnr": decibels(mse), "gaussians": len(self.model)})
         return value, mse
 
     def _solid(self) -> np.ndarray | None:
@@ -248,7 +249,3 @@ def _mean_square(error: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor
     if mask is None:
         return squares.mean()
     return torch.where(mask[..., None], squares, 0).sum() / (squares.shape[-1] * mask.sum())
-
-
-def _psnr(mse: float) -> float:
-    return float(-10 * np.log10(max(mse, 1e-10)))

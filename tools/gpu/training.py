@@ -5,9 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from statistics import fmean
 
 import torch
 
+from hyrfpack.evaluate.metrics import decibels
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, Trainer
@@ -74,7 +76,7 @@ def timed_training(scene: Scene, model: HybridModel, setup: Setup) -> Training:
         gaussians=count,
         steps=steps,
         seconds=seconds,
-        psnr=(_psnr(errors[:5]), _psnr(errors[-5:])),
+        psnr=(decibels(fmean(errors[:5])), decibels(fmean(errors[-5:]))),
         stages=dict(sorted(stages.items(), key=lambda item: -item[1])),
         peak=peak,
         kernels={name: ms / PROFILED_STEPS for name, ms in kernels.items()},
@@ -88,7 +90,3 @@ def advance(trainer: Trainer, steps: int, seconds: float, errors: list[float]) -
         report=lambda trainer, loss, mse: errors.append(mse),
         stop=lambda: trainer.step >= last or time.perf_counter() >= end,
     )
-
-
-def _psnr(errors: list[float]) -> float:
-    return float(-10 * torch.tensor(errors).mean().log10())
