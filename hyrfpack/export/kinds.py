@@ -1,4 +1,4 @@
-"""Which format an export is to be, and what can be refused before minutes of work."""
+"""What is asked for: which kind of file and which Gaussians, and what can be refused before minutes of work."""
 
 from __future__ import annotations
 
@@ -12,19 +12,23 @@ import numpy as np
 from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.export.cameras import COLMAP_FILES
 from hyrfpack.outputs import Outputs
-from hyrfpack.splats.files import USD, WRITTEN
-from hyrfpack.splats.formats import spz
 from hyrfpack.splats.harmonics import MAX_DEGREE
+from hyrfpack.splats.splats import Splats
+from hyrfpack.splats.table import FORMATS, Kind
 
-PAGE, TRANSFORMS, COLMAP = ".html", ".json", ""
-POINTS = (".points.ply", ".points.glb")
-ENDINGS = (*POINTS, *WRITTEN, PAGE, TRANSFORMS)
-# What is imported for an ending alone, and what pip calls it.
-PACKAGES = {**dict.fromkeys(USD, ("pxr", "usd-core")), ".points.glb": ("trimesh",) * 2, COLMAP: ("pycolmap",) * 2}
+# What is exported besides the formats of splats.
+PAGE, TRANSFORMS = Kind(ending=".html", antialiased=True), Kind(ending=".json", degree=0)
+POINTS = (
+    Kind(ending=".points.ply", degree=0),
+    Kind(ending=".points.glb", degree=0, package=("trimesh", "trimesh")),
+)
+COLMAP = Kind(ending="", degree=0, package=("pycolmap", "pycolmap"))  # a folder
+_KINDS = {kind.ending: kind for kind in (*POINTS, *FORMATS.values(), PAGE, TRANSFORMS)}
+ENDINGS = tuple(_KINDS)
 
 
-def kind_of(target: str | os.PathLike[str]) -> str:
-    """The ending that decides the format, one of ENDINGS; COLMAP for a folder or a name without ending.
+def kind_of(target: str | os.PathLike[str]) -> Kind:
+    """What the ending, one of ENDINGS, says is to be written; COLMAP for a folder or a name without ending.
 
     Raises:
         HyrfError: it is none of them.
@@ -34,8 +38,8 @@ def kind_of(target: str | os.PathLike[str]) -> str:
         raise HyrfError(
             f"{target}: compressed PLY is read, not written; .sog and .spz are small, .ply is not compressed"
         )
-    for kind in ENDINGS:
-        if name.endswith(kind):
+    for ending, kind in _KINDS.items():
+        if name.endswith(ending):
             return kind
     if os.path.isdir(target) or not Path(name).suffix:
         return COLMAP
@@ -45,7 +49,7 @@ def kind_of(target: str | os.PathLike[str]) -> str:
 
 
 def check_request(
-    kind: str, target: str | os.PathLike[str], degree: int, crop: Sequence[float] | None, min_opacity: float
+    kind: Kind, target: str | os.PathLike[str], degree: int, crop: Sequence[float] | None, min_opacity: float
 ) -> None:
     """Refuse what would fail later on: see `export`. Raises HyrfError."""
     if degree not in range(MAX_DEGREE + 1):
@@ -54,28 +58,56 @@ def check_request(
         raise HyrfError(f"the crop {crop} is no box; name the least x, y, z, then the greatest, in world units")
     if not 0 <= min_opacity <= 1:
         raise HyrfError(f"an opacity of {min_opacity} cannot be asked for; name 0 to 1")
-    if kind == TRANSFORMS and (crop is not None or min_opacity > 0):
+    if kind is TRANSFORMS and (crop is not None or min_opacity > 0):
         raise HyrfError(
             f"{target}: this holds cameras only, and --crop and --min-opacity choose Gaussians; leave them out"
         )
-    if kind in PACKAGES:
-        module, package = PACKAGES[kind]
+    if kind.package:
+        module, package = kind.package
         with needs_package(package, f"{target}: writing this format"):
             import_module(module)
 
 
 def check_place(target: str | os.PathLike[str], outputs: Outputs) -> None:
     """Refuse a target that may not or cannot be written. Raises HyrfError."""
-    if kind_of(target) == COLMAP:
+    if kind_of(target) is COLMAP:
         outputs.folder(target, COLMAP_FILES)
     else:
         outputs.file(target)
 
 
-def check_reach(kind: str, reach: float) -> None:
-    """Refuse what a format cannot place: splats up to `reach` world units along an axis. Raises HyrfError."""
-    if kind == ".spz" and reach > spz.FARTHEST:
+def check_reach(kind: Kind, reach: float) -> None:
+    """Refuse what a file cannot place: splats up to `reach` world units along an axis. Raises HyrfError."""
+    if reach > kind.farthest:
         raise HyrfError(
-            f"the scene reaches {reach:,.0f} units from the origin with its background, and .spz {spz.FARTHEST:,}; "
-            "export another format, or try --no-background"
+            f"the scene reaches {reach:,.0f} units from the origin with its background, and {kind.ending} "
+            f"{kind.farthest:,}; export another format, or try --no-background"
         )
+
+
+def chosen(splats: Splats, crop: Sequence[float] | None = None, min_opacity: float = 0.0) -> Splats:
+    """Those with centres in the box `crop` and not fainter than `min_opacity`; see `export`.
+
+    Raises:
+        HyrfError: none is left.
+    """
+    keep = kept_of(splats.positions, splats.opacities, crop, min_opacity)
+    return splats if keep.all() else splats[keep]
+
+
+def kept_of(
+    positions: np.ndarray, opacities: np.ndarray, crop: Sequence[float] | None, min_opacity: float
+) -> np.ndarray:
+    """(N,) bool: which Gaussians with positions (N, 3) and opacities (N,) `chosen` keeps. HyrfError when none."""
+    keep = opacities >= min_opacity
+    if crop is not None:
+        keep &= ((positions >= crop[:3]) & (positions <= crop[3:])).all(axis=1)
+    if not len(positions):
+        raise HyrfError("no Gaussian is left: no camera sees any; name the photos with --data, or train again")
+    if not keep.any():
+        low, high = (corner.round(4).tolist() for corner in (positions.min(0), positions.max(0)))
+        raise HyrfError(
+            f"no Gaussian is left: centres lie between {low} and {high}, opacities reach {opacities.max():.3f}; "
+            "widen --crop or lower --min-opacity"
+        )
+    return keep

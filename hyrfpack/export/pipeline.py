@@ -17,18 +17,28 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.export.background import background_picture, background_reach, background_splats
 from hyrfpack.export.bake import bake
 from hyrfpack.export.cameras import encode_transforms, write_colmap
-from hyrfpack.export.choice import chosen, kept_of
-from hyrfpack.export.kinds import COLMAP, PAGE, POINTS, TRANSFORMS, check_place, check_reach, check_request, kind_of
+from hyrfpack.export.kinds import (
+    COLMAP,
+    PAGE,
+    POINTS,
+    TRANSFORMS,
+    check_place,
+    check_reach,
+    check_request,
+    chosen,
+    kept_of,
+    kind_of,
+)
 from hyrfpack.export.measure import Likeness, likeness
 from hyrfpack.export.points import encode_points
 from hyrfpack.export.source import Source
 from hyrfpack.outputs import Outputs
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Scene, evenly_spaced
-from hyrfpack.splats.files import decode_splats, encode_splats
-from hyrfpack.splats.formats import spz
+from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.harmonics import MAX_DEGREE
 from hyrfpack.splats.splats import Splats, concatenate
+from hyrfpack.splats.table import FORMATS, Format, Kind
 from hyrfpack.web.html import decode_page, encode_page
 
 PAGE_CAMERAS = 12  # that a page can be stepped through
@@ -116,22 +126,23 @@ def export(
     read = Source.read(source, data)
     if kind in (TRANSFORMS, COLMAP) and not read.cameras:
         raise HyrfError(f"{source}: it keeps no cameras; export them from the file that training wrote, or name --data")
-    if kind == TRANSFORMS:
+    if kind is TRANSFORMS:
         return _export_cameras(read, target)
-    sphere = background and crop is None and read.model.config.background and kind not in (COLMAP, *POINTS)
+    points = kind in (COLMAP, *POINTS)
+    sphere = background and crop is None and read.model.config.background and not points
     _check_model(read, kind, crop, min_opacity, sphere)
-    degree = 0 if kind in (".splat", COLMAP, *POINTS) else degree
+    degree = min(degree, kind.degree)
     places = (
         "cameras" if read.cameras else "places around the scene, for the file keeps no cameras (--data names photos)"
     )
     say(f"fitting colours of degree {degree} at {len(read.fitted)} {places}")
-    if kind in (COLMAP, *POINTS):
+    if points:
         return _export_points(read, kind, target, chosen(bake(read.model, read.fitted, (0,))[0], crop, min_opacity))
     degrees = (degree,) if crop is not None else range(degree + 1)
     baked = {d: chosen(splats, crop, min_opacity) for d, splats in bake(read.model, read.fitted, degrees).items()}
     say(f"writing {len(baked[degree]):,} Gaussians{' and the background' if sphere else ''}")
     what = read, baked, degree, sphere, Path(target)
-    packed = _pack_page(*what) if kind == PAGE else _pack_splats(*what, kind, spz_version)
+    packed = _pack_page(*what) if kind is PAGE else _pack_splats(*what, kind, spz_version)
     write_atomic(target, packed.data)
     report = ExportReport(str(target), len(packed.data), len(packed.before[degree][0]), packed.background, degree)
     if crop is not None:
@@ -165,18 +176,17 @@ def _pack_page(read: Source, baked: dict[int, Splats], degree: int, sphere: bool
 
 
 def _pack_splats(
-    read: Source, baked: dict[int, Splats], degree: int, sphere: bool, target: Path, kind: str, spz_version: int
+    read: Source, baked: dict[int, Splats], degree: int, sphere: bool, target: Path, form: Format, spz_version: int
 ) -> _Packed:
-    largest = spz.LARGEST_SCALE if kind == ".spz" else math.inf
-    behind = [background_splats(read.model, read.fitted, largest)] if sphere else []
+    behind = [background_splats(read.model, read.fitted, form.largest_scale)] if sphere else []
     whole = {d: concatenate((splats, *behind)) for d, splats in baked.items()}
     first = read.cameras[0][1] if read.cameras else None
-    data = encode_splats(whole[degree], kind, up=read.up, camera=first, spz_version=spz_version)
-    after = decode_splats(data, kind, str(target)), None
+    data = form.encode(whole[degree], Hints(read.up, first, spz_version))
+    after = form.decode(data, str(target)), None
     return _Packed(data, {d: (splats, None) for d, splats in whole.items()}, after, sum(map(len, behind)))
 
 
-def _measured(report: ExportReport, read: Source, packed: _Packed, kind: str, sphere: bool, say: Say) -> ExportReport:
+def _measured(report: ExportReport, read: Source, packed: _Packed, kind: Kind, sphere: bool, say: Say) -> ExportReport:
     """The report with all PSNR filled in."""
     if not read.measured:
         say("nothing is measured, for no photo is held out")
@@ -191,12 +201,13 @@ def _measured(report: ExportReport, read: Source, packed: _Packed, kind: str, sp
     cost = _cost(before, file, read.error)
     if cost > COARSE:
         seen = "" if read.cameras else ", seen from made-up viewpoints (name photos with --data to be sure)"
-        if read.model.config.antialiased and not packed.after[0].antialiased:
-            say(f"{kind} cannot tell that the model is antialiased: say so where it is drawn, or choose .spz or .sog")
+        if read.model.config.antialiased and not kind.antialiased:
+            able = " or ".join(form.ending for form in FORMATS.values() if form.antialiased)
+            say(f"{kind.ending} cannot tell that the model is antialiased: say so where it is drawn, or choose {able}")
         else:
             say(
-                f"{kind} costs {cost:.1f} dB{seen}: it is too coarse for this scene, perhaps for its unit of length; "
-                "choose another format"
+                f"{kind.ending} costs {cost:.1f} dB{seen}: it is too coarse for this scene, perhaps for its unit of "
+                "length; choose another format"
             )
     return replace(
         report,
@@ -224,7 +235,7 @@ def _cost(before: Likeness, after: Likeness, error: float) -> float:
 
 
 @torch.no_grad()
-def _check_model(read: Source, kind: str, crop: Sequence[float] | None, min_opacity: float, sphere: bool) -> None:
+def _check_model(read: Source, kind: Kind, crop: Sequence[float] | None, min_opacity: float, sphere: bool) -> None:
     """Refuse a choice that leaves nothing, and a scene too far away, before the bake."""
     model, frame = read.model, read.model.config.frame
     positions = frame.to_world(model.gaussians.positions.numpy())
@@ -240,13 +251,13 @@ def _export_cameras(read: Source, target: str | os.PathLike[str]) -> ExportRepor
     return ExportReport(str(target), len(data), cameras=len(read.cameras))
 
 
-def _export_points(read: Source, kind: str, target: str | os.PathLike[str], splats: Splats) -> ExportReport:
+def _export_points(read: Source, kind: Kind, target: str | os.PathLike[str], splats: Splats) -> ExportReport:
     """Centres of splats, and cameras."""
-    if kind == COLMAP:
+    if kind is COLMAP:
         write_colmap(read.cameras, target, splats)
         size = sum(table.stat().st_size for table in Path(target, "sparse", "0").glob("*.bin"))
         return ExportReport(str(target), size, cameras=len(read.cameras))
-    data = encode_points(splats, [camera for _, camera in read.cameras], Path(kind).suffix[1:], read.up)
+    data = encode_points(splats, [camera for _, camera in read.cameras], Path(kind.ending).suffix[1:], read.up)
     write_atomic(target, data)
     return ExportReport(str(target), len(data), len(splats), cameras=len(read.cameras))
 

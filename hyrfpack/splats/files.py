@@ -1,4 +1,4 @@
-"""Splat files by their extension: which format it is, writing and reading it."""
+"""Splat files by their ending: writing and reading them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera
-from hyrfpack.splats.formats import gltf, ply, sog, splat, spz, usd
+from hyrfpack.splats.formats import sog
+from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats
+from hyrfpack.splats.table import FORMATS
 
-USD = (".usda", ".usdc", ".usdz")
-WRITTEN = (".ply", ".splat", ".spz", ".glb", *USD, ".sog")
-READ = (".ply", ".splat", ".spz", ".sog")  # by `read_splats`; .compressed.ply is among .ply
+READ = tuple(ending for ending, row in FORMATS.items() if row.read)  # .compressed.ply is among .ply
 LISTED = 4  # names that are told of what a folder holds
 MAX_BYTES = 1 << 32  # of a file to be read: 17 million Gaussians as PLY
 
@@ -26,43 +26,15 @@ def encode_splats(
 
     Args:
         splats: in the input's axes and units.
-        extension: one of WRITTEN. ".splat" holds no harmonics beyond degree 0.
+        extension: one of FORMATS. ".splat" holds no harmonics beyond degree 0.
         up: (3,) unit vector in the world, for the formats that know up (glTF, USD).
         camera: to look from first, for the formats that hold one (USD).
-        spz_version: 3 or 4, see `spz.encode`.
+        spz_version: 3 or 4, see `Hints`.
 
     Raises:
         HyrfError: the format's package is missing.
     """
-    if extension in USD:
-        return usd.encode(splats, extension=extension[1:], up=up, camera=camera)
-    if extension == ".glb":
-        return gltf.encode(splats, up=up)
-    if extension == ".spz":
-        return spz.encode(splats, spz_version)
-    return {".ply": ply, ".splat": splat, ".sog": sog}[extension].encode(splats)
-
-
-def decode_splats(data: bytes, extension: str, name: str) -> Splats:
-    """The splats in the bytes of a file, in the axes that `encode_splats` was given.
-
-    Args:
-        data: the file.
-        extension: one of WRITTEN.
-        name: what error messages call the file.
-
-    Raises:
-        HyrfDataError: the bytes are no such file, or are damaged.
-    """
-    if extension in USD:
-        return usd.decode(data, name, extension[1:])
-    if extension == ".glb":
-        return gltf.decode(data, name)
-    if extension == ".sog":
-        return sog.decode(sog.unzip(data, name), name)
-    if extension == ".ply":
-        return ply.read_ply(data, name)
-    return {".splat": splat, ".spz": spz}[extension].decode(data, name)
+    return FORMATS[extension].encode(splats, Hints(up, camera, spz_version))
 
 
 def read_splats(path: str | os.PathLike[str]) -> Splats:
@@ -77,10 +49,11 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
     extension = path.suffix.lower()
     try:
         if path.is_dir():
-            return sog.decode(_loose_sog(path), str(path))
+            return sog.decode_files(_loose_sog(path), str(path))
         if path.exists() and extension not in READ:
             raise HyrfDataError(f"{path}: files with this ending are not known; name one of {', '.join(READ)}")
-        return decode_splats(_bytes_of(path), extension, str(path))
+        data = _bytes_of(path)
+        return FORMATS[extension].decode(data, str(path))
     except OSError as error:
         raise HyrfDataError(f"{path}: the file cannot be read ({error.strerror or error}); check the path") from error
 

@@ -22,6 +22,7 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
 from hyrfpack.splats.formats import spz
+from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats
 
 SPZ_VERSION = 3  # gzip, which every browser unpacks
@@ -90,7 +91,7 @@ def encode_page(
     if background is not None:
         texts.append(f'<img id="background" alt="" hidden src="data:image/webp;base64,{_webp(background)}">')
     style, script = _part("style.css"), '"use strict";\n' + "\n".join(_part(name) for name in SCRIPTS)
-    packed = memoryview(spz.encode(local, version=SPZ_VERSION))
+    packed = memoryview(spz.encode(local, Hints(spz_version=SPZ_VERSION)))
     blocks = (base64.b64encode(packed[at : at + BLOCK]).decode() for at in range(0, len(packed), BLOCK))
     values = {
         "policy": _policy(style, script),

@@ -19,8 +19,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
 from hyrfpack.export import ExportReport, export, pipeline
 from hyrfpack.export.bake import bake
-from hyrfpack.export.choice import chosen
-from hyrfpack.export.kinds import ENDINGS, kind_of
+from hyrfpack.export.kinds import ENDINGS, chosen, kind_of
 from hyrfpack.export.measure import likeness
 from hyrfpack.export.pipeline import page_of
 from hyrfpack.export.source import Source
@@ -28,13 +27,13 @@ from hyrfpack.format import load, save
 from hyrfpack.model import Frame
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, Picture, Scene
-from hyrfpack.splats.files import USD, WRITTEN, decode_splats
+from hyrfpack.splats.table import FORMATS
 from hyrfpack.web.html import decode_page
 
 POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
 FOUR = ring(4)
 CROP = (-0.3, -10, -10, 0.4, 10, 0.2)
-SPLATS = (*WRITTEN, ".html")
+SPLATS = (*FORMATS, ".html")
 
 
 def moved(camera: Camera, unit: float, center) -> Camera:
@@ -70,7 +69,7 @@ def no_bake(monkeypatch):
 
 def read_back(path):
     data = path.read_bytes()
-    return decode_page(data, "page")[0] if path.suffix == ".html" else decode_splats(data, path.suffix, str(path))
+    return decode_page(data, "page")[0] if path.suffix == ".html" else FORMATS[path.suffix].decode(data, str(path))
 
 
 def nearest(points: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -223,7 +222,9 @@ def test_the_psnr_is_that_of_the_file(ending, plain, tmp_path):
 
 
 def test_a_file_that_lost_something_scores_less(plain, tmp_path, monkeypatch):
-    monkeypatch.setattr(pipeline, "decode_splats", lambda *arguments: decode_splats(*arguments)[:20])
+    form = FORMATS[".ply"]
+    lossy = replace(form, decode=lambda *arguments: form.decode(*arguments)[:20])
+    monkeypatch.setattr(pipeline, "kind_of", lambda target: lossy)
     report = export(plain, tmp_path / "a.ply")
     assert report.psnr < report.by_degree[3] - 3
 
@@ -292,7 +293,7 @@ def test_held_out_photos_score_the_model_and_the_file_and_are_not_fitted(plain, 
     scene = replace(ball_scene(8), train=photos[1::2], test=photos[::2])
     fitted = []
     monkeypatch.setattr(
-        write, "bake", lambda model, cameras, degrees: fitted.extend(cameras) or bake(model, [], degrees)
+        pipeline, "bake", lambda model, cameras, degrees: fitted.extend(cameras) or bake(model, [], degrees)
     )
     report = export(plain, tmp_path / "a.ply", data=scene)
     assert fitted == [view.camera for view in scene.train] and report.views == 4
@@ -346,8 +347,9 @@ def test_a_compact_file_is_baked_and_measured_around_the_scene(compact, tmp_path
 
 
 def test_the_ending_names_the_format():
-    assert [kind_of(f"a/b{ending}") for ending in ENDINGS] == list(ENDINGS)
-    assert kind_of("A/B.PLY") == ".ply" and kind_of("a.b/c") == "" and kind_of("my.scene.spz") == ".spz"
+    assert [kind_of(f"a/b{ending}").ending for ending in ENDINGS] == list(ENDINGS)
+    for name, ending in {"A/B.PLY": ".ply", "a.b/c": "", "my.scene.spz": ".spz"}.items():
+        assert kind_of(name).ending == ending
     for name in ("a.xyz", "model.hyrf", "a.ply.txt"):
         with pytest.raises(HyrfError, match=rf"^{name}: the ending names the format; [^\n]*\.ply[^\n]*$"):
             kind_of(name)
@@ -407,7 +409,7 @@ def test_a_folder_with_the_ending_of_a_file_is_refused_before_the_bake(plain, tm
 @pytest.mark.parametrize(
     ("ending", "module", "package"),
     [
-        *((ending, "pxr", "usd-core") for ending in USD),
+        *((ending, "pxr", "usd-core") for ending in (".usda", ".usdc", ".usdz")),
         (".points.glb", "trimesh", "trimesh"),
         ("", "pycolmap", "pycolmap"),
     ],
@@ -420,12 +422,15 @@ def test_packages_that_are_not_there_are_missed_before_the_bake(
         export(plain, tmp_path / f"a{ending}")
 
 
-@pytest.mark.parametrize("failing", ["encode_splats", "decode_splats", "background_splats"])
+@pytest.mark.parametrize("failing", ["encode", "decode", "background_splats"])
 def test_what_goes_wrong_leaves_the_old_file_as_it_was(failing, sphere, tmp_path, monkeypatch):
     def fail(*arguments, **options):
         raise HyrfError("no")
 
-    monkeypatch.setattr(pipeline, failing, fail)
+    if failing == "background_splats":
+        monkeypatch.setattr(pipeline, failing, fail)
+    else:
+        monkeypatch.setattr(pipeline, "kind_of", lambda target: replace(FORMATS[".ply"], **{failing: fail}))
     (tmp_path / "a.ply").write_bytes(b"old")
     with pytest.raises(HyrfError, match="^no$"):
         export(sphere, tmp_path / "a.ply", degree=0)

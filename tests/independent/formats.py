@@ -10,6 +10,7 @@ import numpy as np
 from independent.clouds import BAND_0, EXACT, Differences
 
 from hyrfpack.splats.formats import gltf, ply, sog, splat, spz
+from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats
 
 UP = np.array([0.36, -0.8, 0.48])  # of the made-up cloud, for glTF and USD
@@ -58,8 +59,8 @@ LOOSEST = Differences(*np.max([astuple(precision) for precision in (SPLAT, SPZ, 
 FORMATS = {
     "ply": Format("ply", ply.encode, EXACT),
     "splat": Format("splat", splat.encode, SPLAT, degrees=(0,)),
-    "spz3": Format("spz", partial(spz.encode, version=3), OUR_SPZ),
-    "spz4": Format("spz", partial(spz.encode, version=4), OUR_SPZ),
+    "spz3": Format("spz", partial(spz.encode, hints=Hints(spz_version=3)), OUR_SPZ),
+    "spz4": Format("spz", partial(spz.encode, hints=Hints(spz_version=4)), OUR_SPZ),
     "sog": Format("sog", sog.encode, SOG),
-    "glb": Format("glb", partial(gltf.encode, up=UP), EXACT),
+    "glb": Format("glb", partial(gltf.encode, hints=Hints(UP)), EXACT),
 }

@@ -26,7 +26,7 @@ from independent.clouds import (
 from independent.formats import COMPRESSED_PLY, FORMATS, SPZ
 from PIL import Image
 
-from hyrfpack.splats.files import decode_splats
+from hyrfpack.splats.table import FORMATS as OURS
 from tools.studies import peers_formats
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def test_we_read_what_gsply_writes(degree, gsply, tmp_path):
     gsply.write_spz(tmp_path / "4.spz", data, version=4)
     precisions = {"plain.ply": FORMATS["ply"].precision, "packed.compressed.ply": COMPRESSED_PLY}
     for name, precision in (precisions | {"3.spz": SPZ, "4.spz": SPZ}).items():
-        ours = cloud_of_ours(decode_splats((tmp_path / name).read_bytes(), Path(name).suffix, name))
+        ours = cloud_of_ours(OURS[Path(name).suffix].decode((tmp_path / name).read_bytes(), name))
         if name.endswith(".spz"):  # it wrote a PLY's numbers as they were
             ours = turned_back(ours, TURN_ABOUT_X)
         assert differences(cloud_of_ours(made_up(degree)), ours).within(precision), name

@@ -19,6 +19,7 @@ from independent.clouds import (
 from independent.formats import BYTE, FORMATS, UP
 
 from hyrfpack.splats.formats import gltf
+from hyrfpack.splats.formats.hints import Hints
 
 # three.js keeps colours and harmonics as bytes, whatever the file holds.
 ROUNDING = Differences(0, 0, 1e-6, BYTE, color=0.02, harmonic=BYTE / BAND_0)
@@ -65,7 +66,7 @@ def test_a_gltf_stands_upright_whichever_way_was_up(node, tmp_path):
     ups = np.concatenate((np.eye(3), -np.eye(3)))
     files = [tmp_path / f"{number}.glb" for number in range(len(ups))]
     for up, file in zip(ups, files, strict=True):
-        file.write_bytes(gltf.encode(made_up(0), up=up))
+        file.write_bytes(gltf.encode(made_up(0), Hints(up)))
     for up, answer in zip(ups, node("three.mjs", *files), strict=True):
         theirs = in_our_axes(cloud_of_three(answer), answer["matrix"], up)
         assert differences(cloud_of_ours(made_up(0)), theirs).within(FORMATS["glb"].precision + ROUNDING), up
@@ -75,7 +76,7 @@ def test_a_gltf_far_from_the_origin_stays_sharp(node, tmp_path):
     splats = made_up(0)
     splats = replace(splats, positions=splats.positions + [3e6, -5e6, 2e6])
     file = tmp_path / "far.glb"
-    file.write_bytes(gltf.encode(splats, up=UP))
+    file.write_bytes(gltf.encode(splats, Hints(UP)))
     (answer,) = node("three.mjs", file)
     theirs = in_our_axes(cloud_of_three(answer), answer["matrix"], UP)
     assert differences(cloud_of_ours(splats), theirs).position < 1e-5  # float32 would be off by 0.25

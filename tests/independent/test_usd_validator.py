@@ -19,6 +19,7 @@ pytest.importorskip("pxr", reason="usd-core is not installed")
 from pxr import Usd, UsdGeom
 
 from hyrfpack.splats.formats import usd
+from hyrfpack.splats.formats.hints import Hints
 
 KINDS = ("usda", "usdc", "usdz")
 TEXT_IS_SLOW = "UsdAsciiPerformanceChecker"  # the validator would rather have .usdc, whatever the text says
@@ -36,7 +37,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("usd")
     paths = {kind: folder / f"splats.{kind}" for kind in KINDS}
     for kind, path in paths.items():
-        path.write_bytes(usd.encode(made_up(3), extension=kind, up=UP, camera=camera(), meters_per_unit=0.5))
+        path.write_bytes(usd.encode(made_up(3), Hints(UP, camera()), extension=kind, meters_per_unit=0.5))
     return paths
 
 
@@ -68,7 +69,7 @@ def cloud_of_usd(prim: Usd.Prim) -> Cloud:
 @pytest.mark.parametrize("kind", KINDS)
 def test_openusd_reads_what_we_write(kind, degree, tmp_path):
     path = tmp_path / f"splats.{kind}"
-    path.write_bytes(usd.encode(made_up(degree), extension=kind, up=UP))
+    path.write_bytes(usd.encode(made_up(degree), Hints(UP), extension=kind))
     stage = Usd.Stage.Open(str(path))
     assert differences(cloud_of_ours(made_up(degree)), cloud_of_usd(the_splats(stage))).within(EXACT)
 
@@ -76,7 +77,7 @@ def test_openusd_reads_what_we_write(kind, degree, tmp_path):
 @pytest.mark.parametrize("up", np.concatenate((np.eye(3), -np.eye(3), UP[None])))
 def test_the_stage_stands_upright_and_its_unit_is_told(up, tmp_path):
     path = tmp_path / "splats.usdc"
-    path.write_bytes(usd.encode(made_up(0), extension="usdc", up=up, meters_per_unit=0.5))
+    path.write_bytes(usd.encode(made_up(0), Hints(up), extension="usdc", meters_per_unit=0.5))
     stage = Usd.Stage.Open(str(path))
     stage_from_prim = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(the_splats(stage))).T
     turn = stage_from_prim[:3, :3]
@@ -90,7 +91,7 @@ def test_a_stage_far_from_the_origin_stays_sharp(tmp_path):
     near = made_up(0)
     far = replace(near, positions=near.positions + [3e6, -5e6, 2e6])
     path = tmp_path / "far.usdc"
-    path.write_bytes(usd.encode(far, extension="usdc", up=UP))
+    path.write_bytes(usd.encode(far, Hints(UP), extension="usdc"))
     stage = Usd.Stage.Open(str(path))
     prim = the_splats(stage)
     matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim)).T

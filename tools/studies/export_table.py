@@ -21,12 +21,13 @@ import numpy as np
 import hyrfpack
 from hyrfpack.export.background import background_picture, background_splats
 from hyrfpack.export.bake import bake
+from hyrfpack.export.kinds import PAGE
 from hyrfpack.export.measure import Likeness, likeness
 from hyrfpack.export.pipeline import page
 from hyrfpack.export.source import Source
-from hyrfpack.splats.files import WRITTEN, decode_splats, encode_splats
-from hyrfpack.splats.formats import spz
+from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats, concatenate
+from hyrfpack.splats.table import FORMATS
 from hyrfpack.web.html import decode_page
 
 Result = TypeVar("Result")
@@ -69,7 +70,8 @@ def main() -> None:
     print("| format | degree | bytes | write (s) | read (s) | dB, model | dB, photos | checked by |")
     print("|---|---|---|---|---|---|---|---|")
     for name in formats:
-        for degree in [0] if name == ".splat" else arguments.degrees:
+        kind = FORMATS.get(name.split()[0], PAGE)
+        for degree in sorted({min(degree, kind.degree) for degree in arguments.degrees}):
             row(source, name, degree, baked, whole, picture)
 
 
@@ -82,26 +84,20 @@ def row(
     picture: np.ndarray | None,
 ) -> None:
     """Write, read, score and print one file."""
-    if name == ".html":
+    if name == PAGE.ending:
         data, write = timed(lambda: page(source, baked[degree], picture, "scene"))
         back, read = timed(lambda: decode_page(data, name))
     else:
-        data, write = timed(lambda: pack(source, whole[degree], name))
-        back, read = timed(lambda: (decode_splats(data, name.split()[0], name), None))
+        form = FORMATS[name.split()[0]]
+        hints = Hints(source.up, source.cameras[0][1], 4 if name.endswith("v4") else 3)
+        data, write = timed(lambda: form.encode(whole[degree], hints))
+        back, read = timed(lambda: (form.decode(data, name), None))
     file = score(source, {"file": back})["file"]
     print(
         f"| {name} | {degree} | {len(data):,} | {write:.2f} | {read:.2f} | {file.model:.2f} | {file.photos:.2f} "
         f"| {CHECKED_BY[name]} |",
         flush=True,
     )
-
-
-def pack(source: Source, splats: Splats, name: str) -> bytes:
-    """The bytes of a file."""
-    if name == ".spz v4":
-        return spz.encode(splats, version=4)
-    assert name in WRITTEN
-    return encode_splats(splats, name, up=source.up, camera=source.cameras[0][1])
 
 
 def score(source: Source, contenders: dict[str, tuple[Splats, np.ndarray | None]]) -> dict[str, Likeness]:

@@ -27,6 +27,7 @@ import numpy as np
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats.checked import checked_splats
+from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.harmonics import MAX_DEGREE, terms_of
 from hyrfpack.splats.placement import local_origin, local_positions, matrices_of, placed, rotation_of, upright_rotation
 from hyrfpack.splats.splats import Splats, concatenate, quaternion_of
@@ -43,7 +44,7 @@ _MIN_BYTES = 16  # of one splat: less, and the file shows the same data again an
 _MAX_BYTES = (1 << 32) - 1  # lengths are uint32
 
 
-def encode(splats: Splats, *, up: np.ndarray) -> bytes:
+def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     """Splats as a .glb file.
 
     The numbers stay in the input's axes and units. The node turns them to glTF's axes, where y is up; where the scene
@@ -52,14 +53,14 @@ def encode(splats: Splats, *, up: np.ndarray) -> bytes:
 
     Args:
         splats: at least one.
-        up: (3,) unit vector in the world: which way is up in the scene.
+        hints: which way is up in the scene.
 
     Raises:
         HyrfDataError: there are none, or they do not fit into float32 or into 4 GiB.
     """
     if not len(splats):
         raise HyrfDataError("there is no Gaussian, and glTF has no form for nothing; export at least one")
-    origin, turn = local_origin(splats.positions), upright_rotation(up, np.array(GLTF_UP))
+    origin, turn = local_origin(splats.positions), upright_rotation(hints.up, np.array(GLTF_UP))
     attributes = {"POSITION": local_positions(splats, origin)}
     attributes["COLOR_0"] = linear_colors(splats)
     attributes[f"{EXTENSION}:ROTATION"] = splats.quats[:, [1, 2, 3, 0]]

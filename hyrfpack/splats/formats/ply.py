@@ -13,6 +13,7 @@ from scipy.special import expit
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats import compressed_ply
 from hyrfpack.splats.formats.checked import checked_splats
+from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.ply_elements import columns, read_elements, read_header
 from hyrfpack.splats.harmonics import MAX_DEGREE, terms_of
 from hyrfpack.splats.splats import Splats
@@ -26,7 +27,7 @@ _NEEDED = (*_POSITION, *_COLOR, "opacity", *_SCALE, *_ROTATION)
 _LEAST, _MOST = -104.0, 20.0
 
 
-def encode(splats: Splats) -> bytes:
+def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     """Splats as a binary little-endian PLY file. Everything is stored as float32; `antialiased` is not stored.
 
     Raises:
@@ -53,6 +54,12 @@ def encode(splats: Splats) -> bytes:
 
 
 def decode(data: bytes, name: str) -> Splats:
+    """Splats of a PLY file of either kind, this one or `compressed_ply`. Errors as `decode_plain` and its `decode`."""
+    packed = compressed_ply.is_compressed(read_header(data, name))
+    return compressed_ply.decode(data, name) if packed else decode_plain(data, name)
+
+
+def decode_plain(data: bytes, name: str) -> Splats:
     """Splats of a PLY file, binary or in text, with its properties in any order, of any type.
 
     Other properties and elements are skipped; normals may be absent. Harmonics end at degree 3. Opacities may be
@@ -97,12 +104,6 @@ def decode(data: bytes, name: str) -> Splats:
             expit(rows["opacity"].astype(np.float64)),
             harmonics,
         )
-
-
-def read_ply(data: bytes, name: str) -> Splats:
-    """Splats of a PLY file of either kind, this one or `compressed_ply`. Errors as their `decode`."""
-    packed = compressed_ply.is_compressed(read_header(data, name))
-    return compressed_ply.decode(data, name) if packed else decode(data, name)
 
 
 def _rest_names(count: int) -> list[str]:

@@ -30,6 +30,7 @@ from PIL import Image
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.quant.morton import morton_codes
 from hyrfpack.splats.formats.checked import checked_splats
+from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.palette import build_palette, nearest
 from hyrfpack.splats.formats.smallest_three import with_largest, without_largest
 from hyrfpack.splats.splats import Splats
@@ -63,7 +64,7 @@ _MOST_META = 1 << 20  # bytes
 _UNEARNED = 1 << 20  # Gaussians that pictures of no size may hold; more need a byte each
 
 
-def encode(splats: Splats) -> bytes:
+def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     """A `.sog` file. Deterministic.
 
     Positions are rounded to 1 / 65535 of the scene's extent after sign(x) log(1 + |x|), opacities to 1 / 255, rotations
@@ -135,7 +136,7 @@ def encode_files(splats: Splats) -> dict[str, bytes]:
 
 
 def unzip(data: bytes, name: str) -> dict[str, bytes]:
-    """The files of a `.sog` bundle that its meta.json names, and meta.json itself, for `decode`.
+    """The files of a `.sog` bundle that its meta.json names, and meta.json itself, for `decode_files`.
 
     Args:
         data: the bundle.
@@ -165,7 +166,12 @@ def picture_names(meta: bytes, name: str) -> list[str]:
     return list(dict.fromkeys(_file(parsed, group, i, name) for group in _groups(parsed) for i in _numbers_of(group)))
 
 
-def decode(files: Mapping[str, bytes], name: str) -> Splats:
+def decode(data: bytes, name: str) -> Splats:
+    """Splats of a `.sog` bundle. Errors as those of `unzip` and `decode_files`."""
+    return decode_files(unzip(data, name), name)
+
+
+def decode_files(files: Mapping[str, bytes], name: str) -> Splats:
     """Splats out of meta.json and the pictures that it names.
 
     Args:

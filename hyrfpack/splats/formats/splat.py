@@ -14,13 +14,15 @@ import numpy as np
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats.checked import checked_splats
+from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.harmonics import BAND_0
 from hyrfpack.splats.splats import Splats
 
+DEGREE = 0  # of the harmonics
 _RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 
 
-def encode(splats: Splats) -> bytes:
+def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     """Splats as a .splat file, without their higher harmonics and `antialiased`.
 
     Gaussians come in the order of opacity times volume, largest first (equal ones as they were): viewers draw the file

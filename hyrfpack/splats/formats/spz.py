@@ -28,6 +28,7 @@ import zstandard
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.splats.formats.checked import checked_splats
+from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.smallest_three import with_largest, without_largest
 from hyrfpack.splats.harmonics import MAX_DEGREE, harmonics_rotation, terms_of
 from hyrfpack.splats.splats import Splats
@@ -69,7 +70,7 @@ _HARMONICS_OF = np.float32((_BYTES - 128) / 128)
 _AXIS_OF = np.float32(_BYTES / 127.5 - 1)
 
 
-def encode(splats: Splats, version: int = 3) -> bytes:
+def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     """Splats as an SPZ file.
 
     What is lost: positions are rounded to multiples of 2^-b, b the most fractional bits up to 23 with which the
@@ -79,12 +80,13 @@ def encode(splats: Splats, version: int = 3) -> bytes:
 
     Args:
         splats: what to store; `antialiased` too.
-        version: 3, one gzip stream, which most programs read, or 4, streams of zstd: smaller and faster.
+        hints: the version, one of VERSIONS.
 
     Raises:
         ValueError: another version.
         HyrfDataError: positions are too far from the origin (4,194,303 units).
     """
+    version = hints.spz_version
     if version not in VERSIONS:
         raise ValueError(f"SPZ version {version} cannot be written; choose one of {VERSIONS}")
     bits = _fractional_bits(splats.positions)

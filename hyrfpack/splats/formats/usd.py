@@ -14,13 +14,14 @@ import io
 import tempfile
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError, needs_package
 from hyrfpack.scene import Camera
 from hyrfpack.splats.formats.checked import checked_splats
+from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.harmonics import MAX_DEGREE, terms_of
 from hyrfpack.splats.placement import local_origin, local_positions, matrices_of, placed, rotation_of, upright_rotation
 from hyrfpack.splats.splats import Splats
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
 
 Extension = Literal["usda", "usdc", "usdz"]
+EXTENSIONS: tuple[Extension, ...] = get_args(Extension)
+PACKAGE = "pxr", "usd-core"
 _SPLATS = "ParticleField3DGaussianSplat"
 _APERTURE = 36.0  # width of the film; USD counts focal lengths and film in tenths of a scene unit, only ratios matter
 _NEAR, _FAR = 0.01, 1.1  # clipping: times the median depth, and times the largest reach
@@ -37,12 +40,7 @@ _MAX_BYTES = (1 << 32) - 1  # of a .usdz: its zip has no 64-bit form
 
 
 def encode(
-    splats: Splats,
-    *,
-    extension: Extension,
-    up: np.ndarray,
-    camera: Camera | None = None,
-    meters_per_unit: float = 1.0,
+    splats: Splats, hints: Hints = NO_HINTS, *, extension: Extension = "usdc", meters_per_unit: float = 1.0
 ) -> bytes:
     """Splats as a USD file.
 
@@ -51,10 +49,9 @@ def encode(
 
     Args:
         splats: any number; scales of 0 become the smallest above it, as the schema's checkers want.
+        hints: which way is up in the scene, and a camera to look from first. USD's z is up where that is nearer to the
+            world's z than to its y, otherwise USD's y.
         extension: "usda" is text, "usdc" binary, "usdz" an uncompressed package of the latter.
-        up: (3,) unit vector in the world: which way is up in the scene. USD's z is up where it is nearer to that than
-            to y, otherwise USD's y.
-        camera: to look from first.
         meters_per_unit: how long a world unit is.
 
     Raises:
@@ -65,18 +62,18 @@ def encode(
         from pxr import Kind, Usd, UsdGeom
 
     stage = Usd.Stage.CreateInMemory()
-    z_up = bool(up[2] > abs(up[1]))
+    z_up = bool(hints.up[2] > abs(hints.up[1]))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z if z_up else UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, meters_per_unit)
     stage.GetRootLayer().documentation = "3D Gaussians, written by hyrfpack"
     world = UsdGeom.Xform.Define(stage, "/World")
     stage.SetDefaultPrim(world.GetPrim())
     Usd.ModelAPI(world).SetKind(Kind.Tokens.component)
-    turn = upright_rotation(up, np.array([0.0, 0.0, 1.0] if z_up else [0.0, 1.0, 0.0]))
+    turn = upright_rotation(hints.up, np.array([0.0, 0.0, 1.0] if z_up else [0.0, 1.0, 0.0]))
     _transform(world, turn, np.zeros(3))
     _add_splats(stage, splats)
-    if camera is not None:
-        _add_camera(stage, camera, splats)
+    if hints.camera is not None:
+        _add_camera(stage, hints.camera, splats)
     if extension == "usda":
         return stage.GetRootLayer().ExportToString().encode()
     with tempfile.TemporaryDirectory() as folder:

@@ -66,15 +66,15 @@ def test_the_largest_of_w_x_y_z_is_left_out(largest):
 
 
 def test_no_gaussians_are_a_file_too():
-    assert len(ply.read_ply(file_of(0, WORDS, rest=24), "a.ply")) == 0
+    assert len(ply.decode(file_of(0, WORDS, rest=24), "a.ply")) == 0
 
 
-def test_read_ply_tells_both_kinds_apart(shared_data):
+def test_decoding_a_ply_tells_both_kinds_apart(shared_data):
     data = (shared_data / "trained_models" / "biker.compressed.ply").read_bytes()
-    splats = ply.read_ply(data, "biker.compressed.ply")
+    splats = ply.decode(data, "biker.compressed.ply")
     assert len(splats) == 152_746 and splats.degree == 0
     with pytest.raises(HyrfDataError, match="holds no Gaussians"):
-        ply.decode(data, "biker.compressed.ply")
+        ply.decode_plain(data, "biker.compressed.ply")
 
 
 GOOD = file_of(300, WORDS)
@@ -83,7 +83,7 @@ GOOD = file_of(300, WORDS)
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (ply.encode(ply.read_ply(file_of(0, WORDS), "")), "'vertex' has no property packed_position"),
+        (ply.encode(ply.decode(file_of(0, WORDS), "")), "'vertex' has no property packed_position"),
         (GOOD.replace(b"uint packed_scale", b"int packed_scale"), "no property packed_scale of the right type"),
         (GOOD.replace(b"max_scale_z", b"max_scale_w"), "'chunk' has no property max_scale_z"),
         (GOOD.replace(b"element chunk", b"element chunky"), "'chunk' has no property min_x"),
@@ -111,7 +111,7 @@ def test_decode_refuses_with_a_sentence(data, words):
 def test_damaged_files_become_splats_or_a_sentence(edits, length):
     data = file_of(5, WORDS, colored=True, rest=9)
     try:
-        splats = ply.read_ply(damaged(data, edits, length), "a.ply")
+        splats = ply.decode(damaged(data, edits, length), "a.ply")
     except HyrfDataError as error:
         assert str(error).startswith("a.ply: ")
     else:

@@ -63,7 +63,7 @@ def test_comments_hold_anything():
 @pytest.mark.parametrize("count", [0, 1, 500])
 def test_everything_comes_back_to_the_precision_of_float32(degree, count):
     splats = make_splats(count, degree)
-    decoded = ply.read_ply(ply.encode(splats), "a.ply")
+    decoded = ply.decode(ply.encode(splats), "a.ply")
     np.testing.assert_array_equal(decoded.positions, splats.positions)
     np.testing.assert_array_equal(decoded.harmonics, splats.harmonics)
     np.testing.assert_allclose(decoded.quats, splats.quats, atol=1e-7)
@@ -117,7 +117,7 @@ def test_variants_of_the_layout_mean_the_same(variant):
     if variant == "big":
         data = re.sub(rb"(?<!\x00)\n", b"\r\n", data[: data.index(b"end_header")]) + data[data.index(b"end_header") :]
 
-    decoded = ply.read_ply(data, "a.ply")
+    decoded = ply.decode(data, "a.ply")
 
     for name in ("positions", "scales", "opacities", "harmonics"):
         np.testing.assert_allclose(getattr(decoded, name), getattr(splats, name), rtol=1e-6, err_msg=name)
@@ -150,7 +150,7 @@ def test_harmonics_of_degree_4_are_left_out():
 )
 def test_files_of_other_programs_are_read(shared_data, file, count, degree):
     data = (shared_data / "trained_models" / file).read_bytes()
-    splats = ply.read_ply(data, file)
+    splats = ply.decode(data, file)
     assert len(splats) == count and splats.degree == degree
     body = np.frombuffer(data[data.index(b"end_header\n") + 11 :], "<f4").reshape(count, -1)
     np.testing.assert_array_equal(splats.positions, body[:, :3])
@@ -192,7 +192,7 @@ GOOD = file_of(NAMES, "float", ROW.tobytes(), 1)
 )  # fmt: skip
 def test_read_ply_refuses_with_a_sentence(data, words):
     with pytest.raises(HyrfDataError, match=words) as error:
-        ply.read_ply(data, "some.ply")
+        ply.decode(data, "some.ply")
     assert str(error.value).startswith("some.ply: ")
 
 
@@ -209,7 +209,7 @@ def test_damaged_files_become_splats_or_a_sentence(text, edits, length):
         names = ["x", "y", "z", "nx", "ny", "nz", *NAMES[3:]]
         data = file_of(names, "float", "\n".join(" ".join(map(str, row)) for row in values).encode(), 5, "ascii")
     try:
-        splats = ply.read_ply(damaged(data, edits, length), "a.ply")
+        splats = ply.decode(damaged(data, edits, length), "a.ply")
     except HyrfDataError as error:
         assert str(error).startswith("a.ply: ")
     else:

@@ -58,7 +58,7 @@ def packed(**changes: object) -> dict[str, bytes]:
 
 
 def test_a_file_packed_by_hand_is_read() -> None:
-    splats = sog.decode(packed(antialias=True), "hand")
+    splats = sog.decode_files(packed(antialias=True), "hand")
     np.testing.assert_allclose(splats.positions, [[0, np.e - 1, 1 - np.e]], atol=2e-5)
     np.testing.assert_allclose(splats.scales, np.exp([[0, 1, 2]]), rtol=1e-6)
     np.testing.assert_allclose(splats.quats, [[0.5**0.5, 0, 0, 0.5**0.5]], atol=5e-3)
@@ -69,14 +69,15 @@ def test_a_file_packed_by_hand_is_read() -> None:
 
 def test_a_first_entry_that_old_writers_lost_follows_from_the_others() -> None:
     files = packed(scales={"codebook": [None, *map(float, range(1, 256))], "files": ["scales.webp"]})
-    np.testing.assert_allclose(np.log(sog.decode(files, "old").scales), [[1 - 254 / 255, 1, 2]], atol=1e-6)
+    np.testing.assert_allclose(np.log(sog.decode_files(files, "old").scales), [[1 - 254 / 255, 1, 2]], atol=1e-6)
 
 
 def test_splat_transform_means_the_same_numbers(shared_data: Path) -> None:
     folder = shared_data / "trained_models"
     if not folder.is_dir():
         pytest.skip(f"trained models not found at {folder}")
-    splats = sog.decode({file.name: file.read_bytes() for file in (folder / "playbot_lod3_sog").iterdir()}, "playbot")
+    files = {file.name: file.read_bytes() for file in (folder / "playbot_lod3_sog").iterdir()}
+    splats = sog.decode_files(files, "playbot")
     data = (folder / "playbot_lod3_sh2.ply").read_bytes()
     header, _, body = data.partition(b"end_header\n")
     names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property")]
@@ -96,7 +97,7 @@ def test_splat_transform_means_the_same_numbers(shared_data: Path) -> None:
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_what_is_written_is_read_within_the_steps_of_the_format(degree: int) -> None:
     splats = some_splats(500, degree)
-    read = sog.decode(sog.unzip(sog.encode(splats), "bundle"), "bundle")
+    read = sog.decode(sog.encode(splats), "bundle")
     cells = np.sign(splats.positions) * np.log1p(np.abs(splats.positions))
     read_cells = np.sign(read.positions) * np.log1p(np.abs(read.positions))
     # The order is the file's: each finds the one at its own place.
@@ -113,7 +114,7 @@ def test_what_is_written_is_read_within_the_steps_of_the_format(degree: int) -> 
 
 def test_colours_that_repeat_are_kept_to_the_last_bit() -> None:
     splats = some_splats(64)
-    read = sog.decode(sog.encode_files(splats[np.arange(512) % 2]), "same")
+    read = sog.decode_files(sog.encode_files(splats[np.arange(512) % 2]), "same")
     assert set(map(bytes, read.harmonics[:, 0])) == set(map(bytes, splats.harmonics[:2, 0]))
     np.testing.assert_allclose(np.unique(read.harmonics[:, 1:]), np.unique(splats.harmonics[:2, 1:]))
 
@@ -121,7 +122,7 @@ def test_colours_that_repeat_are_kept_to_the_last_bit() -> None:
 def test_one_value_beyond_all_others_leaves_the_rest_fine() -> None:
     splats = some_splats(2000, 0)
     splats.harmonics[7] = 1000
-    read = sog.decode(sog.encode_files(splats), "outlier").harmonics
+    read = sog.decode_files(sog.encode_files(splats), "outlier").harmonics
     ordinary = np.sort(splats.harmonics[np.arange(2000) != 7].ravel())
     assert np.abs(np.sort(read[read < 999].ravel()) - ordinary).max() < 0.1  # even steps: 2
     assert read.max() == pytest.approx(1000)
@@ -130,14 +131,14 @@ def test_one_value_beyond_all_others_leaves_the_rest_fine() -> None:
 @pytest.mark.parametrize("count", [0, 1, 65])
 def test_small_files_are_whole(count: int) -> None:
     splats = some_splats(count)
-    read = sog.decode(sog.unzip(sog.encode(splats), "small"), "small")
+    read = sog.decode(sog.encode(splats), "small")
     assert len(read) == count and read.degree == (3 if count else 0)
 
 
 def test_scales_of_nothing_and_flat_scenes_are_written() -> None:
     flat = some_splats(300, 1)
     flat.positions[:, 2], flat.scales[:, 1] = 5, 0
-    read = sog.decode(sog.encode_files(flat), "flat")
+    read = sog.decode_files(sog.encode_files(flat), "flat")
     np.testing.assert_allclose(read.positions[:, 2], 5, rtol=1e-12)
     assert read.scales.min() < 1e-11
 
@@ -190,7 +191,7 @@ def test_a_palette_finds_separate_clusters() -> None:
 )
 def test_what_cannot_be_is_refused_in_a_sentence(changes: dict, message: str) -> None:
     with pytest.raises(HyrfDataError, match=message):
-        sog.decode(packed(**changes), "bad")
+        sog.decode_files(packed(**changes), "bad")
 
 
 def test_a_zip_that_unpacks_to_far_more_is_refused_unread() -> None:
@@ -221,7 +222,7 @@ def test_a_picture_of_far_more_pixels_than_gaussians_is_refused_undecoded(side: 
     file = io.BytesIO()
     Image.new("RGB" if side == 300 else "1", (side, side)).save(file, "PNG")
     with pytest.raises(HyrfDataError, match=r"quats.webp .*(pixels|picture)"):
-        sog.decode(packed() | {"quats.webp": file.getvalue()}, "bomb")
+        sog.decode_files(packed() | {"quats.webp": file.getvalue()}, "bomb")
 
 
 def test_only_what_meta_names_is_unpacked() -> None:
@@ -240,7 +241,7 @@ def test_mutated_bundles_are_splats_or_refused(data: st.DataObject) -> None:
         bundle[data.draw(st.integers(0, len(bundle) - 1))] = data.draw(st.integers(0, 255))
     bundle = bundle[: data.draw(st.integers(0, 2 * len(bundle)))]
     try:
-        sog.decode(sog.unzip(bytes(bundle), "fuzz"), "fuzz")
+        sog.decode(bytes(bundle), "fuzz")
     except HyrfDataError:
         pass
 
@@ -255,7 +256,7 @@ def test_mutated_files_are_splats_or_refused(data: st.DataObject) -> None:
         changed[data.draw(st.integers(0, len(changed) - 1))] = data.draw(st.integers(0, 255))
     files[name] = bytes(changed)
     try:
-        sog.decode(files, "fuzz")
+        sog.decode_files(files, "fuzz")
     except HyrfDataError:
         pass
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats import compressed_ply, spz
+from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats, normalized_quats
 
 # Half a turn about x changes the sign of harmonics that are odd in y and z together.
@@ -75,7 +76,7 @@ def test_decode_reads_a_record_packed_by_hand(version):
 def test_what_is_lost_stays_within_the_promised_bounds(version, degree):
     splats = make_splats(3000, degree, antialiased=degree == 2)
 
-    decoded = spz.decode(spz.encode(splats, version), "a.spz")
+    decoded = spz.decode(spz.encode(splats, Hints(spz_version=version)), "a.spz")
 
     farthest = np.abs(splats.positions).max()
     assert np.abs(decoded.positions - splats.positions).max() <= farthest / 2**22 / 2
@@ -90,8 +91,8 @@ def test_what_is_lost_stays_within_the_promised_bounds(version, degree):
 
 @pytest.mark.parametrize("version", [3, 4])
 def test_numbers_that_were_decoded_are_encoded_as_they_were(version):
-    once = spz.encode(make_splats(500), version)
-    twice = spz.encode(spz.decode(once, "a.spz"), version)
+    once = spz.encode(make_splats(500), Hints(spz_version=version))
+    twice = spz.encode(spz.decode(once, "a.spz"), Hints(spz_version=version))
 
     first, second = spz.decode(once, "a.spz"), spz.decode(twice, "a.spz")
     for name in ("positions", "scales", "opacities", "harmonics"):
@@ -103,7 +104,7 @@ def test_numbers_that_were_decoded_are_encoded_as_they_were(version):
 def test_stored_numbers_are_those_of_the_model_turned_about_x(version):
     splats = make_splats(1)
     turned = splats.rotated(np.diag([1.0, -1, -1]))
-    data = spz.encode(splats, version)
+    data = spz.encode(splats, Hints(spz_version=version))
     content = gzip.decompress(data)[16:] if version == 3 else zstandard.decompress(data[32 + 6 * 16 :])
 
     stored = [int.from_bytes(content[at : at + 3], "little", signed=True) for at in (0, 3, 6)]
@@ -115,7 +116,7 @@ def test_stored_numbers_are_those_of_the_model_turned_about_x(version):
 
 @pytest.mark.parametrize("version", [3, 4])
 def test_no_gaussians_make_a_file_too(version):
-    assert len(spz.decode(spz.encode(make_splats(0, 2), version), "a.spz")) == 0
+    assert len(spz.decode(spz.encode(make_splats(0, 2), Hints(spz_version=version)), "a.spz")) == 0
 
 
 def test_positions_use_the_bits_that_the_farthest_one_leaves():
@@ -155,7 +156,9 @@ def test_extensions_are_skipped():
 def test_the_same_splats_make_the_same_bytes_without_a_time():
     data = spz.encode(make_splats(50))
     assert data[:10] == b"\x1f\x8b\x08\0\0\0\0\0\0\xff"
-    assert data == spz.encode(make_splats(50)) and spz.encode(make_splats(50), 4) == spz.encode(make_splats(50), 4)
+    assert data == spz.encode(make_splats(50))
+    newer = Hints(spz_version=4)
+    assert spz.encode(make_splats(50), newer) == spz.encode(make_splats(50), newer)
 
 
 def test_biker_is_the_model_of_its_compressed_ply(shared_data):
@@ -211,7 +214,7 @@ def test_decode_refuses_with_a_sentence(data, words):
 
 def test_versions_that_are_not_written_are_a_mistake_of_the_caller():
     with pytest.raises(ValueError, match="version 2"):
-        spz.encode(make_splats(1), 2)
+        spz.encode(make_splats(1), Hints(spz_version=2))
 
 
 @pytest.mark.parametrize("version", [3, 4])
@@ -241,7 +244,7 @@ def test_a_bomb_is_not_unpacked(version):
     length=st.sampled_from([1.0, 1.0, 0.9, 0.3]),
 )
 def test_damaged_files_become_splats_or_a_sentence(version, inside, edits, length):
-    data = spz.encode(make_splats(20, 1), version)
+    data = spz.encode(make_splats(20, 1), Hints(spz_version=version))
     inside &= version == 3
     data = bytearray(gzip.decompress(data) if inside else data)
     for place, byte in edits:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.scene import Camera
 from hyrfpack.splats.formats import usd
+from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats
 
 EXTENSIONS = ("usda", "usdc", "usdz")
@@ -28,9 +29,9 @@ def pxr():
     return lambda name: importlib.import_module(f"pxr.{name}")
 
 
-def opened(pxr, tmp_path, splats: Splats, extension: str = "usdc", **options):
+def opened(pxr, tmp_path, splats: Splats, hints: Hints, extension: str = "usdc", **options):
     file = tmp_path / f"a.{extension}"
-    file.write_bytes(usd.encode(splats, extension=extension, **options))
+    file.write_bytes(usd.encode(splats, hints, extension=extension, **options))
     return pxr("Usd").Stage.Open(str(file))
 
 
@@ -38,7 +39,7 @@ def opened(pxr, tmp_path, splats: Splats, extension: str = "usdc", **options):
 @pytest.mark.parametrize("degree", [0, 3])
 def test_what_is_written_is_read_in_the_same_axes(pxr, extension, degree):
     splats = made_up(degree=degree, shift=(5e5, -4e6, 120.0))
-    read = usd.decode(usd.encode(splats, extension=extension, up=Y_DOWN), "a", extension)
+    read = usd.decode(usd.encode(splats, Hints(Y_DOWN), extension=extension), "a", extension)
     np.testing.assert_allclose(read.positions, splats.positions, rtol=0, atol=1e-6)
     np.testing.assert_allclose(read.quats, splats.quats, rtol=0, atol=1e-7)
     for name in ("scales", "opacities", "harmonics"):
@@ -47,7 +48,7 @@ def test_what_is_written_is_read_in_the_same_axes(pxr, extension, degree):
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
 def test_the_same_splats_make_the_same_bytes(pxr, extension):
-    first, second = (usd.encode(made_up(), extension=extension, up=Y_DOWN, camera=CAMERA) for _ in range(2))
+    first, second = (usd.encode(made_up(), Hints(Y_DOWN, CAMERA), extension=extension) for _ in range(2))
     assert first == second
 
 
@@ -56,14 +57,14 @@ def test_the_validator_of_others_finds_nothing_even_far_away_and_with_scales_of_
     splats = made_up(shift=(1e6, 1e6, 1e6))
     splats = replace(splats, scales=np.maximum(splats.scales - 0.02, 0))
     assert (splats.scales == 0).any()
-    opened(pxr, tmp_path, splats, up=Y_DOWN, camera=CAMERA)
+    opened(pxr, tmp_path, splats, Hints(Y_DOWN, CAMERA))
     engine = validator.ValidationEngine()
     engine.enable_rule(validator.GaussianSplatSchemaChecker)
     assert [issue.message for issue in engine.validate(str(tmp_path / "a.usdc")).issues()] == []
 
 
 def test_usds_own_validators_find_nothing(pxr, tmp_path):
-    stage = opened(pxr, tmp_path, made_up(), "usdz", up=Z_UP, camera=CAMERA)
+    stage = opened(pxr, tmp_path, made_up(), Hints(Z_UP, CAMERA), "usdz")
     registry = pxr("UsdValidation").ValidationRegistry()
     validators = [registry.GetOrLoadValidatorByName(each.name) for each in registry.GetAllValidatorMetadata()]
     assert validators
@@ -74,7 +75,7 @@ def test_usds_own_validators_find_nothing(pxr, tmp_path):
     ("up", "axis"), [(Y_DOWN, "Y"), (Z_UP, "Z"), (-Z_UP, "Y"), (np.array([0.48, -0.6, 0.64]), "Z")]
 )
 def test_the_stage_turns_up_to_its_own(pxr, tmp_path, up, axis):
-    stage = opened(pxr, tmp_path, made_up(5), up=up, meters_per_unit=0.25)
+    stage = opened(pxr, tmp_path, made_up(5), Hints(up), meters_per_unit=0.25)
     assert (stage.GetMetadata("upAxis"), stage.GetMetadata("metersPerUnit")) == (axis, 0.25)
     world = pxr("UsdGeom").Xformable(stage.GetDefaultPrim())
     turned = world.GetLocalTransformation().TransformDir(pxr("Gf").Vec3d(*up))
@@ -84,14 +85,14 @@ def test_the_stage_turns_up_to_its_own(pxr, tmp_path, up, axis):
 
 def test_upright_splats_turn_with_their_harmonics(pxr):
     splats, turn = made_up(), np.diag([1.0, -1.0, -1.0])
-    read = usd.decode(usd.encode(splats, extension="usdc", up=Y_DOWN), "a", "usdc", upright=True)
+    read = usd.decode(usd.encode(splats, Hints(Y_DOWN), extension="usdc"), "a", "usdc", upright=True)
     np.testing.assert_allclose(read.positions, splats.positions * (1, -1, -1), atol=1e-6)
     np.testing.assert_allclose(read.harmonics, splats.rotated(turn).harmonics, atol=1e-6)
 
 
 def test_the_extent_is_the_box_of_all_points_at_three_sigma(pxr, tmp_path):
     splats = made_up(30)
-    stage = opened(pxr, tmp_path, splats, up=Y_DOWN)
+    stage = opened(pxr, tmp_path, splats, Hints(Y_DOWN))
     field = pxr("UsdVol").ParticleField3DGaussianSplat.Get(stage, "/World/Gaussians")
     sphere = np.random.default_rng(0).normal(size=(20_000, 3))
     sphere *= 3 / np.linalg.norm(sphere, axis=1, keepdims=True)
@@ -105,7 +106,8 @@ def test_the_extent_is_the_box_of_all_points_at_three_sigma(pxr, tmp_path):
 
 def test_the_camera_projects_as_opencv_does(pxr, tmp_path):
     splats = made_up(20)
-    stage = opened(pxr, tmp_path, splats, up=np.array([0.1, -0.7, 0.2]) / np.sqrt(0.54), camera=CAMERA)
+    up = np.array([0.1, -0.7, 0.2]) / np.sqrt(0.54)
+    stage = opened(pxr, tmp_path, splats, Hints(up, CAMERA))
     field, camera = stage.GetPrimAtPath("/World/Gaussians"), stage.GetPrimAtPath("/World/Camera")
     geom, code = pxr("UsdGeom"), pxr("Usd").TimeCode.Default()
     frustum = geom.Camera(camera).GetCamera(code).frustum
@@ -121,14 +123,14 @@ def test_the_camera_projects_as_opencv_does(pxr, tmp_path):
 
 
 def test_files_within_a_package_start_at_multiples_of_64(pxr):
-    data = usd.encode(made_up(), extension="usdz", up=Y_DOWN)
+    data = usd.encode(made_up(), Hints(Y_DOWN), extension="usdz")
     (info,) = zipfile.ZipFile(BytesIO(data)).infolist()
     start = info.header_offset + 30 + sum(np.frombuffer(data, "<u2", 2, info.header_offset + 26).tolist())
     assert start % 64 == 0 and data[start : start + 8] == b"PXR-USDC" and info.compress_type == zipfile.ZIP_STORED
 
 
 def test_no_splats_are_a_field_of_none(pxr):
-    assert len(usd.decode(usd.encode(made_up()[:0], extension="usda", up=Y_DOWN), "a", "usda")) == 0
+    assert len(usd.decode(usd.encode(made_up()[:0], Hints(Y_DOWN), extension="usda"), "a", "usda")) == 0
 
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
@@ -148,7 +150,7 @@ def test_what_is_no_usd_is_refused_in_a_sentence(pxr, extension):
     ],
 )
 def test_what_does_not_fit_is_refused_in_a_sentence(pxr, old, new, sentence):
-    text = usd.encode(made_up(2, degree=0), extension="usda", up=Z_UP).decode()
+    text = usd.encode(made_up(2, degree=0), Hints(Z_UP), extension="usda").decode()
     assert old in text
     with pytest.raises(HyrfDataError, match=f"^a.usda: .*{sentence}"):
         usd.decode(text.replace(old, new).encode(), "a.usda", "usda")
@@ -157,4 +159,4 @@ def test_what_does_not_fit_is_refused_in_a_sentence(pxr, old, new, sentence):
 def test_without_usd_core_the_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pxr", None)
     with pytest.raises(HyrfError, match="pip install usd-core"):
-        usd.encode(made_up(), extension="usda", up=Y_DOWN)
+        usd.encode(made_up(), Hints(Y_DOWN), extension="usda")
