@@ -10,7 +10,8 @@ import torch
 from PIL import Image
 
 import hyrfpack
-from hyrfpack.cameras.paths import orbit, stored_viewpoint
+from hyrfpack.cameras.capture import Capture
+from hyrfpack.cameras.paths import orbit
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.files import read_splats
 
@@ -35,7 +36,7 @@ def main() -> None:
     original = Drawable.of(read_splats(args.splats), model.config.frame)
     rows = []
     with torch.no_grad():
-        for camera in orbit(stored_viewpoint(hyrfpack.describe(args.model)), VIEWS):
+        for camera in orbit(Capture(hyrfpack.describe(args.model)).viewpoint, VIEWS):
             pair = draw(original, camera).rgb, hyrfpack.render(model, camera, background=False).rgb
             rows.append(np.concatenate([picture.clamp(0, 1).numpy() for picture in pair], axis=1))
     Image.fromarray((np.concatenate(rows) * 255).round().astype(np.uint8)).save(args.picture)

@@ -25,11 +25,13 @@ def public_functions() -> Iterator[tuple[str, object]]:
         if inspect.isfunction(getattr(hyrfpack, name)):
             yield f"hyrfpack.{name}", getattr(hyrfpack, name)
     modules = [importlib.import_module(f"hyrfpack.ops.{name}") for name in OPERATIONS]
-    for module in (*modules, quant):
-        for name, value in vars(module).items():
-            here = getattr(value, "__module__", "").startswith(module.__name__)
-            if inspect.isfunction(value) and here and not name.startswith("_") and name not in WITHOUT:
-                yield f"{module.__name__}.{name}", value
+    operations = {f"{m.__name__}.{name}": value for m in modules for name, value in vars(m).items()}
+    coders = {f"{quant.__name__}.{name}": getattr(quant, name) for name in quant.__all__}
+    for name, value in {**operations, **coders}.items():
+        module, _, short = name.rpartition(".")
+        here = value.__module__ == module or module == quant.__name__ if inspect.isfunction(value) else False
+        if here and not short.startswith("_") and short not in WITHOUT:
+            yield name, value
 
 
 FUNCTIONS = dict(public_functions())

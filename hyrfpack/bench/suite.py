@@ -76,6 +76,12 @@ def bench(
         HyrfError: the model or the photos cannot be used, a result is not finite, or Numba is missing.
         ValueError: there is no such group, no repeat, or a scene without a model.
         TypeError: `scene` is no Scene.
+
+    Example:
+        >>> import hyrfpack
+        >>> report = hyrfpack.bench("bonsai.hyrf", repeats=1, only=["mlp"])
+        >>> sorted({row.group for row in report.rows})
+        ['mlp']
     """
     for name in only or ():
         if name not in GROUPS:

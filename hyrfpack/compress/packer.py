@@ -93,6 +93,12 @@ def compress(
         HyrfError: a file cannot be read or written, the target is what is read, the options do not go together, or
             what is asked for cannot be had.
         TypeError: `data` is no Scene.
+
+    Example:
+        >>> import hyrfpack
+        >>> report = hyrfpack.compress("runs/bonsai/model.hyrf", "small.hyrf")
+        >>> report.profile, report.bytes_after < report.bytes_before
+        ('compact', True)
     """
     if "noise" in settings:
         warnings.warn("compress(noise=...) is now compress(distortion=...)", DeprecationWarning, stacklevel=2)

@@ -43,6 +43,12 @@ def load_scene(
     Raises:
         HyrfDataError: the folder cannot be used; one sentence says what, where, and what to do.
         ValueError: an unknown `layout`, a negative `test_every` or `max_size`.
+
+    Example:
+        >>> import hyrfpack
+        >>> scene = hyrfpack.load_scene("photos/bonsai", test_every=5)
+        >>> len(scene.train), len(scene.test), scene.train[0].camera.width
+        (8, 2, 48)
     """
     if test_every < 0:
         raise ValueError(f"test_every must be 0 or more, not {test_every}")

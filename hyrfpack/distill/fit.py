@@ -136,6 +136,13 @@ def distill(
         HyrfDataError: the source cannot be read, or there is nothing to be seen in it.
         HyrfError: the target cannot be written.
         TypeError: the settings or a camera are something else.
+
+    Example:
+        >>> import hyrfpack
+        >>> quick = hyrfpack.DistillConfig(steps=4, psnr=15, size=32, train_views=6, test_views=2)
+        >>> report = hyrfpack.distill("bonsai.ply", "again.hyrf", quick)
+        >>> report.bytes_after < report.bytes_source
+        True
     """
     check_type("config", config, DistillConfig)
     for camera in cameras or ():

@@ -95,6 +95,12 @@ def evaluate(
     Raises:
         HyrfError: there is no view to score, or a file cannot be read or written.
         TypeError: the model, a view or the settings are something else.
+
+    Example:
+        >>> import hyrfpack
+        >>> scores = hyrfpack.evaluate(hyrfpack.load("bonsai.hyrf"), hyrfpack.load_scene("photos/bonsai").test)
+        >>> len(scores.views), scores.psnr > 10, scores.lpips is None
+        (2, True, True)
     """
     check_type("model", model, HybridModel)
     check_type("settings", settings, RenderSettings)

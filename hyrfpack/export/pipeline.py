@@ -117,6 +117,12 @@ def export(
     Raises:
         HyrfError: a file cannot be read or written, or the options do not go together.
         TypeError: `data` is no Scene.
+
+    Example:
+        >>> import hyrfpack
+        >>> report = hyrfpack.export("bonsai.hyrf", "bonsai.spz", degree=1, background=False)
+        >>> report.degree, report.bytes > 0, report.psnr > 10
+        (1, True, True)
     """
     if data is not None:
         check_type("data", data, Scene)

@@ -115,6 +115,13 @@ def save(
 
     Raises:
         HyrfError: also when the file cannot be written.
+
+    Example:
+        >>> import hyrfpack
+        >>> model = hyrfpack.load("bonsai.hyrf")
+        >>> report = hyrfpack.save(model, "copy.hyrf", provenance={"note": "by hand"})
+        >>> report.profile, report.gaussians == len(model)
+        ('raw', True)
     """
     return write_model(encode_model(model, profile, provenance, **settings), path)
 
@@ -135,7 +142,14 @@ def write_model(data: bytes, path: str | os.PathLike[str]) -> CompressionReport:
 def load(
     path: str | os.PathLike[str], device: str | torch.device = "cpu", fraction: float | None = None
 ) -> HybridModel:
-    """Read a model from a `.hyrf` file. Arguments and errors as `decode_model`, and where no file can be read."""
+    """Read a model from a `.hyrf` file. Arguments and errors as `decode_model`, and where no file can be read.
+
+    Example:
+        >>> import hyrfpack
+        >>> model = hyrfpack.load("bonsai.hyrf")
+        >>> model.gaussians.positions.shape[1], model.gaussians.positions.requires_grad
+        (3, False)
+    """
     device = choose_device(device)
     with Container.open(path, SECTIONS, fraction) as container:
         return _decode(container).to(device)

@@ -48,6 +48,12 @@ def describe(path: str | os.PathLike[str], fraction: float | None = None) -> dic
 
     Raises:
         HyrfFormatError: there is no such file, or its header, table of contents or metadata is damaged.
+
+    Example:
+        >>> import hyrfpack
+        >>> facts = hyrfpack.describe("bonsai.hyrf")
+        >>> facts["profile"], facts["version"], facts["sections"][0]["type"]
+        ('compact', '1.1', 'META')
     """
     with Container.open(path, SECTIONS, fraction) as container:
         metadata = read_metadata(container)

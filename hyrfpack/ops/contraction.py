@@ -20,6 +20,10 @@ def contract(u: Tensor) -> Tensor:
 
     Returns:
         (..., 3) in [0, 1]. Differentiable everywhere, also at |u| = 1 (C1).
+
+    Example:
+        >>> contract(torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))[:, 0]
+        tensor([0.5000, 0.7500, 0.8750])
     """
     # Divided by the largest component first: the square of 1e30 would overflow float32.
     largest = u.abs().amax(-1, keepdim=True).clamp_min(1)
@@ -34,6 +38,10 @@ def expand(c: Tensor) -> Tensor:
         u = y / (|y| (2 - |y|))           otherwise
 
     Points at or past |y| = 2, which no finite u maps to, are taken just inside: |u| stays below 2^20.
+
+    Example:
+        >>> expand(torch.tensor([[0.875, 0.5, 0.5]]))
+        tensor([[2., 0., 0.]])
     """
     y = 4 * (c - 0.5)
     radius = torch.linalg.vector_norm(y, dim=-1, keepdim=True).clamp_min(1)

@@ -24,6 +24,10 @@ def pack_bits(values: np.ndarray, lengths: np.ndarray) -> bytes:
 
     Raises:
         ValueError: the shapes differ or a length is too large.
+
+    Example:
+        >>> pack_bits(np.array([1, 2], np.uint64), np.array([1, 7], np.uint8)).hex()
+        '05'
     """
     _check(values.shape, lengths)
     bits = int(lengths.sum(dtype=np.int64))
@@ -62,6 +66,10 @@ def unpack_bits(data: bytes | memoryview, lengths: np.ndarray) -> np.ndarray:
     Raises:
         DamagedDataError: the lengths need more or fewer bytes, or the bits left over are not zero.
         ValueError: a length is too large.
+
+    Example:
+        >>> unpack_bits(bytes([0x05]), np.array([1, 7], np.uint8)).tolist()
+        [1, 2]
     """
     _check(lengths.shape, lengths)
     reader = BitReader(data, int(lengths.sum(dtype=np.int64)))

@@ -205,6 +205,11 @@ def huffman_encode(symbols: np.ndarray, code: HuffmanCode | None = None) -> Huff
 
     Raises:
         ValueError: another dtype or shape, or a symbol for which `code` has no code.
+
+    Example:
+        >>> symbols = np.array([7, 7, 7, 9], np.uint8)
+        >>> huffman_decode(huffman_encode(symbols)).tolist()
+        [7, 7, 7, 9]
     """
     if symbols.ndim != 1 or symbols.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"symbols must be (N,) uint8 or uint16, got {symbols.shape} {symbols.dtype}")

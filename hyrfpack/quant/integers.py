@@ -52,6 +52,11 @@ def encode_integers(
 
     Raises:
         ValueError: a value out of range, or another shape or dtype.
+
+    Example:
+        >>> data = encode_integers(np.array([0, -3, 1_000_000]), signed=True)
+        >>> decode_integers(data, 3, signed=True).tolist()
+        [0, -3, 1000000]
     """
     values = np.asarray(values)
     if values.ndim != 1 or values.dtype.kind not in "iu":

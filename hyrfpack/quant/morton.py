@@ -26,7 +26,12 @@ _BLOCK = 1 << 14  # points at once: few enough that temporaries stay in the cach
 
 
 def morton_codes(cells: np.ndarray) -> np.ndarray:
-    """Cells (N, 3), each coordinate 0 to 2^21 - 1, to codes (N,) int64: bit 3 i + a is bit i of coordinate a."""
+    """Cells (N, 3), each coordinate 0 to 2^21 - 1, to codes (N,) int64: bit 3 i + a is bit i of coordinate a.
+
+    Example:
+        >>> morton_codes(np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]])).tolist()
+        [1, 2, 4]
+    """
     codes = np.zeros(len(cells), np.int64)
     for first in range(0, len(cells), _BLOCK):
         part = slice(first, first + _BLOCK)

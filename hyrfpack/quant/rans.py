@@ -77,6 +77,11 @@ def encode_tokens(tokens: np.ndarray, contexts: np.ndarray | None = None, implem
 
     Raises:
         ValueError: another shape or dtype, or a token that is too large.
+
+    Example:
+        >>> tokens = np.array([0, 0, 1, 0, 2], np.uint8)
+        >>> decode_tokens(encode_tokens(tokens), 5).tokens.tolist()
+        [0, 0, 1, 0, 2]
     """
     backend = _backend(implementation)
     contexts, classes_of_context = _checked_contexts(contexts, len(tokens))

@@ -12,6 +12,10 @@ def step_of(code: int | np.ndarray) -> np.ndarray:
     """The step, int64 in units of 2^-24, of a code from 1 to 255: (8 + e mod 8) 2^(e div 8).
 
     Neighbouring steps differ by 1/15 to 1/8; they reach from 5e-7 to 1920.
+
+    Example:
+        >>> float(step_of(step_code(0.25)) / ONE)
+        0.25
     """
     code = np.asarray(code, np.int64)
     return (8 + (code & 7)) << (code >> 3)

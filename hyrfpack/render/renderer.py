@@ -109,6 +109,13 @@ def render(
     Raises:
         HyrfError: a number that the view needs is NaN or infinite.
         TypeError: the model, the camera or the settings are something else.
+
+    Example:
+        >>> import hyrfpack
+        >>> model = hyrfpack.load("bonsai.hyrf")
+        >>> camera = hyrfpack.load_scene("photos/bonsai").test[0].camera
+        >>> hyrfpack.render(model, camera).rgb.shape
+        torch.Size([48, 48, 3])
     """
     check_type("model", model, HybridModel)
     check_type("camera", camera, Camera)

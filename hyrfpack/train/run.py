@@ -88,6 +88,13 @@ def train(
             replace photos or other files, or cannot be written (a checkpoint that cannot, while training, is a line on
             standard error).
         TypeError: `scene` is no Scene or `config` no TrainConfig.
+
+    Example:
+        >>> import hyrfpack
+        >>> scene = hyrfpack.load_scene("photos/bonsai")
+        >>> result = hyrfpack.train(scene, "runs/first", hyrfpack.TrainConfig(steps=10), quiet=True)
+        >>> result.complete, result.step, result.model.name
+        (True, 10, 'model.hyrf')
     """
     check_type("scene", scene, Scene)
     out = Path(out)

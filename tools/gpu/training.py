@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from statistics import fmean
 
-import torch
-
 from hyrfpack.evaluate.metrics import decibels
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Scene

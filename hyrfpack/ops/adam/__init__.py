@@ -50,6 +50,12 @@ def adam_step(
 
     Raises:
         ValueError: lists, shapes, types, devices or layouts do not fit together, or `step` is below 1.
+
+    Example:
+        >>> x, m, v = torch.ones(3), torch.zeros(3), torch.zeros(3)
+        >>> broken = adam_step([x], [torch.full((3,), 2.0)], [m], [v], step=1, rate=0.1)
+        >>> x, float(broken)
+        (tensor([0.9000, 0.9000, 0.9000]), 0.0)
     """
     tensors = list(zip(values, gradients, exp_avg, exp_avg_sq, strict=True))
     for value, *others in tensors:

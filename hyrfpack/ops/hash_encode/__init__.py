@@ -39,6 +39,11 @@ def hash_encode(
 
     Raises:
         ValueError: shapes, sizes, types or devices do not fit together.
+
+    Example:
+        >>> table = torch.ones(8 + 64, 2)  # of 2 x 2 x 2 and 4 x 4 x 4 corners
+        >>> hash_encode(torch.rand(5, 3), table, (2, 4), log2_table_size=6).shape
+        torch.Size([5, 4])
     """
     if coords.ndim != 2 or coords.shape[1] != 3 or table.ndim != 2:
         raise ValueError(f"coords {tuple(coords.shape)} must be (N, 3) and table {tuple(table.shape)} (rows, F)")

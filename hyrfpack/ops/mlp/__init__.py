@@ -43,6 +43,11 @@ def mlp(
 
     Raises:
         ValueError: shapes, types or devices do not fit together.
+
+    Example:
+        >>> weights, biases = [torch.eye(2), torch.ones(1, 2)], [torch.zeros(2), torch.zeros(1)]
+        >>> mlp(torch.tensor([[1.0, -3.0]]), weights, biases)
+        tensor([[1.]])
     """
     widths = [x.shape[-1], *(weight.shape[0] for weight in weights)]
     layers = zip(weights, widths, strict=False)

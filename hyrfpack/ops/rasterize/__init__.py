@@ -95,6 +95,13 @@ def rasterize(
     Raises:
         ValueError: shapes, dtypes or devices that do not fit, or a picture without pixels.
         MemoryError: more pairs of a Gaussian and a tile than "cpu" (2^28) or "gpu" (2^31) can number.
+
+    Example:
+        >>> one = torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 3), 0.1)
+        >>> red, light = torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([0.9])
+        >>> drawn = rasterize(*one, light, red, torch.eye(4), (32.0, 32.0, 16.0, 16.0), 32, 32)
+        >>> drawn.rgb.shape, bool(drawn.rgb[16, 16, 0] > 0.8)
+        (torch.Size([32, 32, 3]), True)
     """
     inputs = (means, quats, scales, opacities, colors)
     named = dict(zip(SHAPES, inputs, strict=True))

@@ -45,5 +45,10 @@ def frequency_encoding(directions: Tensor) -> Tensor:
 
 
 def encode_directions(directions: Tensor, encoding: str) -> Tensor:
-    """Unit vectors (N, 3) to the decoder's direction inputs; `encoding` is "sh" or "frequency"."""
+    """Unit vectors (N, 3) to the decoder's direction inputs; `encoding` is "sh" or "frequency".
+
+    Example:
+        >>> encode_directions(torch.tensor([[0.0, 0.0, 1.0]]), "sh").shape
+        torch.Size([1, 9])
+    """
     return spherical_harmonics(directions) if encoding == "sh" else frequency_encoding(directions)

@@ -31,6 +31,11 @@ def ssim(image: Tensor, reference: Tensor, *, implementation: str = "auto") -> T
 
     Raises:
         ValueError: shapes, types or devices do not fit together.
+
+    Example:
+        >>> picture = torch.rand(16, 16, 3)
+        >>> round(float(ssim(picture, picture)), 6)
+        1.0
     """
     _check(image, reference, None)
     chosen = choose(implementation, _AVAILABLE, image, reference)
@@ -64,6 +69,11 @@ def photometric_loss(
 
     Raises:
         ValueError: shapes, types or devices do not fit together.
+
+    Example:
+        >>> photo = torch.zeros(16, 16, 3)
+        >>> round(float(photometric_loss(photo + 0.5, photo, ssim_weight=0.0)), 6)
+        0.5
     """
     _check(image, target, mask)
     chosen = choose(implementation, _AVAILABLE, image, target)
