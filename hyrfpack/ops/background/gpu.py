@@ -115,14 +115,20 @@ def _bias(bias, start, OUTPUTS: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.con
 
 @triton.jit(do_not_specialize=["height", "width", "stride", "rows", "columns"])
 def draw_nodes(
-    transmittance, height, width, threshold, stride, rows, columns,
-    corner_x, corner_y, corner_z, right_x, right_y, right_z, down_x, down_y, down_z, origin_x, origin_y, origin_z,
-    half_x, half_y, half_z, table, levels, w1, b1, w2, b2, w3, b3, out,
+    transmittance, height, width, threshold, stride, rows, columns, rays, half_extent, table, levels, weights, biases,
+    out,
     STRIDE: tl.constexpr, LEVELS: tl.constexpr, EXTRA: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr,
     LEVELS_P: tl.constexpr, EXTRA_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, PART: tl.constexpr,
     BLOCK_COLUMNS: tl.constexpr, FREQUENCY: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Colours of a block of nodes; the ray of node (i, j) is along corner + i down + j right."""
+    """Colours of a block of nodes.
+
+    Tuples: rays of `_rays`, half_extent, weights and biases of the three layers. Whole numbers stay out of them, for
+    there Triton builds a kernel for each that is 1 or a multiple of 16.
+    """
+    corner, right, down, origin = rays
+    w1, w2, w3 = weights
+    b1, b2, b3 = biases
     BLOCK: tl.constexpr = _BLOCK_ROWS * BLOCK_COLUMNS
     INPUTS: tl.constexpr = 2 * LEVELS + EXTRA
     blocks = tl.cdiv(columns, BLOCK_COLUMNS)
@@ -134,17 +140,18 @@ def draw_nodes(
     colors = tl.zeros([BLOCK, _OUTPUTS_P], tl.float32)
     if tl.max(needed.to(tl.int32), 0) > 0:
         row, column = i.to(tl.float32), j.to(tl.float32)
-        x = corner_x + row * down_x + column * right_x
-        y = corner_y + row * down_y + column * right_y
-        z = corner_z + row * down_z + column * right_z
+        x = corner[0] + row * down[0] + column * right[0]
+        y = corner[1] + row * down[1] + column * right[1]
+        z = corner[2] + row * down[2] + column * right[2]
         length = tl.sqrt_rn(x * x + y * y + z * z)
         x, y, z = tl.div_rn(x, length), tl.div_rn(y, length), tl.div_rn(z, length)
         # `reference.sphere_points`.
-        along = x * origin_x + y * origin_y + z * origin_z
-        px, py, pz = origin_x - along * x, origin_y - along * y, origin_z - along * z
+        along = x * origin[0] + y * origin[1] + z * origin[2]
+        px, py, pz = origin[0] - along * x, origin[1] - along * y, origin[2] - along * z
         outside = px * px + py * py + pz * pz - _RADIUS * _RADIUS
         rest = tl.sqrt_rn(tl.maximum(-outside, 0.0))
-        u, v, w = _contract((px + rest * x) / half_x, (py + rest * y) / half_y, (pz + rest * z) / half_z)
+        px, py, pz = px + rest * x, py + rest * y, pz + rest * z
+        u, v, w = _contract(px / half_extent[0], py / half_extent[1], pz / half_extent[2])
         features0, features1 = _features(u, v, w, table, levels, needed, LEVELS, LEVELS_P)
 
         hidden = _bias(b1, 0, H1, H1_P, BLOCK)
@@ -186,10 +193,10 @@ def background_grid(
     """As `hyrfpack.ops.background.background_grid`, of a field that fits and with no gradients."""
     height, width = transmittance.shape
     rows, columns = grid_size(height, width, stride)
-    w1, w2, w3 = (weight.detach().contiguous() for weight in weights)
-    b1, b2, b3 = (bias.detach().contiguous() for bias in biases)
-    levels, extra = len(resolutions), w1.shape[1] - 2 * len(resolutions)
-    widths = _padded(len(w1)), _padded(len(w2))
+    weights, biases = (tuple(tensor.detach().contiguous() for tensor in layers) for layers in (weights, biases))
+    levels, extra = len(resolutions), weights[0].shape[1] - 2 * len(resolutions)
+    hidden = [len(bias) for bias in biases[:2]]
+    widths = [_padded(width) for width in hidden]
     block_columns, warps, part = _launch(mixed, max(widths))
     colors = table.new_empty((3, rows, columns))
     draw_nodes[(triton.cdiv(rows, _BLOCK_ROWS.value) * triton.cdiv(columns, block_columns),)](
@@ -200,17 +207,18 @@ def background_grid(
         stride,
         rows,
         columns,
-        *_rays(pose, intrinsics, stride),
-        *half_extent,
+        _rays(pose, intrinsics, stride),
+        tuple(half_extent),
         whole_rows(table),
         level_numbers(resolutions, log2_table_size, table.device),
-        *(w1, b1, w2, b2, w3, b3),
+        weights,
+        biases,
         colors,
         STRIDE=stride,
         LEVELS=levels,
         EXTRA=extra,
-        H1=len(w1),
-        H2=len(w2),
+        H1=hidden[0],
+        H2=hidden[1],
         LEVELS_P=_padded(levels),
         EXTRA_P=_padded(extra),
         H1_P=widths[0],
@@ -225,13 +233,13 @@ def background_grid(
     return colors.permute(1, 2, 0)
 
 
-def _rays(pose: Tensor, intrinsics: tuple[float, float, float, float], stride: int) -> list[float]:
-    """The first node's ray, its steps from column to column and from row to row, and the origin: 12 numbers."""
+def _rays(pose: Tensor, intrinsics: tuple[float, float, float, float], stride: int) -> tuple[tuple[float, ...], ...]:
+    """The first node's ray, its steps from column to column and from row to row, and the origin, of 3 numbers each."""
     fx, fy, cx, cy = intrinsics
     pose = pose.detach().cpu().double()
     seen = [[(0.5 - cx) / fx, (0.5 - cy) / fy, 1], [stride / fx, 0, 0], [0, stride / fy, 0]]
     rays = torch.tensor(seen, dtype=torch.float64) @ pose[:3, :3]
-    return torch.cat((rays.reshape(-1), camera_center(pose))).tolist()
+    return tuple(map(tuple, (*rays.tolist(), camera_center(pose).tolist())))
 
 
 def _padded(width: int) -> int:
