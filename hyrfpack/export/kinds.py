@@ -8,9 +8,12 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from hyrfpack.errors import HyrfError, needs_package
+from hyrfpack.export.background import background_reach
 from hyrfpack.export.cameras import COLMAP_FILES
+from hyrfpack.export.source import Source
 from hyrfpack.outputs import Outputs
 from hyrfpack.splats.harmonics import MAX_DEGREE
 from hyrfpack.splats.splats import Splats
@@ -76,8 +79,15 @@ def check_place(target: str | os.PathLike[str], outputs: Outputs) -> None:
         outputs.file(target)
 
 
-def check_reach(kind: Kind, reach: float) -> None:
-    """Refuse what a file cannot place: splats up to `reach` world units along an axis. Raises HyrfError."""
+@torch.no_grad()
+def check_model(read: Source, kind: Kind, crop: Sequence[float] | None, min_opacity: float, sphere: bool) -> None:
+    """Refuse a choice that leaves nothing, and a scene, with its background if `sphere`, too far away for the kind of
+    file: before the bake. Raises HyrfError."""
+    model, frame = read.model, read.model.config.frame
+    positions = frame.to_world(model.gaussians.positions.numpy())
+    if crop is not None or min_opacity > 0:  # the bake makes no Gaussian less faint
+        positions = positions[kept_of(positions, model.decode_geometry().opacities.numpy(), crop, min_opacity)]
+    reach = max(float(np.abs(positions).max()), background_reach(frame) if sphere else 0.0)
     if reach > kind.farthest:
         raise HyrfError(
             f"the scene reaches {reach:,.0f} units from the origin with its background, and {kind.ending} "

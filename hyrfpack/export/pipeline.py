@@ -9,12 +9,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_type
 from hyrfpack.errors import HyrfError
-from hyrfpack.export.background import background_picture, background_reach, background_splats
+from hyrfpack.export.background import background_picture, background_splats
 from hyrfpack.export.bake import bake
 from hyrfpack.export.cameras import encode_transforms, write_colmap
 from hyrfpack.export.kinds import (
@@ -22,11 +21,10 @@ from hyrfpack.export.kinds import (
     PAGE,
     POINTS,
     TRANSFORMS,
+    check_model,
     check_place,
-    check_reach,
     check_request,
     chosen,
-    kept_of,
     kind_of,
 )
 from hyrfpack.export.measure import Likeness, likeness
@@ -136,7 +134,7 @@ def export(
         return _export_cameras(read, target)
     points = kind in (COLMAP, *POINTS)
     sphere = background and crop is None and read.model.config.background and not points
-    _check_model(read, kind, crop, min_opacity, sphere)
+    check_model(read, kind, crop, min_opacity, sphere)
     degree = min(degree, kind.degree)
     places = (
         "cameras" if read.cameras else "places around the scene, for the file keeps no cameras (--data names photos)"
@@ -238,17 +236,6 @@ def _cost(before: Likeness, after: Likeness, error: float) -> float:
     if before.photos is not None and after.photos is not None:
         return before.photos - after.photos
     return 10 * math.log10((error + 10 ** (-after.model / 10)) / (error + 10 ** (-before.model / 10)))
-
-
-@torch.no_grad()
-def _check_model(read: Source, kind: Kind, crop: Sequence[float] | None, min_opacity: float, sphere: bool) -> None:
-    """Refuse a choice that leaves nothing, and a scene too far away, before the bake."""
-    model, frame = read.model, read.model.config.frame
-    positions = frame.to_world(model.gaussians.positions.numpy())
-    if crop is not None or min_opacity > 0:  # the bake makes no Gaussian less faint
-        positions = positions[kept_of(positions, model.decode_geometry().opacities.numpy(), crop, min_opacity)]
-    reach = float(np.abs(positions).max())
-    check_reach(kind, max(reach, background_reach(frame)) if sphere else reach)
 
 
 def _export_cameras(read: Source, target: str | os.PathLike[str]) -> ExportReport:

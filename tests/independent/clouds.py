@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import astuple, dataclass, replace
 
 import numpy as np
+from independent.ply_files import Stored
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
 from hyrfpack.splats.splats import Splats
-from tools.studies import peers_formats
 
 TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0])  # by 180 degrees: from SPZ's axes (right, up, back) to those of a PLY
 KINDS = 24
@@ -63,19 +63,17 @@ def cloud_of_ours(splats: Splats) -> Cloud:
     return cloud_of(splats.positions, splats.scales, splats.quats, splats.opacities, splats.harmonics)
 
 
-def cloud_of_ply(splats: peers_formats.Splats) -> Cloud:
+def cloud_of_ply(splats: Stored) -> Cloud:
     """From what the PLY of 3D Gaussian Splatting stores: logarithms of scales, logits of opacities."""
     opacities = 1 / (1 + np.exp(-np.float64(splats.opacity_logits)))
     return cloud_of(splats.positions, np.exp(np.float64(splats.log_scales)), splats.quats, opacities, splats.harmonics)
 
 
-def ply_of(splats: Splats) -> peers_formats.Splats:
-    """What a PLY of 3D Gaussian Splatting stores, for `peers_formats.write_ply`."""
+def ply_of(splats: Splats) -> Stored:
+    """What a PLY of 3D Gaussian Splatting stores, for `write_ply`."""
     opacities = np.float64(splats.opacities)
     logits = np.log(opacities / (1 - opacities)).astype(np.float32)
-    return peers_formats.Splats(
-        splats.positions.astype(np.float32), np.log(splats.scales), splats.quats, logits, splats.harmonics
-    )
+    return Stored(splats.positions.astype(np.float32), np.log(splats.scales), splats.quats, logits, splats.harmonics)
 
 
 def made_up(degree: int, count: int = 300) -> Splats:

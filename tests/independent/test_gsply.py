@@ -24,10 +24,10 @@ from independent.clouds import (
     turned_back,
 )
 from independent.formats import COMPRESSED_PLY, FORMATS, SPZ
+from independent.ply_files import Stored
 from PIL import Image
 
 from hyrfpack.splats.table import FORMATS as OURS
-from tools.studies import peers_formats
 
 if TYPE_CHECKING:
     from gsply import GSData
@@ -52,7 +52,7 @@ def cloud_of_gsply(data: GSData) -> Cloud:
     harmonics = data.sh0[:, None]
     if data.shN is not None:
         harmonics = np.concatenate((harmonics, data.shN), axis=1)
-    return cloud_of_ply(peers_formats.Splats(data.means, data.scales, data.quats, data.opacities, harmonics))
+    return cloud_of_ply(Stored(data.means, data.scales, data.quats, data.opacities, harmonics))
 
 
 @pytest.mark.parametrize("kind", ["ply", "spz3", "spz4", "sog"])

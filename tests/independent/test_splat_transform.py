@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from independent.clouds import cloud_of_ours, cloud_of_ply, differences, made_up, ply_of
 from independent.formats import COMPRESSED_PLY, FORMATS, SOG, SPZ
+from independent.ply_files import read_ply, write_ply
 
 from hyrfpack.splats.formats import gltf
 from hyrfpack.splats.table import FORMATS as OURS
-from tools.studies.peers_formats import read_ply, write_ply
 
 READ = ("ply", "splat", "spz3", "spz4", "sog")
 

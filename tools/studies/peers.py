@@ -3,15 +3,15 @@
     python -m tools.studies.peers runs/bonsai/model.hyrf data/bonsai
     python -m tools.studies.peers runs/bonsai/model.hyrf data/bonsai --ours small.hyrf medium.hyrf large.hyrf
 
-Other formats hold explicit Gaussians, so the model is baked first: geometry as it decodes, colour as spherical
-harmonics fitted to what the training cameras see. Each format then writes its real files (see `peers_formats.py`),
-which its own program reads back. All are rendered by our rasteriser and scored on the held-out photos.
+Other formats hold explicit Gaussians, so the model is baked first, as `hyrfpack export` does it. SPZ and SOG are then
+what it writes; gsplat's PNG is what gsplat writes (see `gsplat_png.py`). Every file is read back, drawn by our
+rasteriser and scored on the held-out photos.
 
 The peers are given an advantage wherever there was a choice: the background sphere, which their formats cannot hold, is
-rendered for them from our model and its bytes are not counted; opacities and scales are cut where nobody sees it;
-Gaussians come in Morton order; and the faintest are left out in some of their settings, in none of ours.
-What they are not given: the Gaussians were trained with our fields, not with spherical harmonics of their own, so
-`drop, baked` says what a format loses and `drop, trained` says what leaving the hybrid model costs as well.
+rendered for them from our model and its bytes are not counted; Gaussians come in Morton order; and the faintest are
+left out in some of their settings, in none of ours. What they are not given: the Gaussians were trained with our
+fields, not with spherical harmonics of their own, so `drop, baked` says what a format loses and `drop, trained` says
+what leaving the hybrid model costs as well.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import json
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import cycle, product
 from pathlib import Path
 from statistics import fmean
@@ -32,16 +33,19 @@ from torch import Tensor
 import hyrfpack
 from hyrfpack.evaluate.figures import blank_figure, save_figure
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
+from hyrfpack.export.bake import bake
+from hyrfpack.export.kinds import chosen
+from hyrfpack.export.source import Source
 from hyrfpack.format.codec import PROFILES
-from hyrfpack.model import Geometry, HybridModel
-from hyrfpack.model.gaussians import logit
-from hyrfpack.ops.poses import camera_center
-from hyrfpack.ops.rasterize import rasterize
-from hyrfpack.ops.rasterize.cull import frustum_cull
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.model import HybridModel
+from hyrfpack.render import render
 from hyrfpack.scene import Camera, View
-from hyrfpack.splats.harmonics import harmonics_basis
-from tools.studies.peers_formats import NotAvailable, Png, RoundTrip, Sog, Splats, SplatTransform, Spz, morton_order
+from hyrfpack.splats.draw import Drawable, draw
+from hyrfpack.splats.formats import spz
+from hyrfpack.splats.formats.hints import NO_HINTS, Hints
+from hyrfpack.splats.splats import Splats
+from hyrfpack.splats.table import FORMATS
+from tools.studies import gsplat_png
 
 # Our settings: profile -> variants of its settings. A profile that is not named here is taken with its defaults.
 OURS: dict[str, list[dict]] = {
@@ -50,22 +54,17 @@ OURS: dict[str, list[dict]] = {
         {"color": (1, 128), "scale": (1, 32), "opacity": (1, 16)},
         {"color": (3, 256), "scale": (2, 128), "opacity": (2, 32)},
     ],
-    "compact": [{}, *({"distortion": value} for value in (2e-6, 8e-6, 8e-5, 3e-4))],
+    "compact": [{}, *({"noise": noise} for noise in (2e-6, 8e-6, 8e-5, 3e-4))],
 }
 REFERENCES = ("raw",)  # profiles that do not compress
 
 # Settings of the peers.
+PEERS = ("SPZ", "SOG", "PNG")
 DEGREES = (0, 1, 2, 3)
-RIDGES = (0.05, 0.5)  # of the fitted harmonics: more costs colour and makes them easier to quantise and to cluster
-MIN_OPACITIES = (0.0, 0.15)
-SPZ_LENGTHS = (1.0, 1 / 4)
-SOG_CLUSTERS = (1024, 4096)
+MIN_OPACITIES = (0.0, 0.05, 0.15)
 PNG_CLUSTERS = (1024, 4096)
 
-UNSEEN = 0.01  # weight of a training camera that a Gaussian sends no light to
-BLOCK = 32768  # Gaussians fitted at once
-LOGIT_TAIL = 7.0  # opacities beyond are cut, 1e-3 from 1; the rasteriser cuts alpha at 0.99
-LOG_SCALE_LEAST = -10.0  # of local units, far below a pixel; the least that SPZ can hold, too
+RoundTrip = Callable[[Splats], tuple[int, Splats]]
 COLORS = ("#d93025", "#8430ce", "#1a73e8", "#188038", "#e37400", "#12858d", "#5f6368")  # of formats, as they come
 
 
@@ -81,7 +80,7 @@ class Row:
         bits: per Gaussian of the trained model.
         psnr, ssim: against the held-out photos.
         drop_hybrid: dB of `psnr` lost against the trained model.
-        drop_baked: the same against the baked model of the same degree and the least ridge; None for our files.
+        drop_baked: the same against the baked model of the same degree; None for our files.
         likeness: PSNR against the trained model's own pictures, dB.
     """
 
@@ -95,59 +94,6 @@ class Row:
     drop_hybrid: float
     drop_baked: float | None
     likeness: float
-
-
-@torch.no_grad()
-def bake(model: HybridModel, cameras: Sequence[Camera]) -> dict[tuple[int, float], Splats]:
-    """The model as explicit Gaussians in local units and Morton order, by the degree of the harmonics and the ridge.
-
-    Colours minimise, for each Gaussian over cameras v at directions d_v,
-
-        sum_v w_v |0.5 + sum_i k_i Y_i(d_v) - color(d_v)|^2 + ridge sum_{i > 0} |k_i|^2
-
-    with w_v = UNSEEN + the light that the Gaussian sends to picture v, in units of its mean over pictures. Only the
-    normal equations are kept, for BLOCK Gaussians at a time: 2 kB each.
-    """
-    geometry, positions = model.decode_geometry(), model.gaussians.positions.detach()
-    poses = [torch.as_tensor(model.config.frame.local_pose(camera), dtype=torch.float32) for camera in cameras]
-    light = torch.stack([_light(positions, geometry, *camera) for camera in zip(cameras, poses, strict=True)])
-    weights = UNSEEN + light / light.mean(0).clamp_min(1e-9)
-    fitted: dict[tuple[int, float], list[Tensor]] = {variant: [] for variant in product(DEGREES, RIDGES)}
-    for index in torch.arange(len(positions)).split(BLOCK):
-        normal = torch.zeros(len(index), 16, 16, dtype=torch.float64)
-        target = torch.zeros(len(index), 16, 3, dtype=torch.float64)
-        for row, pose in zip(weights, poses, strict=True):
-            viewpoint = camera_center(pose)
-            directions = torch.nn.functional.normalize(positions[index] - viewpoint, dim=-1, eps=1e-12)
-            basis = harmonics_basis(directions.double())
-            weighted = (row[index, None] * basis)[..., None]
-            normal += weighted * basis[:, None]
-            target += weighted * (model.decode_colors(viewpoint, index).double() - 0.5)[:, None]
-        penalty = (torch.arange(16) > 0).double().diag()
-        for (degree, ridge), parts in fitted.items():
-            terms = (degree + 1) ** 2
-            ridged = (normal + ridge * penalty)[:, :terms, :terms]
-            parts.append(torch.cholesky_solve(target[:, :terms], torch.linalg.cholesky(ridged)).float())
-    quats = torch.nn.functional.normalize(geometry.quats, dim=-1)
-    quats = torch.where(quats[:, :1] < 0, -quats, quats)
-    shared = (
-        positions.numpy(),
-        geometry.scales.log().clamp_min(LOG_SCALE_LEAST).numpy(),
-        quats.numpy(),
-        logit(geometry.opacities).clamp_max(LOGIT_TAIL).numpy(),
-    )
-    order = morton_order(shared[0])
-    return {variant: Splats(*shared, torch.cat(parts).numpy())[order] for variant, parts in fitted.items()}
-
-
-def _light(positions: Tensor, geometry: Geometry, camera: Camera, pose: Tensor) -> Tensor:
-    """(N,) the light that each Gaussian sends to a picture: the sum over pixels of T alpha, its colour's gradient."""
-    size = camera.intrinsics, camera.width, camera.height
-    with torch.enable_grad():
-        colors = torch.ones(len(positions), 3, requires_grad=True)
-        raster = rasterize(positions, geometry.quats, geometry.scales, geometry.opacities, colors, pose, *size)
-        (gradient,) = torch.autograd.grad(raster.rgb[..., 0].sum(), colors)
-    return gradient[:, 0]
 
 
 @dataclass(frozen=True)
@@ -193,30 +139,9 @@ def _background(model: HybridModel, camera: Camera) -> Tensor:
     return model.decode_background(points, camera.intrinsics, pose).reshape(camera.height, camera.width, 3)
 
 
-@torch.no_grad()
-def draw(splats: Splats, view: HeldOut, model: HybridModel) -> Tensor:
-    """(H, W, 3) explicit Gaussians in the local units of `model`, as `hyrfpack.render` draws the model's own."""
-    settings, camera = RenderSettings(), view.camera
-    pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=torch.float32)
-    size = camera.intrinsics, camera.width, camera.height
-    index = frustum_cull(torch.from_numpy(splats.positions), pose, *size, settings.near, settings.cull_tolerance)
-    positions, log_scales, quats, opacity_logits, harmonics = (
-        torch.from_numpy(np.ascontiguousarray(values, np.float32))[index] for values in vars(splats).values()
-    )
-    directions = torch.nn.functional.normalize(positions - camera_center(pose), dim=-1, eps=1e-12)
-    basis = harmonics_basis(directions)[:, : harmonics.shape[1]]
-    raster = rasterize(
-        positions,
-        quats,
-        log_scales.exp(),
-        opacity_logits.sigmoid(),
-        (torch.einsum("nk,nkc->nc", basis, harmonics) + 0.5).clamp_min(0),
-        pose,
-        *size,
-        near=settings.near,
-        antialiased=model.config.antialiased,
-        transmittance_min=settings.transmittance_min,
-    )
+def picture_of(splats: Drawable, view: HeldOut) -> Tensor:
+    """(H, W, 3) splats over the trained model's background."""
+    raster = draw(splats, view.camera)
     return raster.rgb + raster.transmittance[..., None] * view.behind
 
 
@@ -235,99 +160,76 @@ class Setting:
     """A point on a peer's curve.
 
     Attributes:
+        peer: one of PEERS.
         name: what `run` does.
-        degree, ridge: of the baked model.
+        degree: of the baked model.
         min_opacity: fainter Gaussians are left out.
         run: writes the files and reads them back.
     """
 
-    format: str
+    peer: str
     name: str
     degree: int
-    ridge: float
     min_opacity: float
     run: RoundTrip
 
     def __str__(self) -> str:
-        ridge = f"ridge {self.ridge:g}" if self.degree else ""
         pruned = f"opacity >= {self.min_opacity:g}" if self.min_opacity else ""
-        return ", ".join(part for part in (f"degree {self.degree}", self.name, ridge, pruned) if part)
+        return ", ".join(part for part in (f"degree {self.degree}", self.name, pruned) if part)
 
 
-def settings_of(format: str, flat: dict[str, RoundTrip], full: dict[str, RoundTrip]) -> Iterator[Setting]:
-    """All settings of a format: what runs for degree 0, for higher degrees with every ridge, and both pruned."""
-    for degree, ridge, least in product(DEGREES, RIDGES, MIN_OPACITIES):
-        if degree or ridge == RIDGES[0]:
-            for name, run in (full if degree else flat).items():
-                yield Setting(format, name, degree, ridge, least, run)
+def through(ending: str, hints: Hints, splats: Splats) -> tuple[int, Splats]:
+    """Bytes of a file of ours, and the Gaussians read back from it."""
+    data = FORMATS[ending].encode(splats, hints)
+    return len(data), FORMATS[ending].decode(data, ending)
 
 
-def spz_settings(program: SplatTransform) -> Iterator[Setting]:
-    """All settings of SPZ."""
-    runs = {f"lengths x {length:g}": Spz(program, length).round_trip for length in SPZ_LENGTHS}
-    return settings_of("SPZ", runs, runs)
+def runs_of(peer: str, degree: int) -> dict[str, RoundTrip]:
+    """What can be set in a peer's files, by name."""
+    if peer == "SPZ":
+        return {f"version {v}": partial(through, ".spz", Hints(spz_version=v)) for v in spz.VERSIONS}
+    if peer == "SOG":
+        return {"": partial(through, ".sog", NO_HINTS)}
+    if not degree:  # there is nothing to cluster
+        return {"": partial(gsplat_png.round_trip, clusters=1)}
+    return {f"{count:,} clusters": partial(gsplat_png.round_trip, clusters=count) for count in PNG_CLUSTERS}
 
 
-def sog_settings(program: SplatTransform) -> Iterator[Setting]:
-    """All settings of SOG."""
-    runs = {f"{clusters:,} clusters": Sog(program, clusters).round_trip for clusters in SOG_CLUSTERS}
-    yield from settings_of("SOG", {"": Sog(program).round_trip}, runs)
-    for degree in DEGREES[1:]:  # slow, and far right on the curve: one each
-        yield Setting("SOG", "palette as it comes", degree, RIDGES[0], 0.0, Sog(program).round_trip)
-
-
-def png_settings() -> Iterator[Setting]:
-    """All settings of gsplat's PNG."""
-    Png.find()
-    runs = {f"{clusters:,} clusters": Png(clusters).round_trip for clusters in PNG_CLUSTERS}
-    return settings_of("PNG", {"": Png(PNG_CLUSTERS[0]).round_trip}, runs)
-
-
-def available_settings(formats: Sequence[str], splat_transform: str | None) -> list[Setting]:
-    """The settings of all formats wanted that can run here; says why others cannot."""
-    makers: dict[str, Callable[[], Iterator[Setting]]] = {
-        "SPZ": lambda: spz_settings(SplatTransform.find(splat_transform)),
-        "SOG": lambda: sog_settings(SplatTransform.find(splat_transform)),
-        "PNG": png_settings,
-    }
-    settings: list[Setting] = []
-    for name in formats:
-        try:
-            settings += makers[name]()
-        except NotAvailable as reason:
-            print(f"{name} is left out: {reason}", flush=True)
-    return settings
+def settings_of(peer: str) -> Iterator[Setting]:
+    """All settings of a peer."""
+    for degree, least in product(DEGREES, MIN_OPACITIES):
+        for name, run in runs_of(peer, degree).items():
+            yield Setting(peer, name, degree, least, run)
 
 
 class Measure:
     """Measures files of one trained model."""
 
-    def __init__(self, model: HybridModel, train: Sequence[View], test: Sequence[View]) -> None:
-        self.model = model
-        self.views = held_out(model, test)
+    def __init__(self, source: Source, test: Sequence[View]) -> None:
+        self.model = source.model
+        self.views = held_out(self.model, test)
         self.trained = score([view.trained for view in self.views], self.views)
-        self.baked = bake(model, [view.camera for view in train])
-        self.baked_psnr = [self.splats(self.baked[degree, RIDGES[0]])[0] for degree in DEGREES]
+        baked = bake(self.model, source.fitted, DEGREES)
+        self.baked = {degree: gsplat_png.in_morton_order(splats) for degree, splats in baked.items()}
+        self.baked_psnr = [self.splats(self.baked[degree])[0] for degree in DEGREES]
 
     def splats(self, splats: Splats) -> tuple[float, float, float]:
         """Scores of explicit Gaussians."""
-        return score((draw(splats, view, self.model) for view in self.views), self.views)
+        drawable = Drawable.of(splats, self.model.config.frame)
+        return score((picture_of(drawable, view) for view in self.views), self.views)
 
     def _row(
-        self, format: str, setting: str, size: int, count: int, scores: Sequence[float], degree: int | None = None
+        self, whose: str, setting: str, size: int, count: int, scores: Sequence[float], degree: int | None = None
     ) -> Row:
         quality, structure, likeness = scores
         drop_baked = None if degree is None else self.baked_psnr[degree] - quality
         bits, drop = 8 * size / len(self.model), self.trained[0] - quality
-        return Row(format, setting, size, count, bits, quality, structure, drop, drop_baked, likeness)
+        return Row(whose, setting, size, count, bits, quality, structure, drop, drop_baked, likeness)
 
     def peer(self, setting: Setting) -> Row:
         """Write, read back, draw and score a peer's file."""
-        baked = self.baked[setting.degree, setting.ridge]
-        kept = baked[baked.opacity_logits >= float(logit(torch.tensor(setting.min_opacity)))]
-        with tempfile.TemporaryDirectory() as folder:
-            size, read = setting.run(kept, Path(folder))
-        return self._row(setting.format, str(setting), size, len(read), self.splats(read), setting.degree)
+        size, read = setting.run(chosen(self.baked[setting.degree], None, setting.min_opacity))
+        return self._row(setting.peer, str(setting), size, len(read), self.splats(read), setting.degree)
 
     def ours(self, path: Path, setting: str) -> Row:
         """Load, render and score a `.hyrf` file."""
@@ -405,15 +307,19 @@ def main() -> None:
     parser.add_argument("model", type=Path, help="a trained model.hyrf")
     parser.add_argument("data", type=Path, help="the folder it was trained on")
     parser.add_argument("--ours", type=Path, nargs="*", default=[], help="compressed .hyrf files to plot as ours, too")
-    parser.add_argument("--formats", nargs="*", choices=("SPZ", "SOG", "PNG"), default=["SPZ", "SOG", "PNG"])
-    parser.add_argument("--splat-transform", help="the program (default: on the PATH, or through npx)")
+    parser.add_argument("--formats", nargs="*", choices=PEERS, default=PEERS)
     parser.add_argument("--out", type=Path, help="folder for results (runs/peers/<name of the data folder>)")
     args = parser.parse_args()
     out = args.out or Path("runs/peers") / args.data.name
     out.mkdir(parents=True, exist_ok=True)
-    settings = available_settings(args.formats, args.splat_transform)
-    scene, model = hyrfpack.load_scene(args.data), hyrfpack.load(args.model)
-    measure = Measure(model, scene.train, scene.test)
+    peers = list(args.formats)
+    if "PNG" in peers and (missing := gsplat_png.missing_packages()):
+        peers.remove("PNG")
+        print(f"PNG is left out: there is no {', no '.join(missing)}; see tools/studies/gsplat_png.py", flush=True)
+    settings = [setting for peer in peers for setting in settings_of(peer)]
+    scene = hyrfpack.load_scene(args.data)
+    source = Source.read(args.model, scene)
+    measure, model = Measure(source, scene.test), source.model
     baked = ", ".join(f"degree {degree} {quality:.2f}" for degree, quality in enumerate(measure.baked_psnr))
     print(
         f"{args.data.name}: {len(model):,} Gaussians; PSNR trained {measure.trained[0]:.2f}; baked {baked}", flush=True
