@@ -82,11 +82,11 @@ class Viewpoint:
         Looks slightly down at the frame's centre from 2.5 times its longest half-axis away, 800 x 600 with 50 degrees
         across; up is -y, as in most reconstructions.
         """
-        center, up = np.asarray(center, np.float64), np.array([0.0, -1.0, 0.0])
-        position = center + 2.5 * scale * np.array([0.0, -math.sin(math.radians(20)), -math.cos(math.radians(20))])
+        middle, up = np.asarray(center, np.float64), np.array([0.0, -1.0, 0.0])
+        position = middle + 2.5 * scale * np.array([0.0, -math.sin(math.radians(20)), -math.cos(math.radians(20))])
         focal = 400 / math.tan(math.radians(25))
-        camera = Camera(800, 600, focal, focal, 400.0, 300.0, look_at(position, center, up))
-        return cls(center, up, camera, (0.0, 360.0))
+        camera = Camera(800, 600, focal, focal, 400.0, 300.0, look_at(position, middle, up))
+        return cls(middle, up, camera, (0.0, 360.0))
 
     def to_json(self) -> dict[str, Any]:
         """A dictionary ready for JSON: the "viewpoint" of a file's provenance."""
@@ -135,7 +135,7 @@ def orbit(viewpoint: Viewpoint, frames: int) -> list[Camera]:
     offset = camera.position - center
     radius = np.linalg.norm(offset - (offset @ up) * up)
     if not radius > 1e-9 * np.linalg.norm(offset):  # straight above: the circle would be a point
-        offset = offset + 0.5 * max(np.linalg.norm(offset), 1e-6) * _perpendicular(up)
+        offset = offset + 0.5 * max(float(np.linalg.norm(offset)), 1e-6) * _perpendicular(up)
     turns = np.arange(frames) / frames
     if last - first >= 360:
         angles = first + (last - first) * turns

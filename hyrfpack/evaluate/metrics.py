@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from torch import Tensor
 
 from hyrfpack.ops.ssim import photometric_loss
@@ -38,7 +39,7 @@ def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
 
 def decibels(mse: float) -> float:
     """The PSNR of a mean squared error of colours in [0, 1]: dB, `IDENTICAL_PSNR` at most."""
-    return min(-10 * math.log10(mse), IDENTICAL_PSNR) if mse > 0 else IDENTICAL_PSNR
+    return min(float(-10 * np.log10(mse)), IDENTICAL_PSNR) if mse > 0 else IDENTICAL_PSNR
 
 
 def stated_error(provenance: dict) -> float:

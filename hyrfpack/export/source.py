@@ -63,22 +63,23 @@ class Source:
             why = error.__cause__
             raise HyrfDataError(f"{path}: its viewpoint cannot be used ({why!s:.160}); train the model again") from why
         up, center = viewpoint.up / math.hypot(*viewpoint.up), viewpoint.center
-        error = stated_error(facts["provenance"])
+        stated = stated_error(facts["provenance"])
         cameras = capture.cameras
+        measured: list[tuple[Camera, View | None]]
         if data is not None and data.train:
             named = [(view.name, view.camera) for view in data.train]
             measured = [(view.camera, view) for view in evenly_spaced(data.test, MEASURED)]
             fitted = evenly_spaced(cameras, FITTED)
-            return cls(model, named, fitted, measured, _up_of(cameras, up), center, error)
+            return cls(model, named, fitted, measured, _up_of(cameras, up), center, stated)
         if capture.made_up:
             between = evenly_spaced(cameras[1::2], MEASURED)  # of an orbit with twice as many cameras as RING
             measured = [(camera, None) for camera in between]
-            return cls(model, [], _around(viewpoint, center, up), measured, up, center, error)
+            return cls(model, [], _around(viewpoint, center, up), measured, up, center, stated)
         named = [(f"{number:04d}.png", camera) for number, camera in enumerate(cameras)]
         spare = cameras[::HELD_OUT] if len(cameras) >= FEW else cameras
         fitted = [c for number, c in enumerate(cameras) if number % HELD_OUT] if len(cameras) >= FEW else cameras
         measured = [(camera, None) for camera in evenly_spaced(spare, MEASURED)]
-        return cls(model, named, fitted, measured, _up_of(cameras, up), center, error)
+        return cls(model, named, fitted, measured, _up_of(cameras, up), center, stated)
 
 
 def _up_of(cameras: list[Camera], up: np.ndarray) -> np.ndarray:

@@ -6,9 +6,10 @@ than the operations do.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -41,7 +42,7 @@ class Call:
     wanted: tuple[str, ...]
     bounds: tuple[float, float] = (1e-4, 1e-3)
 
-    def forward(self, *how: object) -> Callable[[], Tensor]:
+    def forward(self, *how: Any) -> Callable[[], Tensor]:
         """A task that returns the values; its arguments are those of `both`."""
         run = self._bound(*how)[0]
         return torch.no_grad()(run)
@@ -72,7 +73,7 @@ class Call:
 
         return task
 
-    def passes(self, *how: object, upstream: Tensor | None = None) -> tuple[Callable[[], Tensor], Callable]:
+    def passes(self, *how: Any, upstream: Tensor | None = None) -> tuple[Callable[[], Tensor], Callable]:
         """Two tasks: the forward pass as training makes it, and the backward pass of one such.
 
         Args:
@@ -102,7 +103,7 @@ def cotangent(values: Tensor) -> Tensor:
     return torch.randn(values.shape, generator=generator).to(values.device, values.dtype)
 
 
-def rasterize_call(inputs: Mapping[str, Tensor], *view: object, **options: object) -> Call:
+def rasterize_call(inputs: Mapping[str, Tensor], *view: Any, **options: Any) -> Call:
     """Drawing: (H, W, 4) colours and transmittance.
 
     Args:
@@ -111,7 +112,8 @@ def rasterize_call(inputs: Mapping[str, Tensor], *view: object, **options: objec
     """
 
     def draw(implementation: str, **tensors: Tensor) -> Tensor:
-        return picture(rasterize(*tensors.values(), *view, implementation=implementation, **options))
+        splats: Iterable[Any] = tensors.values()
+        return picture(rasterize(*splats, *view, implementation=implementation, **options))
 
     # A few pixels' alpha or T falls on the other side of its threshold; their share of the length is below this.
     return Call(draw, inputs, tuple(inputs), (1e-3, 1e-2))

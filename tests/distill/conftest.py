@@ -2,11 +2,11 @@ from __future__ import annotations
 
 import pytest
 
-from hyrfpack.distill import run, start
+from hyrfpack.distill import fit, start
 
 
 @pytest.fixture(autouse=True)
 def short_work(monkeypatch: pytest.MonkeyPatch) -> None:
     """As little of everything as still makes a model."""
     monkeypatch.setattr(start, "LEAST_STEPS", 100)
-    monkeypatch.setattr(run, "TRIALS", 2)
+    monkeypatch.setattr(fit, "TRIALS", 2)

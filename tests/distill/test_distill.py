@@ -8,7 +8,7 @@ import pytest
 from explicit_balls import LITTLE, ball
 
 import hyrfpack
-from hyrfpack.distill import DistillConfig, distill_splats, run, teacher
+from hyrfpack.distill import DistillConfig, distill_splats, fit, teacher
 from hyrfpack.distill.teacher import likeness, teaching_scene
 from hyrfpack.distill.views import Weighted, viewpoints
 from hyrfpack.errors import HyrfDataError, HyrfError
@@ -117,7 +117,7 @@ def test_interrupt_while_packing_leaves_the_file_that_was_there(
     target = tmp_path / "x.hyrf"
     target.write_bytes(b"before")
     monkeypatch.setattr(run, "TOLERATED", -np.inf)  # the first try will not do
-    monkeypatch.setattr(run.Packer, "attempt", _interrupted_at_the_second(run.Packer.attempt))
+    monkeypatch.setattr(fit.Packer, "attempt", _interrupted_at_the_second(fit.Packer.attempt))
     with pytest.raises(KeyboardInterrupt):
         distill_splats(ball(20), target, LITTLE)
     assert [path.name for path in tmp_path.iterdir()] == ["x.hyrf"]
@@ -149,7 +149,7 @@ def test_nothing_is_measured_or_drawn_twice_however_often_packing_is_tried(
     for tolerated in ("TOLERATED", "TOLERATED_PLAIN"):
         monkeypatch.setattr(run, tolerated, -np.inf)  # no try will do
     measured = counting(monkeypatch, run, "measure_sensitivity")
-    tried = counting(monkeypatch, run.Packer, "attempt")
+    tried = counting(monkeypatch, fit.Packer, "attempt")
     drawn = counting(monkeypatch, teacher, "photograph")
 
     distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, steps=12))
@@ -192,10 +192,10 @@ def test_a_file_less_like_the_original_than_asked_for_says_so(tmp_path: Path) ->
 
 
 def test_what_packing_took_is_asked_for_and_not_learned() -> None:
-    told = run._shortfall(36.5, 38.6, DistillConfig(psnr=37), made_up=True)
+    told = fit._shortfall(36.5, 38.6, DistillConfig(psnr=37), made_up=True)
     assert "reached 36.5" in told and told.endswith("with --psnr") and "--steps" not in told
-    assert "--cameras" not in run._shortfall(36.5, 36.6, DistillConfig(psnr=37), made_up=False)
-    assert not run._below(36.96, 37) and run._below(36.94, 37)
+    assert "--cameras" not in fit._shortfall(36.5, 36.6, DistillConfig(psnr=37), made_up=False)
+    assert not fit._below(36.96, 37) and fit._below(36.94, 37)
 
 
 def test_settings_out_of_range_are_refused() -> None:
