@@ -62,7 +62,7 @@ def codec_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> I
             f"{subject.name} is of profile '{subject.profile}': its numbers are quantised already, so coding them "
             "again loses less than coding the trained model"
         )
-    cases = []
+    cases: list[Case] = []
     for profile in PROFILES:
         try:
             cases += _cases(subject, profile, note)
@@ -130,7 +130,7 @@ def _cases(subject: Subject, profile: str, note: Callable[[str], None]) -> Itera
     for knob, values in KNOBS.get(profile, {}).items():
         default = defaults[knob]
         if knob == "distortion":
-            values = [default * factor for factor in values]
+            values = tuple(default * factor for factor in values)
         for value in sorted({*values, default}):
             if value == default:
                 yield replace(itself, setting=f"{profile}, {knob}", value=_in_words(value), is_default=True)

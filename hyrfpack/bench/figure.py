@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -89,8 +90,12 @@ def panels(rows: Sequence[Row]) -> list[Panel]:
             continue
         (size,) = {row.bytes for row in rows if row.group == "codec" and row.is_reference}
         made.append(Panel(f"{title}, encoding", "time / raw", here, lambda row: row.ratio.wall))
-        made.append(Panel(f"{title}, size", "bytes / raw", here, lambda row, size=size: row.bytes / size))
+        made.append(Panel(f"{title}, size", "bytes / raw", here, partial(_size_ratio, reference=size)))
     return made
+
+
+def _size_ratio(row: Row, reference: int) -> float:
+    return (row.bytes or 0) / reference
 
 
 def _draw(axes: Axes, panel: Panel) -> list[tuple[Row, float, float, str]]:
@@ -165,9 +170,9 @@ def _overlap(a: Box, b: Box) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def _plain(value: float, _position: int | None) -> str:
+def _plain(value: float, _position: float) -> str:
     return f"{value:g}"
 
 
-def _nothing(_value: float, _position: int | None) -> str:
+def _nothing(_value: float, _position: float) -> str:
     return ""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hyrfpack.bench.rows import Row
 from hyrfpack.bench.subject import Subject
-from hyrfpack.measure.error import difference, relative_difference, worst
+from hyrfpack.measure.error import Error, difference, relative_difference, worst
 from hyrfpack.measure.timing import take_turns
 from hyrfpack.model import HybridModel
 from hyrfpack.model.calls import (
@@ -77,7 +77,7 @@ def mlp_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Ite
     """Run both fields' decoders on the features of all Gaussians; the radiance field's as one view sees them."""
     model, _, pose = _one_view(subject)
     for name, part, features in decoder_inputs(model, camera_center(pose)):
-        call = mlp_call(features, part.weights, part.biases)
+        call = mlp_call(features, list(part.weights), list(part.biases))
         yield from _compare("mlp", f"{name}, ", call, MLP_WAYS, relative_difference, repeats)
 
 
@@ -92,7 +92,7 @@ def _compare(
     prefix: str,
     call: Call,
     ways: tuple[Way, ...],
-    compare: Callable[[Tensor, Tensor, str], object],
+    compare: Callable[[Tensor, Tensor, str], Error],
     repeats: int,
 ) -> Iterator[Row]:
     """Rows of one operation, forward alone and with gradients; all ways take turns."""

@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,7 +20,7 @@ from hyrfpack.render import RenderSettings, render
 # What is tried of each setting, the exact value first. `near` is not among them: it says what belongs to the picture.
 # Nor is no culling at all the exact picture: EWA projection linearises about a centre, far outside the picture it
 # smears Gaussians all over it, and training culls as rendering does, so nothing ever taught them otherwise.
-SWEEPS: dict[str, tuple[float, ...]] = {
+SWEEPS: dict[str, tuple[Any, ...]] = {
     "background_threshold": (0.0, 1 / 512, 1 / 255, 0.01, 0.03, 0.1, 0.2, 0.3),
     "background_stride": (1, 2, 3, 4),
     "cull_tolerance": (1.0, 0.0, 0.1, 0.2, 0.3, 0.5, math.inf),

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 import torch
@@ -57,14 +58,12 @@ class Subject:
         """PSNR and SSIM, means over views, against the photos, or against the `exact` pictures without photos."""
         against = self.photos or [(to_8bit(picture), None) for picture in exact]
         images = [to_8bit(picture) for picture in pictures]
-        return tuple(
-            fmean(score(image, target, mask) for image, (target, mask) in zip(images, against, strict=True))
-            for score in (psnr, ssim)
-        )
+        pairs = [(image, *photo) for image, photo in zip(images, against, strict=True)]
+        return fmean(psnr(*pair) for pair in pairs), fmean(ssim(*pair) for pair in pairs)
 
     def losses(
         self, pictures: Sequence[Tensor], exact: Sequence[Tensor], best: tuple[float, float], what: str
-    ) -> dict[str, object]:
+    ) -> dict[str, Any]:
         """What a `Row` says of pictures: `error` and the scores, and their drops from `best` where there are photos.
 
         Args:
@@ -77,9 +76,9 @@ class Subject:
             HyrfError: a picture holds NaN or infinity.
         """
         psnr, ssim = self.scores(pictures, exact)
-        flat = [torch.cat([picture.flatten() for picture in many]) for many in (pictures, exact)]
+        found, right = (torch.cat([picture.flatten() for picture in many]) for many in (pictures, exact))
         drops = {"psnr_drop": best[0] - psnr, "ssim_drop": best[1] - ssim} if self.photos else {}
-        return {"error": difference(*flat, what), "psnr": psnr, "ssim": ssim, **drops}
+        return {"error": difference(found, right, what), "psnr": psnr, "ssim": ssim, **drops}
 
     def in_words(self) -> str:
         """What is measured on, and what quality is measured against, in one sentence."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
-from hyrfpack.bench.rows import Error, Row
+from hyrfpack.bench.rows import Row
 from hyrfpack.bench.suite import BenchReport
 from hyrfpack.errors import HyrfError
 from hyrfpack.measure.machine import machine_line
@@ -55,7 +56,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         if group in PARTS:
             parts = list(dict.fromkeys(part for row in here for part in row.parts))
             columns = {head: columns[head] for head in ("setting", "value")}
-            columns |= {part: lambda row, part=part: _pair(row.parts.get(part)) for part in parts}
+            columns |= {part: partial(_part, part=part) for part in parts}
             title = f"{group}: {PARTS[group]}, max / rms"
             made.append(_table(title, columns, [row for row in here if row.parts and not row.is_reference]))
     return made
@@ -106,7 +107,8 @@ def _time(time: Timing) -> str:
     return _number(time.ms) + ("" if time.spread_ms is None else f" ± {_number(time.spread_ms, '.2g')}")
 
 
-def _pair(error: Error | None) -> str:
+def _part(row: Row, part: str) -> str:
+    error = row.parts.get(part)
     return "" if error is None else f"{_error(error.max)} / {_error(error.rms)}"
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -153,8 +154,8 @@ def _seen(model: HybridModel, cameras: Sequence[Camera]) -> tuple[np.ndarray, fl
     sums = np.zeros((6 * 4**FINEST, 5))
 
     def add(points: Tensor, colors: Tensor, weights: np.ndarray) -> None:
-        colors, cells = colors.double().numpy(), cells_of(points.double().numpy(), FINEST)
-        columns = np.column_stack((np.ones(len(colors)), colors, (colors**2).sum(1)))
+        values, cells = colors.double().numpy(), cells_of(points.double().numpy(), FINEST)
+        columns = np.column_stack((np.ones(len(values)), values, (values**2).sum(1)))
         for total, column in zip(sums.T, columns.T, strict=True):
             total += np.bincount(cells, weights * column, len(sums))
 
@@ -184,7 +185,7 @@ def _transmittance(model: HybridModel, geometry: Geometry, camera: Camera) -> Te
     size = camera.intrinsics, camera.width, camera.height
     index = frustum_cull(positions, pose, *size, settings.near, settings.cull_tolerance)
     means, here = positions[index], geometry[index]
-    how = {"near": settings.near, "antialiased": model.config.antialiased}
+    how: dict[str, Any] = {"near": settings.near, "antialiased": model.config.antialiased}
     raster = rasterize(means, here.quats, here.scales, here.opacities, torch.zeros_like(means), pose, *size, **how)
     refuse_nonfinite("Gaussians", raster.transmittance)
     return raster.transmittance
@@ -213,9 +214,9 @@ def _tile(sums: np.ndarray, largest: float, budget: int) -> tuple[np.ndarray, np
     every = np.concatenate(errors)
     order = np.argsort(-every, kind="stable")
     order = order[every[order] > 0][: (budget - len(pyramid[0])) // 3]
-    divided = np.zeros(len(every), bool)
-    divided[order] = True
-    divided = [*np.split(divided, np.cumsum([len(level) for level in errors])[:-1]), np.zeros(len(sums), bool)]
+    chosen = np.zeros(len(every), bool)
+    chosen[order] = True
+    divided = [*np.split(chosen, np.cumsum([len(level) for level in errors])[:-1]), np.zeros(len(sums), bool)]
 
     found = []
     index, above = np.arange(len(pyramid[0])), np.full((len(pyramid[0]), 3), 0.5)
@@ -225,7 +226,8 @@ def _tile(sums: np.ndarray, largest: float, budget: int) -> tuple[np.ndarray, np
         kept, parts = ~parted[index], parted[index]
         found.append((*cell_centers(index[kept], level), np.full(kept.sum(), level), colors[kept]))
         index, above = (4 * index[parts][:, None] + np.arange(4)).ravel(), colors[parts].repeat(4, axis=0)
-    return tuple(np.concatenate(columns) for columns in zip(*found, strict=True))
+    directions, sides, levels, tones = (np.concatenate(columns) for columns in zip(*found, strict=True))
+    return directions, sides, levels, tones
 
 
 def cells_of(points: np.ndarray, level: int) -> np.ndarray:

@@ -59,7 +59,7 @@ def write_colmap(
         model.add_image_with_trivial_frame(pycolmap.Image(name=name, image_id=image_id, camera_id=numbers[lens]), pose)
     if points is not None:
         solid = np.flatnonzero(points.opacities >= _MIN_OPACITY)
-        chosen = points[np.array(evenly_spaced(solid, max_points), np.int64)]
+        chosen = points[np.array(evenly_spaced(solid.tolist(), max_points), np.int64)]
         colors = np.round(255 * chosen.base_colors).astype(np.uint8)
         for position, color in zip(chosen.positions, colors, strict=True):
             model.add_point3D(position, pycolmap.Track(), color)

@@ -331,7 +331,7 @@ def write_container(sections: Sequence[Section], minor: int = MINOR) -> bytes:
         raise ValueError(f"{offset} bytes that decode to {raw} exceed the format's limits")
     table = b"".join(toc)
     header = _HEADER.pack(MAGIC, MAJOR, minor, 0, offset, _TOC_OFFSET, len(table), len(sections), zlib.crc32(table))
-    return b"".join([header, _CHECKSUM.pack(zlib.crc32(header)), table, *payloads])
+    return header + _CHECKSUM.pack(zlib.crc32(header)) + table + b"".join(payloads)
 
 
 def read_container(

@@ -7,6 +7,7 @@ import math
 import sys
 import zlib
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import hyrfpack
 from hyrfpack.errors import HyrfError, HyrfFormatError
@@ -107,8 +108,8 @@ def read_metadata(container: Container) -> Metadata:
             f"{name}: the metadata has {entry.length} bytes and says it decodes to {entry.raw_length}; the file is "
             "damaged, write it again"
         )
-    data = bytes(container[METADATA].data)
-    if entry.codec == CODEC_DEFLATED:
+    data = bytes(container[METADATA].data)  # refuses a file without any
+    if entry is not None and entry.codec == CODEC_DEFLATED:
         data = _inflate(data, entry.raw_length, name)
     try:
         values = json.loads(data.decode("utf-8"), parse_constant=_finite, parse_float=_finite)
@@ -150,7 +151,7 @@ def _inflate(data: bytes, length: int, name: str) -> bytes:
     return text
 
 
-def _check(value: object, kind: type | tuple | dict, path: str) -> None:
+def _check(value: Any, kind: type | tuple | dict, path: str) -> None:
     """Raise ValueError unless a JSON value has the types of `kind`. Keys that `kind` lacks may have any."""
     if isinstance(kind, dict):
         _check(value, dict, path)
@@ -172,7 +173,7 @@ def _check(value: object, kind: type | tuple | dict, path: str) -> None:
 
 def _is_deep(value: object) -> bool:
     """Whether objects and lists are nested deeper than MAX_DEPTH; found level by level, so that any depth can be."""
-    level = [value]
+    level: list[Any] = [value]
     for _ in range(MAX_DEPTH + 1):
         level = [item for item in level if isinstance(item, (dict, list, tuple))]
         if not level:

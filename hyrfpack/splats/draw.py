@@ -114,8 +114,8 @@ def sent_light(
     size = camera.intrinsics, camera.width, camera.height
     with torch.enable_grad():
         colors = torch.zeros_like(means, requires_grad=True)
-        how = {"near": RenderSettings().near, "antialiased": antialiased}
-        raster = rasterize(means, quats, scales, opacities, colors, pose, *size, **how)
+        near = RenderSettings().near
+        raster = rasterize(means, quats, scales, opacities, colors, pose, *size, near=near, antialiased=antialiased)
         if not raster.rgb.requires_grad:  # nothing is drawn
             return means.new_zeros(len(means))
         return torch.autograd.grad(raster.rgb[..., 0].sum(), colors)[0][:, 0]

@@ -99,7 +99,8 @@ def concatenate(parts: Sequence[Splats]) -> Splats:
     degree = max(part.degree for part in parts)
     same = [part.with_degree(degree) for part in parts]
     names = ("positions", "scales", "quats", "opacities", "harmonics")
-    return replace(same[0], **{name: np.concatenate([getattr(part, name) for part in same]) for name in names})
+    joined = (np.concatenate([getattr(part, name) for part in same]) for name in names)
+    return Splats(*joined, antialiased=same[0].antialiased)
 
 
 def normalized_quats(quats: np.ndarray) -> np.ndarray:

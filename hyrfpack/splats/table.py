@@ -51,7 +51,7 @@ class Format(Kind):
 
 
 def _usd(extension: usd.Extension) -> Format:
-    encode, decode = (partial(function, extension=extension) for function in (usd.encode, usd.decode))
+    encode, decode = partial(usd.encode, extension=extension), partial(usd.decode, extension=extension)
     return Format(ending=f".{extension}", encode=encode, decode=decode, package=usd.PACKAGE)
 
 

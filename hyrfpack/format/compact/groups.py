@@ -87,7 +87,7 @@ def decode_groups(data: memoryview, groups: StepGroups) -> np.ndarray:
     if codes.max(initial=0) > 255:
         raise DamagedDataError(f"the step code {codes.max()} is above 255; it is damaged")
     used = codes != NOT_CODED
-    chosen = decode_integers(data[first : first + second], np.count_nonzero(used))
+    chosen = decode_integers(data[first : first + second], int(np.count_nonzero(used)))
     if chosen.max(initial=0) >= MODELS:
         raise DamagedDataError(f"the model {chosen.max()} of {MODELS}; it is damaged")
     models = np.full(groups.count, MODELS, np.uint8)

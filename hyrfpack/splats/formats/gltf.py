@@ -150,7 +150,8 @@ def decode(data: bytes, name: str, *, upright: bool = False) -> Splats:
 
 def _packed(arrays: list[np.ndarray]) -> tuple[list[dict[str, Any]], list[dict[str, Any]], list[bytes]]:
     """Accessors, buffer views and bytes of arrays (N, width), one after the other; integers are normalised."""
-    accessors, views, parts, offset = [], [], [], 0
+    accessors, parts, offset = [], [], 0
+    views: list[dict[str, Any]] = []
     for values in arrays:
         kind = next(kind for kind, width in _WIDTHS.items() if width == values.shape[1])
         component = next(number for number, dtype in _TYPES.items() if dtype == values.dtype)
@@ -183,7 +184,8 @@ def _chunks(data: bytes, name: str) -> tuple[dict[str, Any], memoryview]:
             f"{name}: it says version {version} and {length:,} bytes, but version 2 is read and it has {len(data):,}; "
             "export it again"
         )
-    chunks, offset = {}, _HEADER.size
+    chunks: dict[bytes, memoryview] = {}
+    offset = _HEADER.size
     while offset < len(data):
         if offset + _CHUNK.size > len(data):
             raise HyrfDataError(f"{name}: it ends within the head of a chunk; the file is damaged")

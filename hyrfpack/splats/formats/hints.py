@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -19,7 +19,7 @@ class Hints:
         spz_version: 3, one gzip stream, which most programs read, or 4, streams of zstd: smaller and faster (SPZ).
     """
 
-    up: np.ndarray | tuple[float, float, float] = (0.0, -1.0, 0.0)
+    up: np.ndarray = field(default_factory=lambda: np.array([0.0, -1.0, 0.0]))
     camera: Camera | None = None
     spz_version: int = 3
 

@@ -58,7 +58,8 @@ def read_header(data: bytes, name: str) -> PlyHeader:
     end = _ENDS.search(data, 0, _LONGEST_HEADER)
     if end is None:
         raise HyrfDataError(f"{name}: its PLY header has no end within {_LONGEST_HEADER:,} bytes; it is damaged")
-    order, elements, properties = "", {}, None
+    order, elements = "", dict[str, Element]()
+    properties: dict[str, str] | None = None
     for line in data[: end.start()].decode("utf-8", "replace").split("\n")[1:]:
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
@@ -94,7 +95,7 @@ def read_elements(data: bytes, header: PlyHeader, wanted: set[str], name: str) -
     Raises:
         HyrfDataError: the file ends too early, a row in text is not made of numbers, or lists stand in the way.
     """
-    rows, place = {}, header.length
+    rows, place = dict[str, np.ndarray](), header.length
     text = io.StringIO(data[place:].decode("ascii", "replace")) if header.order == "=" else None
     for label, element in header.elements.items():
         if wanted <= rows.keys():
@@ -124,11 +125,11 @@ def read_elements(data: bytes, header: PlyHeader, wanted: set[str], name: str) -
 
 def columns(rows: np.ndarray, names: Collection[str]) -> np.ndarray:
     """The properties `names` of rows, as one array (count, len(names)) of their widest type."""
-    names = list(names)
-    kinds = {rows.dtype[name] for name in rows.dtype.names}
+    there = rows.dtype.names or ()
+    kinds = {rows.dtype[name] for name in there}
     if len(kinds) == 1:  # as all programs write it: one table, many times faster
-        table = rows.view(kinds.pop()).reshape(len(rows), len(rows.dtype))
-        return table[:, [rows.dtype.names.index(name) for name in names]]
+        table = rows.view(kinds.pop()).reshape(len(rows), len(there))
+        return table[:, [there.index(name) for name in names]]
     return np.stack([rows[name] for name in names], axis=1)
 
 

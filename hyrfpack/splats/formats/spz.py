@@ -312,7 +312,7 @@ def _unpack_positions(packed: np.ndarray, bits: int, version: int) -> np.ndarray
 def _pack_quats(quats: np.ndarray) -> np.ndarray:
     """Quaternions (N, 4) wxyz as (N,) uint32: in the 2 high bits which of x, y, z, w is largest, then the other three
     in this order: a sign and 9 bits of the magnitude, of which 511 is sqrt(1/2)."""
-    largest, others = without_largest(quats[:, [1, 2, 3, 0]] * np.float32([1, -1, -1, 1]))
+    largest, others = without_largest(quats[:, [1, 2, 3, 0]] * np.array([1, -1, -1, 1], np.float32))
     sizes = np.minimum(np.rint(np.abs(others) * (511 * _SQRT_2)), 511).astype(np.uint32)
     codes = sizes | (others < 0).astype(np.uint32) << 9
     return (largest.astype(np.uint32) << 30 | codes[:, 0] << 20 | codes[:, 1] << 10 | codes[:, 2]).astype("<u4")
@@ -322,14 +322,14 @@ def _unpack_quats(packed: np.ndarray, version: int) -> np.ndarray:
     """(N, 4) float32 wxyz."""
     if version >= 3:
         words = packed.view("<u4")
-        codes = words[:, None] >> np.uint32([20, 10, 0])
+        codes = words[:, None] >> np.array([20, 10, 0], np.uint32)
         sizes = (codes & 511).astype(np.float32) * np.float32(1 / (511 * _SQRT_2))
         others = np.where(codes & 512, -sizes, sizes)
         quats = with_largest(words >> 30, others)
     else:
         others = _AXIS_OF[packed.reshape(-1, 3)]
         quats = with_largest(np.full(len(others), 3), others)
-    return quats[:, [3, 0, 1, 2]] * np.float32([1, 1, -1, -1])  # of xyzw
+    return quats[:, [3, 0, 1, 2]] * np.array([1, 1, -1, -1], np.float32)  # of xyzw
 
 
 def _pack_harmonics(harmonics: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ import io
 import tempfile
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -213,7 +213,7 @@ def _read_splats(prim: Usd.Prim, name: str, upright: bool) -> Splats:
 
     if not 0 <= degree <= MAX_DEGREE:
         raise HyrfDataError(f"{name}: harmonics of degree {degree} are not read, 0 to {MAX_DEGREE} are; export it so")
-    splats = {
+    splats: dict[str, Any] = {
         "positions": read(field.GetPositionsAttr(), 3),
         "scales": read(field.GetScalesAttr(), 3),
         "quats": read(field.GetOrientationsAttr(), 4)[:, [3, 0, 1, 2]],
