@@ -16,8 +16,9 @@ from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.device import upload
 from hyrfpack.errors import HyrfTrainingError
-from hyrfpack.format.arrays import GROUPS
-from hyrfpack.format.compact import Plan, Quantized
+from hyrfpack.format.arrays import by_parameter
+from hyrfpack.format.compact.plan import Plan
+from hyrfpack.format.compact.quantized import Quantized
 from hyrfpack.format.sections import COLORS
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.ssim import photometric_loss
@@ -88,15 +89,13 @@ def finetune(
     with closing((cache or PictureCache()).stream(order)) as pictures, torch_on_one_thread():
         for step, (view, picture) in enumerate(pictures):
             quantized = quantize(tuned, plan, sensitivity, reach=0, like=quantized)
-            exact = {name: parameter.detach().clone() for name, parameter in tuned.named_parameters()}
-            _load(tuned, quantized.arrays())
+            exact = deepcopy(tuned.state_dict())
+            tuned.load_state_dict(dict(by_parameter(quantized.arrays(), tuned)), strict=False)
             solid = None if tuned.config.background else np.array(tuned.config.solid, np.float32)
             target, mask = upload(picture, solid, tuned.gaussians.positions.device)
             loss = photometric_loss(render(tuned, view.camera).rgb, target, mask)
             loss.backward()
-            with torch.no_grad():
-                for name, parameter in tuned.named_parameters():
-                    parameter.copy_(exact[name])
+            tuned.load_state_dict(exact)
             _add_rate(tuned, quantized, LOSS_PER_ERROR * ERROR_PER_BIT * plan.distortion_per_number)
             broken = optimizer.step(step, steps)
             if not torch.isfinite(loss) or broken.any():
@@ -107,18 +106,6 @@ def finetune(
             report(step + 1, float(loss.detach()))
     tuned.gaussians.positions.requires_grad_(True)
     return tuned
-
-
-@torch.no_grad()
-def _load(model: HybridModel, arrays: dict[str, np.ndarray]) -> None:
-    """Set the parameters of the sections in `arrays`."""
-    parameters = dict(model.named_parameters())
-    for group, values in arrays.items():
-        rest = torch.from_numpy(values.ravel())
-        for name in GROUPS[group]:
-            parameter = parameters[name]
-            part, rest = rest[: parameter.numel()], rest[parameter.numel() :]
-            parameter.copy_(part.view(parameter.shape))
 
 
 @torch.no_grad()
@@ -136,13 +123,10 @@ def _add_rate(model: HybridModel, quantized: Quantized, price: float) -> None:
     for group, chosen in quantized.groups.items():
         groups = plan.groups[group]
         slopes[group] = _slope(chosen.symbols, groups.index, groups.count, chosen.codes)
-    for group, values in slopes.items():
-        rest = torch.from_numpy((price * values).astype(np.float32).ravel())
-        for name in GROUPS[group]:
-            parameter = parameters[name]
-            part, rest = rest[: parameter.numel()], rest[parameter.numel() :]
-            if parameter.grad is not None:
-                parameter.grad += part.view(parameter.shape)
+    slopes = {group: (price * values).astype(np.float32) for group, values in slopes.items()}
+    for name, slope in by_parameter(slopes, model):
+        if parameters[name].grad is not None:
+            parameters[name].grad += slope
 
 
 def _slope(symbols: np.ndarray, index: np.ndarray, count: int, codes: np.ndarray) -> np.ndarray:

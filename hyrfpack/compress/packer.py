@@ -33,7 +33,7 @@ from hyrfpack.format.codec import (
     without_cameras,
     write_model,
 )
-from hyrfpack.format.compact import Quantized
+from hyrfpack.format.compact.quantized import Quantized
 from hyrfpack.format.info import describe
 from hyrfpack.format.sections import COLORS, OPACITIES, POSITIONS, SCALES
 from hyrfpack.model import HybridModel
@@ -255,12 +255,7 @@ def _difference(pictures: list[torch.Tensor], others: list[torch.Tensor]) -> flo
 def added_errors(planned: HybridModel, quantized: Quantized, sensitivity: Sensitivity) -> dict[str, float]:
     """What storing a planned model adds to the pictures' mean squared error, by section and by estimate."""
     wanted, stored, s = to_arrays(planned), quantized.arrays(), sensitivity.of(quantized.plan.kept)
-    weights = {
-        COLORS: np.repeat(s.colors, 3),
-        SCALES: s.scales,
-        **s.tables,
-        **s.decoders,
-    }
+    weights = {COLORS: np.repeat(s.colors, 3), SCALES: s.scales, **s.fields}
     # A point is anywhere in its cell.
     bits = np.concatenate([layer.points.bits[layer.points.classes] for layer in quantized.plan.layers])
     _, opacity = opacity_error(planned, wanted[OPACITIES][:, 0].astype(np.float64), s.opacities)

@@ -45,15 +45,16 @@ def quantize(
     arrays = {group: values.astype(np.float64) for group, values in to_arrays(model).items()}
     sensitivity, d = sensitivity.of(plan.kept), plan.distortion_per_number
     opacity, error = opacity_error(model, arrays[OPACITIES][:, 0], sensitivity.opacities)
-    by_group = {**sensitivity.tables, **sensitivity.decoders}
     jobs = {
-        group: partial(quantize_groups, arrays[group].ravel(), plan.groups[group], by_group[group], d, reach)
-        for group in plan.groups
+        group: partial(quantize_groups, arrays[group].ravel(), groups, sensitivity.fields[group], d, reach)
+        for group, groups in plan.groups.items()
     }
     # Cut before it is turned: a colour far outside would come back as another.
     colors = np.clip(arrays[COLORS], -LIMIT / 2, LIMIT / 2) @ plan.basis.astype(np.float64)
-    for layer, part in enumerate(plan.parts):
-        classes, s = plan.layers[layer].points.classes, sensitivity.of(part)
+    stop = 0
+    for layer, classes in enumerate(layer.points.classes for layer in plan.layers):
+        part = slice(stop, stop := stop + len(classes))
+        s = sensitivity.of(part)
 
         def opacity_cost(places: np.ndarray, candidates: np.ndarray, part: slice = part) -> np.ndarray:
             return error(places + part.start, candidates)

@@ -35,21 +35,19 @@ class Sensitivity:
         positions: (N,) by a coordinate in the contracted cube, mean of the three axes.
         colors: (N,) by a colour logit, mean of the three.
         scales, opacities: (N,) by the explicit logits.
-        tables: (rows * 2,) by an entry of each hash table, by section.
-        decoders: (numbers,) by the numbers of each decoder, laid out as in the file, by section.
+        fields: by the numbers of each hash table and decoder, laid out as in the file, by section.
     """
 
     positions: np.ndarray
     colors: np.ndarray
     scales: np.ndarray
     opacities: np.ndarray
-    tables: dict[str, np.ndarray]
-    decoders: dict[str, np.ndarray]
+    fields: dict[str, np.ndarray]
 
     def of(self, index: np.ndarray | slice) -> Sensitivity:
-        """That of the Gaussians at `index` (n,) int64, and of all tables and decoders."""
+        """That of the Gaussians at `index` (n,) int64, and of all fields."""
         parts = (getattr(self, name)[index] for name in ("positions", "colors", "scales", "opacities"))
-        return Sensitivity(*parts, self.tables, self.decoders)
+        return Sensitivity(*parts, self.fields)
 
 
 def measure_sensitivity(model: HybridModel, cameras: Sequence[Camera], seed: int = 0) -> Sensitivity:
@@ -119,13 +117,10 @@ def _gathered(
         group: np.concatenate([squares[name].double().cpu().numpy().ravel() for name in GROUPS[group]]) / field_pixels
         for group in (*TABLES, *MLPS)
     }
-    decoders = {group: fields[group] for group in MLPS}
-    return Sensitivity(
-        *explicit,
-        # Both numbers of a row are read together.
-        tables={group: fields[group].reshape(-1, 2).mean(axis=1).repeat(2) for group in TABLES},
-        decoders={group: np.maximum(values, LEAST * values.mean()) for group, values in decoders.items()},
-    )
+    # Both numbers of a row are read together.
+    fields |= {group: fields[group].reshape(-1, 2).mean(axis=1).repeat(2) for group in TABLES}
+    fields |= {group: np.maximum(fields[group], LEAST * fields[group].mean()) for group in MLPS}
+    return Sensitivity(*explicit, fields)
 
 
 def _local(model: HybridModel, measured: np.ndarray, guess: np.ndarray) -> np.ndarray:

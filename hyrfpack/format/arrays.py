@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -91,13 +92,16 @@ def to_model(config: ModelConfig, arrays: dict[str, np.ndarray]) -> HybridModel:
     gaussians = Gaussians(*(torch.from_numpy(arrays[group]) for group in sections.LAYERED))
     with torch.device("meta"):  # shapes alone: nothing is drawn or allocated that would be thrown away
         model = HybridModel(config, gaussians)
-    shapes = {name: value.shape for name, value in model.state_dict().items()}
-    state = {}
-    for group, names in GROUPS.items():
-        parts = torch.from_numpy(arrays[group]).flatten().split([shapes[name].numel() for name in names])
-        state.update((name, part.reshape(shapes[name]).clone()) for name, part in zip(names, parts, strict=True))
-    model.load_state_dict(state, assign=True)
+    model.load_state_dict({name: value.clone() for name, value in by_parameter(arrays, model)}, assign=True)
     return model
+
+
+def by_parameter(arrays: dict[str, np.ndarray], model: HybridModel) -> Iterator[tuple[str, torch.Tensor]]:
+    """Numbers of some groups by the names of the model's parameters and in their shapes, on the CPU."""
+    shapes = {name: value.shape for name, value in model.state_dict().items()}
+    for group, values in arrays.items():
+        parts = torch.from_numpy(values).flatten().split([shapes[name].numel() for name in GROUPS[group]])
+        yield from ((name, part.view(shapes[name])) for name, part in zip(GROUPS[group], parts, strict=True))
 
 
 def check_rules(rules: dict) -> None:

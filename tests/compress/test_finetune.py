@@ -17,7 +17,7 @@ from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.evaluate import evaluate
 from hyrfpack.format import decode_model, encode_model
-from hyrfpack.format.compact import Plan
+from hyrfpack.format.compact.plan import Plan
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Picture, Scene
 from hyrfpack.train import TrainConfig, Trainer

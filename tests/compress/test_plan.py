@@ -26,9 +26,9 @@ from hyrfpack.compress.quantize import decide, quantize
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import GROUPS, group_shapes, to_arrays, to_model
-from hyrfpack.format.compact import Plan, Quantized, encode
-from hyrfpack.format.compact.plan import from_lattice
-from hyrfpack.format.compact.quantized import encode_sections
+from hyrfpack.format.compact import encode
+from hyrfpack.format.compact.plan import Plan, from_lattice
+from hyrfpack.format.compact.quantized import Quantized
 from hyrfpack.model import Frame, HybridModel, contract
 from hyrfpack.quant.steps import NOT_CODED, ONE, step_of
 
@@ -62,8 +62,7 @@ def a_sensitivity(model: HybridModel, spread: float = 2.0, seed: int = 0) -> Sen
     explicit = [together * np.exp(rng.normal(size=len(model)) / 4) for _ in range(4)]
     return Sensitivity(
         *explicit,
-        tables={group: draw(sizes[group]) for group in ("GTAB", "RTAB")},
-        decoders={group: draw(sizes[group]) for group in ("GMLP", "RMLP")},
+        fields={group: draw(sizes[group]) for group in ("GTAB", "RTAB", "GMLP", "RMLP")},
     )
 
 
@@ -145,8 +144,8 @@ def test_less_distortion_asked_for_takes_more_bits_everywhere() -> None:
     model = a_model()
 
     def size(distortion: float) -> int:
-        quantized = decided(model, distortion, prune=False)
-        return sum(len(data) for _, data in encode_sections(quantized).values())
+        made, _ = encode(model, decided(model, distortion, prune=False))
+        return sum(len(section.data) for section in made)
 
     sizes = [size(distortion) for distortion in (1e-8, 1e-6, 1e-4, 1e-2)]
 
@@ -196,7 +195,7 @@ def test_more_distortion_allowed_prunes_more() -> None:
 @settings(max_examples=80, deadline=None)
 def test_classes_fall_with_the_mean_sensitivity(rows: list[tuple[float, ...]]) -> None:
     positions, colors, scales, opacities = np.array(rows).T
-    sensitivity = Sensitivity(positions, colors, scales, opacities, {}, {})
+    sensitivity = Sensitivity(positions, colors, scales, opacities, {})
 
     classes = importance_classes(sensitivity)
 
@@ -216,7 +215,7 @@ def test_unseen_gaussians_are_in_the_last_class() -> None:
     seen = np.where(np.arange(50) < 25, 0.0, 1e-3)
 
     with np.errstate(divide="ignore"):
-        classes = importance_classes(Sensitivity(seen, seen, seen, seen, {}, {}))
+        classes = importance_classes(Sensitivity(seen, seen, seen, seen, {}))
 
     assert (classes[:25] == CLASSES - 1).all() and (classes[25:] < CLASSES - 1).all()
 

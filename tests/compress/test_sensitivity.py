@@ -98,11 +98,11 @@ def test_fields_are_the_slopes_of_pictures():
 
     outputs = {"GMLP": model.geometry.biases[-1], "RMLP": model.radiance.biases[-1]}
     for group, biases in outputs.items():
-        values = found.decoders[group][-len(biases) :]
+        values = found.fields[group][-len(biases) :]
         expected = [slope(model, every, biases, place, 0.02) for place in range(len(biases))]
         assert values.sum() == pytest.approx(sum(expected), rel=0.5), group
     for group, field in (("GTAB", model.geometry), ("RTAB", model.radiance)):
-        values = found.tables[group]
+        values = found.fields[group]
         rows = values.reshape(-1, 2)
         assert (rows[:, 0] == rows[:, 1]).all()
         largest = 2 * int(rows[:, 0].argmax())
@@ -120,8 +120,8 @@ def test_rows_that_no_gaussian_reads_count_nothing_and_decoders_never_nothing():
         field.grid(coords).sum().backward()
         read = (field.grid.table.grad != 0).any(dim=1).numpy()
         assert 0 < read.sum() < len(read)
-        assert (found.tables[group].reshape(-1, 2)[~read] == 0).all()
-    assert all((values > 0).all() for values in found.decoders.values())
+        assert (found.fields[group].reshape(-1, 2)[~read] == 0).all()
+    assert all((values > 0).all() for group, values in found.fields.items() if group in ("GMLP", "RMLP"))
 
 
 def test_gaussians_that_no_camera_sees_count_by_their_size_opacity_and_distance():
@@ -163,9 +163,8 @@ def test_the_same_model_gives_the_same_numbers_on_any_number_of_threads(backgrou
     for other in found[1:]:
         for name in ("positions", "colors", "scales", "opacities"):
             np.testing.assert_array_equal(getattr(other, name), getattr(found[0], name), err_msg=name)
-        for name in ("tables", "decoders"):
-            for group, values in getattr(found[0], name).items():
-                np.testing.assert_array_equal(getattr(other, name)[group], values, err_msg=group)
+        for group, values in found[0].fields.items():
+            np.testing.assert_array_equal(other.fields[group], values, err_msg=group)
 
 
 def test_measuring_leaves_the_model_and_the_random_state_alone():
@@ -186,7 +185,7 @@ def test_sizes_are_those_of_the_file():
     found = measure_sensitivity(model, CAMERAS[:2])
 
     parameters = dict(model.named_parameters())
-    for group, values in {**found.tables, **found.decoders}.items():
+    for group, values in found.fields.items():
         assert len(values) == sum(parameters[name].numel() for name in GROUPS[group]), group
         assert values.dtype == np.float64 and np.isfinite(values).all()
     for name in ("positions", "colors", "scales", "opacities"):

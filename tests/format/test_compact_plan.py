@@ -13,10 +13,10 @@ from scenes import small_model
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.arrays import GROUPS, group_shapes, to_arrays, to_model
-from hyrfpack.format.compact import CODECS, decode_positions, decode_section
+from hyrfpack.format.compact import CODECS, decode_positions, decode_section, encode
 from hyrfpack.format.compact import plan as layout
 from hyrfpack.format.compact.plan import groups_of
-from hyrfpack.format.compact.quantized import CODEC_CHANNELS, CODEC_GROUPS, CODEC_POINTS, encode_sections
+from hyrfpack.format.compact.quantized import CODEC_CHANNELS, CODEC_GROUPS, CODEC_POINTS
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.hash_encode.reference import cells as reference_cells
 from hyrfpack.ops.hash_encode.reference import corner_rows
@@ -145,4 +145,4 @@ def test_damage_is_refused_or_yields_finite_numbers(data: st.DataObject) -> None
 
 
 MODEL = a_model(40)
-CODED = encode_sections(drawn(MODEL, prune=False))
+CODED = {section.type: (section.codec, section.data) for section in encode(MODEL, drawn(MODEL, prune=False))[0]}

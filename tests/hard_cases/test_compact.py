@@ -10,7 +10,7 @@ from scenes import ball_points, ring, small_model
 from hyrfpack import compress, load, save
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
-from hyrfpack.format.compact import Quantized
+from hyrfpack.format.compact.quantized import Quantized
 from hyrfpack.format.container import read_container
 from hyrfpack.model import HybridModel
 from tools.safety.plans import drawn, even

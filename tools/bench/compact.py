@@ -8,8 +8,7 @@ error is that of the explicit logits, against the model that was coded.
 from __future__ import annotations
 
 import tracemalloc
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from unittest import mock
 
@@ -18,15 +17,15 @@ import torch
 
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.quantize import quantize
-from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.format.arrays import to_arrays, to_model
 from hyrfpack.format.codec import decode_model, encode_model
-from hyrfpack.format.compact import Plan
-from hyrfpack.format.sections import LOGITS, MLPS, TABLES
+from hyrfpack.format.compact.plan import Plan
+from hyrfpack.format.sections import LOGITS, TABLES
 from hyrfpack.measure.timing import take_turns
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.parallel import has_numba
+from tools.safety.plans import drawn_sensitivity
 
 SIZES = ((100_000, 14), (1_000_000, 17))  # Gaussians, log2 of the radiance table; that of geometry is half as large
 REPEATS = 3
@@ -48,25 +47,6 @@ def drawn_model(count: int, log2_table_size: int) -> HybridModel:
     for group in TABLES:
         arrays[group] = rng.normal(0, 0.1, arrays[group].shape).astype(np.float32)
     return to_model(config, arrays)
-
-
-def drawn_sensitivity(model: HybridModel) -> Sensitivity:
-    """Log-normal sensitivities, 3 to 4 decades wide."""
-    rng = np.random.default_rng(1)
-    sizes = {group: values.size for group, values in to_arrays(model).items()}
-
-    def spread(count: int, mean: float) -> np.ndarray:
-        return np.exp(rng.normal(np.log(mean), 2, count))
-
-    gaussian = spread(len(model), 1e-9)
-    return Sensitivity(
-        100 * gaussian,
-        gaussian,
-        gaussian / 2,
-        2 * gaussian,
-        {group: spread(sizes[group], 1e-8) for group in TABLES},
-        {group: spread(sizes[group], 1e-4) for group in MLPS},
-    )
 
 
 def bench() -> list[dict]:
@@ -114,18 +94,13 @@ def _bench_model(count: int, log2_table_size: int) -> list[dict]:
 
 
 def _with_numba(fast: bool, task: Callable[[], object]) -> Callable[[], object]:
+    """The task with compiled kernels, or as it is where Numba is missing."""
+
     def run() -> object:
-        with _numba(fast):
+        with mock.patch("hyrfpack.quant.rans.has_numba", lambda: fast):
             return task()
 
     return run
-
-
-@contextmanager
-def _numba(fast: bool) -> Iterator[None]:
-    """The codecs with compiled kernels, or as they are where Numba is missing."""
-    with mock.patch("hyrfpack.quant.rans.has_numba", lambda: fast):
-        yield
 
 
 def _peak(task: Callable[[], object]) -> float:

@@ -16,8 +16,7 @@ from hyrfpack.compress.quantize import decide
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.format import encode_model
 from hyrfpack.format.arrays import decoder_widths, grids, to_arrays
-from hyrfpack.format.compact import Quantized
-from hyrfpack.format.sections import MLPS, TABLES
+from hyrfpack.format.compact.quantized import Quantized
 from hyrfpack.model import HybridModel
 from hyrfpack.quant.morton import MAX_BITS
 
@@ -33,14 +32,14 @@ def drawn_sensitivity(model: HybridModel, seed: int = 0) -> Sensitivity:
     shares = np.exp(SPREAD * rng.normal(size=len(model))) / max(len(model), 1)
     places = model.cube_coords(model.gaussians.positions.detach().double()).numpy()
     points = 2 * np.minimum(places * (1 << MAX_BITS), (1 << MAX_BITS) - 1).astype(np.int64) + 1
-    tables, decoders = {}, {}
+    fields = {}
     for group, grid in grids(model.config).items():
         usage = grid.usage(points, MAX_BITS + 1)
-        tables[group] = (TABLE * usage / max(usage.sum(), 1)).repeat(2)
+        fields[group] = (TABLE * usage / max(usage.sum(), 1)).repeat(2)
     for group, widths in decoder_widths(model.config).items():
         count = sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(widths))
-        decoders[group] = DECODER / count * np.exp(SPREAD * rng.normal(size=count))
-    return Sensitivity(POSITIONS * shares, *[LOGITS * shares] * 3, tables, decoders)
+        fields[group] = DECODER / count * np.exp(SPREAD * rng.normal(size=count))
+    return Sensitivity(POSITIONS * shares, *[LOGITS * shares] * 3, fields)
 
 
 def drawn(model: HybridModel, distortion: float = DISTORTION, prune: bool = True, layered: bool = False) -> Quantized:
@@ -53,9 +52,8 @@ def even(model: HybridModel, step: float) -> Quantized:
     """All Gaussians, and all numbers, those that nobody reads included, in steps within 1/15 of `step`."""
     arrays = to_arrays(model)
     ones = {group: np.ones(values.size) for group, values in arrays.items()}
-    tables, decoders = ({group: ones[group] for group in groups} for groups in (TABLES, MLPS))
     distortion = step**2 / 12 * sum(values.size for values in arrays.values())
-    return decide(model, Sensitivity(*np.ones((4, len(model))), tables, decoders), distortion, prune=False)
+    return decide(model, Sensitivity(*np.ones((4, len(model))), ones), distortion, prune=False)
 
 
 def encode(model: HybridModel, profile: str, provenance: dict | None = None, **settings: object) -> bytes:

@@ -13,55 +13,17 @@ from __future__ import annotations
 import numpy as np
 
 from hyrfpack.errors import HyrfFormatError
-from hyrfpack.format.arrays import group_shapes
 from hyrfpack.format.compact.groups import decode_groups
-from hyrfpack.format.compact.plan import Plan, from_lattice, groups_of
-from hyrfpack.format.compact.quantized import (
-    CODEC_CHANNELS,
-    CODEC_GROUPS,
-    CODEC_POINTS,
-    Quantized,
-    decode_channels,
-    encode_sections,
-)
-from hyrfpack.format.container import Section
-from hyrfpack.format.sections import LAYERED, LOGITS, MLPS, POSITIONS, TABLES, layer_section
+from hyrfpack.format.compact.plan import from_lattice, groups_of
+from hyrfpack.format.compact.quantized import CODEC_CHANNELS, CODEC_GROUPS, CODEC_POINTS, decode_channels, encode
+from hyrfpack.format.sections import LOGITS, MLPS, POSITIONS, TABLES
 from hyrfpack.model.config import ModelConfig
-from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.quant.points import Points, decode_points
 
-__all__ = [
-    "Quantized",
-    "CODEC_POINTS",
-    "Plan",
-    "decode_positions",
-    "decode_section",
-    "encode",
-]
+__all__ = ["CODEC_POINTS", "decode_positions", "decode_section", "encode"]
 
 # The sections that may have a codec.
-CODECS = {
-    CODEC_POINTS: (POSITIONS,),
-    CODEC_CHANNELS: LOGITS,
-    CODEC_GROUPS: (*TABLES, *MLPS),
-}
-
-
-def encode(model: HybridModel, quantized: Quantized) -> tuple[list[Section], dict]:
-    """Sections for a model, and what was decided, for people.
-
-    Args:
-        model: what was quantised, for its configuration.
-        quantized: its numbers, from `hyrfpack.compress.quantize`.
-    """
-    coded, plan, shapes = encode_sections(quantized), quantized.plan, {}
-    for layer, points in enumerate(plan.layers):
-        for group, shape in group_shapes(model.config, len(points.points.classes)).items():
-            shapes.setdefault(layer_section(group, layer) if group in LAYERED else group, shape)
-    settings = {"distortion": plan.distortion_per_number, "gaussians_before": len(model)}
-    return [
-        Section(type, codec, data, 4 * shapes[type][0] * shapes[type][1]) for type, (codec, data) in coded.items()
-    ], settings
+CODECS = {CODEC_POINTS: (POSITIONS,), CODEC_CHANNELS: LOGITS, CODEC_GROUPS: (*TABLES, *MLPS)}
 
 
 def decode_positions(data: memoryview, count: int, config: ModelConfig) -> tuple[np.ndarray, Points]:

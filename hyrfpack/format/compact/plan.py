@@ -64,12 +64,6 @@ class Plan:
         arrays[POSITIONS] = np.concatenate(places)
         return to_model(model.config, arrays)
 
-    @property
-    def parts(self) -> list[slice]:
-        """Which of the Gaussians each layer has."""
-        stops = np.cumsum([len(layer.points.classes) for layer in self.layers]).tolist()
-        return [slice(start, stop) for start, stop in zip([0, *stops], stops, strict=False)]
-
 
 def from_lattice(points: Points, frame: Frame) -> np.ndarray:
     """Local positions (N, 3) float32 of the centres of the points' cells."""

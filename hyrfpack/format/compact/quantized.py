@@ -12,23 +12,15 @@ import numpy as np
 from hyrfpack.format.compact.channels import Channel, decode_channel, encode_channel
 from hyrfpack.format.compact.groups import GroupSymbols, encode_groups
 from hyrfpack.format.compact.plan import Plan
-from hyrfpack.format.sections import (
-    COLORS,
-    LAYERED,
-    LOGITS,
-    MLPS,
-    OPACITIES,
-    POSITIONS,
-    SCALES,
-    TABLES,
-    layer_section,
-)
+from hyrfpack.format.container import Section
+from hyrfpack.format.sections import COLORS, LAYERED, LOGITS, MLPS, POSITIONS, TABLES, layer_section
+from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.points import Points
 
 CODEC_POINTS, CODEC_CHANNELS, CODEC_GROUPS = 6, 7, 8
-COLUMNS = {COLORS: 3, SCALES: 1, OPACITIES: 1}
+COLUMNS = dict(zip(LOGITS, (3, 1, 1), strict=True))
 _BLOCK = 1 << 15  # numbers at once: few enough that temporaries stay in the caches
 
 T = TypeVar("T")
@@ -57,29 +49,37 @@ class Quantized:
         return arrays
 
 
-def encode_sections(quantized: Quantized) -> dict[str, tuple[int, bytes]]:
-    """Codec and stored bytes of each section but the metadata, in file order: a part of the file from its start on is
-    a model if it holds the first layer and the fields."""
+def encode(model: HybridModel, quantized: Quantized) -> tuple[list[Section], dict]:
+    """Sections for a model but for the metadata, in file order, and what was decided, for people.
+
+    A part of the file from its start on is a model if it holds the first layer and the fields.
+
+    Args:
+        model: whose numbers were quantised.
+        quantized: from `hyrfpack.compress.quantize`.
+    """
     plan = quantized.plan
 
-    def encode_channels(layer: int, group: str) -> tuple[int, bytes]:
+    def encode_channels(layer: int, group: str) -> Section:
         basis = plan.basis.astype("<f4").tobytes() if group == COLORS else b""
         classes = plan.layers[layer].points.classes
-        channels = [encode_channel(channel, classes) for channel in quantized.channels[layer][group]]
-        return CODEC_CHANNELS, basis + b"".join(channels)
+        data = basis + b"".join(encode_channel(channel, classes) for channel in quantized.channels[layer][group])
+        return Section(layer_section(group, layer), CODEC_CHANNELS, data, 4 * COLUMNS[group] * len(classes))
 
-    def encode_numbers(group: str) -> tuple[int, bytes]:
-        return CODEC_GROUPS, encode_groups(quantized.groups[group], plan.groups[group])
+    def encode_numbers(group: str) -> Section:
+        data = encode_groups(quantized.groups[group], plan.groups[group])
+        return Section(group, CODEC_GROUPS, data, 4 * len(plan.groups[group].index))
 
     jobs = {group: partial(encode_numbers, group) for group in plan.groups}
     for layer in range(len(plan.layers)):
         jobs |= {layer_section(group, layer): partial(encode_channels, layer, group) for group in COLUMNS}
     done = run_jobs(jobs)
-    for layer, points in enumerate(plan.layers):
-        done[layer_section(POSITIONS, layer)] = CODEC_POINTS, points.positions
-    first = [*MLPS, *LAYERED, *TABLES]
+    for layer, part in enumerate(plan.layers):
+        type = layer_section(POSITIONS, layer)
+        done[type] = Section(type, CODEC_POINTS, part.positions, 12 * len(part.points.classes))
     further = [layer_section(group, layer) for layer in range(1, len(plan.layers)) for group in LAYERED]
-    return {type: done[type] for type in (*first, *further)}
+    settings = {"distortion": plan.distortion_per_number, "gaussians_before": len(model)}
+    return [done[type] for type in (*MLPS, *LAYERED, *TABLES, *further)], settings
 
 
 def decode_channels(data: memoryview, points: Points, columns: int) -> np.ndarray:
