@@ -4,8 +4,9 @@
     python -m tools.studies.peers runs/bonsai/model.hyrf data/bonsai --ours small.hyrf medium.hyrf large.hyrf
 
 Other formats hold explicit Gaussians, so the model is baked first, as `hyrfpack export` does it. SPZ and SOG are then
-what it writes; gsplat's PNG is what gsplat writes (see `gsplat_png.py`). Every file is read back, drawn by our
-rasteriser and scored on the held-out photos.
+what it writes (our SPZ keeps 6 bits of a harmonic, others 4 or 5: larger files, closer to the model); gsplat's PNG is
+what gsplat writes (see `gsplat_png.py`). Every file is read back, drawn by our rasteriser and scored on the held-out
+photos.
 
 The peers are given an advantage wherever there was a choice: the background sphere, which their formats cannot hold, is
 rendered for them from our model and its bytes are not counted; Gaussians come in Morton order; and the faintest are
