@@ -94,8 +94,8 @@ def panels(rows: Sequence[Row]) -> list[Panel]:
     return made
 
 
-def _size_ratio(row: Row, reference: int) -> float:
-    return (row.bytes or 0) / reference
+def _size_ratio(row: Row, reference: int | None) -> float:
+    return (row.bytes or 0) / (reference or 1)
 
 
 def _draw(axes: Axes, panel: Panel) -> list[tuple[Row, float, float, str]]:

@@ -125,8 +125,9 @@ def _add_rate(model: HybridModel, quantized: Quantized, price: float) -> None:
         slopes[group] = _slope(chosen.symbols, groups.index, groups.count, chosen.codes)
     slopes = {group: (price * values).astype(np.float32) for group, values in slopes.items()}
     for name, slope in by_parameter(slopes, model):
-        if parameters[name].grad is not None:
-            parameters[name].grad += slope
+        gradient = parameters[name].grad
+        if gradient is not None:
+            gradient += slope
 
 
 def _slope(symbols: np.ndarray, index: np.ndarray, count: int, codes: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from hyrfpack.compress.search import coarsest, finest
 from hyrfpack.compress.sensitivity import Sensitivity, measure_sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate import Evaluation, evaluate
+from hyrfpack.evaluate import evaluate
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import (
     DEFAULT_PROFILE,
@@ -49,11 +50,11 @@ TRIALS, FINETUNED_TRIALS = 9, 4  # of a search
 
 @dataclass(frozen=True)
 class Trial:
-    """A file that was made: its bytes, the error it adds by section, and what it scores."""
+    """A file that was made: its bytes, the error it adds by section, and dB of PSNR lost where that was measured."""
 
     data: bytes
     errors: dict[str, float]
-    scores: Evaluation | None
+    lost: float = 0.0
 
 
 def compress(
@@ -68,7 +69,7 @@ def compress(
     max_psnr_drop: float | None = None,
     distortion: float | None = None,
     say: Callable[[str], None] = lambda sentence: None,
-    **settings: object,
+    **settings: Any,
 ) -> CompressionReport:
     """Pack a `.hyrf` file into a smaller one.
 
@@ -171,13 +172,13 @@ class Packer:
         model = self.model
         plan = make_plan(model, self.sensitivity, distortion, self.prune)
         planned = plan.apply(model)
-        if self.finetune_steps:
+        if self.scene is not None and self.finetune_steps:
             self.say(f"fine-tuning for {self.finetune_steps:,} steps")
             steps = self.finetune_steps
             model = planned = finetune(planned, plan, self.sensitivity, self.scene.train, steps, cache=self.cache)
         quantized = quantize(planned, plan, self.sensitivity, reach=0 if self.finetune_steps else 1)
         data = encode_model(model, "compact", self.provenance, quantized=quantized)
-        return Trial(data, added_errors(planned, quantized, self.sensitivity), None)
+        return Trial(data, added_errors(planned, quantized, self.sensitivity))
 
     def verified(self, trial: Trial, wanted: float, cameras: Sequence[Camera]) -> Trial:
         """The trial, or a finer one where its pictures turn out to be further off than `wanted` says.
@@ -218,24 +219,24 @@ class Packer:
         return trial, f"distortion {distortion:.2g} gives {len(trial.data):,} of {limit:,} bytes"
 
     def within_drop(self, limit: float, start: float) -> tuple[Trial, str]:
+        assert self.scene is not None
         views = self.scene.test or self.scene.train
         before = evaluate(self.model, views).psnr
 
         def attempt(distortion: float) -> Trial:
             trial = self.attempt(distortion)
-            trial = dataclasses.replace(trial, scores=evaluate(decode_model(trial.data), views))
-            lost = before - trial.scores.psnr
+            lost = before - evaluate(decode_model(trial.data), views).psnr
+            trial = dataclasses.replace(trial, lost=lost)
             self.say(f"distortion {distortion:.2g}: {len(trial.data):,} bytes, {lost:+.3f} dB lost")
             return trial
 
-        answer = coarsest(attempt, lambda trial: before - trial.scores.psnr <= limit, start, self._trials(), LIMITS)
+        answer = coarsest(attempt, lambda trial: trial.lost <= limit, start, self._trials(), LIMITS)
         if answer is None:
             raise HyrfError(
                 f"even the finest file loses more than {limit:g} dB of PSNR; allow more, or use profile 'raw'"
             )
         distortion, trial = answer
-        lost = before - trial.scores.psnr
-        return trial, f"distortion {distortion:.2g} loses {lost:+.3f} of {limit:g} dB on {len(views)} photos"
+        return trial, f"distortion {distortion:.2g} loses {trial.lost:+.3f} of {limit:g} dB on {len(views)} photos"
 
     def _trials(self) -> int:
         return FINETUNED_TRIALS if self.finetune_steps else TRIALS

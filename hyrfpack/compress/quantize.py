@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -45,7 +47,7 @@ def quantize(
     arrays = {group: values.astype(np.float64) for group, values in to_arrays(model).items()}
     sensitivity, d = sensitivity.of(plan.kept), plan.distortion_per_number
     opacity, error = opacity_error(model, arrays[OPACITIES][:, 0], sensitivity.opacities)
-    jobs = {
+    jobs: dict[str, Callable[[], Any]] = {
         group: partial(quantize_groups, arrays[group].ravel(), groups, sensitivity.fields[group], d, reach)
         for group, groups in plan.groups.items()
     }
@@ -59,7 +61,7 @@ def quantize(
         def opacity_cost(places: np.ndarray, candidates: np.ndarray, part: slice = part) -> np.ndarray:
             return error(places + part.start, candidates)
 
-        parts = {
+        parts: dict[str, tuple[np.ndarray, np.ndarray, ErrorModel | None, int]] = {
             COLORS: (colors[part], s.colors, None, reach),
             SCALES: (arrays[SCALES][part], s.scales, None, reach),
             OPACITIES: (opacity[part, None], s.opacities, opacity_cost, reach and OPACITY_REACH),

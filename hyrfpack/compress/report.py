@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.capture import Capture
@@ -193,10 +192,10 @@ def _write_pictures(
     scored = sorted(zip(views, before.views, after.views, strict=True), key=lambda item: item[2].psnr - item[1].psnr)
     chosen = evenly_spaced(scored, SHOWN)
     both = model.decode(), packed.decode()
-    pairs: list[tuple[Tensor, Tensor]] = [
-        tuple(
-            to_8bit(render(each, view.camera, decoded=decoded).rgb)
-            for each, decoded in zip((model, packed), both, strict=True)
+    pairs = [
+        (
+            to_8bit(render(model, view.camera, decoded=both[0]).rgb),
+            to_8bit(render(packed, view.camera, decoded=both[1]).rgb),
         )
         for view, *_ in chosen
     ]

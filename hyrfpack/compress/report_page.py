@@ -35,9 +35,9 @@ pre { background: #f1f3f4; padding: .8rem; white-space: pre-wrap; overflow-wrap:
 """
 
 
-def picture_names(number: int) -> tuple[str, ...]:
+def picture_names(number: int) -> list[str]:
     """The pictures of a shown view, counted from 1, one of each of KINDS."""
-    return tuple(f"view{number}_{kind}.png" for kind in KINDS)
+    return [f"view{number}_{kind}.png" for kind in KINDS]
 
 
 PAGE = "index.html"
@@ -76,7 +76,7 @@ class ShownView:
     before: float
     after: float
     between: float
-    files: tuple[str, str, str]
+    files: list[str]
 
 
 @dataclass(frozen=True)

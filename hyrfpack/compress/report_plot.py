@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hyrfpack.compress.report_page import Findings, Point, size_in_words
 from hyrfpack.evaluate.figures import blank_figure, save_figure
@@ -55,7 +55,7 @@ def _scatter(axes: Axes, findings: Findings, points: Sequence[Point], height: Ca
     axes.margins(x=0.12, y=0.15)
 
 
-def _name(axes: Axes, findings: Findings, point: Point, place: tuple[float, float], system: object) -> None:
+def _name(axes: Axes, findings: Findings, point: Point, place: tuple[float, float], system: Any) -> None:
     """Write beside a point what it is, unless the line says so; on the side where the line is not."""
     if point is findings.chosen or point in findings.profiles:
         words = f"{point.name}: exact" if findings.is_exact(point.scores) else point.name

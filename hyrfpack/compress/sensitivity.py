@@ -46,8 +46,8 @@ class Sensitivity:
 
     def of(self, index: np.ndarray | slice) -> Sensitivity:
         """That of the Gaussians at `index` (n,) int64, and of all fields."""
-        parts = (getattr(self, name)[index] for name in ("positions", "colors", "scales", "opacities"))
-        return Sensitivity(*parts, self.fields)
+        explicit = self.positions[index], self.colors[index], self.scales[index], self.opacities[index]
+        return Sensitivity(*explicit, self.fields)
 
 
 def measure_sensitivity(model: HybridModel, cameras: Sequence[Camera], seed: int = 0) -> Sensitivity:
@@ -120,7 +120,8 @@ def _gathered(
     # Both numbers of a row are read together.
     fields |= {group: fields[group].reshape(-1, 2).mean(axis=1).repeat(2) for group in TABLES}
     fields |= {group: np.maximum(fields[group], LEAST * fields[group].mean()) for group in MLPS}
-    return Sensitivity(*explicit, fields)
+    positions, colors, scales, opacities = explicit
+    return Sensitivity(positions, colors, scales, opacities, fields)
 
 
 def _local(model: HybridModel, measured: np.ndarray, guess: np.ndarray) -> np.ndarray:

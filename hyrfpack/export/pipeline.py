@@ -18,7 +18,6 @@ from hyrfpack.export.bake import bake
 from hyrfpack.export.cameras import encode_transforms, write_colmap
 from hyrfpack.export.kinds import (
     COLMAP,
-    PAGE,
     POINTS,
     TRANSFORMS,
     check_model,
@@ -146,7 +145,7 @@ def export(
     baked = {d: chosen(splats, crop, min_opacity) for d, splats in bake(read.model, read.fitted, degrees).items()}
     say(f"writing {len(baked[degree]):,} Gaussians{' and the background' if sphere else ''}")
     what = read, baked, degree, sphere, Path(target)
-    packed = _pack_page(*what) if kind is PAGE else _pack_splats(*what, kind, spz_version)
+    packed = _pack_splats(*what, kind, spz_version) if isinstance(kind, Format) else _pack_page(*what)
     write_atomic(target, packed.data)
     report = ExportReport(str(target), len(packed.data), len(packed.before[degree][0]), packed.background, degree)
     if crop is not None:

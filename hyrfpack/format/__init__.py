@@ -6,9 +6,12 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hyrfpack.format.info import SectionSize, describe
+
+if TYPE_CHECKING:
+    from hyrfpack.format.codec import CompressionReport, decode_model, encode_model, load, repack, save
 
 _LAZY = ("CompressionReport", "decode_model", "encode_model", "load", "repack", "save")
 

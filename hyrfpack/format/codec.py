@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from hyrfpack.device import choose_device
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import compact, paper, raw
 from hyrfpack.format.arrays import RULES, check_rules, group_shapes, parse_config, to_model
-from hyrfpack.format.container import Container, read_container, write_container
+from hyrfpack.format.container import Container, Section, read_container, write_container
 from hyrfpack.format.info import SectionSize, section_sizes
 from hyrfpack.format.metadata import Metadata, read_metadata
 from hyrfpack.format.sections import LAYERED, METADATA, POSITIONS, SECTIONS, group_and_layer, layer_section
@@ -25,7 +26,11 @@ from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.quant import DamagedDataError
 
-PROFILES = {"raw": raw.encode, "paper": paper.encode, "compact": compact.encode}
+PROFILES: dict[str, Callable[..., tuple[list[Section], dict]]] = {
+    "raw": raw.encode,
+    "paper": paper.encode,
+    "compact": compact.encode,
+}
 DEFAULT_PROFILE = "compact"  # of `compress`
 DECODERS = {**raw.DECODERS, **paper.DECODERS}  # of codecs that need no other section
 
@@ -55,7 +60,7 @@ class CompressionReport:
     found: str = ""
 
 
-def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | None = None, **settings: object) -> bytes:
+def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | None = None, **settings: Any) -> bytes:
     """Write a model as the bytes of a `.hyrf` file: same model, same settings, same bytes.
 
     Args:
@@ -109,7 +114,7 @@ def save(
     path: str | os.PathLike[str],
     profile: str = "raw",
     provenance: dict | None = None,
-    **settings: object,
+    **settings: Any,
 ) -> CompressionReport:
     """Write a model to a `.hyrf` file, whole or not at all. Arguments and errors as `encode_model`.
 
@@ -160,7 +165,7 @@ def repack(
     target: str | os.PathLike[str],
     profile: str = "raw",
     fraction: float | None = None,
-    **settings: object,
+    **settings: Any,
 ) -> CompressionReport:
     """Rewrite a `.hyrf` file with profile "raw" or "paper"; its provenance goes along.
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -67,7 +68,7 @@ class PaperSettings:
                 )
 
 
-def encode(model: HybridModel, **settings: object) -> tuple[list[Section], dict]:
+def encode(model: HybridModel, **settings: Any) -> tuple[list[Section], dict]:
     """Sections for a model, and the settings used. Gaussians keep their order.
 
     Raises:

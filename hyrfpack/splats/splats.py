@@ -98,9 +98,14 @@ def concatenate(parts: Sequence[Splats]) -> Splats:
     """All splats of the parts, one after the other, at the highest degree among them. `antialiased` as the first."""
     degree = max(part.degree for part in parts)
     same = [part.with_degree(degree) for part in parts]
-    names = ("positions", "scales", "quats", "opacities", "harmonics")
-    joined = (np.concatenate([getattr(part, name) for part in same]) for name in names)
-    return Splats(*joined, antialiased=same[0].antialiased)
+    return replace(
+        same[0],
+        positions=np.concatenate([part.positions for part in same]),
+        scales=np.concatenate([part.scales for part in same]),
+        quats=np.concatenate([part.quats for part in same]),
+        opacities=np.concatenate([part.opacities for part in same]),
+        harmonics=np.concatenate([part.harmonics for part in same]),
+    )
 
 
 def normalized_quats(quats: np.ndarray) -> np.ndarray:

@@ -106,7 +106,7 @@ def test_cameras_that_look_away_are_one_sentence(tmp_path: Path) -> None:
 
 def test_folder_that_cannot_be_made_is_told_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_bytes(b"")
-    monkeypatch.setattr(run, "_cameras", lambda *arguments: pytest.fail("the work began"))
+    monkeypatch.setattr(fit, "_cameras", lambda *arguments: pytest.fail("the work began"))
     with pytest.raises(HyrfError, match="file is a file, no folder"):
         distill_splats(ball(20), tmp_path / "file" / "x.hyrf", LITTLE)
 
@@ -116,7 +116,7 @@ def test_interrupt_while_packing_leaves_the_file_that_was_there(
 ) -> None:
     target = tmp_path / "x.hyrf"
     target.write_bytes(b"before")
-    monkeypatch.setattr(run, "TOLERATED", -np.inf)  # the first try will not do
+    monkeypatch.setattr(fit, "TOLERATED", -np.inf)  # the first try will not do
     monkeypatch.setattr(fit.Packer, "attempt", _interrupted_at_the_second(fit.Packer.attempt))
     with pytest.raises(KeyboardInterrupt):
         distill_splats(ball(20), target, LITTLE)
@@ -147,8 +147,8 @@ def test_nothing_is_measured_or_drawn_twice_however_often_packing_is_tried(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for tolerated in ("TOLERATED", "TOLERATED_PLAIN"):
-        monkeypatch.setattr(run, tolerated, -np.inf)  # no try will do
-    measured = counting(monkeypatch, run, "measure_sensitivity")
+        monkeypatch.setattr(fit, tolerated, -np.inf)  # no try will do
+    measured = counting(monkeypatch, fit, "measure_sensitivity")
     tried = counting(monkeypatch, fit.Packer, "attempt")
     drawn = counting(monkeypatch, teacher, "photograph")
 
@@ -162,10 +162,10 @@ def test_nothing_is_measured_or_drawn_twice_however_often_packing_is_tried(
 def test_a_short_import_looks_from_fewer_places_and_regresses_less(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looked = counting(monkeypatch, run, "viewpoints")
-    started = counting(monkeypatch, run, "initial_model")
-    monkeypatch.setattr(run, "_fit_to_pictures", lambda *args: None)
-    monkeypatch.setattr(run, "_pack", _interrupt)
+    looked = counting(monkeypatch, fit, "viewpoints")
+    started = counting(monkeypatch, fit, "initial_model")
+    monkeypatch.setattr(fit, "_fit_to_pictures", lambda *args: None)
+    monkeypatch.setattr(fit, "_pack", _interrupt)
     for steps in (1, 500):
         with pytest.raises(KeyboardInterrupt):
             distill_splats(ball(20), tmp_path / "x.hyrf", DistillConfig(steps=steps, size=16))

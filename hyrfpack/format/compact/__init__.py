@@ -50,7 +50,9 @@ def decode_section(
     """
     if group not in CODECS[codec]:
         raise HyrfFormatError(f"it cannot have codec {codec}; the file is damaged, write it again")
-    if points is None and group not in MLPS:
+    if group in MLPS:
+        return decode_groups(data, groups_of(group, config)).reshape(shape)
+    if points is None:
         raise HyrfFormatError(f"codec {codec} needs positions of codec {CODEC_POINTS}; write the file again")
     if codec == CODEC_CHANNELS:
         return decode_channels(data, points, shape[1])

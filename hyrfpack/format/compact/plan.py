@@ -75,7 +75,7 @@ def from_lattice(points: Points, frame: Frame) -> np.ndarray:
     return local
 
 
-def groups_of(group: str, config: ModelConfig, points: Points | None) -> StepGroups:
+def groups_of(group: str, config: ModelConfig, points: Points | None = None) -> StepGroups:
     """Which numbers of a table's or decoder's section share a step.
 
     Rows of a table by level and usage class: 0 if no Gaussian reads the row, else 1 + floor(log4 n), n being how many
@@ -86,6 +86,7 @@ def groups_of(group: str, config: ModelConfig, points: Points | None) -> StepGro
         pairs = pairwise(decoder_widths(config)[group])
         sizes = [size for inputs, outputs in pairs for size in (*[inputs] * outputs, outputs)]
         return StepGroups(np.repeat(np.arange(len(sizes)), sizes), len(sizes))
+    assert points is not None  # of a table
     grid = grids(config)[group]
     every = max(1, -(-len(points.cells) // COUNTED))
     usage = grid.usage(points[::every].centers(), MAX_BITS + 1)

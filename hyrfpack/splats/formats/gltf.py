@@ -184,7 +184,7 @@ def _chunks(data: bytes, name: str) -> tuple[dict[str, Any], memoryview]:
             f"{name}: it says version {version} and {length:,} bytes, but version 2 is read and it has {len(data):,}; "
             "export it again"
         )
-    chunks: dict[bytes, memoryview] = {}
+    chunks: dict[int, memoryview] = {}
     offset = _HEADER.size
     while offset < len(data):
         if offset + _CHUNK.size > len(data):
@@ -196,7 +196,7 @@ def _chunks(data: bytes, name: str) -> tuple[dict[str, Any], memoryview]:
         chunks.setdefault(kind, memoryview(data)[offset : offset + size])
         offset += size
     try:
-        content = json.loads(bytes(chunks.get(_JSON, b"")))
+        content = json.loads(bytes(chunks.get(_JSON, memoryview(b""))))
     except (ValueError, RecursionError) as error:
         raise HyrfDataError(f"{name}: its JSON cannot be read ({str(error):.120}); the file is damaged") from error
     if not isinstance(content, dict):
