@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -19,15 +20,20 @@ def machine() -> dict[str, object]:
         "cores": thread_count(),
         "python": platform.python_version(),
         "hyrfpack": hyrfpack.__version__,
+        **versions("torch", "numba", "numpy"),
     }
-    for package in ("torch", "numba", "numpy"):
-        try:
-            facts[package] = version(package)
-        except PackageNotFoundError:
-            facts[package] = None
     if torch.cuda.is_available():
         facts["gpu"] = torch.cuda.get_device_name()
     return facts
+
+
+def versions(*packages: str) -> dict[str, str | None]:
+    """Of packages; None for those that are not installed."""
+    found: dict[str, str | None] = dict.fromkeys(packages)
+    for package in packages:
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
 
 
 def machine_line(facts: dict[str, object]) -> str:

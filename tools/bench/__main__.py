@@ -26,6 +26,7 @@ from rich.table import Table
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from hyrfpack.measure.machine import machine, machine_line
+from tools.tables import cell
 
 Row = dict[str, object]
 
@@ -48,7 +49,7 @@ def table(name: str, rows: list[Row]) -> Table:
         numeric = any(isinstance(row.get(key), (int, float)) for row in rows)
         shown.add_column(key.replace("_", " "), justify="right" if numeric else "left", overflow="fold")
     for row in rows:
-        shown.add_row(*(_cell(row.get(key)) for key in keys))
+        shown.add_row(*(escape(cell(row.get(key))) for key in keys))
     return shown
 
 
@@ -67,14 +68,6 @@ def main(arguments: list[str] | None = None) -> None:
         console.print(table(name, results[name]))
     if asked.json:
         asked.json.write_text(json.dumps({"machine": facts, "results": results}, indent=1) + "\n")
-
-
-def _cell(value: object) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, float):
-        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-    return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else escape(str(value))
 
 
 if __name__ == "__main__":

@@ -8,12 +8,13 @@ import re
 import subprocess
 from collections.abc import Sequence
 from datetime import datetime, timezone
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import torch
 
+from hyrfpack.measure.machine import machine_line, versions
 from tools.gpu.rows import Row
+from tools.tables import cell, markdown
 
 ROOT = Path(__file__).parents[2]
 HIDDEN = ("table", "part", "item", "status", "note")
@@ -31,11 +32,7 @@ def machine(device: torch.device) -> dict[str, object]:
         facts["driver"] = _output("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader")
         facts["cuda or rocm"] = torch.version.cuda or torch.version.hip
     facts |= {"python": platform.python_version(), "torch": torch.__version__}
-    for package in ("triton", "numpy", "numba", "gsplat"):
-        try:
-            facts[package] = version(package)
-        except PackageNotFoundError:
-            facts[package] = None
+    facts |= versions("triton", "numpy", "numba", "gsplat")
     facts["commit"] = _output("git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=12")
     facts["date"] = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
     return facts
@@ -57,13 +54,13 @@ def write(folder: Path, facts: dict[str, object], settings: dict[str, object], r
     page = folder / f"{file_name(str(facts['device']))}.md"
     content = {"machine": facts, "settings": settings, "rows": list(rows)}
     page.with_suffix(".json").write_text(json.dumps(content, indent=1) + "\n")
-    page.write_text(markdown(facts, rows))
+    page.write_text(text(facts, rows))
     return page
 
 
-def markdown(facts: dict[str, object], rows: Sequence[Row]) -> str:
+def text(facts: dict[str, object], rows: Sequence[Row]) -> str:
     """The page: the machine, the goals, what failed, then a table for each kind of row."""
-    told = ", ".join(f"{key} {value}" for key, value in facts.items() if key != "device" and value is not None)
+    told = machine_line({key: value for key, value in facts.items() if key != "device" and value is not None})
     lines = [f"# {facts['device']}", "", f"Written by `python -m tools.gpu.check`: {told}.", ""]
     lines += ["How to read it: [README.md](README.md).", ""]
     tables: dict[str, list[Row]] = {name: [] for name in FIRST}
@@ -78,32 +75,22 @@ def markdown(facts: dict[str, object], rows: Sequence[Row]) -> str:
             tables.setdefault(str(row["table"]), []).append(row)
     for name, here in tables.items():
         if here:
-            lines += [f"## {name}", "", *table(here), ""]
+            lines += [f"## {name}", "", table(here), ""]
         elif name == "Failed and left out":
             lines += ["Nothing failed, nothing was left out.", ""]
     return "\n".join(lines)
 
 
-def table(rows: Sequence[Row]) -> list[str]:
-    """Rows as lines of a Markdown table: a column for each key, in order of appearance; numbers to the right."""
+def table(rows: Sequence[Row]) -> str:
+    """Rows as a Markdown table: a column for each key, in order of appearance; numbers to the right."""
     hidden = set(HIDDEN) - ({"status"} if any("where" in row for row in rows) else set())
     keys = list(dict.fromkeys(key for row in rows for key in row if key not in hidden))
     keys = [key for key in keys if any(row.get(key) is not None for row in rows)]
     if any(row.get("status") for row in rows) and "status" not in keys:
         keys.append("status")
     ruler = ["--:" if any(isinstance(row.get(key), (int, float)) for row in rows) else "---" for key in keys]
-    cells = [[_cell(row.get(key)) for key in keys] for row in rows]
-    return ["| " + " | ".join(line) + " |" for line in (keys, ruler, *cells)]
-
-
-def _cell(value: object) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, float):
-        small = value != 0 and abs(value) < 1e-3
-        return f"{value:.1e}" if small else f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-    text = f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
-    return text.replace("|", "\\|").replace("\n", " ")
+    cells = [[cell(row.get(key)).replace("|", "\\|").replace("\n", " ") for key in keys] for row in rows]
+    return markdown(keys, cells, ruler)
 
 
 def _output(*command: str) -> str | None:

@@ -23,6 +23,7 @@ from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.codec import load_with_provenance, without_cameras
 from tools.studies.train_sets import DATA
+from tools.tables import markdown
 
 ENDS = (1e-7, 1e-2)
 
@@ -86,14 +87,10 @@ class Set:
 def table(rows: list[dict]) -> str:
     """The rows as Markdown."""
     kinds = [kind for kind in ("paper", "default", "matched", "finetuned") if kind in rows[0]]
-    lines = [
-        "| set | Gaussians | PSNR / SSIM | "
-        + " | ".join(f"{kind}: bytes, dB lost, SSIM lost" for kind in kinds)
-        + " |",
-        "|---|---|---|" + "---|" * len(kinds),
-    ]
+    columns = ["set", "Gaussians", "PSNR / SSIM", *(f"{kind}: bytes, dB lost, SSIM lost" for kind in kinds)]
+    lines = []
     for row in rows:
-        cells = []
+        cells = [row["set"], f"{row['gaussians']:,}", f"{row['psnr']:.2f} / {row['ssim']:.4f}"]
         for kind in kinds:
             made = row[kind]
             if made is None:
@@ -101,10 +98,8 @@ def table(rows: list[dict]) -> str:
                 continue
             share = "" if kind == "paper" else f" ({made['bytes'] / row['paper']['bytes']:.3f})"
             cells.append(f"{made['bytes']:,}{share}, {made['drop']:+.3f}, {made['ssim_drop']:+.4f}")
-        lines.append(
-            f"| {row['set']} | {row['gaussians']:,} | {row['psnr']:.2f} / {row['ssim']:.4f} | {' | '.join(cells)} |"
-        )
-    return "\n".join(lines)
+        lines.append(cells)
+    return markdown(columns, lines)
 
 
 def main() -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from hyrfpack.train import TrainConfig
 from tools.studies.train_sets import measure, study_arguments
+from tools.tables import line, markdown
 
 VARIANTS: dict[str, dict] = {
     "default": {},
@@ -31,7 +32,7 @@ def main() -> None:
     args = study_arguments(
         __doc__, steps=2000, sets=["mipnerf360_bonsai", "gerrard_hall"], out=Path("runs/design")
     ).parse_args()
-    print("| variant | set | PSNR | spread | SSIM | Gaussians | bytes | steps/s |\n|---|---|---|---|---|---|---|---|")
+    print(markdown(("variant", "set", "PSNR", "spread", "SSIM", "Gaussians", "bytes", "steps/s"), []))
     for number, (variant, changes) in enumerate(VARIANTS.items()):
         if args.only and not any(part in variant for part in args.only):
             continue
@@ -49,12 +50,9 @@ def main() -> None:
             mean = {
                 key: statistics.fmean(row[key] for row in rows) for key in rows[0] if key != "set" and key != "preset"
             }
-            print(
-                f"| {variant} | {name} | {mean['psnr_paper']:.2f} | {max(scores) - min(scores):.2f} | "
-                f"{mean['ssim_paper']:.3f} | {mean['gaussians']:,.0f} | {mean['bytes_paper']:,.0f} | "
-                f"{mean['steps_per_second']:.1f} |",
-                flush=True,
-            )
+            cells = [f"{mean['psnr_paper']:.2f}", f"{max(scores) - min(scores):.2f}", f"{mean['ssim_paper']:.3f}"]
+            cells += [f"{mean['gaussians']:,.0f}", f"{mean['bytes_paper']:,.0f}", f"{mean['steps_per_second']:.1f}"]
+            print(line([variant, name, *cells]), flush=True)
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import hyrfpack
 from hyrfpack.train import TrainConfig
+from tools.tables import markdown
 
 PROFILES = ("paper", "compact")
 DATA = Path(os.environ.get("HYRFPACK_DATA") or Path(__file__).parents[3] / "shared" / "data")
@@ -58,21 +59,11 @@ def measure(folder: Path, out: Path, config: TrainConfig, reuse: bool) -> dict:
 
 def table(rows: list[dict]) -> str:
     """The rows as Markdown."""
-    columns = [f"{profile} bytes | loss | s" for profile in PROFILES]
-    header = [
-        "set",
-        "preset",
-        "PSNR",
-        "SSIM",
-        "Gaussians",
-        "raw bytes",
-        *columns,
-        "compact / paper",
-        "steps/s",
-        "train s",
-    ]
-    lines = ["| " + " | ".join([*header, "frame ms"]) + " |"]
-    lines.append("|---" * (lines[0].count("|") - 1) + "|")
+    header = ["set", "preset", "PSNR", "SSIM", "Gaussians", "raw bytes"]
+    for profile in PROFILES:
+        header += [f"{profile} bytes", "loss", "s"]
+    header += ["compact / paper", "steps/s", "train s", "frame ms"]
+    lines = []
     for r in rows:
         cells = [r["set"], r["preset"], f"{r['psnr']:.2f}", f"{r['ssim']:.3f}", f"{r['gaussians']:,}"]
         cells.append(f"{r['bytes_raw']:,}")
@@ -81,8 +72,8 @@ def table(rows: list[dict]) -> str:
             cells += [f"{r[f'bytes_{profile}']:,}", f"{loss:.3f} dB", f"{r[f'seconds_{profile}']:.1f}"]
         cells += [f"{r['bytes_compact'] / r['bytes_paper']:.2f}", f"{r['steps_per_second']:.1f}"]
         cells += [f"{r['seconds']:.0f}", f"{r['frame_ms']:.1f}"]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        lines.append(cells)
+    return markdown(header, lines)
 
 
 def study_arguments(
