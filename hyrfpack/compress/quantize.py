@@ -87,7 +87,7 @@ def opacity_error(model: HybridModel, logits: np.ndarray, sensitivity: np.ndarra
     opacities = expit(neural + logits)
     weights = sensitivity / np.maximum(opacities * (1 - opacities), 1e-4) ** 2
 
-    def error(places: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+    def error(places: np.ndarray | slice, candidates: np.ndarray) -> np.ndarray:
         return weights[places] * (expit(neural[places] + candidates) - opacities[places]) ** 2
 
     return np.clip(logits, -SATURATED - neural, SATURATED - neural), error

@@ -28,7 +28,8 @@ def coarsest(
     Returns:
         The distortion and its trial, None when not even the least distortion fits.
     """
-    low = high = None  # the coarsest that fits and the finest that does not
+    low: float | None = None  # the coarsest that fits
+    high: float | None = None  # the finest that does not
     distortion, best = min(max(start, ends[0]), ends[1]), None
     for _ in range(trials):
         trial = attempt(distortion)

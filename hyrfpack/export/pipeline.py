@@ -249,7 +249,9 @@ def _export_points(read: Source, kind: Kind, target: str | os.PathLike[str], spl
         write_colmap(read.cameras, target, splats)
         size = sum(table.stat().st_size for table in Path(target, "sparse", "0").glob("*.bin"))
         return ExportReport(str(target), size, cameras=len(read.cameras))
-    data = encode_points(splats, [camera for _, camera in read.cameras], Path(kind.ending).suffix[1:], read.up)
+    data = encode_points(
+        splats, [camera for _, camera in read.cameras], "glb" if kind.ending.endswith("glb") else "ply", read.up
+    )
     write_atomic(target, data)
     return ExportReport(str(target), len(data), len(splats), cameras=len(read.cameras))
 

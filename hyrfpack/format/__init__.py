@@ -13,12 +13,19 @@ from hyrfpack.format.info import SectionSize, describe
 if TYPE_CHECKING:
     from hyrfpack.format.codec import CompressionReport, decode_model, encode_model, load, repack, save
 
-_LAZY = ("CompressionReport", "decode_model", "encode_model", "load", "repack", "save")
-
-__all__ = ["SectionSize", "describe", *_LAZY]
+__all__ = [
+    "CompressionReport",
+    "SectionSize",
+    "decode_model",
+    "describe",
+    "encode_model",
+    "load",
+    "repack",
+    "save",
+]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
+    if name not in __all__:
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
     return getattr(import_module("hyrfpack.format.codec"), name)

@@ -231,7 +231,9 @@ def _decode(container: Container) -> HybridModel:
         type = layer_section(POSITIONS, layer)
         if sections[type].codec == compact.CODEC_POINTS:
             with _naming(name, type):
-                arrays[type], points[layer] = compact.decode_positions(sections[type].data, layers[layer], config)
+                arrays[type], points[layer] = compact.decode_positions(
+                    memoryview(sections[type].data), layers[layer], config
+                )
 
     run_tasks(decode_positions, there)
     rest = [type for type in wanted if type not in arrays]
@@ -239,14 +241,12 @@ def _decode(container: Container) -> HybridModel:
     def decode(index: int) -> None:
         type = rest[index]
         group, layer = group_and_layer(type)
-        section = sections[type]
+        codec, data = sections[type].codec, memoryview(sections[type].data)
         with _naming(name, type):
-            if section.codec in DECODERS:
-                arrays[type] = DECODERS[section.codec](section.data, shapes[type])
+            if codec in DECODERS:
+                arrays[type] = DECODERS[codec](data, shapes[type])
             else:
-                arrays[type] = compact.decode_section(
-                    group, section.codec, section.data, shapes[type], config, points.get(layer)
-                )
+                arrays[type] = compact.decode_section(group, codec, data, shapes[type], config, points.get(layer))
 
     run_tasks(decode, len(rest))
     for type, values in arrays.items():

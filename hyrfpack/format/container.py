@@ -313,7 +313,8 @@ def write_container(sections: Sequence[Section], minor: int = MINOR) -> bytes:
     if len(set(types)) != len(types):
         raise ValueError(f"section types repeat: {', '.join(types)}")
     offset = _TOC_OFFSET + _ENTRY.size * len(sections)
-    toc, payloads = [], []
+    toc: list[bytes] = []
+    payloads: list[bytes | memoryview] = []
     for section in sections:
         if not _TYPE.fullmatch(section.type):
             raise ValueError(f"section type '{section.type}' is not four letters, digits or underscores")

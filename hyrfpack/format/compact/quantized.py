@@ -70,7 +70,7 @@ def encode(model: HybridModel, quantized: Quantized) -> tuple[list[Section], dic
         data = encode_groups(quantized.groups[group], plan.groups[group])
         return Section(group, CODEC_GROUPS, data, 4 * len(plan.groups[group].index))
 
-    jobs = {group: partial(encode_numbers, group) for group in plan.groups}
+    jobs: dict[str, Callable[[], Section]] = {group: partial(encode_numbers, group) for group in plan.groups}
     for layer in range(len(plan.layers)):
         jobs |= {layer_section(group, layer): partial(encode_channels, layer, group) for group in COLUMNS}
     done = run_jobs(jobs)
