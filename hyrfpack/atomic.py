@@ -153,4 +153,4 @@ def _explain(path: str | os.PathLike[str], length: int | None, error: OSError) -
         return f"{path}: your quota is used up and this file was not written; free {size} and try again"
     if error.errno == errno.EFBIG:
         return f"{path}: so large a file is not allowed here (see 'ulimit -f'); choose another place"
-    return f"{path}: the file cannot be written ({error.strerror or error}); choose another place or mend this one"
+    return f"{path}: the file cannot be written ({error.strerror or error}); choose another place or repair this one"

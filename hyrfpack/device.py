@@ -45,7 +45,7 @@ def choose_device(
     if isinstance(name, torch.device):
         name = str(name) if name.type == "cuda" else name.type
     if not re.fullmatch(r"auto|cpu|mps|cuda(:[0-9]{1,3})?", name):
-        raise HyrfError(f"'{name}' is no device; use auto, cpu, cuda, cuda:N or mps")
+        raise HyrfError(f"'{name}' is not a device; use auto, cpu, cuda, cuda:N or mps")
     kind, _, number = name.partition(":")
     # Asking for GPUs is enough to make a fork a bad one, also where there is none.
     if kind in ("auto", "cuda") and torch.cuda._is_in_bad_fork() and torch.cuda.is_available():

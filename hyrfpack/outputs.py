@@ -172,7 +172,7 @@ def _check_place(folder: Path) -> None:
     place = _real(folder)
     above = next(path for path in (place, *place.parents) if os.path.lexists(path))
     if not above.is_dir():
-        raise HyrfError(f"{folder}: {above} is a file, no folder; name another place")
+        raise HyrfError(f"{folder}: {above} is a file, not a folder; name another place")
     check_writable(above)
 
 

@@ -84,8 +84,8 @@ def test_failure_leaves_the_old_file_and_no_temporary_one(tmp_path, monkeypatch,
     [
         (errno.ENOSPC, "the disk is full and this file was not written; free 1,234 bytes and try again"),
         (errno.EDQUOT, "your quota is used up and this file was not written; free 1,234 bytes and try again"),
-        (errno.EIO, "the file cannot be written (Input/output error); choose another place or mend this one"),
-        (errno.EROFS, "the file cannot be written (Read-only file system); choose another place or mend this one"),
+        (errno.EIO, "the file cannot be written (Input/output error); choose another place or repair this one"),
+        (errno.EROFS, "the file cannot be written (Read-only file system); choose another place or repair this one"),
     ],
 )
 def test_disk_that_takes_no_more_is_one_sentence(tmp_path, monkeypatch, number, sentence):

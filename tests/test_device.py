@@ -37,7 +37,7 @@ def test_a_device_that_is_not_there_is_refused_in_one_sentence(name):
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "cuda:-1", "cpu:0", "", "auto:1"])
 def test_what_is_no_device_is_refused_in_one_sentence(name):
-    with pytest.raises(HyrfError, match="is no device"):
+    with pytest.raises(HyrfError, match="is not a device"):
         choose_device(name)
 
 

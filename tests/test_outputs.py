@@ -126,7 +126,7 @@ def test_pictures_beside_a_single_new_file_do_not_matter(tmp_path, model):
         ("small.ply", "ends in .hyrf"),
         ("small", "ends in .hyrf"),
         ("folder", "this is a folder"),
-        ("file/small.hyrf", "is a file, no folder"),
+        ("file/small.hyrf", "is a file, not a folder"),
         ("a" * 300 + ".hyrf", "longer than 255 bytes"),
         ("a" * 300 + "/small.hyrf", "longer than 255 bytes"),
         ("aaaa/" * 1000 + "small.hyrf", "longer than 4095 bytes"),

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from hyrfpack.bench.rows import Error, Row, difference, in_words
+from hyrfpack.bench.rows import Row, in_words
 from hyrfpack.bench.subject import Subject
 from hyrfpack.compress.quantize import decide
 from hyrfpack.compress.sensitivity import measure_sensitivity
@@ -23,6 +23,7 @@ from hyrfpack.format.codec import DEFAULT_PROFILE, PROFILES
 from hyrfpack.format.container import read_container
 from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.sections import LAYERED, POSITIONS, SECTIONS
+from hyrfpack.measure.error import Error, difference
 from hyrfpack.measure.timing import take_turns
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from hyrfpack.measure.error import Error, difference
+from hyrfpack.measure.error import Error
 from hyrfpack.measure.timing import Ratio, Timing
 
-__all__ = ["Error", "Row", "difference", "in_words"]
+__all__ = ["Error", "Row", "in_words"]
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.bench.rows import difference
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.paths import orbit
 from hyrfpack.compress.distortion import default_distortion
@@ -24,6 +23,7 @@ from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.format import describe, load
+from hyrfpack.measure.error import difference
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 from hyrfpack.train import TrainConfig, train

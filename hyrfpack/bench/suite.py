@@ -54,7 +54,7 @@ def bench(
     *,
     repeats: int = 7,
     only: Sequence[str] | None = None,
-    report: Callable[[str], None] = lambda sentence: None,
+    say: Callable[[str], None] = lambda sentence: None,
 ) -> BenchReport:
     """Measure operations, renderer settings and file profiles of a model: time, beside error.
 
@@ -70,7 +70,7 @@ def bench(
             pictures, from viewpoints that the file hints at.
         repeats: turns of each contender, at least 1; those that take seconds get fewer.
         only: groups to measure, names out of `GROUPS`; all when None.
-        report: called with a sentence before each part.
+        say: told what is going on, a sentence before each part.
 
     Raises:
         HyrfError: the model or the photos cannot be used, a result is not finite, or Numba is missing.
@@ -94,12 +94,12 @@ def bench(
         check_type("scene", scene, Scene)
     with needs_package("numba", "measuring the compiled kernels"):
         import numba  # noqa: F401 - asked for here, before the work starts
-    subject = built_in_subject(report) if model is None else read_subject(model, scene)
+    subject = built_in_subject(say) if model is None else read_subject(model, scene)
     notes: list[str] = []
     rows: list[Row] = []
     for name in GROUPS:
         if name in (only or GROUPS):
-            report(f"measuring {name}")
+            say(f"measuring {name}")
             rows += GROUPS[name](subject, repeats, notes.append)
     if any(row.time.repeats < repeats for row in rows):
         notes.append(f"a contender that has been measured for {ENOUGH_SECONDS:g} s gets no further turn")

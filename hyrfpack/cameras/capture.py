@@ -59,7 +59,7 @@ class Capture:
             return [camera_from_numbers(numbers) for numbers in self.facts["provenance"]["cameras"]]
         except (TypeError, ValueError, ArithmeticError) as error:
             raise HyrfDataError(
-                f"the cameras that the file keeps make no sense ({error!s:.160}); name the photos with --data"
+                f"the cameras that the file keeps are not valid ({error!s:.160}); name the photos with --data"
             ) from error
 
     @property

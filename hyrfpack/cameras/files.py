@@ -95,7 +95,7 @@ def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
         except KeyError as error:
             raise HyrfDataError(f"{path}: camera {number} has no {error}; add it") from error
         except (TypeError, ValueError, ArithmeticError) as error:
-            raise HyrfDataError(f"{path}: camera {number} makes no sense ({error!s:.160}); correct it") from error
+            raise HyrfDataError(f"{path}: camera {number} is not valid ({error!s:.160}); correct it") from error
     if not cameras:
         raise HyrfDataError(f"{path}: there is no camera in it; add at least one")
     return cameras

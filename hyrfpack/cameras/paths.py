@@ -45,7 +45,7 @@ class Viewpoint:
         if self.center.shape != (3,) or not (np.abs([*self.center, *others]) < 1e37).all():
             raise ValueError("a number is missing or not finite")
         if self.up.shape != (3,) or not 0 < np.linalg.norm(self.up) < np.inf:
-            raise ValueError("'up' is no direction")
+            raise ValueError("'up' is not a direction")
 
     @classmethod
     def of(cls, cameras: Sequence[Camera]) -> Viewpoint:

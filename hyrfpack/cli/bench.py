@@ -73,7 +73,7 @@ def bench(
         words.fill(page, dict.fromkeys(("machine", *(only or GROUPS)), ""), str(markdown))
     if markdown is not None:  # a page with the places is not replaced, they are filled
         Outputs(model, scene=scene, overwrite=overwrite or bool(page)).file(markdown)
-    result = measure(model, scene, repeats=repeats, only=only or None, report=note)
+    result = measure(model, scene, repeats=repeats, only=only or None, say=note)
     if json_file == "-":
         print_json(result.to_dict())
     else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -42,6 +43,15 @@ OUTPUT = _OutputPath()
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace files that are there; what the command reads is never replaced."
 )
+
+
+def number(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
+    """Refuse NaN, which no range does."""
+    if value is not None and math.isnan(value):
+        raise click.BadParameter("NaN is not a number", ctx, param)
+    return value
+
+
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
 
 

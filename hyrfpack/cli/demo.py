@@ -25,7 +25,7 @@ def demo(output: Path, steps: int, overwrite: bool, as_json: bool) -> None:
     from hyrfpack.demo.run import FILES, run_demo
 
     Outputs(overwrite=overwrite).folder(output, FILES)
-    result = run_demo(output, steps=steps, report=note)
+    result = run_demo(output, steps=steps, say=note)
     if as_json:
         print_json(result.to_dict())
         return

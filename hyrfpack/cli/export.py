@@ -37,7 +37,7 @@ class _Box(click.ParamType):
         except ValueError:
             numbers = ()
         if len(numbers) != 6 or any(map(math.isnan, numbers)):
-            self.fail(f"'{value}' is no box; write it as MINX,MINY,MINZ,MAXX,MAXY,MAXZ in world units", param, ctx)
+            self.fail(f"'{value}' is not a box; write it as MINX,MINY,MINZ,MAXX,MAXY,MAXZ in world units", param, ctx)
         if any(low > high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
             self.fail(f"'{value}' is turned inside out; give the least x, y and z first", param, ctx)
         return numbers

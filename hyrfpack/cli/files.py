@@ -16,6 +16,7 @@ from hyrfpack.cli.common import (
     PATH,
     json_option,
     note,
+    number,
     overwrite_option,
     print_json,
     read_scene,
@@ -46,15 +47,8 @@ class _Bytes(click.ParamType):
         except (ValueError, OverflowError):
             size = 0
         if size < 1:
-            self.fail(f"'{value}' is no size; write it as 2MB, 350kB or 1500000", param, ctx)
+            self.fail(f"'{value}' is not a size; write it as 2MB, 350kB or 1500000", param, ctx)
         return size
-
-
-def _number(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
-    """Refuse NaN, which no range does."""
-    if value is not None and math.isnan(value):
-        raise click.BadParameter("NaN is no number", ctx, param)
-    return value
 
 
 @click.command(short_help="Pack a model into a small file.")
@@ -80,7 +74,7 @@ def _number(ctx: click.Context, param: click.Parameter, value: float | None) -> 
 @click.option(
     "--max-psnr-drop",
     type=click.FloatRange(min=0),
-    callback=_number,
+    callback=number,
     metavar="DB",
     help="As small as can be for so many dB lost on the held-out photos of --data.",
 )
@@ -151,7 +145,7 @@ def compress(
 @click.option(
     "--fraction",
     type=click.FloatRange(0, 1),
-    callback=_number,
+    callback=number,
     metavar="F",
     help="Use only so much of the file, from its start, such as 0.6: a coarser model.",
 )
@@ -271,18 +265,18 @@ def _section_table(sections: list[dict], total: int, gaussians: int, shares: dic
 
     together: dict[str, list] = {}
     for part in sections:
-        type = group_and_layer(part["type"])[0]
-        sizes = together.setdefault(type, [SECTIONS.get(type, part["holds"]), 0, 0])
+        tag = group_and_layer(part["type"])[0]
+        sizes = together.setdefault(tag, [SECTIONS.get(tag, part["holds"]), 0, 0])
         sizes[1] += part["before"]
         sizes[2] += part["after"]
-    parts = [(type, holds, f"{before:,}", after) for type, (holds, before, after) in together.items()]
+    parts = [(tag, holds, f"{before:,}", after) for tag, (holds, before, after) in together.items()]
     parts.append(("", "header, table of contents, padding", "", total - sum(after for *_, after in parts)))
     rows, header = [], ["section", "unpacked bytes", "stored bytes", "share", "bits/Gaussian", "bits/number"]
-    for type, holds, before, after in parts:
-        numbers = int(before.replace(",", "") or 0) / 4 if type not in (METADATA, "") else 0
+    for tag, holds, before, after in parts:
+        numbers = int(before.replace(",", "") or 0) / 4 if tag not in (METADATA, "") else 0
         rows.append(
             [
-                f"{type} {holds}".strip(),
+                f"{tag} {holds}".strip(),
                 before,
                 f"{after:,}",
                 f"{after / total:.1%}",
@@ -291,7 +285,7 @@ def _section_table(sections: list[dict], total: int, gaussians: int, shares: dic
             ]
         )
         if shares:
-            rows[-1].append(f"{shares[type]:.1%}" if type in shares else "")
+            rows[-1].append(f"{shares[tag]:.1%}" if tag in shares else "")
     return table([*header, *(["of the loss"] if shares else [])], rows)
 
 

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from hyrfpack.cli.common import OUTPUT, PATH, SEED, json_option, note, overwrite_option, print_json, table
+from hyrfpack.cli.common import OUTPUT, PATH, SEED, json_option, note, number, overwrite_option, print_json, table
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
     from hyrfpack.distill import DistillReport
-
-
-def _finite(ctx: click.Context, param: click.Parameter, value: float) -> float:
-    """Refuse NaN, which no range does."""
-    if math.isnan(value):
-        raise click.BadParameter("NaN is no number", ctx, param)
-    return value
 
 
 @click.command("import", short_help="Make a small model of 3D Gaussians from elsewhere.")
@@ -29,11 +21,11 @@ def _finite(ctx: click.Context, param: click.Parameter, value: float) -> float:
 @click.option(
     "--psnr",
     type=click.FloatRange(10, 60),
-    callback=_finite,
+    callback=number,
     default=37.0,
     show_default=True,
     metavar="DB",
-    help="How like SOURCE's pictures those of FILE shall be: more dB take more bytes.",
+    help="How like SOURCE's pictures those of FILE should be: more dB take more bytes.",
 )
 @click.option(
     "--size",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,7 @@ FINEST = 32  # step code, 8e-6: with it differences of numbers within the limit 
 _SAMPLE = 1 << 16  # numbers that the weight is chosen on
 
 # (places, candidate values) -> what each would add to the pictures' mean squared error
-ErrorModel = Callable[[np.ndarray | slice, np.ndarray], np.ndarray]
+ErrorModel = Callable[[Any, np.ndarray], np.ndarray]
 
 
 def quantize_channel(

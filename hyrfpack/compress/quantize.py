@@ -17,9 +17,10 @@ from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.compact.channels import LIMIT
 from hyrfpack.format.compact.plan import Plan
-from hyrfpack.format.compact.quantized import COLUMNS, Quantized, run_jobs
+from hyrfpack.format.compact.quantized import COLUMNS, Quantized
 from hyrfpack.format.sections import COLORS, OPACITIES, SCALES
 from hyrfpack.model import HybridModel
+from hyrfpack.parallel.pool import run_jobs
 
 SATURATED = 8.0  # an opacity's total logit beyond it looks like it: sigmoid is within 3.4e-4 of its end
 OPACITY_REACH = 4  # where opacity is near 0 or 1 logits may move far
@@ -87,7 +88,7 @@ def opacity_error(model: HybridModel, logits: np.ndarray, sensitivity: np.ndarra
     opacities = expit(neural + logits)
     weights = sensitivity / np.maximum(opacities * (1 - opacities), 1e-4) ** 2
 
-    def error(places: np.ndarray | slice, candidates: np.ndarray) -> np.ndarray:
+    def error(places: Any, candidates: np.ndarray) -> np.ndarray:
         return weights[places] * (expit(neural[places] + candidates) - opacities[places]) ** 2
 
     return np.clip(logits, -SATURATED - neural, SATURATED - neural), error

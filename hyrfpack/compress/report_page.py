@@ -218,11 +218,11 @@ def _parts(report: CompressionReport) -> list[Element]:
         size[1] += part.after
     header = ["part", "bytes before", "bytes after", "share of the file", "bits a number"]
     rows, total = [], report.bytes_after
-    for type, (before, after) in sizes.items():
-        numbers = 0 if type == METADATA else before // 4
+    for tag, (before, after) in sizes.items():
+        numbers = 0 if tag == METADATA else before // 4
         bits = f"{8 * after / numbers:.2f}" if numbers else ""
-        loss = f"{report.shares[type]:.1%}" if type in report.shares else ""
-        rows.append([names.get(type, type), f"{before:,}", f"{after:,}", f"{after / total:.1%}", bits, loss])
+        loss = f"{report.shares[tag]:.1%}" if tag in report.shares else ""
+        rows.append([names.get(tag, tag), f"{before:,}", f"{after:,}", f"{after / total:.1%}", bits, loss])
     rest = total - sum(after for _, after in sizes.values())
     rows.append(["header, table of contents, padding", "", f"{rest:,}", f"{rest / total:.1%}", "", ""])
     rows.append(["the whole file", f"{report.bytes_before:,}", f"{total:,}", "100.0%", "", ""])

@@ -39,12 +39,10 @@ def coarsest(
             high = distortion
         if low == ends[1] or high == ends[0]:
             break
-        if high is None:
-            distortion = min(low * FACTOR, ends[1])
-        elif low is None:
-            distortion = max(high / FACTOR, ends[0])
-        else:
+        if low is not None and high is not None:
             distortion = (low * high) ** 0.5
+        else:
+            distortion = min(distortion * FACTOR, ends[1]) if high is None else max(distortion / FACTOR, ends[0])
     if best is None and high != ends[0] and fits(trial := attempt(ends[0])):
         best = ends[0], trial
     return best

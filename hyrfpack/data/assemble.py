@@ -79,7 +79,9 @@ def make_scene(
         HyrfDataError: no photo, a name twice, a bad pose, intrinsics or size, or nothing left to train on.
     """
     if not photos:
-        raise HyrfDataError(f"{path}: its poses are of no photo at all; reconstruct again, or mend lists of file names")
+        raise HyrfDataError(
+            f"{path}: its poses are of no photo at all; reconstruct again, or correct lists of file names"
+        )
     photos = sorted(photos, key=lambda photo: photo.name)
     for first, second in zip(photos, photos[1:], strict=False):
         if first.name == second.name:
@@ -200,7 +202,7 @@ def _make_view(photo: Photo, max_size: int) -> View:
     if not same_aspect(header.width, header.height, lens.width, lens.height):
         raise HyrfDataError(
             f"{photo.path}: the picture is {header.width} x {header.height} but its camera says {lens.width} x "
-            f"{lens.height}, which is no uniform rescaling; use the pictures that were calibrated (unrotated)"
+            f"{lens.height}, which is not a uniform rescaling; use the pictures that were calibrated (unrotated)"
         )
     size = shrunk_size(*header.size, max_size)
     if size != (lens.width, lens.height):
@@ -233,7 +235,7 @@ def _rigid(pose: np.ndarray, path: Path) -> np.ndarray:
     try:
         pose = rigid_pose(pose)
     except ValueError as error:
-        raise HyrfDataError(f"{path}: {error}; mend it, or register this photo again") from error
+        raise HyrfDataError(f"{path}: {error}; correct it, or register this photo again") from error
     u, _, vt = np.linalg.svd(pose[:3, :3])
     rigid = np.eye(4)
     rigid[:3, :3] = u @ vt

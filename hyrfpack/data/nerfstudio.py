@@ -88,7 +88,7 @@ def _own_split(content: dict[str, Any], file: Path) -> tuple[set | None, set, li
     for key in ("train_filenames", "val_filenames", "test_filenames"):
         names = content.get(key) or []
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise HyrfDataError(f"{file}: '{key}' is no list of file names; mend or remove it")
+            raise HyrfDataError(f"{file}: '{key}' is not a list of file names; correct or remove it")
         lists[key] = {PurePosixPath(slashed(name)) for name in names}
     train, val, test = lists.values()
     held_out = test or val

@@ -203,7 +203,7 @@ def _opened(path: Path):
             raise HyrfDataError(f"{path}: the picture file is empty (0 bytes); copy it again")
         image = Image.open(path)
         if image.format == "EPS":  # a program, which Pillow would have Ghostscript run
-            raise HyrfDataError(f"{path}: PostScript is no photo; save it as PNG or JPEG")
+            raise HyrfDataError(f"{path}: PostScript is not a photo; save it as PNG or JPEG")
     except HyrfDataError:
         raise
     except FileNotFoundError as error:

@@ -26,10 +26,10 @@ def read_json(path: Path) -> dict[str, Any]:
         raise HyrfDataError(f"{path}: not valid JSON ({str(error)[:120]}); the file is damaged") from error
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:
-        raise HyrfDataError(f"{path}: has no list of 'frames'; it is no transforms file, or it is empty")
+        raise HyrfDataError(f"{path}: has no list of 'frames'; it is not a transforms file, or it is empty")
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-            raise HyrfDataError(f"{path}: frame {index} has no 'file_path'; mend or remove the frame")
+            raise HyrfDataError(f"{path}: frame {index} has no 'file_path'; correct or remove the frame")
         frame["file_path"] = slashed(frame["file_path"])
     return content
 
@@ -45,14 +45,16 @@ def number(entries: dict[str, Any], key: str, path: Path) -> float | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not _is_finite(value):
-        raise HyrfDataError(f"{path}: '{key}' is {str(value)[:40]!r} and no finite number; mend the entry")
+        raise HyrfDataError(f"{path}: '{key}' is {str(value)[:40]!r} and not a finite number; correct the entry")
     return float(value)
 
 
 def focal_from_angle(angle: float, size: int, path: Path) -> float:
     """Focal length in pixels of a picture `size` pixels wide that spans `angle` radians: size / (2 tan(angle / 2))."""
     if not 0 < angle < math.pi or 0.5 * angle == 0:  # half of the smallest number is 0
-        raise HyrfDataError(f"{path}: a field of view of {angle:g} radians is outside (0, pi); mend 'camera_angle_x'")
+        raise HyrfDataError(
+            f"{path}: a field of view of {angle:g} radians is outside (0, pi); correct 'camera_angle_x'"
+        )
     return 0.5 * size / math.tan(0.5 * angle)
 
 
@@ -65,7 +67,7 @@ def pose_from_opengl(frame: dict[str, Any], path: Path) -> np.ndarray:
         matrix = np.empty(0)
     if matrix.shape not in ((3, 4), (4, 4)):
         raise HyrfDataError(
-            f"{path}: frame {frame['file_path'][:80]} has no 4 x 4 'transform_matrix' of numbers; mend or remove it"
+            f"{path}: frame {frame['file_path'][:80]} has no 4 x 4 'transform_matrix' of numbers; correct or remove it"
         )
     # Transposing inverts the rotation because it is orthonormal: `make_scene` refuses a pose that is not.
     with np.errstate(invalid="ignore", over="ignore"):

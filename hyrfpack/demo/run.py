@@ -105,7 +105,7 @@ def run_demo(
     steps: int = 3000,
     views: int = 60,
     size: int = 200,
-    report: Callable[[str], None] = lambda sentence: None,
+    say: Callable[[str], None] = lambda sentence: None,
 ) -> DemoResult:
     """Make a scene, train on it, compress, decompress, render, score, export, and draw one picture of it.
 
@@ -117,21 +117,21 @@ def run_demo(
         folder: made if missing.
         steps: of the training.
         views, size: how many photos, and their width and height in pixels.
-        report: called with a sentence before each part.
+        say: told what is going on, a sentence before each part.
 
     Raises:
         HyrfError: something cannot be written.
     """
     folder = Path(folder)
-    report(f"making a scene of {views} photos")
+    say(f"making a scene of {views} photos")
     write_demo_scene(folder / SCENE, views=views, size=size)
     scene = load_scene(folder / SCENE)
-    report(f"training {steps:,} steps on {len(scene.train)} photos, {len(scene.test)} held out")
+    say(f"training {steps:,} steps on {len(scene.train)} photos, {len(scene.test)} held out")
     trained = train(scene, folder / RUN, TrainConfig(steps=steps), overwrite=True)
     if trained.model is None:
         raise KeyboardInterrupt
 
-    report("compressing, decompressing and scoring")
+    say("compressing, decompressing and scoring")
     back, profiles = folder / BACK, []
     for profile in ("raw", *PACKED):
         path, compress_seconds = trained.model, None
@@ -143,11 +143,11 @@ def run_demo(
         stored = path.stat().st_size
         profiles.append(ProfileResult(profile, scores.psnr, scores.ssim, stored, compress_seconds, decompress_seconds))
 
-    report("rendering held-out views")
+    say("rendering held-out views")
     model = load(path)
     for _ in render_files(model, [(view.name, view.camera) for view in scene.test], folder / RENDERS):
         pass
-    report("making a page for the browser")
+    say("making a page for the browser")
     page = export(path, folder / PAGE, data=scene)
     result = DemoResult(
         steps=steps,

@@ -168,5 +168,5 @@ def refuse_nonfinite(name: str, values: Tensor) -> None:
     if not values.isfinite().all():
         raise HyrfError(
             f"the bake's {name} hold NaN or infinity, from a broken model or numbers beyond float32; "
-            "train the model again or mend the cameras"
+            "train the model again or correct the cameras"
         )

@@ -58,7 +58,7 @@ def check_request(
     if degree not in range(MAX_DEGREE + 1):
         raise HyrfError(f"spherical harmonics of degree {degree} are not known; name 0 to {MAX_DEGREE}")
     if crop is not None and (np.shape(crop) != (6,) or np.isnan(crop).any()):
-        raise HyrfError(f"the crop {crop} is no box; name the least x, y, z, then the greatest, in world units")
+        raise HyrfError(f"the crop {crop} is not a box; name the least x, y, z, then the greatest, in world units")
     if not 0 <= min_opacity <= 1:
         raise HyrfError(f"an opacity of {min_opacity} cannot be asked for; name 0 to 1")
     if kind is TRANSFORMS and (crop is not None or min_opacity > 0):

@@ -201,57 +201,57 @@ def _decode(container: Container) -> HybridModel:
             if layer == 0 or group in LAYERED:
                 shapes[layer_section(group, layer)] = shape
     # Every size is checked before the first section is decoded.
-    for type, (rows, columns) in shapes.items():
-        entry = container.entries.get(type)
+    for tag, (rows, columns) in shapes.items():
+        entry = container.entries.get(tag)
         if entry is None:
-            raise HyrfFormatError(f"{name}: there is no section '{type}'; the file is incomplete, write it again")
+            raise HyrfFormatError(f"{name}: there is no section '{tag}'; the file is incomplete, write it again")
         if entry.codec not in DECODERS and entry.codec not in compact.CODECS:
-            raise HyrfFormatError(f"{name}: section '{type}' has the unknown codec {entry.codec}; update hyrfpack")
+            raise HyrfFormatError(f"{name}: section '{tag}' has the unknown codec {entry.codec}; update hyrfpack")
         if entry.raw_length != 4 * rows * columns:
             raise HyrfFormatError(
-                f"{name}: section '{type}' says it decodes to {entry.raw_length} bytes and the metadata asks for "
+                f"{name}: section '{tag}' says it decodes to {entry.raw_length} bytes and the metadata asks for "
                 f"{4 * rows * columns}; the file is damaged, write it again"
             )
     # Of a file that is not all there: the first layer must be, further ones up to the first that lacks something.
     there = 1
     while there < len(layers) and all(layer_section(group, there) in container for group in LAYERED):
         there += 1
-    wanted = [type for type in shapes if group_and_layer(type)[1] < there]
-    if any(type not in container for type in wanted) and container.available < container.length:
-        needed = max(container.entries[type].end for type in wanted)
+    wanted = [tag for tag in shapes if group_and_layer(tag)[1] < there]
+    if any(tag not in container for tag in wanted) and container.available < container.length:
+        needed = max(container.entries[tag].end for tag in wanted)
         raise HyrfFormatError(
             f"{name}: the first {needed:,} of {container.length:,} bytes make a model, and only "
             f"{container.available:,} are there or allowed; take more of the file"
         )
-    sections = {type: container[type] for type in wanted}
+    sections = {tag: container[tag] for tag in wanted}
     arrays: dict[str, np.ndarray] = {}
     points = {}  # of each layer with positions on a lattice, on which other sections lean
 
     def decode_positions(layer: int) -> None:
-        type = layer_section(POSITIONS, layer)
-        if sections[type].codec == compact.CODEC_POINTS:
-            with _naming(name, type):
-                arrays[type], points[layer] = compact.decode_positions(
-                    memoryview(sections[type].data), layers[layer], config
+        tag = layer_section(POSITIONS, layer)
+        if sections[tag].codec == compact.CODEC_POINTS:
+            with _naming(name, tag):
+                arrays[tag], points[layer] = compact.decode_positions(
+                    memoryview(sections[tag].data), layers[layer], config
                 )
 
     run_tasks(decode_positions, there)
-    rest = [type for type in wanted if type not in arrays]
+    rest = [tag for tag in wanted if tag not in arrays]
 
     def decode(index: int) -> None:
-        type = rest[index]
-        group, layer = group_and_layer(type)
-        codec, data = sections[type].codec, memoryview(sections[type].data)
-        with _naming(name, type):
+        tag = rest[index]
+        group, layer = group_and_layer(tag)
+        codec, data = sections[tag].codec, memoryview(sections[tag].data)
+        with _naming(name, tag):
             if codec in DECODERS:
-                arrays[type] = DECODERS[codec](data, shapes[type])
+                arrays[tag] = DECODERS[codec](data, shapes[tag])
             else:
-                arrays[type] = compact.decode_section(group, codec, data, shapes[type], config, points.get(layer))
+                arrays[tag] = compact.decode_section(group, codec, data, shapes[tag], config, points.get(layer))
 
     run_tasks(decode, len(rest))
-    for type, values in arrays.items():
+    for tag, values in arrays.items():
         if not np.isfinite(values).all():
-            raise HyrfFormatError(f"{name}: section '{type}' holds numbers that are not finite; write the file again")
+            raise HyrfFormatError(f"{name}: section '{tag}' holds numbers that are not finite; write the file again")
     for group in LAYERED if there > 1 else ():
         arrays[group] = np.concatenate([arrays.pop(layer_section(group, layer)) for layer in range(there)])
     return to_model(config, arrays).requires_grad_(False)

@@ -161,33 +161,33 @@ class Container:
     @property
     def sections(self) -> list[Section]:
         """Every section of a known type, in file order, read and verified."""
-        return [self[type] for type in self.entries if type in self]
+        return [self[tag] for tag in self.entries if tag in self]
 
-    def __contains__(self, type: str) -> bool:
-        entry = self.entries.get(type)
-        return entry is not None and (self._known is None or type in self._known) and self._reaches(entry)
+    def __contains__(self, tag: str) -> bool:
+        entry = self.entries.get(tag)
+        return entry is not None and (self._known is None or tag in self._known) and self._reaches(entry)
 
-    def __getitem__(self, type: str) -> Section:
+    def __getitem__(self, tag: str) -> Section:
         """Read one section and verify its checksum and padding.
 
         Raises:
             HyrfFormatError: the file has no such section, or its bytes are damaged.
         """
-        if type not in self.entries or (self._known is not None and type not in self._known):
-            raise HyrfFormatError(f"{self.name}: there is no section '{type}'; the file is incomplete, write it again")
-        entry = self.entries[type]
+        if tag not in self.entries or (self._known is not None and tag not in self._known):
+            raise HyrfFormatError(f"{self.name}: there is no section '{tag}'; the file is incomplete, write it again")
+        entry = self.entries[tag]
         if not self._reaches(entry):
             raise HyrfFormatError(
-                f"{self.name}: section '{type}' ends at byte {entry.end:,} and only {self.available:,} of the "
+                f"{self.name}: section '{tag}' ends at byte {entry.end:,} and only {self.available:,} of the "
                 f"file's {self.length:,} bytes are there or allowed; take more of the file"
             )
         stored = memoryview(self._read_at(entry.offset, _padded(entry.length)))
         data = stored[: entry.length]
         if zlib.crc32(data) != entry.checksum:
-            raise self._damaged(f"the checksum of section '{type}' does not match its bytes")
+            raise self._damaged(f"the checksum of section '{tag}' does not match its bytes")
         if any(stored[entry.length :]):
-            raise self._damaged(f"the padding after section '{type}' is not zero")
-        return Section(type, entry.codec, data, entry.raw_length, entry.required)
+            raise self._damaged(f"the padding after section '{tag}' is not zero")
+        return Section(tag, entry.codec, data, entry.raw_length, entry.required)
 
     def _reaches(self, entry: Entry) -> bool:
         return entry.end <= self.available
@@ -261,28 +261,29 @@ class Container:
         entries: dict[str, Entry] = {}
         end = _TOC_OFFSET + len(toc)
         for index in range(count):
-            tag, codec, flags, offset, stored, raw, checksum, reserved = _ENTRY.unpack_from(toc, index * _ENTRY.size)
-            type = tag.decode("latin-1")
-            if not _TYPE.fullmatch(type):
-                raise self._damaged(f"section {index} has the malformed type {tag!r}")
-            if type in entries:
-                raise self._damaged(f"section '{type}' occurs twice")
+            entry = _ENTRY.unpack_from(toc, index * _ENTRY.size)
+            letters, codec, flags, offset, stored, raw, checksum, reserved = entry
+            tag = letters.decode("latin-1")
+            if not _TYPE.fullmatch(tag):
+                raise self._damaged(f"section {index} has the malformed type {letters!r}")
+            if tag in entries:
+                raise self._damaged(f"section '{tag}' occurs twice")
             required = bool(flags & _REQUIRED)
-            if required and self._known is not None and type not in self._known:
+            if required and self._known is not None and tag not in self._known:
                 raise HyrfFormatError(
-                    f"{self.name}: section '{type}' is required and this hyrfpack does not know it (the file has "
+                    f"{self.name}: section '{tag}' is required and this hyrfpack does not know it (the file has "
                     f"format version {self.version[0]}.{self.version[1]}); update hyrfpack"
                 )
             if flags & ~_REQUIRED or reserved:
-                raise self._damaged(f"section '{type}' sets reserved bits")
+                raise self._damaged(f"section '{tag}' sets reserved bits")
             if offset != end:
                 raise self._damaged(
-                    f"section '{type}' says it starts at {offset:,} and the one before it ends at {end:,}"
+                    f"section '{tag}' says it starts at {offset:,} and the one before it ends at {end:,}"
                 )
             if stored > length - offset:
-                raise self._damaged(f"section '{type}' says {stored:,} bytes and {length - offset:,} are left")
+                raise self._damaged(f"section '{tag}' says {stored:,} bytes and {length - offset:,} are left")
             end = offset + _padded(stored)
-            entries[type] = Entry(type, codec, required, offset, stored, raw, checksum)
+            entries[tag] = Entry(tag, codec, required, offset, stored, raw, checksum)
         if end != length:
             raise self._damaged(f"the sections end at {end:,} and the file at {length:,}")
         # What is not there can be promised without paying for it: it does not count.
@@ -322,9 +323,9 @@ def write_container(sections: Sequence[Section], minor: int = MINOR) -> bytes:
             raise ValueError(f"section '{section.type}': codec {section.codec}, raw length {section.raw_length}")
         data = _as_bytes(section.data)
         flags = _REQUIRED if section.required else 0
-        tag = section.type.encode("ascii")
+        letters = section.type.encode("ascii")
         checksum = zlib.crc32(data)
-        toc.append(_ENTRY.pack(tag, section.codec, flags, offset, len(data), section.raw_length, checksum, 0))
+        toc.append(_ENTRY.pack(letters, section.codec, flags, offset, len(data), section.raw_length, checksum, 0))
         payloads += [data, bytes(_padded(len(data)) - len(data))]
         offset += _padded(len(data))
     raw = sum(section.raw_length for section in sections)

@@ -29,8 +29,8 @@ class SectionSize:
 def section_sizes(container: Container) -> list[SectionSize]:
     """Sizes of all sections in file order, unknown optional ones included."""
     return [
-        SectionSize(type, SECTIONS.get(type, "unknown"), entry.raw_length, entry.length)
-        for type, entry in container.entries.items()
+        SectionSize(tag, SECTIONS.get(tag, "unknown"), entry.raw_length, entry.length)
+        for tag, entry in container.entries.items()
     ]
 
 

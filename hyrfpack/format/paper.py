@@ -109,28 +109,28 @@ def _without_tails(model: HybridModel, opacity_logits: np.ndarray) -> np.ndarray
     return np.clip(opacity_logits, -LOGIT_LIMIT - neural, LOGIT_LIMIT - neural)
 
 
-def _check_half_range(type: str, values: np.ndarray) -> None:
+def _check_half_range(tag: str, values: np.ndarray) -> None:
     largest = np.abs(values).max(initial=0)
     if largest > FLOAT16_MAX:
         raise HyrfError(
-            f"numbers in the model's {sections.SECTIONS[type]} reach {largest:.6g} and half precision ends at "
+            f"numbers in the model's {sections.SECTIONS[tag]} reach {largest:.6g} and half precision ends at "
             f"{FLOAT16_MAX:.0f}; keep this model as profile raw, or train it again without such outliers"
         )
 
 
-def _encode_float16(type: str, values: np.ndarray) -> Section:
-    _check_half_range(type, values)
-    return Section(type, CODEC_FLOAT16, values.astype("<f2").tobytes(), 4 * values.size)
+def _encode_float16(tag: str, values: np.ndarray) -> Section:
+    _check_half_range(tag, values)
+    return Section(tag, CODEC_FLOAT16, values.astype("<f2").tobytes(), 4 * values.size)
 
 
 def _decode_float16(data: memoryview, shape: tuple[int, int]) -> np.ndarray:
     return decode_plain(data, shape, "<f2")
 
 
-def _encode_min_max(type: str, values: np.ndarray) -> Section:
+def _encode_min_max(tag: str, values: np.ndarray) -> Section:
     codes, params = MinMaxQuantizer(TABLE_BITS).encode(values)
     data = params.to_bytes() + huffman_encode(codes.ravel()).to_bytes()
-    return Section(type, CODEC_MIN_MAX, data, 4 * values.size)
+    return Section(tag, CODEC_MIN_MAX, data, 4 * values.size)
 
 
 def _decode_min_max(data: memoryview, shape: tuple[int, int]) -> np.ndarray:
@@ -139,8 +139,8 @@ def _decode_min_max(data: memoryview, shape: tuple[int, int]) -> np.ndarray:
     return MinMaxQuantizer.decode(codes, params).reshape(shape)
 
 
-def _encode_residual_vq(type: str, values: np.ndarray, shape: tuple[int, int], seed: int) -> Section:
-    _check_half_range(type, values)
+def _encode_residual_vq(tag: str, values: np.ndarray, shape: tuple[int, int], seed: int) -> Section:
+    _check_half_range(tag, values)
     stages, size = shape
     quantizer = ResidualVectorQuantizer(stages, size, codebook_dtype="float16", seed=seed)
     indices, codebooks = quantizer.encode(values)
@@ -148,7 +148,7 @@ def _encode_residual_vq(type: str, values: np.ndarray, shape: tuple[int, int], s
     for stage in indices.T:
         stream = huffman_encode(np.ascontiguousarray(stage)).to_bytes()
         parts += [_STREAM_LENGTH.pack(len(stream)), stream]
-    return Section(type, CODEC_RESIDUAL_VQ, b"".join(parts), 4 * values.size)
+    return Section(tag, CODEC_RESIDUAL_VQ, b"".join(parts), 4 * values.size)
 
 
 def _decode_residual_vq(data: memoryview, shape: tuple[int, int]) -> np.ndarray:

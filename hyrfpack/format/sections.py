@@ -33,9 +33,9 @@ def layer_section(group: str, layer: int) -> str:
 
 
 _OF_LAYERS = {layer_section(group, layer): (group, layer) for layer in range(MAX_LAYERS) for group in LAYERED}
-SECTIONS |= {type: f"{SECTIONS[group]}, layer {layer}" for type, (group, layer) in _OF_LAYERS.items() if layer}
+SECTIONS |= {tag: f"{SECTIONS[group]}, layer {layer}" for tag, (group, layer) in _OF_LAYERS.items() if layer}
 
 
-def group_and_layer(type: str) -> tuple[str, int]:
+def group_and_layer(tag: str) -> tuple[str, int]:
     """What a section is called in the first layer, and its layer: "POS2" is ("POSI", 2). Others are of layer 0."""
-    return _OF_LAYERS.get(type, (type, 0))
+    return _OF_LAYERS.get(tag, (tag, 0))

@@ -12,8 +12,11 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
+from typing import TypeVar
 
 import torch
+
+T = TypeVar("T")
 
 
 def thread_count() -> int:
@@ -107,3 +110,14 @@ def run_ranges(task: Callable[[int, int], None], length: int, minimum: int = 204
     ranges = max(1, min(4 * thread_count(), length // minimum))
     edges = [length * i // ranges for i in range(ranges + 1)]
     run_tasks(lambda i: task(edges[i], edges[i + 1]), ranges)
+
+
+def run_jobs(jobs: dict[str, Callable[[], T]]) -> dict[str, T]:
+    """What independent jobs return; they run side by side."""
+    names, done = list(jobs), {}
+
+    def run(index: int) -> None:
+        done[names[index]] = jobs[names[index]]()
+
+    run_tasks(run, len(names))
+    return {name: done[name] for name in names}

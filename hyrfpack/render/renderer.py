@@ -184,7 +184,7 @@ def _refuse_nonfinite(**values: Tensor) -> None:
 def _nonfinite(name: str) -> HyrfError:
     return HyrfError(
         f"the view's {name} hold NaN or infinity, from a broken model or a pose beyond float32; "
-        "train the model again or mend the pose"
+        "train the model again or correct the pose"
     )
 
 

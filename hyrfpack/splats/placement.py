@@ -91,7 +91,7 @@ def placed(splats: Splats, matrix: np.ndarray, turn: np.ndarray, name: str) -> S
                 splats.antialiased,
             )
     except ValueError as error:
-        raise HyrfDataError(f"{name}: moved as its transform says, {error}; mend the transform") from error
+        raise HyrfDataError(f"{name}: moved as its transform says, {error}; correct the transform") from error
 
 
 def rotation_of(matrix: np.ndarray, name: str) -> tuple[float, np.ndarray]:

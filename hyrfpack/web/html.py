@@ -129,7 +129,7 @@ def decode_page(data: bytes, name: str) -> tuple[Splats, np.ndarray | None]:
         picture = re.search(rb'<img id="background"[^>]*base64,([^"]*)"', data)
         return splats, None if picture is None else _read_webp(base64.b64decode(picture[1], validate=True))
     except (LookupError, TypeError, ValueError, ArithmeticError, RecursionError, OSError) as error:
-        raise HyrfDataError(f"{name}: this is no page of hyrfpack's, or it is damaged; export it again") from error
+        raise HyrfDataError(f"{name}: this is not a page of hyrfpack's, or it is damaged; export it again") from error
 
 
 def _frame(splats: Splats) -> tuple[np.ndarray, float]:

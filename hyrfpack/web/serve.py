@@ -89,7 +89,7 @@ def _server(host: str, port: int) -> _Server:
         address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
 
     if not host.strip():  # to the socket, this is every address
-        raise HyrfError(f"'{host}' is no address to listen at; name {LOCAL}, or 0.0.0.0 to let others look")
+        raise HyrfError(f"'{host}' is not an address to listen at; name {LOCAL}, or 0.0.0.0 to let others look")
     try:
         return Server((host, port), Handler)
     except (OSError, UnicodeError) as error:  # the latter of a name that can be none

@@ -294,7 +294,7 @@ def test_without_numba_there_is_one_sentence(monkeypatch):
 def test_a_file_is_measured_from_an_orbit_and_the_report_survives_json(tmp_path):
     save(model_of(), tmp_path / "tiny.hyrf")
     said = []
-    report = bench(tmp_path / "tiny.hyrf", repeats=1, only=["mlp"], report=said.append)
+    report = bench(tmp_path / "tiny.hyrf", repeats=1, only=["mlp"], say=said.append)
     assert {row.group for row in report.rows} == {"mlp"} and said == ["measuring mlp"]
     assert "60 Gaussians" in report.subject and "6 viewpoints" in report.subject
     assert {"cpu", "cores", "torch"} <= set(report.machine)
@@ -307,7 +307,7 @@ def test_the_built_in_model_brings_its_own_photos(monkeypatch):
     monkeypatch.setattr(subject, "BUILT_IN_PHOTOS", 9)
     monkeypatch.setattr(subject, "BUILT_IN_SIDE", 32)
     said = []
-    report = bench(only=["mlp"], repeats=1, report=said.append)
+    report = bench(only=["mlp"], repeats=1, say=said.append)
     assert "built-in" in report.subject and "2 held-out photos" in report.subject
     assert "2 steps" in said[0] and "minute" in said[0]
 

@@ -132,7 +132,7 @@ def test_words_of_files_are_never_markup(with_photos):
 
 def test_folder_that_cannot_be_made_is_refused_before_the_work(source, tmp_path):
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(HyrfError, match="file is a file, no folder"):
+    with pytest.raises(HyrfError, match="file is a file, not a folder"):
         write_report(tmp_path / "file" / "page", source, source, CompressionReport("raw", 1, 1, 1, []))
 
 

@@ -107,7 +107,7 @@ def test_cameras_that_look_away_are_one_sentence(tmp_path: Path) -> None:
 def test_folder_that_cannot_be_made_is_told_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_bytes(b"")
     monkeypatch.setattr(fit, "_cameras", lambda *arguments: pytest.fail("the work began"))
-    with pytest.raises(HyrfError, match="file is a file, no folder"):
+    with pytest.raises(HyrfError, match="file is a file, not a folder"):
         distill_splats(ball(20), tmp_path / "file" / "x.hyrf", LITTLE)
 
 

@@ -73,7 +73,7 @@ PARTS = {
     "loss": "loss 0.0381",
     "psnr": "PSNR 29.40",
     "gaussians": "4,850 Gaussians",
-    "gone": "15 s gone",
+    "gone": "15 s elapsed",
     "left": "60 s left",
 }
 LONG_PARTS = {
@@ -82,7 +82,7 @@ LONG_PARTS = {
     "loss": "loss 0.0381",
     "psnr": "PSNR 29.40",
     "gaussians": "1,234,850 Gaussians",
-    "gone": "120:15:22 gone",
+    "gone": "120:15:22 elapsed",
     "left": "11:15:22 left",
 }
 FITTING = {

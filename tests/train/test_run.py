@@ -144,7 +144,7 @@ def test_overwriting_replaces_the_run(tmp_path):
 
 def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(HyrfError, match="file is a file, no folder"):
+    with pytest.raises(HyrfError, match="file is a file, not a folder"):
         train(a_scene(), tmp_path / "file" / "run", CONFIG, quiet=True)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 
@@ -15,15 +14,13 @@ from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.container import Section
 from hyrfpack.format.sections import COLORS, LAYERED, LOGITS, MLPS, POSITIONS, TABLES, layer_section
 from hyrfpack.model.hybrid import HybridModel
-from hyrfpack.parallel.pool import run_tasks
+from hyrfpack.parallel.pool import run_jobs
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.points import Points
 
 CODEC_POINTS, CODEC_CHANNELS, CODEC_GROUPS = 6, 7, 8
 COLUMNS = dict(zip(LOGITS, (3, 1, 1), strict=True))
 _BLOCK = 1 << 15  # numbers at once: few enough that temporaries stay in the caches
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -75,11 +72,11 @@ def encode(model: HybridModel, quantized: Quantized) -> tuple[list[Section], dic
         jobs |= {layer_section(group, layer): partial(encode_channels, layer, group) for group in COLUMNS}
     done = run_jobs(jobs)
     for layer, part in enumerate(plan.layers):
-        type = layer_section(POSITIONS, layer)
-        done[type] = Section(type, CODEC_POINTS, part.positions, 12 * len(part.points.classes))
+        tag = layer_section(POSITIONS, layer)
+        done[tag] = Section(tag, CODEC_POINTS, part.positions, 12 * len(part.points.classes))
     further = [layer_section(group, layer) for layer in range(1, len(plan.layers)) for group in LAYERED]
     settings = {"distortion": plan.distortion_per_number, "gaussians_before": len(model)}
-    return [done[type] for type in (*MLPS, *LAYERED, *TABLES, *further)], settings
+    return [done[tag] for tag in (*MLPS, *LAYERED, *TABLES, *further)], settings
 
 
 def decode_channels(data: memoryview, points: Points, columns: int) -> np.ndarray:
@@ -116,14 +113,3 @@ def _joined(channels: list[np.ndarray], basis: np.ndarray) -> np.ndarray:
             first, second, third = (values[part] * float(basis[column, j]) for j, values in enumerate(channels))
             joined[part, column] = first + second + third
     return joined
-
-
-def run_jobs(jobs: dict[str, Callable[[], T]]) -> dict[str, T]:
-    """What independent jobs return; they run side by side."""
-    names, done = list(jobs), {}
-
-    def run(index: int) -> None:
-        done[names[index]] = jobs[names[index]]()
-
-    run_tasks(run, len(names))
-    return {name: done[name] for name in names}

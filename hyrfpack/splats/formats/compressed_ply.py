@@ -93,8 +93,8 @@ def _need(have: dict[str, dict[str, str]], element: str, labels: Sequence[str], 
     for label in labels:
         if have.get(element, {}).get(label) != kind:
             raise HyrfDataError(
-                f"{name}: its element '{element}' has no property {label} of the right type, so this is no compressed "
-                "PLY file of Gaussians"
+                f"{name}: its element '{element}' has no property {label} of the right type, so this is not a "
+                "compressed PLY file of Gaussians"
             )
 
 

@@ -177,7 +177,7 @@ def linear_colors(splats: Splats) -> np.ndarray:
 def _chunks(data: bytes, name: str) -> tuple[dict[str, Any], memoryview]:
     """The parsed JSON and the binary chunk, empty where there is none."""
     if len(data) < _HEADER.size + _CHUNK.size or data[:4] != b"glTF":
-        raise HyrfDataError(f"{name}: this is no .glb file; check the path")
+        raise HyrfDataError(f"{name}: this is not a .glb file; check the path")
     _, version, length = _HEADER.unpack_from(data)
     if version != 2 or length != len(data):
         raise HyrfDataError(
@@ -200,7 +200,7 @@ def _chunks(data: bytes, name: str) -> tuple[dict[str, Any], memoryview]:
     except (ValueError, RecursionError) as error:
         raise HyrfDataError(f"{name}: its JSON cannot be read ({str(error):.120}); the file is damaged") from error
     if not isinstance(content, dict):
-        raise HyrfDataError(f"{name}: its JSON is no object; the file is damaged")
+        raise HyrfDataError(f"{name}: its JSON is not an object; the file is damaged")
     return content, chunks.get(_BIN, memoryview(b""))
 
 

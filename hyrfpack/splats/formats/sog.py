@@ -300,7 +300,7 @@ def _read_picture(data: bytes, most: int, name: str) -> np.ndarray:
     except HyrfDataError:
         raise
     except Exception as error:  # whatever a decoder of pictures raises
-        raise HyrfDataError(f"{name} is no picture that can be read; get the file again") from error
+        raise HyrfDataError(f"{name} is not a picture that can be read; get the file again") from error
 
 
 def _member(archive: zipfile.ZipFile, file: str, room: int, name: str) -> zipfile.ZipInfo:

@@ -55,12 +55,12 @@ def decode(data: bytes, name: str) -> Splats:
     """
     if len(data) % _RECORD.itemsize:
         raise HyrfDataError(
-            f"{name}: {len(data):,} bytes are no whole number of Gaussians of 32 bytes; this is no .splat file, or it "
-            "is truncated"
+            f"{name}: {len(data):,} bytes are not a whole number of Gaussians of 32 bytes; this is not a .splat file, "
+            "or it is truncated"
         )
     records = np.frombuffer(data, _RECORD)
     if (records["scale"] < 0).any():
-        raise HyrfDataError(f"{name}: a scale is negative; this is no .splat file, or it is damaged")
+        raise HyrfDataError(f"{name}: a scale is negative; this is not a .splat file, or it is damaged")
     colors = records["color"] / np.float32(255)
     return checked_splats(
         name,

@@ -108,7 +108,7 @@ def decode(data: bytes, name: str, extension: Extension, *, upright: bool = Fals
         try:
             layer = Sdf.Layer.OpenAsAnonymous(str(path))
             if layer is None or layer.GetCompositionAssetDependencies():
-                raise HyrfDataError(f"{name}: this is no USD file, or it needs others; flatten it into one")
+                raise HyrfDataError(f"{name}: this is not a USD file, or it needs others; flatten it into one")
             stage = Usd.Stage.Open(layer)
             fields = [prim for prim in stage.Traverse() if prim.GetTypeName() == _SPLATS]
             if len(fields) != 1:
