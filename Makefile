@@ -45,7 +45,7 @@ test-oldest: ## run the tests with the oldest versions that pyproject.toml allow
 	$(PYTHON) -m tools.safety.versions oldest
 
 docs: $(READY) ## write the documentation as a site to site/; a broken link is an error
-	$(BIN)/mkdocs build --quiet --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 bench: $(READY) ## time each hot operation at several sizes against its references
 	$(BIN)/python -m tools.bench

@@ -34,10 +34,10 @@ WRONG = {
     'hyrfpack.load_scene("photos", every=8)': "call-arg",
     'hyrfpack.train("photos", "run")': "arg-type",
     "hyrfpack.TrainConfig(step=10)": "call-arg",
-    'hyrfpack.load("a.hyrf").gausians': "attr-defined",
+    'hyrfpack.load("a.hyrf", frction=0.5)': "call-arg",
     'hyrfpack.render(hyrfpack.load("a.hyrf"), "camera")': "arg-type",
     'hyrfpack.compress("a.hyrf", "b.hyrf").bytes': "attr-defined",
-    'hyrfpack.evaluate(hyrfpack.load("a.hyrf"), [], views=3)': "call-arg",
+    'hyrfpack.evaluate(hyrfpack.load("a.hyrf"), "photos").psnr': "arg-type",
     'size: str = hyrfpack.export("a.hyrf", "a.ply").bytes': "assignment",
     "hyrfpack.redner": "attr-defined",
 }

@@ -44,7 +44,7 @@ UNSEEN = 0.01  # of all light, what the faintest Gaussians together may send: th
 FINETUNE = 0.5  # steps of fitting what is packed, for each step before
 REGRESSED, LEAST_REGRESSED = 250, 0.2  # steps from which on the first regression is whole, and its least share
 ESTIMATED = 0.5  # of what packing may add, to ask for: Gaussians that are left out together are missed more
-LEAST_NOISE = 0.5  # of the error before packing, or of the one allowed, that packing may add in any case
+LEAST_DISTORTION = 0.5  # of the error before packing, or of the one allowed, that packing may add in any case
 # Times as much as it may add, fine-tuned and plain: at views to learn from, which are better than others.
 TOLERATED, TOLERATED_PLAIN = 1.1, 0.7
 PLAIN, PLAIN_ENDS = 1 / 16, (1 / 1024, 1.0)  # of it, to ask for without fine-tuning: first, at the least and most
@@ -275,14 +275,14 @@ def _pack(
     cameras = [view.camera for view in scene.train]
     views = evenly_spaced(cameras, config.test_views)
     allowed, error = _mse(config.psnr), _mse(_mean(likeness(model, original, views)))
-    room = max(allowed - error, LEAST_NOISE * min(allowed, error))
+    room = max(allowed - error, LEAST_DISTORTION * min(allowed, error))
     say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
     sensitivity = measure_sensitivity(model, cameras)
     packer = Packer(model, provenance, sensitivity, scene, max(1, round(FINETUNE * config.steps)), True, say, cache)
 
     @functools.cache
-    def attempt(noise: float) -> Trial:
-        return packer.attempt(noise)
+    def attempt(distortion: float) -> Trial:
+        return packer.attempt(distortion)
 
     def fits(trial: Trial, tolerated: float = TOLERATED_PLAIN) -> bool:
         return _mse(_mean(likeness(decode_model(trial.data), original, views))) - error <= tolerated * room
