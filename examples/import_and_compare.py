@@ -24,12 +24,14 @@ def main() -> None:
     parser.add_argument("model", help="the .hyrf file to write")
     parser.add_argument("picture", help="the picture to write: left the Gaussians, right the model")
     parser.add_argument("--steps", type=int, default=hyrfpack.DistillConfig.steps)
+    parser.add_argument(
+        "--size", type=int, default=hyrfpack.DistillConfig.size, help="pixels of pictures to learn from"
+    )
     parser.add_argument("--psnr", type=float, default=hyrfpack.DistillConfig.psnr, help="dB to aim at")
     args = parser.parse_args()
 
-    report = hyrfpack.distill(
-        args.splats, args.model, hyrfpack.DistillConfig(steps=args.steps, psnr=args.psnr), say=print
-    )
+    config = hyrfpack.DistillConfig(steps=args.steps, psnr=args.psnr, size=args.size)
+    report = hyrfpack.distill(args.splats, args.model, config, say=print)
     print(f"{report.bytes_source:,} -> {report.bytes_after:,} bytes, {report.psnr:.1f} dB against the Gaussians")
 
     model = hyrfpack.load(args.model)

@@ -10,6 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from filelock import FileLock  # comes with torch
 from ops.device import needs_triton
 
 ROOT = Path(__file__).parents[2]
@@ -20,14 +21,20 @@ pytestmark = [needs_triton, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")
-def report() -> dict[str, list]:
-    """What tools/gpu/build.py says; in a process of its own, for here kernels may be defined for the interpreter."""
-    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
-    done = subprocess.run(
-        [sys.executable, "-m", "tools.gpu.build", "--json"], cwd=ROOT, env=environment, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list]:
+    """What tools/gpu/build.py says; in a process of its own, for here kernels may be defined for the interpreter.
+
+    The workers of one run share it, for each would wait a minute for its own.
+    """
+    told = tmp_path_factory.getbasetemp().parent / f"gpu_build-{os.environ.get('PYTEST_XDIST_TESTRUNUID', os.getpid())}"
+    with FileLock(f"{told}.lock"):
+        if not told.exists():
+            environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+            command = [sys.executable, "-m", "tools.gpu.build", "--json"]
+            done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+            assert done.returncode == 0, done.stderr
+            told.write_text(done.stdout.splitlines()[-1])
+    return json.loads(told.read_text())
 
 
 def builds_for(report: dict[str, list], target: str) -> list[dict]:

@@ -40,10 +40,10 @@ def _blur(a):
 @triton.jit
 def _taps(first, column, floats, STRIDE: tl.constexpr):
     """The 11 values of a row around each column, STRIDE apart from `first` on; 0 outside the picture."""
-    taps: tuple = ()
+    taps = ()
     for tap in tl.static_range(-_RADIUS, _RADIUS + 1):
         at = column + 3 * tap
-        taps += (tl.load(first + STRIDE * tap, mask=(at >= 0) & (at < floats), other=0),)
+        taps += (tl.load(first + STRIDE * tap, mask=(at >= 0) & (at < floats), other=0),)  # type: ignore[assignment]
     return taps
 
 
