@@ -16,7 +16,7 @@ def printable(text: str) -> str:
 
 
 class HyrfError(Exception):
-    """Something about the input or the request is wrong and the user can mend it.
+    """Something about the input or the request is wrong and the user can correct it.
 
     Sentences quote what hostile files say, so they are made `printable`.
     """

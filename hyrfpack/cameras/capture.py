@@ -19,7 +19,7 @@ def kept_cameras(cameras: Sequence[Camera]) -> list[list[float]]:
     return [camera_to_numbers(camera) for camera in evenly_spaced(cameras, KEPT)]
 
 
-def kept_of(scene: Scene) -> dict:
+def provenance_of(scene: Scene) -> dict:
     """What the provenance of a model trained on a scene keeps of it, for `Capture`.
 
     `max_size` is left out where reading the photos again with DEFAULT_MAX_SIZE gives the same pictures: a model of

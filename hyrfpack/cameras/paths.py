@@ -29,9 +29,6 @@ class Viewpoint:
         camera: the typical camera.
         arc: the first and the last degree of azimuth about `up`, relative to that camera, that photos cover; (0, 360)
             when they go all around.
-
-    Raises:
-        ValueError: a number is not finite, or too large for cameras about it to be, or `up` is no direction.
     """
 
     center: np.ndarray
@@ -39,13 +36,15 @@ class Viewpoint:
     camera: Camera
     arc: tuple[float, float]
 
-    def __post_init__(self) -> None:
+    def checked(self) -> Viewpoint:
+        """Itself. Raises ValueError: a number is not finite or too large for cameras about it, or `up` is (0, 0, 0)."""
         others = *self.camera.position, self.camera.cx, self.camera.cy, *self.arc
         # Cameras about it shall be finite in float32.
         if self.center.shape != (3,) or not (np.abs([*self.center, *others]) < 1e37).all():
             raise ValueError("a number is missing or not finite")
         if self.up.shape != (3,) or not 0 < np.linalg.norm(self.up) < np.inf:
             raise ValueError("'up' is not a direction")
+        return self
 
     @classmethod
     def of(cls, cameras: Sequence[Camera]) -> Viewpoint:
@@ -86,7 +85,7 @@ class Viewpoint:
         position = middle + 2.5 * scale * np.array([0.0, -math.sin(math.radians(20)), -math.cos(math.radians(20))])
         focal = 400 / math.tan(math.radians(25))
         camera = Camera(800, 600, focal, focal, 400.0, 300.0, look_at(position, middle, up))
-        return cls(middle, up, camera, (0.0, 360.0))
+        return cls(middle, up, camera, (0.0, 360.0)).checked()
 
     def to_json(self) -> dict[str, Any]:
         """A dictionary ready for JSON: the "viewpoint" of a file's provenance."""
@@ -110,7 +109,7 @@ class Viewpoint:
         center, up = np.array(stored["center"], np.float64), np.array(stored["up"], np.float64)
         camera = camera_from_json({**stored, **dict(zip(LENS[2:], stored["intrinsics"], strict=True))})
         first, last = (float(value) for value in stored["arc"])
-        return cls(center, up, camera, (first, last))
+        return cls(center, up, camera, (first, last)).checked()
 
 
 def common_direction(cameras: Sequence[Camera]) -> np.ndarray | None:

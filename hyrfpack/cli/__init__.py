@@ -1,6 +1,6 @@
 """The command line: parses, calls the library, prints. No numerics.
 
-Exit codes: 0 done, 1 a bug of ours or interrupted, 2 something the user can mend (one sentence on standard error).
+Exit codes: 0 done, 1 a bug of ours or interrupted, 2 something the user can correct (one sentence on standard error).
 Nothing here imports torch or numpy before a command needs it, so that `hyrfpack info` answers at once.
 """
 

@@ -74,8 +74,8 @@ def compress(
     """Pack a `.hyrf` file into a smaller one.
 
     Profile "compact" measures what each number does to pictures, at the cameras of `data` or those that the file
-    keeps, and spends bits where they show. By itself it aims at a loss of `distortion.PSNR_DROP`; the rest is for when
-    that is not what is wanted. "paper" and "raw" do what they always do, and take none of it.
+    keeps, and spends bits where they show. By itself it aims at a loss of `hyrfpack.compress.distortion.PSNR_DROP`;
+    the rest is for when that is not what is wanted. "paper" and "raw" do what they always do, and take none of it.
 
     Args:
         source: a file of any profile, best "raw".
@@ -172,7 +172,8 @@ class Packer:
         model = self.model
         plan = make_plan(model, self.sensitivity, distortion, self.prune)
         planned = plan.apply(model)
-        if self.scene is not None and self.finetune_steps:
+        if self.finetune_steps:
+            assert self.scene is not None
             self.say(f"fine-tuning for {self.finetune_steps:,} steps")
             steps = self.finetune_steps
             model = planned = finetune(planned, plan, self.sensitivity, self.scene.train, steps, cache=self.cache)

@@ -81,7 +81,7 @@ class LPIPS:
         shapes = {(64, 3, 11, 11): "alex", (64, 3, 3, 3): "vgg"}
         shape = tuple(_take(state, "net.slice1.0.weight", 4).shape)
         if shape not in shapes:
-            raise ValueError("'net.slice1.0.weight' is no first convolution of AlexNet or VGG-16")
+            raise ValueError("'net.slice1.0.weight' is not a first convolution of AlexNet or VGG-16")
         self.name = shapes[shape]
         self.network = NETWORKS[self.name]
         self._convolutions: dict[int, tuple[Tensor, Tensor]] = {}
@@ -158,5 +158,5 @@ class LPIPS:
 def _take(state: dict[str, Tensor], key: str, dimensions: int) -> Tensor:
     value = state.get(key)
     if not isinstance(value, Tensor) or value.dim() != dimensions:
-        raise ValueError(f"'{key}' is missing or is no weight")
+        raise ValueError(f"'{key}' is missing or is not a weight")
     return value.float()

@@ -41,7 +41,7 @@ def bake(model: HybridModel, cameras: Sequence[Camera], degrees: Sequence[int] =
     with f(d) = 0.5 + sum_k h_k Y_k(d) and directions d_s that cover the sphere evenly: from where no camera stood the
     colours follow the model, too, as far as that costs the cameras' views nothing.
 
-    One thing is mended. The model is trained with Gaussians left out whose centres project far outside the picture
+    One thing is corrected. The model is trained with Gaussians left out whose centres project far outside the picture
     (`RenderSettings.cull_tolerance`). Many programs draw these, and large ones near a camera would cover its picture.
     So opacities are multiplied by 1 - s^2, where s is the share of a Gaussian's light, were nothing left out, that
     would go to cameras which the model draws without it; most have s = 0, and those that this makes invisible are

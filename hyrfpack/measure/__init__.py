@@ -1,1 +1,1 @@
-"""The clock and the machine: how anything here is timed, and what is said of where."""
+"""The clock, the machine and the error: how anything here is timed, where, and how far off it is."""

@@ -43,7 +43,7 @@ class MinMaxParams:
             )
         params = cls(*_PARAMS.unpack(data))
         if not (-math.inf < params.minimum <= params.maximum < math.inf and 1 <= params.bits <= 16):
-            raise DamagedDataError(f"min-max parameters: {params} is no range; the data is damaged")
+            raise DamagedDataError(f"min-max parameters: {params} is not a range; the data is damaged")
         return params
 
 

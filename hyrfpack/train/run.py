@@ -16,7 +16,7 @@ import torch
 
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
-from hyrfpack.cameras.capture import kept_of
+from hyrfpack.cameras.capture import provenance_of
 from hyrfpack.checks import check_type
 from hyrfpack.data import PictureCache
 from hyrfpack.device import choose_device, describe_device
@@ -138,7 +138,7 @@ def _finish(trainer: Trainer, out: Path) -> dict:
         "steps": config.steps,
         "seed": config.seed,
         "choices": trainer.choices,
-        **kept_of(scene),
+        **provenance_of(scene),
         "psnr": statistics.median(record["psnr"] for record in trainer.records[-len(trainer.records) // 10 :]),
     }
     report = hyrf_format.save(model, path, profile="raw", provenance=provenance)

@@ -118,7 +118,7 @@ def test_a_plot_of_one_row_without_error_is_drawn(tmp_path):
 def test_json_to_standard_output_is_all_there_is_on_it(model, tmp_path):
     result = hyrfpack("bench", model, "--only", "mlp", "--repeats", 2, "--json", "-", "-o", tmp_path / "b.png")
     assert result.exit_code == 0, result.output
-    values = json.loads(result.stdout, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    values = json.loads(result.stdout, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert {item["group"] for item in values["rows"]} == {"mlp"}
     assert values["rows"][0]["is_reference"] and values["rows"][0]["time"]["repeats"] == 2
     assert (tmp_path / "b.png").exists() and "measuring mlp" in result.stderr

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scenes import ball_scene, ring
 
-from hyrfpack.cameras.capture import KEPT, ORBIT, Capture, kept_cameras, kept_of
+from hyrfpack.cameras.capture import KEPT, ORBIT, Capture, kept_cameras, provenance_of
 from hyrfpack.cameras.paths import Viewpoint, orbit
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera
@@ -28,7 +28,7 @@ def test_files_keep_the_layout_that_they_have_always_had():
 
 def test_what_a_model_keeps_of_a_scene_comes_back():
     scene = replace(ball_scene(5), max_size=700)
-    capture = Capture(facts(**json.loads(json.dumps(kept_of(scene)))))
+    capture = Capture(facts(**json.loads(json.dumps(provenance_of(scene)))))
     photographed = [view.camera for view in scene.train]
     assert capture.max_size == 700 and not capture.made_up
     assert capture.viewpoint.to_json() == Viewpoint.of(photographed).to_json()
@@ -55,7 +55,7 @@ def test_a_viewpoint_that_is_not_asked_for_is_not_looked_at():
 
 @pytest.mark.parametrize("cameras", [7, [[1, 2, 3]], [[32, 32, 0, 1, 1, 1, *range(12)]], {"a": 1}])
 def test_cameras_without_sense_are_one_sentence(cameras):
-    with pytest.raises(HyrfDataError, match=r"cameras that the file keeps make no sense [^\n]*--data$"):
+    with pytest.raises(HyrfDataError, match=r"cameras that the file keeps are not valid [^\n]*--data$"):
         _ = Capture(facts(cameras=cameras)).cameras
 
 

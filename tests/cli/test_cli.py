@@ -148,7 +148,7 @@ def test_decompressed_files_score_like_the_file_they_come_from(packed, data, tmp
 
 def test_evaluate_prints_strict_json_only(packed, data):
     result = succeeded("evaluate", packed, "--data", data, "--json")
-    values = json.loads(result.stdout, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    values = json.loads(result.stdout, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert {"psnr", "ssim", "lpips", "bytes", "gaussians", "views", "seconds_per_frame"} <= set(values)
     assert [view["name"] for view in values["views"]] == ["0000.png", "0008.png"]
     assert values["lpips"] is None and values["lpips_reason"]
@@ -316,11 +316,11 @@ REFUSED_OPTIONS = {
     "photos that are not there": (("--data", "nowhere"), "nowhere"),
     "a gain": (("--data", "DATA", "--max-psnr-drop", "-1"), "--max-psnr-drop"),
     "no step": (("--data", "DATA", "--finetune", 0), "--finetune"),
-    "words for a size": (("--target-size", "small"), "'small' is no size"),
-    "no size": (("--target-size", "0"), "'0' is no size"),
-    "a size of nothing": (("--target-size", "0.0001kB"), "is no size"),
-    "a negative size": (("--target-size", "-5kB"), "is no size"),
-    "two points": (("--target-size", "1.2.3MB"), "is no size"),
+    "words for a size": (("--target-size", "small"), "'small' is not a size"),
+    "no size": (("--target-size", "0"), "'0' is not a size"),
+    "a size of nothing": (("--target-size", "0.0001kB"), "is not a size"),
+    "a negative size": (("--target-size", "-5kB"), "is not a size"),
+    "two points": (("--target-size", "1.2.3MB"), "is not a size"),
 }
 
 

@@ -48,7 +48,7 @@ def test_export_says_what_it_does_and_prints_what_was_lost(model, tmp_path):
 
 def test_the_report_is_one_json_object(model, tmp_path):
     arguments = ("export", model, "-o", tmp_path / "a.splat", "--no-background", "--json")
-    report = json.loads(succeeded(*arguments).stdout, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    report = json.loads(succeeded(*arguments).stdout, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert report["file"] == str(tmp_path / "a.splat") and report["bytes"] == (tmp_path / "a.splat").stat().st_size
     assert (report["gaussians"], report["background"], report["degree"], report["views"]) == (40, 0, 0, 4)
     assert report["by_degree"].keys() == {"0"} and report["psnr"] > 20
@@ -160,7 +160,7 @@ def test_view_refuses_a_port_in_use_and_no_port(model):
 
 
 def test_view_refuses_an_address_that_is_none(model):
-    assert "no address to listen at" in refused("view", model, "--host", "", "--no-browser")
+    assert "not an address to listen at" in refused("view", model, "--host", "", "--no-browser")
 
 
 def test_view_opens_the_browser_where_it_says(model, monkeypatch):

@@ -13,7 +13,7 @@ noises = st.floats(math.log(ENDS[0]), math.log(ENDS[1])).map(math.exp).filter(la
 
 
 class Attempts:
-    """Trials are their noises; remembers them."""
+    """Trials are their distortions; remembers them."""
 
     def __init__(self) -> None:
         self.made: list[float] = []

@@ -236,7 +236,7 @@ def test_forged_camera_files_are_read_or_refused(root, rng):
 def test_a_field_of_view_of_nothing_is_refused(tmp_path):
     (tmp_path / "c.json").write_text(json.dumps(BY_ANGLE | {"camera_angle_x": 0}))
 
-    with pytest.raises(HyrfDataError, match="camera 0 makes no sense"):
+    with pytest.raises(HyrfDataError, match="camera 0 is not valid"):
         cameras_from_json(tmp_path / "c.json")
 
 

@@ -254,7 +254,7 @@ def test_set_is_the_one_asked_for_or_one_of_the_data_folder(tmp_path: Path) -> N
 @pytest.mark.skipif(CUDA, reason="there is a GPU")
 def test_without_a_gpu_it_ends_with_one_sentence_and_code_2(capsys: pytest.CaptureFixture) -> None:
     assert gpu_check.main([]) == 2
-    assert capsys.readouterr().err == f"gpu_check: {gpu_check.NO_GPU}\n"
+    assert capsys.readouterr().err == f"tools.gpu.check: {gpu_check.NO_GPU}\n"
 
 
 def test_it_starts_from_the_repository_root_without_an_installed_hyrfpack() -> None:

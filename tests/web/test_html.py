@@ -101,7 +101,7 @@ def test_a_page_needs_a_camera():
 
 @pytest.mark.parametrize("data", [b"", b"<html>", b'<script type="text/plain" id="scene">{}</script>'])
 def test_what_is_no_page_is_refused_in_one_sentence(data: bytes):
-    with pytest.raises(HyrfDataError, match=r"^x\.html: this is no page"):
+    with pytest.raises(HyrfDataError, match=r"^x\.html: this is not a page"):
         decode_page(data, "x.html")
 
 

@@ -58,7 +58,7 @@ def test_an_address_that_is_not_ours_is_one_sentence(host):
 
 @pytest.mark.parametrize("host", ["", " "])
 def test_no_address_is_one_sentence_and_does_not_mean_all(host):
-    with pytest.raises(HyrfError, match="no address to listen at.*127.0.0.1.*0.0.0.0"):
+    with pytest.raises(HyrfError, match="not an address to listen at.*127.0.0.1.*0.0.0.0"):
         serve(lambda: PAGE, host=host, open_browser=False, say=lambda address: None)
 
 

@@ -96,7 +96,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--long", action="store_true", help="time and train for three times as long")
     asked = parser.parse_args(arguments)
     if not torch.cuda.is_available():
-        print(f"gpu_check: {NO_GPU}", file=sys.stderr)
+        print(f"tools.gpu.check: {NO_GPU}", file=sys.stderr)
         return 2
     data = find_set(asked.data, os.environ.get("HYRFPACK_DATA"), ROOT.parent / "shared" / "data")
     setup = Setup(data=None if data is None else str(data))

@@ -26,7 +26,7 @@ from hyrfpack.ops.rasterize import Rasterization, rasterize
 from hyrfpack.ops.rasterize.shaded import rasterize_shaded
 from hyrfpack.ops.shade import Shading, shade
 from hyrfpack.render import RenderSettings
-from tools.gpu import roofline as roofline
+from tools.gpu import roofline
 from tools.gpu.compare import checked, relative_error, within
 from tools.gpu.roofline import Work
 from tools.gpu.rows import Row

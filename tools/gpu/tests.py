@@ -20,14 +20,12 @@ from tools.gpu.setup import Setup
 
 ROOT = Path(__file__).parents[2]
 TABLE = "Right on this device"
-NO_DEVICE = "test_gpu_build.py"  # builds the kernels for GPUs that need not be there
 NOTHING_RAN = 5  # pytest's exit code where no test was chosen
 
 
 def items(setup: Setup) -> list[str]:
     """The cases of the matrix, then the files of tests; a file has none for pytest where that is not installed."""
     files = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "tests" / "ops").glob("test_*.py"))
-    files = [file for file in files if not file.endswith(NO_DEVICE)]
     return [*CASES, *(files if importlib.util.find_spec("pytest") else [])]
 
 

@@ -1,7 +1,8 @@
 """Makes a large model of a small scene, for measurements of size and speed: trains, splits to a number, settles.
 
     python -m tools.studies.densify_model --data ../shared/data/mipnerf360_bonsai --gaussians 1000000 --out runs/million
-    python -m tools.studies.densify_model --data ../shared/data/ngp_fox --model fox.hyrf --gaussians 200000 --out runs/f
+    python -m tools.studies.densify_model --data ../shared/data/ngp_fox --model fox.hyrf \\
+        --gaussians 200000 --out runs/fox
 
 Photos of few pixels never make density control ask for a million Gaussians. Here it is told to split regardless: in
 each round the Gaussians with the largest gradients are replaced by two children drawn from them, with training steps

@@ -51,10 +51,10 @@ def read_header(data: bytes, name: str) -> PlyHeader:
     """Read the header of a PLY file.
 
     Raises:
-        HyrfDataError: this is no PLY file, or its header breaks the rules of the format.
+        HyrfDataError: this is not a PLY file, or its header breaks the rules of the format.
     """
     if not re.match(rb"ply\r?\n", data):
-        raise HyrfDataError(f"{name}: this is no PLY file, for its first line is not 'ply'")
+        raise HyrfDataError(f"{name}: this is not a PLY file, for its first line is not 'ply'")
     end = _ENDS.search(data, 0, _LONGEST_HEADER)
     if end is None:
         raise HyrfDataError(f"{name}: its PLY header has no end within {_LONGEST_HEADER:,} bytes; it is damaged")

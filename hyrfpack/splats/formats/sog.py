@@ -306,7 +306,7 @@ def _read_picture(data: bytes, most: int, name: str) -> np.ndarray:
 def _member(archive: zipfile.ZipFile, file: str, room: int, name: str) -> zipfile.ZipInfo:
     """A file of the zip, at most `room` bytes large, packed in a way that is unpacked piece by piece."""
     if file not in archive.NameToInfo:
-        raise HyrfDataError(f"{name}: the zip has no {file}; it is no SOG, or damaged")
+        raise HyrfDataError(f"{name}: the zip has no {file}; it is not a SOG, or damaged")
     member = archive.getinfo(file)
     if member.file_size > room:
         raise HyrfDataError(f"{name}: {file} unpacks to {member.file_size:,} bytes, far too many; it is damaged")
@@ -329,7 +329,7 @@ def _parse(data: bytes, name: str) -> dict:
     try:
         meta = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise HyrfDataError(f"{name}: {META} is no JSON ({error}); get the file again") from error
+        raise HyrfDataError(f"{name}: {META} is not JSON ({error}); get the file again") from error
     if not isinstance(meta, dict):
         raise HyrfDataError(f"{name}: {META} holds no SOG; it is damaged")
     version = meta.get("version", 1)  # the first had none

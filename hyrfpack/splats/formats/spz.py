@@ -127,7 +127,7 @@ def decode(data: bytes, name: str) -> Splats:
     elif data[:4] == _MAGIC:
         unpacked = _read_streams(data, name)
     else:
-        raise HyrfDataError(f"{name}: this is no SPZ file, for it starts with neither gzip's nor SPZ's own mark")
+        raise HyrfDataError(f"{name}: this is not an SPZ file, for it starts with neither gzip's nor SPZ's own mark")
     version, degree, bits, flags, sections = unpacked
     positions, opacities, colors, scales, quats, harmonics = (np.frombuffer(part, np.uint8) for part in sections)
     count = len(opacities)
@@ -164,7 +164,7 @@ def _read_header(header: bytes, versions: range, stored: int, name: str) -> tupl
     """Version, count, degree, fractional bits and flags of a header whose sections come from `stored` bytes."""
     magic, version, count, degree, bits, flags, _ = _HEADER.unpack(header)
     if magic != _MAGIC:
-        raise HyrfDataError(f"{name}: this is no SPZ file, for its contents do not start with 'NGSP'")
+        raise HyrfDataError(f"{name}: this is not an SPZ file, for its contents do not start with 'NGSP'")
     if version not in versions:
         raise HyrfDataError(
             f"{name}: this is SPZ version {version}, and versions 1 to 3 (gzip) and 4 (plain header) can be read; "

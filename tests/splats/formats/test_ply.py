@@ -166,8 +166,8 @@ GOOD = file_of(NAMES, "float", ROW.tobytes(), 1)
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (b"", "this is no PLY file"),
-        (b"solid cube", "this is no PLY file"),
+        (b"", "this is not a PLY file"),
+        (b"solid cube", "this is not a PLY file"),
         (b"ply\nformat ascii 1.0\n", "header has no end"),
         (file_of(["x", "y", "z"], "float", bytes(12), 1), r"no Gaussians, for its vertices have no f_dc_0, .* and 7"),
         (file_of([*NAMES[:-1], "w"], "float", ROW.tobytes(), 1), "have no rot_3;"),

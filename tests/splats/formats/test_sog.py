@@ -184,7 +184,7 @@ def test_a_palette_finds_separate_clusters() -> None:
         ),
         ({"quats": {"files": ["../quats.webp"]}}, "picture 1 of quats"),
         ({"quats": {"files": ["gone.webp"]}}, "gone.webp is missing"),
-        ({"quats": {"files": ["meta.json"]}}, "no picture"),
+        ({"quats": {"files": ["meta.json"]}}, "not a picture"),
         ({"quats": {"files": ["sh0.webp"]}}, "tag 51"),
         ({"shN": {"codebook": [0.0] * 256, "files": ["low.webp", "high.webp"]}}, "no palette"),
     ],

@@ -180,8 +180,8 @@ GOOD = {version: file_of(sections_of_one(version), version) for version in (3, 4
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (b"", "this is no SPZ file"),
-        (b"ply\n", "this is no SPZ file"),
+        (b"", "this is not an SPZ file"),
+        (b"ply\n", "this is not an SPZ file"),
         (GOOD[3][:20], "ends within its header"),
         (GOOD[3][:-4], "is truncated"),
         (GOOD[3][:-8] + bytes(8), "gzip stream is damaged"),
