@@ -86,7 +86,7 @@ class ProgressLine:
             "loss": f"loss {self.loss:.4f}",
             "psnr": f"PSNR {decibels(self.mse):.2f}",
             "gaussians": f"{gaussians:,} Gaussians",
-            "gone": f"{duration(now - self.start)} elapsed",
+            "gone": f"{duration(now - self.start)} gone",
             "left": f"{duration(left)} left",
         }
         if self.live:

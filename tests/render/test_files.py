@@ -55,10 +55,12 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
 
 
 def stand_in_ffmpeg(folder, monkeypatch, body: str) -> None:
-    """Put a Python script named ffmpeg first on the PATH."""
+    """Put a Python program named ffmpeg first on the PATH."""
     script = folder / "bin" / "ffmpeg"
     script.parent.mkdir()
-    script.write_text(f"#!{sys.executable}\nimport sys\n{body}\n")
+    (folder / "bin" / "program.py").write_text(f"import sys\n{body}\n")
+    # Not by a first line that names Python: its folder may have a space in its name.
+    script.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{script.parent}/program.py" "$@"\n')
     script.chmod(script.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setenv("PATH", f"{script.parent}{os.pathsep}{os.environ['PATH']}")
 

@@ -73,7 +73,7 @@ PARTS = {
     "loss": "loss 0.0381",
     "psnr": "PSNR 29.40",
     "gaussians": "4,850 Gaussians",
-    "gone": "15 s elapsed",
+    "gone": "15 s gone",
     "left": "60 s left",
 }
 LONG_PARTS = {
@@ -82,14 +82,14 @@ LONG_PARTS = {
     "loss": "loss 0.0381",
     "psnr": "PSNR 29.40",
     "gaussians": "1,234,850 Gaussians",
-    "gone": "120:15:22 elapsed",
+    "gone": "120:15:22 gone",
     "left": "11:15:22 left",
 }
 FITTING = {
     40: "604/3,000  PSNR 29.40  60 s left",
-    60: "604/3,000  40.2 steps/s  PSNR 29.40  15 s elapsed  60 s left",
-    80: "604/3,000  ━━━━━━━━  40.2 steps/s  loss 0.0381  PSNR 29.40  15 s elapsed  60 s left",
-    120: "604/3,000  " + 24 * "━" + "  40.2 steps/s  loss 0.0381  PSNR 29.40  4,850 Gaussians  15 s elapsed  60 s left",
+    60: "604/3,000  40.2 steps/s  PSNR 29.40  15 s gone  60 s left",
+    80: "604/3,000  ━━━━━━━━  40.2 steps/s  loss 0.0381  PSNR 29.40  15 s gone  60 s left",
+    120: "604/3,000  " + 24 * "━" + "  40.2 steps/s  loss 0.0381  PSNR 29.40  4,850 Gaussians  15 s gone  60 s left",
 }
 
 
@@ -191,7 +191,7 @@ def test_more_than_two_minutes_are_said_as_hours_minutes_and_seconds(seconds, sa
 def test_times_of_a_log_file_are_readable(capsys, monkeypatch):
     trained(Clock(monkeypatch), steps=3000, seconds=0.5, count=600)
     last = capsys.readouterr().err.splitlines()[-1]
-    assert re.search(r"  0:0[45]:\d\d elapsed  0:20:\d\d left$", last)
+    assert re.search(r"  0:0[45]:\d\d gone  0:20:\d\d left$", last)
 
 
 def test_compiling_in_the_first_steps_does_not_count_as_slowness(capsys, monkeypatch):
