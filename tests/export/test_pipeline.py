@@ -255,7 +255,7 @@ def told_of(unit: float, judged: str, folder) -> tuple[str, ExportReport]:
     cameras = [moved(camera, unit, (0, 0, 0)) for camera in ring(8)]
     source, said = write(folder / "model.hyrf", model, cameras), []
     if judged == "made-up viewpoints":
-        hyrfpack.compress(source, folder / "compact.hyrf", noise=1e-7)
+        hyrfpack.compress(source, folder / "compact.hyrf", distortion=1e-7)
         source = folder / "compact.hyrf"
     data = photographed(model, cameras) if judged == "photos" else None
     report = export(source, folder / "a.spz", degree=0, data=data, say=said.append)
