@@ -95,7 +95,8 @@ def panels(rows: Sequence[Row]) -> list[Panel]:
 
 
 def _size_ratio(row: Row, reference: int | None) -> float:
-    return (row.bytes or 0) / (reference or 1)
+    assert row.bytes is not None and reference is not None  # rows of the codec have bytes
+    return row.bytes / reference
 
 
 def _draw(axes: Axes, panel: Panel) -> list[tuple[Row, float, float, str]]:
