@@ -9,10 +9,10 @@ BIN := .venv/bin
 READY := .venv/.ready
 PEERS := tests/node/node_modules/.ready
 
-.PHONY: help demo test test-newest test-oldest docs bench gpu speed sets choices ablations precision kill fuzz lint format clean
+.PHONY: help demo test test-newest test-oldest docs player bench gpu speed sets choices ablations precision kill fuzz fuzz-browser lint format clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z.-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z.-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo "  PYTHON=python3.12 and the like choose the interpreter of a new .venv"
 
 .venv: $(READY) ## make or refresh the environment
@@ -47,6 +47,9 @@ test-oldest: ## run the tests with the oldest versions that pyproject.toml allow
 docs: $(READY) ## write the documentation as a site to site/; a broken link is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
+player: $(READY) $(PEERS) ## give the scripts of the web player short names again, after they have changed
+	$(BIN)/python -m tools.browser.shorten
+
 bench: $(READY) ## time each hot operation at several sizes against its references
 	$(BIN)/python -m tools.bench
 
@@ -73,6 +76,9 @@ kill: $(READY) ## kill the commands at random moments and check what is left (te
 
 fuzz: $(READY) ## feed the .hyrf reader a million hostile files (ten minutes)
 	$(BIN)/python -m tools.safety.fuzz
+
+fuzz-browser: $(READY) ## feed hostile files to the readers in Python and in JavaScript and compare (a minute)
+	$(BIN)/python -m tools.safety.fuzz_browser
 
 lint: $(READY) ## check style and types only
 	$(BIN)/ruff check .

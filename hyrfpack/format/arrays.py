@@ -107,7 +107,7 @@ def by_parameter(arrays: dict[str, np.ndarray], model: HybridModel) -> Iterator[
 def check_rules(rules: dict) -> None:
     """Raise HyrfFormatError unless this version computes by exactly these rules."""
     for name in sorted({*rules, *RULES}):
-        if rules.get(name) != RULES.get(name):
+        if name not in RULES or rules.get(name) != RULES[name]:
             raise HyrfFormatError(
                 f"rule {name!r:.40} is {rules.get(name)!r:.40} and this hyrfpack knows only {RULES.get(name)!r}; "
                 "update hyrfpack"

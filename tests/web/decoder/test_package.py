@@ -1,0 +1,203 @@
+"""The decoder as others get it: an npm package without dependencies, and modules with types."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+from pathlib import Path
+
+import numpy as np
+
+import hyrfpack
+from hyrfpack.format import describe
+from hyrfpack.format.arrays import group_shapes, parse_config
+from hyrfpack.format.container import read_container
+from hyrfpack.format.sections import LAYERED, MLPS, TABLES
+from hyrfpack.model import HashGridConfig
+
+ROOT = Path(__file__).parents[3]
+PACKAGE = ROOT / "hyrfpack" / "web" / "hyrf"
+GOLDEN = ROOT / "tests" / "golden"
+PUBLIC = ("index", "grids", "fields", "harmonics", "viewpoint")
+
+
+def run_module(code: str, folder: Path, *arguments: str) -> object:
+    """What a module under node prints as JSON."""
+    run = subprocess.run(
+        ["node", "--input-type=module", "-e", code, *arguments], cwd=folder, capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr
+    return json.loads(run.stdout)
+
+
+def test_types_hold(compiler):
+    run = subprocess.run(
+        ["node", str(compiler), "--project", str(Path(__file__).with_name("tsconfig.json"))],
+        capture_output=True,
+        text=True,
+    )
+
+    assert run.returncode == 0, run.stdout
+
+
+def test_the_package_is_of_hyrfpacks_version_and_license():
+    package = json.loads((PACKAGE / "package.json").read_text())
+
+    assert package["version"] == hyrfpack.__version__
+    assert package["license"] == "Apache-2.0"
+    assert (PACKAGE / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
+
+
+def test_public_modules_are_exported():
+    exports = json.loads((PACKAGE / "package.json").read_text())["exports"]
+
+    assert exports == {("." if name == "index" else f"./{name}.js"): f"./{name}.js" for name in PUBLIC}
+    assert all((PACKAGE / file).exists() for file in exports.values())
+
+
+def test_modules_import_nothing_but_each_other_and_use_no_page():
+    for module in PACKAGE.glob("*.js"):
+        code = module.read_text()
+        for source in re.findall(r'^import .* from "(.*)";$', code, re.MULTILINE):
+            assert (PACKAGE / source).parent == PACKAGE and (PACKAGE / source).exists()
+        # One form of import, on one line: what puts modules together for a page knows no other.
+        assert len(re.findall(r"^import\b", code, re.MULTILINE)) == len(
+            re.findall(r'^import \{ [\w, ]+ \} from "\./\w+\.js";$', code, re.MULTILINE)
+        )
+        assert not re.search(r"\b(document|window|eval|require)\b[.(]", code), module.name
+
+
+def test_what_is_packed_reads_a_file_where_it_is_installed(npm, tmp_path):
+    listed = subprocess.run(
+        [npm, "pack", "--dry-run", "--json"], cwd=PACKAGE, capture_output=True, text=True, check=True
+    )
+    (pack,) = json.loads(listed.stdout)
+    modules = {path.name for path in PACKAGE.glob("*.js")}
+    assert {file["path"] for file in pack["files"]} == modules | {"package.json", "README.md", "LICENSE"}
+    assert pack["size"] < 60_000
+
+    subprocess.run([npm, "pack", "--pack-destination", str(tmp_path)], cwd=PACKAGE, capture_output=True, check=True)
+    (archive,) = tmp_path.glob("*.tgz")
+    (tmp_path / "app").mkdir()
+    (tmp_path / "app" / "package.json").write_text("{}")
+    install = [npm, "install", "--offline", "--no-audit", "--no-fund", str(archive)]
+    subprocess.run(install, cwd=tmp_path / "app", capture_output=True, check=True)
+    code = """
+        import { readFileSync } from "node:fs";
+        import { read } from "hyrf.js";
+        import { gridLevels } from "hyrf.js/grids.js";
+        const model = await read(readFileSync(process.argv[1]));
+        console.log(JSON.stringify([Array.from(model.positions), gridLevels(model.config.geometry).length]));
+    """
+    positions, levels = run_module(code, tmp_path / "app", str(GOLDEN / "v1.1_compact.hyrf"))
+
+    recorded = np.load(GOLDEN / "v1.1_compact.npz")["gaussians.positions"]
+    assert np.array_equal(np.array(positions, np.float32), recorded.ravel())
+    assert levels == 2
+
+
+def test_shapes_of_grids_and_decoders_are_hyrfpacks():
+    rng = np.random.default_rng(1)
+    facts = describe(GOLDEN / "v1.0_raw.hyrf")["config"]
+    configs = []
+    for _ in range(3000):
+        base = int(rng.integers(2, 1 + 2 ** rng.integers(1, 17)))
+        finest = int(rng.integers(base, 65537)) if rng.random() < 0.5 else min(65536, base << int(rng.integers(0, 9)))
+        grid = {"log2_table_size": int(rng.integers(4, 25)), "levels": int(rng.integers(1, 33))}
+        grid |= {"base": base, "finest": finest}
+        encoding = str(rng.choice(["sh", "frequency"]))
+        configs.append(facts | {"radiance": grid, "hidden": int(rng.integers(1, 1025)), "direction_encoding": encoding})
+    code = """
+        import { readFileSync } from "node:fs";
+        import { decoderLayout, decoderSize, gridLevels, tableRows } from "./grids.js";
+        const configs = JSON.parse(readFileSync(0));
+        console.log(JSON.stringify(configs.map((config) => [
+          gridLevels(config.radiance).map(({ resolution, first, rows }) => [resolution, first, first + rows]),
+          tableRows(config.radiance),
+          ...["geometry", "radiance"].map((field) => decoderSize(config, field)),
+          decoderLayout(config, "radiance"),
+        ])));
+    """
+    run = subprocess.run(
+        ["node", "--input-type=module", "-e", code],
+        input=json.dumps(configs),
+        cwd=PACKAGE,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+    for config, (levels, rows, geometry, radiance, layers) in zip(configs, json.loads(run.stdout), strict=True):
+        grid, shapes = HashGridConfig(**config["radiance"]), group_shapes(parse_config(config), 0)
+        assert [level[0] for level in levels] == list(grid.resolutions)
+        assert [level[1] for level in levels] + [levels[-1][2]] == list(grid.offsets)
+        assert rows == grid.rows
+        assert [(geometry, 1), (radiance, 1)] == [shapes[tag] for tag in MLPS]
+        hidden, directions = config["hidden"], {"sh": 9, "frequency": 24}[config["direction_encoding"]]
+        inputs = 2 * grid.levels + directions
+        assert [(layer["inputs"], layer["outputs"]) for layer in layers] == [
+            (inputs, hidden),
+            (hidden, hidden),
+            (hidden, 3),
+        ]
+        assert [layer["bias"] - layer["matrix"] for layer in layers] == [inputs * hidden, hidden * hidden, 3 * hidden]
+
+
+def test_a_file_is_described_from_its_first_bytes():
+    file = GOLDEN / "v1.1_compact_layers.hyrf"
+    data = file.read_bytes()
+    container = read_container(data)
+    start = 48 + 40 * len(container.entries)
+    code = """
+        import { readFileSync } from "node:fs";
+        import { describe } from "./index.js";
+        const bytes = readFileSync(process.argv[1]);
+        const facts = describe(bytes.subarray(0, Number(process.argv[2])));
+        let refused = "";
+        try { describe(bytes.subarray(0, Number(process.argv[2]) - 1)); } catch (error) { refused = error.message; }
+        console.log(JSON.stringify({ facts, refused, same: describe(bytes) }));
+    """
+
+    answer = run_module(code, PACKAGE, str(file), str(start))
+
+    first = ("META", *LAYERED, *TABLES, *MLPS)
+    assert (
+        answer["facts"]
+        == answer["same"]
+        == {
+            "version": list(container.version),
+            "length": len(data),
+            "sections": [
+                {"type": e.type, "codec": e.codec, "offset": e.offset, "stored": e.length, "raw": e.raw_length}
+                for e in container.entries.values()
+            ],
+            "firstLayer": max(container.entries[tag].end for tag in first),
+        }
+    )
+    assert "within its table of contents" in answer["refused"]
+
+
+def test_a_file_is_read_in_a_worker():
+    code = """
+        import { readFileSync } from "node:fs";
+        import { pathToFileURL } from "node:url";
+        import { Worker } from "node:worker_threads";
+        const source = `
+          import { parentPort, workerData } from "node:worker_threads";
+          const { read } = await import(workerData.reader);
+          const model = await read(new Uint8Array(workerData.bytes));
+          parentPort.postMessage(model, [model.positions.buffer]);
+        `;
+        const shared = new SharedArrayBuffer(readFileSync(process.argv[1]).length);
+        new Uint8Array(shared).set(readFileSync(process.argv[1]));
+        const reader = pathToFileURL("index.js").href;
+        const url = new URL("data:text/javascript," + encodeURIComponent(source));
+        const worker = new Worker(url, { workerData: { reader, bytes: shared } });
+        worker.once("message", ({ count, positions }) => console.log(JSON.stringify([count, Array.from(positions)])));
+    """
+
+    count, positions = run_module(code, PACKAGE, str(GOLDEN / "v1.1_compact.hyrf"))
+
+    recorded = np.load(GOLDEN / "v1.1_compact.npz")["gaussians.positions"]
+    assert count == len(recorded) and np.array_equal(np.array(positions, np.float32), recorded.ravel())

@@ -1,0 +1,543 @@
+"""The decoder in JavaScript gives the numbers that hyrfpack gives, bit for bit, and refuses what hyrfpack refuses.
+
+Every number of every codec is exact: integers decide, and floats are float32 results of float64 operations that
+docs/format.md prescribes one by one. So arrays are compared by hash, without a tolerance.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+import zlib
+from pathlib import Path
+from random import Random
+
+import numpy as np
+import pytest
+import torch
+from forged_files import (
+    FREE,
+    SMALL,
+    channel,
+    file_of,
+    largest_tables,
+    lattice,
+    metadata,
+    most_gaussians,
+    plain,
+    shapes_of,
+    text_of,
+    with_text,
+)
+
+from hyrfpack.format import encode_model
+from hyrfpack.format.arrays import GROUPS
+from hyrfpack.format.container import read_container
+from hyrfpack.format.sections import LAYERED, SECTIONS, layer_section
+from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
+from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.quant import huffman_encode, rans_lanes
+from hyrfpack.quant.bits import pack_bits
+from hyrfpack.quant.integers import encode_integers
+from hyrfpack.quant.rans_models import adaptive_frequencies, update_steps
+from tools.safety.fuzz_browser import compare, disagreement, in_javascript, in_python
+from tools.safety.fuzz_mutate import KINDS, Part, assemble, disassemble, seeds
+from tools.safety.plans import encode
+
+TESTS = Path(__file__).parents[2]
+GOLDEN = sorted((TESTS / "golden").glob("*.hyrf"))
+CORPUS = sorted((TESTS / "fuzz" / "corpus").glob("*/*.hyrf"))
+
+
+def check_alike(files: dict[str, bytes], cut: bool = False) -> tuple[list[str], list[str]]:
+    """Both readers say the same of these files; returns the names of those accepted and of those refused."""
+    accepted: list[str] = []
+    refused: list[str] = []
+    for (name, data), verdict in zip(
+        files.items(), in_javascript([(data, cut) for data in files.values()]), strict=True
+    ):
+        assert not disagreement(in_python(data, cut), verdict), name
+        (refused if verdict.refused else accepted).append(name)
+    return accepted, refused
+
+
+def made_up_model(seed: int, count: int) -> HybridModel:
+    """A model whose configuration is drawn."""
+    rng = np.random.default_rng(seed)
+
+    def grid() -> HashGridConfig:
+        base = int(rng.integers(2, 9))
+        levels, finest = int(rng.integers(1, 7)), int(rng.integers(base, 65))
+        return HashGridConfig(int(rng.integers(4, 11)), levels, base, finest)
+
+    config = ModelConfig(
+        frame=Frame(tuple(rng.normal(size=3) * 100), float(rng.uniform(0.01, 50)), tuple(rng.uniform(0.25, 1, 3))),
+        geometry=grid(),
+        radiance=grid(),
+        hidden=int(rng.integers(1, 20)),
+        background=bool(rng.integers(2)),
+        scale_rule=str(rng.choice(["sum", "product"])),
+        scale_grows=bool(rng.integers(2)),
+        direction_encoding=str(rng.choice(["sh", "frequency"])),
+        antialiased=bool(rng.integers(2)),
+    )
+    values = torch.from_numpy(rng.normal(size=(count, 8)).astype(np.float32))
+    model = HybridModel(config, Gaussians(values[:, :3], values[:, 3:6], values[:, 6:7], values[:, 7:]))
+    with torch.no_grad():
+        for parameter in (*model.geometry.parameters(), *model.radiance.parameters()):
+            parameter.copy_(torch.from_numpy(rng.laplace(scale=0.1, size=parameter.shape)))
+    return model
+
+
+@pytest.mark.parametrize("file", GOLDEN, ids=lambda file: file.stem)
+def test_golden_files_decode_to_the_recorded_numbers(file):
+    recorded = np.load(file.with_suffix(".npz"))
+
+    (verdict,) = in_javascript([(file.read_bytes(), False)])
+
+    assert verdict.whole and sum(verdict.layers) == len(recorded["gaussians.positions"])
+    for group, names in GROUPS.items():
+        numbers = b"".join(recorded[name].astype("<f4").tobytes() for name in names)
+        assert verdict.groups[group] == hashlib.sha256(numbers).hexdigest(), group
+
+
+def test_models_of_any_configuration_decode_to_the_same_numbers():
+    files = {}
+    for seed in range(12):
+        model = made_up_model(seed, (0, 1, 2, 7, 300, 1500)[seed % 6])
+        for profile in ("raw", "paper", "compact"):
+            files[f"{profile} {seed}"] = encode(model, profile)
+        files[f"layers {seed}"] = encode(model, "compact", distortion=1e-6, prune=False, layered=True)
+
+    accepted, _ = check_alike(files)
+
+    assert accepted == list(files)
+
+
+def test_every_group_in_every_codec_decodes_to_the_same_numbers():
+    files = {str(number): data for number, data in enumerate(seeds()[0])}
+
+    accepted, _ = check_alike(files)
+
+    assert accepted == list(files)
+
+
+def test_streams_of_many_lanes_decode_to_the_same_numbers():
+    """Dozens of lanes, static and adaptive models, and a first layer of which every second point counts for tables."""
+    data = encode(made_up_model(3, 160_000), "compact", prune=False)
+    assert read_container(data)["POSI"].raw_length // 12 > 65536
+
+    accepted, _ = check_alike({"many": data})
+
+    assert accepted
+
+
+def draw_codes(rng: np.random.Generator, count: int, base: int) -> np.ndarray:
+    """Morton codes (count,) int64 in order, the ends among them."""
+    codes = rng.integers(0, 1 << 3 * base, count)
+    codes[:2] = 0, (1 << 3 * base) - 1
+    return np.sort(codes)
+
+
+@pytest.mark.parametrize("base", [1, 2, 8, 9, 10, 17, 18])
+def test_points_of_any_depth_decode_to_the_same_numbers(base):
+    """Codes of up to 54 bits, more than a number of JavaScript holds, and tails of up to 51."""
+    rng, count = np.random.default_rng(base), 300
+    bits = [base, 18, min(base + 1, 18), (base + 18) // 2]
+    classes = rng.integers(0, 4, count).astype(np.uint8)
+    tails = pack_bits(
+        rng.integers(0, 1 << 54, count).astype(np.uint64), (3 * (np.array(bits) - base)).astype(np.uint8)[classes]
+    )
+    meta = metadata(count)
+    payload = lattice(draw_codes(rng, count, base), base, bits, classes, tails)
+
+    accepted, _ = check_alike({"points": file_of(meta, plain(meta) | {"POSI": (6, payload)})})
+
+    assert accepted
+
+
+@pytest.mark.parametrize("base", [1, 8, 9, 10, 17, 18])
+def test_points_one_step_outside_the_cube_are_refused(base):
+    codes = np.array([5, (1 << 3 * base) - 1])
+    payloads = [lattice(codes + step, base, [base], np.zeros(2, np.uint8)) for step in (0, 1)]
+    meta = metadata(2)
+    files = {str(k): file_of(meta, plain(meta) | {"POSI": (6, data)}) for k, data in enumerate(payloads)}
+
+    assert check_alike(files) == (["0"], ["1"])
+
+
+def test_channels_at_the_edges_decode_to_the_same_numbers():
+    """Steps of all sizes, differences up to their limits, every weight; one difference more is refused."""
+    rng, files = np.random.default_rng(5), {}
+    for weight in range(17):
+        count = int(rng.integers(2, 200))
+        classes = rng.integers(0, 16, count).astype(np.uint8)
+        points = lattice(draw_codes(rng, count, 5), 5, [5] * 16, classes)
+        codes = bytes(rng.integers(0, 256, 16).tolist())
+        steps = np.array([(8 + code % 8) << code // 8 for code in codes])[classes]
+        limits = np.minimum((1 << 39) // steps, 1 << 30)
+        differences = rng.integers(-limits, limits + 1)
+        differences[0] = limits[0]
+        meta = metadata(count)
+        basis = rng.uniform(-1, 1, 9).astype("<f4").tobytes()
+        good, beyond = (
+            channel(values, classes, codes, rng.uniform(-4096, 4096), weight)
+            for values in (differences, differences + (np.arange(count) == 0))
+        )
+        one = {"POSI": (6, points), "COLO": (7, basis + 3 * good), "SCAL": (7, good), "OPAC": (7, good)}
+        files[f"good {weight}"] = file_of(meta, plain(meta) | one)
+        files[f"beyond {weight}"] = file_of(meta, plain(meta) | one | {"OPAC": (7, beyond)})
+
+    accepted, refused = check_alike(files)
+
+    assert len(accepted) > 10 and len(accepted) == len(refused)
+    assert all(name.startswith("good") for name in accepted)
+
+
+def test_groups_at_the_edges_decode_to_the_same_numbers():
+    rng, files = np.random.default_rng(6), {}
+    meta = metadata(0, hidden=30)
+    count = 2 * 30 + 8 + 3
+    for largest in (1 << 24, (1 << 24) + 1):
+        codes = rng.integers(0, 256, count)
+        codes[0] = 255
+        models = rng.integers(0, 8, int((codes > 0).sum()))
+        sizes = [size for inputs, outputs in ((2, 30), (30, 30), (30, 8)) for size in [inputs] * outputs + [outputs]]
+        all_models = np.zeros(count, np.int64)
+        all_models[codes > 0] = models
+        contexts = np.repeat(all_models, sizes)[np.repeat(codes > 0, sizes)].astype(np.uint8)
+        symbols = rng.integers(-(1 << 24), (1 << 24) + 1, len(contexts))
+        symbols[:2] = largest, -(1 << 24)
+        parts = encode_integers(codes), encode_integers(models), encode_integers(symbols, contexts, signed=True)
+        payload = np.array([len(parts[0]), len(parts[1])], "<u4").tobytes() + b"".join(parts)
+        files[str(largest)] = file_of(meta, plain(meta) | {"GMLP": (8, payload)})
+
+    assert check_alike(files) == ([str(1 << 24)], [str((1 << 24) + 1)])
+
+
+@pytest.fixture(scope="module")
+def layered() -> bytes:
+    """A file with Gaussians in layers."""
+    return next(file for file in GOLDEN if file.stem == "v1.1_compact_layers").read_bytes()
+
+
+def test_the_start_of_a_file_is_read_or_refused_as_hyrfpack_does(layered):
+    entries = read_container(layered, SECTIONS).entries.values()
+    ends = {end + step for entry in entries for end in (entry.offset + entry.length, entry.end) for step in (-1, 0, 1)}
+    cuts = sorted({*range(0, len(layered), 37), *ends, len(layered)} - {len(layered) + 1})
+
+    accepted, refused = check_alike({str(cut): layered[:cut] for cut in cuts}, cut=True)
+
+    assert len(accepted) > 10 and len(refused) > 50
+    first_layer = max(entry.end for entry in entries if entry.type[:4] not in _further_layers())
+    assert min(map(int, accepted)) == first_layer and max(map(int, refused)) < first_layer
+
+
+def _further_layers() -> set[str]:
+    return {layer_section(group, layer) for group in LAYERED for layer in range(1, 8)}
+
+
+def test_what_was_read_of_a_file_is_told(layered):
+    whole, most = in_javascript([(layered, False), (layered[:-8], True)])
+
+    assert whole.whole and not most.whole and most.layers == whole.layers[:-1]
+
+
+def test_the_start_of_a_file_is_refused_where_the_whole_was_asked_for(layered):
+    (verdict,) = in_javascript([(layered[:-8], False)])
+
+    assert verdict.refused.startswith("The file is truncated: its header says ")
+
+
+def test_files_with_bytes_after_their_end_are_refused_as_a_start_too(layered):
+    _, refused = check_alike({"longer": layered + b"\0"}, cut=True)
+
+    assert refused
+
+
+# What replaces what in valid metadata, and whether that is still valid.
+JSON_CASES: dict[str, tuple[bytes, bytes, bool]] = {
+    "as it is": (b"", b"", True),
+    "float for an integer": (b'"gaussians":0', b'"gaussians":0.0', False),
+    "exponent for an integer": (b'"gaussians":0', b'"gaussians":0e0', False),
+    "minus zero": (b'"gaussians":0', b'"gaussians":-0', True),
+    "boolean for an integer": (b'"hidden":1', b'"hidden":true', False),
+    "null for an integer": (b'"hidden":1', b'"hidden":null', False),
+    "beyond 64 bits": (b'"hidden":1', b'"hidden":%d' % 2**63, False),
+    "digits for a boolean": (b'"background":true', b'"background":1', False),
+    "integer for a float": (b'"scale":1.0', b'"scale":1', True),
+    "large integer for a float": (b'"scale":1.0', b'"scale":1' + b"0" * 300, True),
+    "too large integer for a float": (b'"scale":1.0', b'"scale":1' + b"0" * 309, False),
+    "overflowing float": (b'"scale":1.0', b'"scale":1e400', False),
+    "underflowing float": (b'"scale":1.0', b'"scale":1e-400', False),
+    "least float": (b'"scale":1.0', b'"scale":5e-324', True),
+    "negative": (b'"scale":1.0', b'"scale":-1.0', False),
+    "NaN": (b'"writer":""', b'"writer":"","x":NaN', False),
+    "infinity": (b'"writer":""', b'"writer":"","x":-Infinity', False),
+    "overflow where it means nothing": (b'"writer":""', b'"writer":"","x":1e400', False),
+    "400 digits where they mean nothing": (b'"writer":""', b'"writer":"","x":' + b"7" * 400, True),
+    "4,300 digits": (b'"writer":""', b'"writer":"","x":-' + b"7" * 4300, True),
+    "4,301 digits": (b'"writer":""', b'"writer":"","x":-' + b"7" * 4301, False),
+    "4,301 digits of a float": (b'"writer":""', b'"writer":"","x":0.' + b"7" * 4301, True),
+    "unknown key": (b'"writer":""', b'"writer":"","x":[{}]', True),
+    "key of JavaScript": (b'"writer":""', b'"writer":"","__proto__":{"hidden":7}', True),
+    "key of JavaScript in config": (b'"hidden":1', b'"hidden":1,"__proto__":1', False),
+    "key of JavaScript for another": (b'"hidden":1', b'"toString":1', False),
+    "unknown key in config": (b'"hidden":1', b'"hidden":1,"x":1', False),
+    "unknown key in a grid": (b'"levels":1', b'"levels":1,"x":1', False),
+    "unknown key in the frame": (b'"scale":1.0', b'"scale":1.0,"x":1', False),
+    "unknown rule": (b'"hash":"instant-ngp"', b'"hash":"instant-ngp","x":1', False),
+    "unknown rule that is null": (b'"hash":"instant-ngp"', b'"hash":"instant-ngp","x":null', False),
+    "integer in a rule": (b'"background_radius":100.0', b'"background_radius":100', True),
+    "other spelling in a rule": (b'"background_radius":100.0', b'"background_radius":1E+2', True),
+    "text in a rule": (b'"background_radius":100.0', b'"background_radius":"100"', False),
+    "equal keys, the last one right": (b'"hidden":1', b'"hidden":7,"hidden":1', True),
+    "equal keys, the last one wrong": (b'"hidden":1', b'"hidden":1,"hidden":0', False),
+    "layers are null": (b'"writer":""', b'"writer":"","layers":null', False),
+    "layers are empty": (b'"writer":""', b'"writer":"","layers":[]', True),
+    "one empty layer": (b'"writer":""', b'"writer":"","layers":[0]', True),
+    "a layer of minus one": (b'"writer":""', b'"writer":"","layers":[1,-1]', False),
+    "a layer with a point": (b'"writer":""', b'"writer":"","layers":[0.0]', False),
+    "nine layers": (b'"writer":""', b'"writer":"","layers":[0,0,0,0,0,0,0,0,0]', False),
+    "a list too short": (b'"solid":[0.0,0.0,0.0]', b'"solid":[0.0,0.0]', False),
+    "an object for a list": (b'"solid":[0.0,0.0,0.0]', b'"solid":{"length":3}', False),
+    "64 levels": (b'"writer":""', b'"writer":"","x":' + b"[" * 63 + b"]" * 63, True),
+    "65 levels": (b'"writer":""', b'"writer":"","x":' + b"[" * 64 + b"]" * 64, False),
+    "65 levels of objects": (b'"writer":""', b'"writer":"","x":' + b'{"a":' * 64 + b"0" + b"}" * 64, False),
+    "escapes": (b'"writer":""', rb'"writer":"\"\\\/\b\f\n\r\t\u00e9\uD83D\ude00"', True),
+    "unknown escape": (b'"writer":""', rb'"writer":"\x41"', False),
+    "short escape": (b'"writer":""', rb'"writer":"\u00e"', False),
+    "half of a pair": (b'"writer":""', rb'"writer":"\ud83d"', True),
+    "half of a pair for a choice": (b'"scale_rule":"sum"', rb'"scale_rule":"\ud83d"', False),
+    "escaped choice": (b'"scale_rule":"sum"', rb'"scale_rule":"\u0073um"', True),
+    "line end in text": (b'"writer":""', b'"writer":"\n"', False),
+    "delete in text": (b'"writer":""', b'"writer":"\x7f"', True),
+    "line separator in text": (b'"writer":""', '"writer":"\u2028"'.encode(), True),
+    "text without end": (b'"writer":""', b'"writer":"\\"', False),
+    "no UTF-8": (b'"writer":""', b'"writer":"\xff"', False),
+    "surrogate in UTF-8": (b'"writer":""', b'"writer":"\xed\xa0\x80"', False),
+    "overlong UTF-8": (b'"writer":""', b'"writer":"\xc0\x80"', False),
+    "byte order mark": (b'{"gauss', b'\xef\xbb\xbf{"gauss', False),
+    "blanks": (b'"writer":""', b' \t\r\n"writer" \t\r\n: \t\r\n"" \t\r\n', True),
+    "blank of another kind": (b'"writer":""', b'\f"writer":""', False),
+    "blank that does not break": (b'"writer":""', b'\xc2\xa0"writer":""', False),
+    "comma at the end": (b'"writer":""', b'"writer":"",', False),
+    "comma at the end of a list": (b'"writer":""', b'"writer":"","x":[1,]', False),
+    "two commas": (b'"writer":""', b'"writer":"",,"x":1', False),
+    "quotes of another kind": (b'"writer":""', b"'writer':''", False),
+    "comment": (b'"writer":""', b'"writer":""/**/', False),
+    "leading zero": (b'"writer":""', b'"writer":"","x":01', False),
+    "plus": (b'"writer":""', b'"writer":"","x":+1', False),
+    "point first": (b'"writer":""', b'"writer":"","x":.5', False),
+    "point last": (b'"writer":""', b'"writer":"","x":1.', False),
+    "exponent without digits": (b'"writer":""', b'"writer":"","x":1e', False),
+    "hexadecimal": (b'"writer":""', b'"writer":"","x":0x1', False),
+    "words in capitals": (b'"writer":""', b'"writer":"","x":True', False),
+    "words run together": (b'"writer":""', b'"writer":"","x":truefalse', False),
+    "undefined": (b'"writer":""', b'"writer":"","x":undefined', False),
+    "text after the end": (b'"writer":""}', b'"writer":""}}', False),
+    "zero after the end": (b'"writer":""}', b'"writer":""}\0', False),
+    "no object": (b"{", b"[{", False),
+}
+
+
+def test_metadata_is_read_as_strictly():
+    meta = metadata(0)
+    payloads = plain(meta)
+    valid = text_of(meta)
+    files = {}
+    for name, (old, new, _) in JSON_CASES.items():
+        assert old in valid, name
+        files[name] = with_text(valid.replace(old, new, 1), payloads, shapes_of(meta))
+    files["empty"] = with_text(b"", payloads, shapes_of(meta))
+    files["not an object"] = with_text(b"7", payloads, shapes_of(meta))
+
+    accepted, _ = check_alike(files)
+
+    assert accepted == [name for name, (_, _, is_valid) in JSON_CASES.items() if is_valid]
+
+
+def deflated(
+    text: bytes, level: int = 9, wbits: int = 15, strategy: int = 0, flush: int = 0, words: bytes = b""
+) -> bytes:
+    """A zlib stream in two halves, with this kind of end between them."""
+    make = zlib.compressobj(level, zlib.DEFLATED, wbits, 8, strategy, *((words,) if words else ()))
+    middle = len(text) // 2
+    return make.compress(text[:middle]) + make.flush(flush) + make.compress(text[middle:]) + make.flush()
+
+
+def test_deflated_metadata_is_unpacked_as_strictly():
+    meta = metadata(0, {"why": "because " * 40, "letters": bytes(range(32, 127)).decode()})
+    payloads, shapes, text = plain(meta), shapes_of(meta), text_of(meta)
+
+    def packed(stream: bytes) -> bytes:
+        return with_text(text, payloads, shapes, stream)
+
+    streams = {
+        f"level {level}, window {wbits}, strategy {strategy}": deflated(text, level, wbits, strategy, zlib.Z_FULL_FLUSH)
+        for level in (0, 1, 9)
+        for wbits in (9, 15)
+        for strategy in (zlib.Z_DEFAULT_STRATEGY, zlib.Z_HUFFMAN_ONLY, zlib.Z_RLE, zlib.Z_FIXED)
+    }
+    valid = list(streams)
+    good = streams[valid[-1]]
+    streams |= {"byte after it": good + b"\0", "cut": good[:-1], "checksum": good[:-1] + bytes([good[-1] ^ 1])}
+    streams |= {"no header": deflated(text, wbits=-15), "gzip": deflated(text, wbits=31)}
+    streams |= {"dictionary": deflated(text, words=b"because"), "another text": deflated(text + b" ")}
+    streams |= {"shorter text": deflated(text[:-1]), "bomb": deflated(text + b" " * 10_000_000)}
+    rng = Random(1)
+    for number in range(400):
+        damaged = bytearray(streams[rng.choice(valid)])
+        damaged[rng.randrange(min(len(damaged), rng.choice((4, 60, 10_000))))] ^= 1 << rng.randrange(8)
+        streams[f"damaged {number}"] = bytes(damaged)
+
+    accepted, _ = check_alike({name: with_text(text, payloads, shapes, data) for name, data in streams.items()})
+
+    assert accepted[: len(valid)] == valid and len(accepted) < len(valid) + 40
+
+
+def tokens_in_lanes(tokens: np.ndarray, lanes_log2: int) -> bytes:
+    """A stream of small integers in so many lanes, as rANS allows it and the format may not."""
+    lanes, alphabet = rans_lanes.Lanes(len(tokens), 1 << lanes_log2), int(tokens.max()) + 1
+    selector, counts, segments = rans_lanes.Selector(None, np.zeros(alphabet, np.uint8), 1), np.zeros((1, alphabet)), []
+    counts = counts.astype(np.int64)
+    for start, stop in update_steps(lanes.steps):
+        segments.append((start, stop, adaptive_frequencies(counts)))
+        counts += rans_lanes.count_tokens(tokens, selector, lanes, start, stop, counts.shape)
+    states, words = rans_lanes.encode_lanes(tokens, selector, lanes, segments)
+    return bytes((lanes_log2, alphabet)) + states.astype("<u4").tobytes() + words.astype("<u2").tobytes()
+
+
+def opacities_of(stream: bytes, classes: np.ndarray, steps: bytes = b"\x40") -> bytes:
+    """A file whose opacities are a channel with this stream."""
+    meta = metadata(len(classes))
+    points = lattice(np.zeros(len(classes), np.int64), 1, [1] * 16, classes)
+    payload = struct.pack("<fBIB", 0.5, 16, len(stream), len(steps)) + steps + stream
+    return file_of(meta, plain(meta) | {"POSI": (6, points), "OPAC": (7, payload)})
+
+
+def test_streams_may_have_no_more_lanes_and_no_longer_ones_than_allowed():
+    few, many = np.array([0, 1, 2, 1, 0], np.uint8), np.zeros(65537, np.uint8)
+    many[7] = 1
+    files = {f"{log2} lanes": opacities_of(tokens_in_lanes(few, log2), np.zeros(5, np.uint8)) for log2 in (0, 13, 14)}
+    files |= {
+        f"{count} tokens": opacities_of(tokens_in_lanes(many[:count], 0), np.zeros(count, np.uint8))
+        for count in (65536, 65537)
+    }
+
+    assert check_alike(files) == (["0 lanes", "13 lanes", "65536 tokens"], ["14 lanes", "65537 tokens"])
+
+
+def test_single_numbers_out_of_range_are_refused():
+    """One defect a file, and nothing else wrong with it; beside it what is just within the range."""
+    zeros, classes = np.zeros(8, np.int64), np.arange(8).astype(np.uint8) % 2
+    largest = 1 + 2**-10
+    files = {}
+    for step in (0, 1):
+        name = "beyond" if step else "good"
+        basis = np.eye(3, dtype="<f4")
+        basis[0, 0] = np.nextafter(np.float32(largest), np.float32(2)) if step else largest
+        meta = metadata(8)
+        points = {"POSI": (6, lattice(zeros, 1, [1] * 16, classes))}
+        flat = channel(zeros, classes, b"\x40\x40", 0.5, 0)
+        files[f"{name} basis"] = file_of(meta, plain(meta) | points | {"COLO": (7, basis.tobytes() + 3 * flat)})
+        files[f"{name} step sizes"] = opacities_of(
+            encode_integers(zeros, classes, signed=True), classes, bytes(2 - step)
+        )
+        large = zeros + (step << 32) * (classes == 1)  # 0 in the lower 32 bits, and folded too
+        files[f"{name} difference"] = opacities_of(encode_integers(large, classes, signed=True), classes, b"\x40\x40")
+        base = 1 - step
+        files[f"{name} base"] = file_of(meta, plain(meta) | {"POSI": (6, lattice(zeros, base, [base], 0 * classes))})
+        one = metadata(1)
+        tail = struct.pack("<BBII", 1, 1, 3, 4) + b"\2" + 7 * b"\0" + bytes([step << 3])
+        files[f"{name} bits left over"] = file_of(one, plain(one) | {"POSI": (6, tail)})
+        words = struct.pack("<BBH", 1, 1, 1 - step) + bytes(2 - 2 * step) + struct.pack("<Q", 26)
+        empty = metadata(0)
+        none = words + struct.pack("<QQIIBB", 0, 0, 0, 0, 1, 2)
+        files[f"{name} codewords"] = file_of(empty, plain(empty) | {"OPAC": (3, none)})
+        unused = struct.pack("<BBH", 1, 1, 2) + b"\0\0" + struct.pack("<e", np.inf if step else 1.0)
+        stream = huffman_encode(np.zeros(8, np.uint8)).to_bytes()
+        unused += struct.pack("<Q", len(stream)) + stream
+        files[f"{name} codeword"] = file_of(meta, plain(meta) | {"OPAC": (3, unused)})
+        chunks = bytearray(huffman_encode((np.arange(1500) % 3).astype(np.uint8)).to_bytes())
+        at = 26 + chunks[16] + chunks[16] - 1
+        first, second = struct.unpack_from("<HH", chunks, at)
+        struct.pack_into("<HH", chunks, at, first + step, second - step)
+        long = metadata(1500)
+        files[f"{name} chunk"] = file_of(long, plain(long) | {"OPAC": (4, struct.pack("<ffB", 0, 1, 2) + chunks)})
+
+    accepted, refused = check_alike(files)
+
+    assert [name.split()[0] for name in (*accepted, *refused)] == ["good"] * len(accepted) + ["beyond"] * len(refused)
+    assert len(accepted) == len(refused)
+
+
+def test_every_file_of_the_corpus_gets_the_same_verdict():
+    _, refused = check_alike({file.stem: file.read_bytes() for file in CORPUS})
+
+    assert len(refused) > 50
+
+
+def test_what_sections_may_decode_to_is_bounded():
+    """At the bound POSI is found empty; a Gaussian more is refused before it is looked at."""
+    empty = dict.fromkeys(("POSI", "COLO", "SCAL", "OPAC"), (1, b""))
+    payloads = plain(metadata(0)) | empty
+
+    def file_and_slack(count: int) -> tuple[bytes, int]:
+        data = file_of(metadata(count), payloads)
+        raw = sum(entry.raw_length for entry in read_container(data, SECTIONS, fraction=0).entries.values())
+        return data, FREE + 1024 * len(data) - raw
+
+    count = 8_000_000
+    count += file_and_slack(count)[1] // 32
+    files = [file_and_slack(count + step)[0] for step in (0, 1)]
+    at, beyond = in_javascript([(data, False) for data in files])
+
+    assert at.refused.startswith("Section 'POSI'") and "'POSI'" in in_python(files[0]).refused
+    assert "say they decode to" in beyond.refused and "say they decode to" in in_python(files[1]).refused
+
+
+def test_what_is_not_there_may_promise_anything():
+    meta = metadata(1 << 39) | {"layers": [0, 1 << 39]}
+    tags = {layer_section(group, 1): 1 << 39 for group in LAYERED}
+    parts = disassemble(file_of(metadata(0), plain(metadata(0))))
+    parts[0] = Part(b"META", 0, 1, text_of(meta), len(text_of(meta)))
+    parts += [Part(tag.encode(), 1, 1, b"12345678", 4 * (3, 3, 1, 1)[k] << 39) for k, tag in enumerate(tags)]
+    data = assemble(parts)
+
+    assert check_alike({"start": data[:-32]}, cut=True) == (["start"], [])
+    assert check_alike({"whole": data}) == ([], ["whole"])
+
+
+def test_hostile_files_get_the_same_verdict():
+    tally = compare(range(100_000, 100_800), seed=3)
+
+    assert not tally.failures
+    assert set(tally.kinds) == set(KINDS) and tally.accepted.total() > 20
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_file_of_a_kilobyte_takes_no_time(name):
+    data = SMALL[name]()
+    assert len(data) < 3000
+
+    (verdict,) = in_javascript([(data, False)])
+
+    assert bool(verdict.refused) == bool(in_python(data).refused)
+    assert verdict.seconds < 0.5 and not verdict.failed
+
+
+@pytest.mark.parametrize("make", [most_gaussians, largest_tables], ids=lambda make: make.__name__)
+def test_a_kilobyte_that_is_worth_all_that_the_format_allows_is_read_in_bounded_memory(make):
+    (verdict,) = in_javascript([(make(), False)])
+
+    assert verdict.groups and verdict.seconds < 10
+    assert verdict.peak < 4 * FREE
+
+
+def test_a_section_that_promises_nothing_and_an_unknown_one_change_nothing():
+    raw = encode_model(made_up_model(2, 5), "raw")
+    files = {"optional": assemble([*disassemble(raw), Part(b"NEW_", 99, 0, b"abc", 0)])}
+    files["required"] = assemble([*disassemble(raw), Part(b"NEW_", 99, 1, b"abc", 0)])
+
+    assert check_alike(files) == (["optional"], ["required"])

@@ -1,0 +1,118 @@
+"""The fields in JavaScript say what the model says in float64."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from web.scripts import run_script
+
+import hyrfpack
+from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
+from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.ops.background.reference import RADIUS
+from hyrfpack.ops.contraction import contract
+from hyrfpack.ops.shade import encode_directions
+from hyrfpack.splats.splats import normalized_quats
+
+EVALUATE = Path(__file__).parent / "evaluate.mjs"
+SMALL = HashGridConfig(log2_table_size=6, levels=3, base=3, finest=12)
+LARGE = HashGridConfig(log2_table_size=14, levels=16, base=16, finest=512)
+ONE_LEVEL = HashGridConfig(log2_table_size=4, levels=1, base=2, finest=2)
+# What was measured is 1e-7: one rounding of sums in float64. Only numbers near 0 are farther off, by as little.
+EXACT = {"rtol": 2e-7, "atol": 1e-7}
+
+
+def random_model(count: int, seed: int = 3, **settings: object) -> HybridModel:
+    """A model with loud fields; Gaussians inside the frame's box, outside and far away, and at its centre."""
+    generator = torch.Generator().manual_seed(seed)
+    frame = Frame((10.0, -3.0, 0.5), 2.5, (1.0, 0.5, 0.25))
+    config = ModelConfig(**{"frame": frame, "geometry": SMALL, "radiance": LARGE, "hidden": 19, **settings})
+
+    def normal(width: int, spread: float = 1.0) -> torch.Tensor:
+        return torch.randn(count, width, generator=generator) * spread
+
+    positions = normal(3) * torch.logspace(-2, 4, count)[:, None]
+    positions[:1] = 0
+    model = HybridModel(config, Gaussians(positions, normal(3), normal(1), normal(1)), generator)
+    with torch.no_grad():
+        for parameter in (*model.geometry.parameters(), *model.radiance.parameters()):
+            parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.4)
+    return model
+
+
+def directions(count: int, seed: int) -> np.ndarray:
+    values = np.random.default_rng(seed).normal(size=(count, 3))
+    values /= np.linalg.norm(values, axis=1, keepdims=True)
+    values[:1] = 0, 0, 1
+    return values.astype(np.float32)
+
+
+def in_float64(model: HybridModel, along: np.ndarray, places: np.ndarray, behind: np.ndarray) -> list[np.ndarray]:
+    """What the script writes, by the model itself."""
+    model = model.double()
+    along, places, behind = (torch.from_numpy(values).double() for values in (along, places, behind))
+    coding = model.config.direction_encoding
+    with torch.no_grad():
+        geometry, coords = model.decode_geometry(), model.cube_coords(model.gaussians.positions)
+        colors = torch.sigmoid(model.radiance(coords, encode_directions(along, coding)) + model.gaussians.color_logits)
+        sphere = contract(model.config.frame.normalize(places))
+        background = torch.sigmoid(model.radiance(sphere, encode_directions(behind, coding)))
+    quats = geometry.quats / geometry.quats.norm(dim=1, keepdim=True)
+    return [part.numpy() for part in (geometry.opacities, geometry.scales, quats, colors, background)]
+
+
+def evaluated(model: HybridModel, tmp_path: Path, *inputs: np.ndarray) -> list[np.ndarray]:
+    count, sphere = len(model), len(inputs[-1])
+    hyrfpack.save(model, tmp_path / "model.hyrf", profile="raw")
+    (tmp_path / "inputs").write_bytes(b"".join(values.astype("<f4").tobytes() for values in inputs))
+    run_script(EVALUATE, tmp_path / "model.hyrf", tmp_path / "inputs", tmp_path / "outputs")
+    numbers = np.fromfile(tmp_path / "outputs", "<f4")
+    parts = np.split(numbers, np.cumsum([count, 3 * count, 4 * count, 3 * count]))
+    shapes = (count,), (count, 3), (count, 4), (count, 3), (sphere, 3)
+    return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"direction_encoding": "sh", "scale_rule": "product"},
+        {"geometry": LARGE, "radiance": SMALL, "hidden": 64, "scale_grows": False},
+        {"geometry": ONE_LEVEL, "radiance": ONE_LEVEL, "hidden": 1},
+    ],
+    ids=["frequency", "sh", "wide", "smallest"],
+)
+def test_fields_are_those_of_the_model_in_float64(settings: dict, tmp_path: Path) -> None:
+    model = random_model(700, **settings)
+    along, behind = directions(700, 1), directions(300, 2)
+    places = (RADIUS * directions(300, 5)).astype(np.float32)
+
+    found = evaluated(model, tmp_path, along, places, behind)
+
+    for values, expected in zip(found, in_float64(model, along, places, behind), strict=True):
+        np.testing.assert_allclose(values, expected, **EXACT)
+
+
+def test_a_model_of_no_gaussians_has_fields_all_the_same(tmp_path: Path) -> None:
+    model, behind = random_model(0), directions(5, 2)
+    places = (RADIUS * behind).astype(np.float32)
+
+    *gaussians, background = evaluated(model, tmp_path, directions(0, 1), places, behind)
+
+    assert [part.size for part in gaussians] == [0, 0, 0, 0]
+    expected = in_float64(model, directions(0, 1), places, behind)[-1]
+    np.testing.assert_allclose(background, expected, **EXACT)
+
+
+def test_a_rotation_that_the_field_takes_to_nothing_is_no_rotation(tmp_path: Path) -> None:
+    model = random_model(4)
+    with torch.no_grad():
+        model.geometry.weights[-1].zero_()
+        model.geometry.biases[-1].copy_(torch.tensor([0.0, 0, 0, 0, -1, 0, 0, 0]))
+
+    quats = evaluated(model, tmp_path, directions(4, 1), directions(1, 2), directions(1, 2))[2]
+
+    np.testing.assert_array_equal(quats, normalized_quats(np.zeros((4, 4))))

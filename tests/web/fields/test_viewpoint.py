@@ -1,0 +1,123 @@
+"""From where the page shows a model: as Python does, and whatever a file says of its photos."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scenes import ball_scene, camera_at, ring, small_model, view_of
+from web.scripts import run_script
+
+import hyrfpack
+from hyrfpack.cameras.capture import provenance_of
+from hyrfpack.cameras.files import camera_from_json, camera_to_json
+from hyrfpack.export.pages import PAGE_CAMERAS
+from hyrfpack.export.source import Source
+from hyrfpack.model import Frame
+from hyrfpack.scene import Camera, Scene, evenly_spaced
+
+SCRIPT = Path(__file__).parent / "viewpoints.mjs"
+FRAME = Frame((40.0, -3.0, 7.0), 2.5, (1.0, 0.5, 0.25))
+
+
+def metadata(provenance: Any, **frame: Any) -> dict:
+    numbers = {"center": list(FRAME.center), "scale": FRAME.scale, "half_extent": list(FRAME.half_extent)}
+    return {"provenance": provenance, "config": {"frame": {**numbers, **frame}}}
+
+
+def viewpoints(tmp_path: Path, all_metadata: list[dict]) -> list[dict]:
+    file = tmp_path / "metadata.json"
+    file.write_text(json.dumps(all_metadata))
+    return run_script(SCRIPT, file)
+
+
+def photographed(cameras: list[Camera]) -> dict:
+    """The provenance of a model trained on photos from there."""
+    scene = ball_scene(2)
+    views = [view_of(f"{k}.png", camera, scene.train[0].load()) for k, camera in enumerate(cameras)]
+    parts = {"points": scene.points, "point_colors": scene.point_colors}
+    return json.loads(json.dumps(provenance_of(Scene("made", "colmap", views, [], **parts))))
+
+
+def drone(count: int) -> list[Camera]:
+    """Cameras that look straight down and are turned against each other."""
+    turns = [(math.cos(a), math.sin(a), 0) for a in 2 * np.pi * np.arange(count) / count]
+    return [camera_at((0.1 * k, 0, 9), (0.1 * k, 0, 0), up) for k, up in enumerate(turns)]
+
+
+GOOD = {
+    "nothing": {},
+    "ring": photographed(ring(40, width=80, height=60)),
+    "few": photographed(ring(3)),
+    "one": photographed([camera_at((0, -3, 1))]),
+    "drone": photographed(drone(14)),
+    "cameras alone": {"cameras": photographed(ring(30))["cameras"]},
+    "viewpoint alone": {"viewpoint": photographed(ring(30))["viewpoint"]},
+    "viewpoint of an arc": {"viewpoint": photographed([camera_at((3, 0.1 * k, 1)) for k in range(7)])["viewpoint"]},
+}
+
+
+def json_of(cameras: list[Camera]) -> np.ndarray:
+    return numbers_of([camera_to_json(camera) for camera in cameras])
+
+
+def numbers_of(cameras: list[dict]) -> np.ndarray:
+    order = ("width", "height", "fx", "fy", "cx", "cy")
+    return np.array([[*(item[key] for key in order), *np.ravel(item["camera_from_world"])] for item in cameras])
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_the_page_is_shown_from_where_python_shows_it(name: str, tmp_path: Path) -> None:
+    file = tmp_path / "model.hyrf"
+    hyrfpack.save(small_model([[0, 0, 0]], frame=FRAME), file, provenance=GOOD[name])
+    read = Source.read(file)
+    cameras = [camera for _, camera in read.cameras] or [camera for camera, _ in read.measured]
+
+    (found,) = viewpoints(tmp_path, [metadata(GOOD[name])])
+
+    close = {"rtol": 1e-9, "atol": 1e-9}
+    np.testing.assert_allclose(numbers_of(found["cameras"]), json_of(evenly_spaced(cameras, PAGE_CAMERAS)), **close)
+    np.testing.assert_allclose(found["up"], read.up, **close)
+    np.testing.assert_allclose(found["target"], read.center, **close)
+    assert found["madeUp"] is (not read.cameras)
+    if found["madeUp"]:
+        np.testing.assert_allclose(numbers_of(found["fitted"]), json_of(read.fitted), **close)
+    else:
+        np.testing.assert_allclose(numbers_of(found["fitted"]), json_of(evenly_spaced(cameras, 48)), **close)
+
+
+def spoiled() -> list[Any]:
+    """Provenances of which each number, list or key is wrong in turn."""
+    row, view = GOOD["few"]["cameras"][0], GOOD["few"]["viewpoint"]
+    wrong = [None, "<b>", [], {}, True, 1e308, -1e300, 0, [[[1]]], "1", 2**53]
+    made: list[Any] = [None, 7, [], "text", {"cameras": 3}, {"viewpoint": 3}, {"cameras": {"length": 3}}]
+    for value in wrong:
+        made += [{"cameras": value}, {"viewpoint": value}, {"cameras": [value]}]
+        for place in range(len(row)):
+            made.append({"cameras": [row, [*row[:place], value, *row[place + 1 :]]]})
+        for key in view:
+            made.append({"viewpoint": {**view, key: value}})
+            made.append({"viewpoint": {other: view[other] for other in view if other != key}})
+            if isinstance(view[key], list):
+                for place in range(len(view[key])):
+                    changed = copy.deepcopy(view)
+                    changed[key][place] = value
+                    made.append({"viewpoint": changed})
+    return made
+
+
+def test_whatever_a_provenance_says_there_is_a_place_to_look_from(tmp_path: Path) -> None:
+    cases = [metadata(provenance) for provenance in spoiled()]
+    frames = [{"center": [1e308, 0, 0]}, {"scale": 1e308}, {"scale": 5e-324}, {"center": [1e37, 1e37, -1e37]}]
+    cases += [metadata(provenance, **frame) for frame in frames for provenance in ({}, GOOD["ring"])]
+
+    for found in viewpoints(tmp_path, cases):
+        assert found["cameras"] and found["fitted"]
+        for item in (*found["cameras"], *found["fitted"]):
+            camera_from_json(item)  # which refuses all that is not a camera
+        assert math.isclose(math.hypot(*found["up"]), 1, rel_tol=1e-9) and np.isfinite(found["target"]).all()

@@ -1,0 +1,314 @@
+"""A Firefox without a screen, driven by its Marionette protocol over a local socket: no Python package is needed.
+
+Its own headless mode has no WebGL, so it runs on a display of memory (Debian's `xvfb`) and draws in software.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import os
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+NAMES = ("firefox-esr", "firefox")
+PREFERENCES = {
+    "marionette.port": 0,  # any free one; the browser writes into its profile which it took
+    "app.update.enabled": False,
+    "app.normandy.enabled": False,
+    "browser.shell.checkDefaultBrowser": False,
+    "browser.startup.homepage_override.mstone": "ignore",
+    "browser.tabs.remote.autostart": True,
+    "datareporting.policy.dataSubmissionEnabled": False,
+    "dom.disable_open_during_load": False,
+    "dom.events.testing.asyncClipboard": True,  # scripts may write to the clipboard without a click
+    "extensions.update.enabled": False,
+    "full-screen-api.allow-trusted-requests-only": False,
+    "network.captive-portal-service.enabled": False,
+    "network.connectivity-service.enabled": False,
+    "network.proxy.type": 0,
+    "remote.prefs.recommended": True,
+    "security.fileuri.strict_origin_policy": False,  # as Chromium, which lets a page of a file make workers of blobs
+    "toolkit.telemetry.enabled": False,
+    "webgl.force-enabled": True,
+    "webgl.disable-fail-if-major-performance-caveat": True,
+}
+SECONDS = 60.0  # that an answer may take
+KEYS = {
+    "Shift": "\ue008", "Enter": "\ue007", "Escape": "\ue00c", "Tab": "\ue004", "ArrowLeft": "\ue012",
+    "ArrowUp": "\ue013", "ArrowRight": "\ue014", "ArrowDown": "\ue015", "Space": " ",
+}  # fmt: skip
+
+
+def find() -> str | None:
+    """The program, None where it or the display that it needs is missing."""
+    return next(filter(None, map(shutil.which, NAMES)), None) if shutil.which("Xvfb") else None
+
+
+def _display() -> tuple[subprocess.Popen, int]:
+    """A display of memory, and its number."""
+    reads, writes = os.pipe()
+    command = ["Xvfb", "-displayfd", str(writes), "-screen", "0", "1600x1200x24", "-nolisten", "tcp"]
+    process = subprocess.Popen(command, pass_fds=(writes,), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    os.close(writes)
+    with os.fdopen(reads) as answer:
+        return process, int(answer.readline())
+
+
+def _script_address(script: str) -> str:
+    return "data:text/javascript;base64," + base64.b64encode(script.encode()).decode()
+
+
+class Firefox:
+    """A browser with one page, with the same methods as `Chromium`.
+
+    Args:
+        profile: an empty folder for it.
+        preferences: further ones, or other values of those above.
+    """
+
+    name = "firefox"
+
+    def __init__(self, profile: Path, **preferences: bool | int | str) -> None:
+        told = {**PREFERENCES, **{name.replace("__", "."): value for name, value in preferences.items()}}
+        lines = (f"user_pref({json.dumps(name)}, {json.dumps(value)});\n" for name, value in told.items())
+        (profile / "user.js").write_text("".join(lines))
+        self._fingers: list[tuple[float, float]] = []
+        self._number = 0
+        self._received = b""
+        program = find()
+        assert program
+        self._display, number = _display()
+        environment = {"HOME": str(profile), "DISPLAY": f":{number}", "LIBGL_ALWAYS_SOFTWARE": "1"}
+        self._process = subprocess.Popen(
+            [program, "--no-remote", "--marionette", "--remote-allow-system-access", "--profile", profile],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, **environment, "MOZ_CRASHREPORTER_DISABLE": "1"},
+        )
+        try:
+            self._socket = self._connect(profile / "MarionetteActivePort")
+            self._receive()  # its greeting
+            self.call("WebDriver:NewSession", strictFileInteractability=False)
+            self._listen()
+            self.call("WebDriver:SetTimeouts", script=int(SECONDS * 1000), pageLoad=int(SECONDS * 1000))
+        except BaseException:
+            self._process.kill()
+            self._display.kill()
+            raise
+
+    def __enter__(self) -> Firefox:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        with contextlib.suppress(OSError, TimeoutError, RuntimeError):
+            self.call("Marionette:Quit", flags=["eForceQuit"])
+        self._socket.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(10)
+        for process in (self._process, self._display):
+            process.kill()
+            process.wait()
+
+    def _connect(self, file: Path) -> socket.socket:
+        ends = time.monotonic() + SECONDS
+        while time.monotonic() < ends and self._process.poll() is None:
+            with contextlib.suppress(OSError, ValueError):
+                return socket.create_connection(("127.0.0.1", int(file.read_text())), timeout=SECONDS)
+            time.sleep(0.05)
+        raise TimeoutError("Firefox opens no port to be driven by")
+
+    # ---- the protocol: messages are JSON with their length before them
+
+    def call(self, method: str, **arguments: Any) -> Any:
+        """One command of the protocol and its answer."""
+        self._number += 1
+        message = json.dumps([0, self._number, method, arguments]).encode()
+        self._socket.sendall(b"%d:%b" % (len(message), message))
+        while True:
+            _, number, error, result = self._receive()
+            if number != self._number:
+                continue
+            if error is not None:
+                raise RuntimeError(f"{method}: {error['message']}")
+            return result
+
+    def _receive(self) -> Any:
+        while b":" not in self._received:
+            self._more()
+        length, _, self._received = self._received.partition(b":")
+        while len(self._received) < int(length):
+            self._more()
+        message, self._received = self._received[: int(length)], self._received[int(length) :]
+        return json.loads(message)
+
+    def _more(self) -> None:
+        data = self._socket.recv(1 << 20)
+        if not data:
+            raise RuntimeError("the browser has ended")
+        self._received += data
+
+    def _privileged(self, script: str, *arguments: Any) -> Any:
+        """What a function body in the browser's own window returns."""
+        self.call("Marionette:SetContext", value="chrome")
+        try:
+            return self.call("WebDriver:ExecuteScript", script=script, args=arguments)["value"]
+        finally:
+            self.call("Marionette:SetContext", value="content")
+
+    def _listen(self) -> None:
+        """Have pages' console.error and console.warn, which stay in their processes, told to the browser's window."""
+        script = (
+            "{const tell = ({ wrappedJSObject: { level, arguments: said } }) => {"
+            '  if (level === "error" || level === "warn") sendAsyncMessage("said", said.map(String).join(" "));'
+            "};"
+            'const storage = Cc["@mozilla.org/consoleAPI-storage;1"].getService(Ci.nsIConsoleAPIStorage);'
+            "storage.addLogEventListener(tell, Services.scriptSecurityManager.getSystemPrincipal());"
+            'addEventListener("unload", () => storage.removeLogEventListener(tell));}'
+        )
+        self._privileged(
+            'window.said = []; const frames = window.getGroupMessageManager("browsers");'
+            'frames.addMessageListener("said", ({ data }) => window.said.push(data));'
+            "frames.loadFrameScript(arguments[0], true);",
+            _script_address(script),
+        )
+
+    # ---- as `Chromium` has it
+
+    def open(self, address: str) -> None:
+        """Go to an address and wait until its document is there."""
+        self.call("WebDriver:Navigate", url="about:blank")  # else a mere change of #... loads nothing
+        self._privileged("Services.console.reset(); window.said = [];")
+        self.call("WebDriver:Navigate", url=address)
+
+    def evaluate(self, expression: str) -> Any:
+        """The value of JavaScript; a promise's when it is fulfilled. Raises RuntimeError with what it throws."""
+        script = (
+            "const done = arguments[0];"
+            "(async () => {return (" + expression + "\n);})()"
+            ".then((value) => done({value}), (error) => done({error: String(error)}));"
+        )
+        answer = self.call("WebDriver:ExecuteAsyncScript", script=script, args=[])["value"]
+        if "error" in answer:
+            raise RuntimeError(answer["error"])
+        return answer.get("value")
+
+    def resize(self, width: int, height: int, *, dense: float = 1.0, phone: bool = False) -> None:
+        """Give the window a size in CSS pixels."""
+        self._privileged(
+            "const [width, height, dense, phone] = arguments, browser = gBrowser.selectedBrowser;"
+            "for (const [name, value] of Object.entries({width, height})) {"
+            '  for (const prefix of ["", "min-", "max-"]) browser.style.setProperty(prefix + name, value + "px");'
+            "}"
+            "const context = browser.browsingContext;"
+            "context.inRDMPane = true;"
+            "context.overrideDPPX = dense;"
+            'context.touchEventsOverride = phone ? "enabled" : "disabled";'
+            # 1: coarse; 2 | 4: fine, hovers
+            'for (const which of ["primary", "all"]) {'
+            "  Services.prefs.setIntPref(`ui.${which}PointerCapabilities`, phone ? 1 : 6);"
+            "}",
+            width, height, dense, phone,
+        )  # fmt: skip
+        ends = time.monotonic() + 5
+        while self.evaluate("[innerWidth, innerHeight]") != [width, height] and time.monotonic() < ends:
+            time.sleep(0.02)
+
+    def _act(self, *sources: dict) -> None:
+        self.call("WebDriver:PerformActions", actions=list(sources))
+
+    def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
+        """A mouse event: mousePressed, mouseReleased, mouseMoved or mouseWheel."""
+        place = {"x": x, "y": y, "duration": 0, "origin": "viewport"}
+        if kind == "mouseWheel":
+            by = {"deltaX": more["deltaX"], "deltaY": more["deltaY"]}
+            self._act({"type": "wheel", "id": "wheel", "actions": [{"type": "scroll", **place, **by}]})
+            return
+        actions: list[dict] = [{"type": "pointerMove", **place}]
+        if kind != "mouseMoved":
+            number = {"left": 0, "middle": 1, "right": 2}[more.get("button", "left")]
+            actions.append(
+                {"type": {"mousePressed": "pointerDown", "mouseReleased": "pointerUp"}[kind], "button": number}
+            )
+        self._act({"type": "pointer", "id": "mouse", "parameters": {"pointerType": "mouse"}, "actions": actions})
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], button: str = "left", steps: int = 4) -> None:
+        """Drag from one place to another."""
+        self.mouse("mousePressed", *start, button=button)
+        for step in range(1, steps + 1):
+            self.mouse("mouseMoved", *(a + (b - a) * step / steps for a, b in zip(start, end, strict=True)))
+        self.mouse("mouseReleased", *end, button=button)
+
+    def touch(self, kind: str, *points: tuple[float, float]) -> None:
+        """A touch event: touchStart, touchMove or touchEnd, with all fingers that are down."""
+        sources = []
+        for number in range(max(len(points), len(self._fingers))):
+            actions: list[dict] = []
+            if number < len(points):
+                x, y = points[number]
+                actions.append({"type": "pointerMove", "x": x, "y": y, "duration": 0, "origin": "viewport"})
+                if number >= len(self._fingers):
+                    actions.append({"type": "pointerDown", "button": 0})
+            else:
+                actions.append({"type": "pointerUp", "button": 0})
+            finger = {"type": "pointer", "id": f"finger {number}", "parameters": {"pointerType": "touch"}}
+            sources.append({**finger, "actions": actions})
+        self._fingers = list(points)
+        self._act(*sources)
+
+    def prefer(self, scheme: str = "light", *, less_motion: bool = False) -> None:
+        """What the person's system asks of pages: a colour scheme, and movement or not."""
+        self._privileged(
+            'Services.prefs.setIntPref("layout.css.prefers-color-scheme.content-override", arguments[0]);'
+            'Services.prefs.setIntPref("ui.prefersReducedMotion", arguments[1]);',
+            ["dark", "light"].index(scheme), int(less_motion),
+        )  # fmt: skip
+
+    def press(self, key: str, seconds: float = 0.0, *, shift: bool = False) -> None:
+        """Press a key, letter or name, for so long."""
+        values = [*([KEYS["Shift"]] if shift else []), KEYS.get(key, key)]
+        for kind in ("keyDown", "keyUp"):
+            actions = [{"type": kind, "value": value} for value in values[:: 1 if kind == "keyDown" else -1]]
+            self._act({"type": "key", "id": "keys", "actions": actions})
+            time.sleep(seconds if kind == "keyDown" else 0)
+
+    @contextlib.contextmanager
+    def before_every_page(self, script: str) -> Iterator[None]:
+        """Inside, a script runs before those of the pages that are opened; its names are its own."""
+        text = (
+            "{let on = true;"
+            f'addMessageListener("forget {self._number}", () => {{ on = false; }});'
+            'addEventListener("DOMWindowCreated", ({ target }) => {'
+            "  const page = target.defaultView;"
+            "  const inside = new Cu.Sandbox(page, {sandboxPrototype: page, wantXrays: false});"
+            f"  if (on) Cu.evalInSandbox({json.dumps(script)}, inside);"
+            "});}"
+        )
+        address, forget = _script_address(text), f"forget {self._number}"
+        frames = 'const frames = window.getGroupMessageManager("browsers");'
+        self._privileged(f"{frames} frames.loadFrameScript(arguments[0], true)", address)
+        try:
+            yield
+        finally:
+            remove = "frames.removeDelayedFrameScript(arguments[0]); frames.broadcastAsyncMessage(arguments[1]);"
+            self._privileged(frames + remove, address, forget)
+
+    def screenshot(self) -> bytes:
+        """PNG of the window."""
+        return base64.b64decode(self.call("WebDriver:TakeScreenshot", full=False)["value"])
+
+    def complaints(self) -> list[str]:
+        """What the page has complained about since it was opened: errors, refused loads, exceptions."""
+        self.evaluate("new Promise((done) => setTimeout(done, 50))")  # what came before this has arrived
+        return self._privileged(
+            "const found = Services.console.getMessageArray().filter((message) =>"
+            "  message instanceof Ci.nsIScriptError && message.innerWindowID && !(message.flags & 1));"
+            "return [...found.map(({ errorMessage }) => errorMessage), ...window.said];"
+        )

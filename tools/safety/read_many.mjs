@@ -1,0 +1,57 @@
+// Read many files with the decoder in JavaScript, for tools/safety/fuzz_browser.py and the tests.
+//
+//   node read_many.mjs FILES
+//
+// FILES: for each file u32 length, u8 1 if its start will do, its bytes. Printed is a line of JSON for each, with the
+// milliseconds of processor time that it took: {ms, layers, whole, groups, peak} with a hash of each group's float32
+// numbers and the most bytes of memory up to then, {ms, refused} with the sentence, or {ms, failed} with an error that
+// should not be.
+import { createHash } from "node:crypto";
+import { readFileSync } from "node:fs";
+
+import { HyrfFormatError, read } from "../../hyrfpack/web/hyrf/index.js";
+
+const hashOf = (numbers) => {
+  if (!(numbers instanceof Float32Array)) throw new Error("no Float32Array");
+  const bytes = new Uint8Array(numbers.buffer, numbers.byteOffset, numbers.byteLength);
+  return createHash("sha256").update(bytes).digest("hex");
+};
+
+// Of this program alone: what `resourceUsage` tells may be that of the one that started it.
+const peakBytes = () => {
+  try {
+    return 1024 * Number(/VmHWM:\s+(\d+) kB/.exec(readFileSync("/proc/self/status", "utf8"))[1]);
+  } catch {
+    return 1024 * process.resourceUsage().maxRSS; // not Linux
+  }
+};
+
+const verdictOn = async (bytes, partial) => {
+  const start = process.cpuUsage();
+  const spent = () => {
+    const { user, system } = process.cpuUsage(start);
+    return (user + system) / 1000;
+  };
+  try {
+    const { layers, whole, positions, colorLogits, scaleLogits, opacityLogits, geometry, radiance } = await read(
+      bytes, { partial },
+    );
+    const ms = spent();
+    const numbers = { POSI: positions, COLO: colorLogits, SCAL: scaleLogits, OPAC: opacityLogits };
+    Object.assign(numbers, { GTAB: geometry.table, GMLP: geometry.decoder });
+    Object.assign(numbers, { RTAB: radiance.table, RMLP: radiance.decoder });
+    const groups = Object.fromEntries(Object.entries(numbers).map(([group, array]) => [group, hashOf(array)]));
+    return { ms, layers, whole, groups, peak: peakBytes() };
+  } catch (error) {
+    const ms = spent();
+    return error instanceof HyrfFormatError ? { ms, refused: error.message } : { ms, failed: String(error.stack) };
+  }
+};
+
+const all = readFileSync(process.argv[2]);
+for (let at = 0; at < all.length; ) {
+  const length = all.readUInt32LE(at), partial = all[at + 4] === 1;
+  const bytes = new Uint8Array(all.subarray(at + 5, at + 5 + length));
+  console.log(JSON.stringify(await verdictOn(bytes, partial)));
+  at += 5 + length;
+}
