@@ -1,0 +1,62 @@
+// Bytes out of compressed ones, by the browser's own decompressors, and never more of them than asked for.
+
+import { refuseSplats } from "./checked.js";
+
+/**
+ * Unpacks a stream as far as asked.
+ * @param {Uint8Array} bytes
+ * @param {"gzip" | "deflate-raw" | "zstd"} how
+ */
+export class Unpacker {
+  constructor(bytes, how) {
+    let stream;
+    try {
+      stream = new DecompressionStream(how);
+    } catch {
+      refuseSplats(`it is packed by ${how}, which this browser cannot unpack; export it in another format or version`);
+    }
+    this.how = how;
+    this.reader = new Blob([bytes]).stream().pipeThrough(stream).getReader();
+    this.rest = new Uint8Array(0); // unpacked, not yet taken
+  }
+
+  /**
+   * The next bytes: so many, or fewer where the stream ends.
+   * @param {number} length
+   * @returns {Promise<Uint8Array>}
+   */
+  async take(length) {
+    const taken = new Uint8Array(length);
+    let filled = 0;
+    for (;;) {
+      const piece = this.rest.subarray(0, length - filled);
+      taken.set(piece, filled);
+      this.rest = this.rest.subarray(piece.length);
+      filled += piece.length;
+      if (filled === length || !(await this.more())) return taken.subarray(0, filled);
+    }
+  }
+
+  /**
+   * Whether there is another byte.
+   * @returns {Promise<boolean>}
+   */
+  async more() {
+    while (!this.rest.length) {
+      let next;
+      try {
+        next = await this.reader.read();
+      } catch {
+        refuseSplats(`a stream of ${this.how} in it is damaged or truncated; fetch or export it again`);
+      }
+      if (next.done) return false;
+      this.rest = next.value;
+    }
+    return true;
+  }
+
+  /** Unpack no more. */
+  close() {
+    this.reader.cancel().catch(() => {});
+  }
+}
