@@ -24,6 +24,8 @@ def public_functions() -> Iterator[tuple[str, object]]:
     for name in hyrfpack.__all__:
         if inspect.isfunction(getattr(hyrfpack, name)):
             yield f"hyrfpack.{name}", getattr(hyrfpack, name)
+    for name in ("gallery", "player"):
+        yield f"hyrfpack.export.{name}", getattr(hyrfpack.export, name)
     modules = [importlib.import_module(f"hyrfpack.ops.{name}") for name in OPERATIONS]
     operations = {f"{m.__name__}.{name}": value for m in modules for name, value in vars(m).items()}
     coders = {f"{quant.__name__}.{name}": getattr(quant, name) for name in quant.__all__}

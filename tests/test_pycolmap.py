@@ -39,7 +39,7 @@ CALLS = {
     "export .ply": "hyrfpack.export('model.hyrf', 'a.ply', data=scene)",
     "export .sog": "hyrfpack.export('model.hyrf', 'a.sog', data=scene)",
     "export .html": "hyrfpack.export('model.hyrf', 'a.html', data=scene)",
-    "export COLMAP": "hyrfpack.export('model.hyrf', 'colmap', data=scene)",
+    "export COLMAP": "hyrfpack.export('model.hyrf', 'colmap', data=scene, colmap=True)",
     "bench": "hyrfpack.bench('model.hyrf', scene, repeats=1, only=['codec'])",
     "distill": "hyrfpack.export('model.hyrf', 'a.ply', data=scene, background=False)\n"
     "hyrfpack.distill('a.ply', 'a.hyrf', hyrfpack.DistillConfig(1, 10, 16, 4, 2))",

@@ -30,8 +30,5 @@ def demo(output: Path, steps: int, overwrite: bool, as_json: bool) -> None:
         print_json(result.to_dict())
         return
     click.echo("\n".join(result.table()))
-    page = result.page
-    click.echo(
-        f"{page.file}: the scene in a browser; {page.bytes:,} bytes, {page.photos_file:.2f} dB on the held-out photos"
-    )
+    click.echo(f"{result.page.file}: the scene in a browser; {result.page.bytes:,} bytes")
     click.echo(f"{result.picture}: photos, renders and errors of held-out views")

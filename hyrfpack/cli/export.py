@@ -20,6 +20,7 @@ from hyrfpack.cli.common import (
     scene_options,
     table,
 )
+from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -43,20 +44,33 @@ class _Box(click.ParamType):
         return numbers
 
 
-degree_option = click.option(
-    "--sh-degree",
-    "degree",
-    type=click.IntRange(0, 3),
-    default=3,
-    show_default=True,
-    help="Of the spherical harmonics: how finely colour follows the direction. A .splat has 0.",
-)
+class _Degree(click.ParamType):
+    """A degree of spherical harmonics, or the word for choosing one."""
+
+    name = "degree"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int | None:
+        if value == "auto":
+            return None
+        if str(value) not in ("0", "1", "2", "3"):
+            self.fail(f"'{value}' is neither 0, 1, 2 or 3 nor auto", param, ctx)
+        return int(str(value))
 
 
 @click.command(short_help="Write a model for other programs.")
-@click.argument("model", type=PATH)
+@click.argument("models", metavar="[MODEL]...", type=PATH, nargs=-1)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="What to write; its ending says how.")
-@degree_option
+@click.option("--baked", is_flag=True, help="Let a .html hold splats, as other formats do, instead of the model.")
+@click.option("--colmap", is_flag=True, help="Write a folder as a COLMAP model: cameras, and centres as points.")
+@click.option(
+    "--sh-degree",
+    "degree",
+    type=_Degree(),
+    default="auto",
+    show_default=True,
+    metavar="0-3|auto",
+    help="Of the spherical harmonics: how finely colour follows the direction. A .splat has 0.",
+)
 @click.option(
     "--crop",
     type=_Box(),
@@ -68,21 +82,27 @@ degree_option = click.option(
 )
 @click.option("--background/--no-background", default=True, help="Take the background along.  [default: do]")
 @click.option(
-    "--data", type=PATH, help="Photos of the scene: for a file that keeps no cameras, and to score held-out ones."
+    "--data",
+    type=PATH,
+    multiple=True,
+    help="Photos of the scene: for a file that keeps no cameras, and to score held-out ones. For a gallery, once for "
+    "each MODEL.",
 )
 @click.option("--spz-version", type=click.Choice(["3", "4"]), default="3", show_default=True, help="Of .spz files.")
 @overwrite_option
 @scene_options
 @json_option
 def export(
-    model: Path,
+    models: tuple[Path, ...],
     output: Path,
-    degree: int,
+    baked: bool,
+    colmap: bool,
+    degree: int | None,
     crop: tuple[float, ...] | None,
     min_opacity: float,
     background: bool,
     spz_version: str,
-    data: Path | None,
+    data: tuple[Path, ...],
     overwrite: bool,
     reading: dict[str, Any],
     as_json: bool,
@@ -91,37 +111,66 @@ def export(
 
     \b
     The ending of -o is the format:
+      .html                                           a page that plays the model itself in any browser
+      a folder                                        the player and the model, for a web server
       .ply .splat .spz .sog .glb .usda .usdc .usdz    3D Gaussians with spherical harmonics
-      .html                                           a page that shows the scene in any browser
       .points.ply .points.glb                         centres as points, cameras as frusta
-      .json, or a folder                              cameras: transforms.json, or a COLMAP model
+      .json, or a folder with --colmap                cameras: transforms.json, or a COLMAP model
 
-    Everything stays in the axes and units of the photos' poses.
+    Several models, and a folder, make a gallery; no model, a player of whatever is dropped on it. Files of splats
+    (.ply .spz .splat .sog) can be played from a folder, too. Everything stays in the axes and units of the photos'
+    poses.
 
     \b
     Examples:
       hyrfpack export bonsai.hyrf -o bonsai.html
+      hyrfpack export bonsai.hyrf -o player/
+      hyrfpack export bonsai.hyrf room.hyrf -o gallery/
       hyrfpack export runs/bonsai/model.hyrf -o bonsai.spz --sh-degree 2
       hyrfpack export bonsai.hyrf -o bonsai.ply --data photos/bonsai --min-opacity 0.02
       hyrfpack export bonsai.hyrf -o table.glb --crop -1,-1,-1,1,1,1
     """
     from hyrfpack.export import export as write
-    from hyrfpack.export.kinds import check_place
+    from hyrfpack.export.folder import check_folder, gallery, player
+    from hyrfpack.export.kinds import PLAYER, check_place, check_request, kind_of
     from hyrfpack.format import describe
+    from hyrfpack.splats.files import READ
 
-    scene = None if data is None else read_scene(data, reading, describe(model))
-    check_place(output, Outputs(model, scene=scene, overwrite=overwrite))
-    report = write(
-        model,
-        output,
-        degree=degree,
-        data=scene,
-        crop=crop,
-        min_opacity=min_opacity,
-        background=background,
-        spz_version=int(spz_version),
-        say=note,
-    )
+    kind = kind_of(output, colmap)
+    if len(models) != 1 and kind is not PLAYER:
+        what = "there is no MODEL to write" if not models else "several models make a gallery, which is a folder"
+        raise HyrfError(f"{output}: {what}; name one MODEL")
+    splats = [model for model in models if model.suffix.lower() in READ]
+    if splats and kind is not PLAYER:
+        raise HyrfError(
+            f"{splats[0]}: files of splats are played from a folder (-o player/); 'hyrfpack import' makes a .hyrf file"
+        )
+    if splats and data:
+        raise HyrfError(f"{splats[0]}: photos go with .hyrf files only; leave out --data, or this file")
+    if data and len(data) != len(models):
+        raise HyrfError(f"--data is given {len(data)} times, for {len(models)} models; give it once for each, or not")
+    check_request(kind, output, degree, crop, min_opacity, background, baked)
+    scenes = [read_scene(path, reading, describe(model)) for path, model in zip(data, models, strict=False)]
+    if kind is PLAYER:
+        check_folder(output, models, scenes, overwrite=overwrite, listed=len(models) > 1)
+    else:
+        check_place(output, Outputs(*models, scene=scenes[0] if scenes else None, overwrite=overwrite), colmap)
+    if len(models) != 1:
+        report = gallery(models, output, data=scenes, say=note) if models else player(None, output)
+    else:
+        report = write(
+            *models,
+            output,
+            degree=degree,
+            data=scenes[0] if scenes else None,
+            crop=crop,
+            min_opacity=min_opacity,
+            background=background,
+            spz_version=int(spz_version),
+            baked=baked,
+            colmap=colmap,
+            say=note,
+        )
     if as_json:
         print_json(asdict(report))
         return
@@ -129,6 +178,11 @@ def export(
 
 
 def _print(report: ExportReport) -> None:
+    if report.native:
+        click.echo(
+            f"{report.file}: {report.bytes:,} bytes, {report.gaussians:,} Gaussians, as they are: nothing is baked"
+        )
+        return
     if report.views:
         rows = [[f"degree {degree}", f"{score:.2f}"] for degree, score in report.by_degree.items()]
         rows.append([f"the file, degree {report.degree}", f"{report.psnr:.2f}"])

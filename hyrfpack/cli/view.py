@@ -7,25 +7,28 @@ from pathlib import Path
 import click
 
 from hyrfpack.cli.common import PATH, note
-from hyrfpack.cli.export import degree_option
 
 
 @click.command(short_help="Look at a model in a browser.")
 @click.argument("model", type=PATH)
-@degree_option
 @click.option("--port", type=click.IntRange(0, 65535), default=0, show_default="a free one", help="Port to serve at.")
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to serve at; 0.0.0.0 lets others look.")
 @click.option("--no-browser", is_flag=True, help="Only print the address.")
-def view(model: Path, degree: int, port: int, host: str, no_browser: bool) -> None:
-    """Look at MODEL, a .hyrf file, in a browser: what 'hyrfpack export' writes as .html, served until Ctrl-C.
+def view(model: Path, port: int, host: str, no_browser: bool) -> None:
+    """Look at MODEL, a .hyrf file or one of splats (.ply .spz .splat .sog), in a browser, until Ctrl-C.
+
+    The file is served as it is, beside the player that 'hyrfpack export' writes into a folder; of a large one, the
+    first layer is seen while the rest comes in.
 
     \b
     Examples:
       hyrfpack view bonsai.hyrf
       hyrfpack view bonsai.hyrf --port 8000 --no-browser
     """
-    from hyrfpack.export.pipeline import page_of
-    from hyrfpack.web.serve import serve
+    from hyrfpack.web.view import view as serve_view
 
-    note("making the page; press Ctrl-C to end")
-    serve(lambda: page_of(model, degree), host=host, port=port, open_browser=not no_browser, say=click.echo)
+    def say(address: str) -> None:
+        note("press Ctrl-C to end")
+        click.echo(address)
+
+    serve_view(model, host=host, port=port, open_browser=not no_browser, say=say)

@@ -73,7 +73,7 @@ class DemoResult:
         frames_per_second: one over the median time to render a held-out view from the compact file.
         profiles: raw, paper, compact.
         picture: path of the picture that shows it.
-        page: what the page that shows it in a browser takes, and how like the compact file it looks.
+        page: what the page takes that holds the compact file and plays it in a browser.
     """
 
     steps: int
@@ -85,14 +85,15 @@ class DemoResult:
     page: ExportReport
 
     def table(self) -> list[str]:
-        """The profiles as lines of aligned text, then the speed."""
+        """The profiles as lines of aligned text, then the speed, and what the page takes."""
         lines = ["profile  PSNR (dB)    SSIM       bytes  compress (s)  decompress (s)"]
         for p in self.profiles:
             there = "-" if p.compress_seconds is None else f"{p.compress_seconds:.2f}"
             back = f"{p.decompress_seconds:.2f}"
             lines.append(f"{p.profile:<7}  {p.psnr:9.2f}  {p.ssim:.4f}  {p.bytes:10,}  {there:>12}  {back:>14}")
         rate = self.steps / self.train_seconds
-        return [*lines, f"{rate:.0f} training steps/s, {self.frames_per_second:.0f} rendered frames/s"]
+        speed = f"{rate:.0f} training steps/s, {self.frames_per_second:.0f} rendered frames/s"
+        return [*lines, speed, f"{self.page.bytes:,} bytes: a web page with the compact file and its player inside"]
 
     def to_dict(self) -> dict:
         """Plain numbers, strings, lists and dictionaries, ready for JSON."""
@@ -110,8 +111,8 @@ def run_demo(
     """Make a scene, train on it, compress, decompress, render, score, export, and draw one picture of it.
 
     Leaves in `folder`: `scene/` (photos and poses), `run/` (the training), `paper.hyrf`, `compact.hyrf`, `back.hyrf`
-    (compact.hyrf decompressed), `renders/` (held-out views from compact.hyrf), `demo.html` (compact.hyrf in a browser)
-    and `demo.png`. Earlier results are replaced.
+    (compact.hyrf decompressed), `renders/` (held-out views from compact.hyrf), `demo.html` (compact.hyrf in a page that
+    plays it) and `demo.png`. Earlier results are replaced.
 
     Args:
         folder: made if missing.

@@ -1,5 +1,7 @@
 """Models for other programs: baked to explicit Gaussians, written in their formats, and shown in a browser."""
 
-from hyrfpack.export.pipeline import ExportReport, export
+from hyrfpack.export.folder import gallery, player
+from hyrfpack.export.pipeline import export
+from hyrfpack.export.report import ExportReport
 
-__all__ = ["ExportReport", "export"]
+__all__ = ["ExportReport", "export", "gallery", "player"]

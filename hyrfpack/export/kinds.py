@@ -26,17 +26,25 @@ POINTS = (
     Kind(ending=".points.glb", degree=0, package=("trimesh", "trimesh")),
 )
 COLMAP = Kind(ending="", degree=0, package=("pycolmap", "pycolmap"))  # a folder
+PLAYER = Kind(ending="")  # the same
 _KINDS = {kind.ending: kind for kind in (*POINTS, *FORMATS.values(), PAGE, TRANSFORMS)}
 ENDINGS = tuple(_KINDS)
 
 
-def kind_of(target: str | os.PathLike[str]) -> Kind:
-    """What the ending, one of ENDINGS, says is to be written; COLMAP for a folder or a name without ending.
+def kind_of(target: str | os.PathLike[str], colmap: bool = False) -> Kind:
+    """What the ending, one of ENDINGS, says is to be written; for a folder or a name without ending a player.
+
+    Args:
+        colmap: into a folder, a COLMAP model instead.
 
     Raises:
         HyrfError: it is none of them.
     """
     name = Path(target).name.lower()
+    if colmap:
+        if name.endswith(ENDINGS) and not os.path.isdir(target):
+            raise HyrfError(f"{target}: a COLMAP model is a folder of tables; name one without ending for --colmap")
+        return COLMAP
     if name.endswith(".compressed.ply"):
         raise HyrfError(
             f"{target}: compressed PLY is read, not written; .sog and .spz are small, .ply is not compressed"
@@ -45,17 +53,23 @@ def kind_of(target: str | os.PathLike[str]) -> Kind:
         if name.endswith(ending):
             return kind
     if os.path.isdir(target) or not Path(name).suffix:
-        return COLMAP
+        return PLAYER
     raise HyrfError(
-        f"{target}: the ending names the format; end it in one of {', '.join(ENDINGS)}, or name a folder for COLMAP"
+        f"{target}: the ending names the format; end it in one of {', '.join(ENDINGS)}, or name a folder for a player"
     )
 
 
 def check_request(
-    kind: Kind, target: str | os.PathLike[str], degree: int, crop: Sequence[float] | None, min_opacity: float
+    kind: Kind,
+    target: str | os.PathLike[str],
+    degree: int | None = None,
+    crop: Sequence[float] | None = None,
+    min_opacity: float = 0.0,
+    background: bool = True,
+    baked: bool = False,
 ) -> None:
     """Refuse what would fail later on: see `export`. Raises HyrfError."""
-    if degree not in range(MAX_DEGREE + 1):
+    if degree is not None and degree not in range(MAX_DEGREE + 1):
         raise HyrfError(f"spherical harmonics of degree {degree} are not known; name 0 to {MAX_DEGREE}")
     if crop is not None and (np.shape(crop) != (6,) or np.isnan(crop).any()):
         raise HyrfError(f"the crop {crop} is not a box; name the least x, y, z, then the greatest, in world units")
@@ -65,15 +79,29 @@ def check_request(
         raise HyrfError(
             f"{target}: this holds cameras only, and --crop and --min-opacity choose Gaussians; leave them out"
         )
+    if baked and kind is PLAYER:
+        raise HyrfError(f"{target}: a player's folder holds the model file itself; for --baked name a file .html")
+    asked = {
+        "--sh-degree": degree is not None,
+        "--crop": crop is not None,
+        "--min-opacity": min_opacity > 0,
+        "--no-background": not background,
+    }
+    if any(asked.values()) and (kind is PLAYER or (kind is PAGE and not baked)):
+        names = " and ".join(name for name, given in asked.items() if given)
+        raise HyrfError(
+            f"{target}: the model goes along whole, and {names} would change it; leave it out, or write splats into a "
+            "page with --baked"
+        )
     if kind.package:
         module, package = kind.package
         with needs_package(package, f"{target}: writing this format"):
             import_module(module)
 
 
-def check_place(target: str | os.PathLike[str], outputs: Outputs) -> None:
-    """Refuse a target that may not or cannot be written. Raises HyrfError."""
-    if kind_of(target) is COLMAP:
+def check_place(target: str | os.PathLike[str], outputs: Outputs, colmap: bool = False) -> None:
+    """Refuse a target, no player's folder, that may not or cannot be written. Raises HyrfError."""
+    if kind_of(target, colmap) is COLMAP:
         outputs.folder(target, COLMAP_FILES)
     else:
         outputs.file(target)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +16,12 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.export.background import background_picture, background_splats
 from hyrfpack.export.bake import bake
 from hyrfpack.export.cameras import encode_transforms, write_colmap
+from hyrfpack.export.degree import choose_degree
+from hyrfpack.export.folder import player
 from hyrfpack.export.kinds import (
     COLMAP,
+    PAGE,
+    PLAYER,
     POINTS,
     TRANSFORMS,
     check_model,
@@ -27,64 +31,34 @@ from hyrfpack.export.kinds import (
     kind_of,
 )
 from hyrfpack.export.measure import Likeness, likeness
+from hyrfpack.export.pages import baked_page, write_native_page
 from hyrfpack.export.points import encode_points
+from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
 from hyrfpack.outputs import Outputs
-from hyrfpack.render import RenderSettings
-from hyrfpack.scene import Scene, evenly_spaced
+from hyrfpack.scene import Scene
 from hyrfpack.splats.formats.hints import Hints
-from hyrfpack.splats.harmonics import MAX_DEGREE
 from hyrfpack.splats.splats import Splats, concatenate
 from hyrfpack.splats.table import FORMATS, Format, Kind
-from hyrfpack.web.html import decode_page, encode_page
+from hyrfpack.web.html import decode_page
 
-PAGE_CAMERAS = 12  # that a page can be stepped through
 COARSE = 1.0  # dB of PSNR against photos that a format may cost before something is said about it
 
 Say = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class ExportReport:
-    """What an export came to. PSNR in dB, means over views.
-
-    Attributes:
-        file: what was written.
-        bytes: on disk.
-        gaussians: in the file, those of the background included; 0 where it is one of cameras.
-        background: how many of these make the background.
-        degree: of the spherical harmonics in the file.
-        views: how many views the loss was measured at; 0 where it was not.
-        by_degree: PSNR of the baked model's pictures against the model's own, by degree, before anything is rounded
-            to what the file holds.
-        psnr: PSNR of the file's pictures, as read back from its bytes, against the model's own.
-        photos_model, photos_file: PSNR of the model's and of the file's pictures against held-out photos, if given.
-        cameras: in the file, where it is one of points or cameras.
-    """
-
-    file: str
-    bytes: int
-    gaussians: int = 0
-    background: int = 0
-    degree: int = 0
-    views: int = 0
-    by_degree: dict[int, float] = field(default_factory=dict)
-    psnr: float | None = None
-    photos_model: float | None = None
-    photos_file: float | None = None
-    cameras: int = 0
 
 
 def export(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
     *,
-    degree: int = MAX_DEGREE,
+    degree: int | None = None,
     data: Scene | None = None,
     crop: Sequence[float] | None = None,
     min_opacity: float = 0.0,
     background: bool = True,
     spz_version: int = 3,
+    baked: bool = False,
+    colmap: bool = False,
     say: Say = lambda sentence: None,
 ) -> ExportReport:
     """Write a `.hyrf` model as what other programs read, in its own axes and units, and measure what was lost.
@@ -92,16 +66,18 @@ def export(
     The ending of `target` names the format:
 
     - .ply, .splat, .spz, .glb, .usda, .usdc, .usdz, .sog: 3D Gaussians with spherical harmonics;
-    - .html: a page that shows the scene in any browser, by itself;
+    - .html: a page that shows the scene in any browser, by itself, with the `.hyrf` file inside; no ending: a folder
+      with a player and the file, for a web server (see `hyrfpack.export.player`);
     - .points.ply, .points.glb: the Gaussians' centres as coloured points, and the cameras as frusta;
-    - .json: the cameras as a transforms.json; no ending: a folder with cameras and points as a COLMAP model.
+    - .json: the cameras as a transforms.json.
 
-    Nothing is measured where a part of the scene was cropped, or only points or cameras were written.
+    Nothing is measured where a part of the scene was cropped, only points or cameras were written, or the model itself.
 
     Args:
         source: the model.
-        target: the file, or for COLMAP the folder, to write.
-        degree: of the spherical harmonics, 0 to 3; ".splat" has 0.
+        target: the file, or the folder, to write.
+        degree: of the spherical harmonics, 0 to 3; ".splat" has 0. None for the lowest one that looks as good as any
+            at cameras that are kept back for the purpose, and are not those that the result is measured at.
         data: photos of the scene: colours are fitted where they were taken from, the held-out ones are scored. Without
             them the cameras that the file keeps serve, or else rings of them around the scene.
         crop: (min x, min y, min z, max x, max y, max z) in world units; Gaussians whose centres lie outside, and the
@@ -109,6 +85,8 @@ def export(
         min_opacity: fainter Gaussians are left out.
         background: whether the model's background goes along.
         spz_version: of ".spz", 3 (which all programs read) or 4.
+        baked: a page holds splats instead of the model.
+        colmap: write cameras and points into a folder, as a COLMAP model.
         say: told what is going on.
 
     Raises:
@@ -123,10 +101,14 @@ def export(
     """
     if data is not None:
         check_type("data", data, Scene)
-    kind = kind_of(target)
-    check_request(kind, target, degree, crop, min_opacity)
-    check_place(target, Outputs(source, scene=data, overwrite=True))
+    kind = kind_of(target, colmap)
+    check_request(kind, target, degree, crop, min_opacity, background, baked)
+    if kind is PLAYER:
+        return player(source, target, data=data, say=say)
+    check_place(target, Outputs(source, scene=data, overwrite=True), colmap)
     read = Source.read(source, data)
+    if kind is PAGE and not baked:
+        return write_native_page(read, source, target, say)
     if kind in (TRANSFORMS, COLMAP) and not read.cameras:
         raise HyrfError(f"{source}: it keeps no cameras; export them from the file that training wrote, or name --data")
     if kind is TRANSFORMS:
@@ -134,20 +116,34 @@ def export(
     points = kind in (COLMAP, *POINTS)
     sphere = background and crop is None and read.model.config.background and not points
     check_model(read, kind, crop, min_opacity, sphere)
-    degree = min(degree, kind.degree)
-    places = (
+    places = f"{len(read.fitted)} " + (
         "cameras" if read.cameras else "places around the scene, for the file keeps no cameras (--data names photos)"
     )
-    say(f"fitting colours of degree {degree} at {len(read.fitted)} {places}")
+    highest = kind.degree if degree is None else min(degree, kind.degree)
+    chosen_by: dict[int, float] = {}
+    if degree is None and highest:
+        say(f"choosing the degree of the colours among {places}")
+        degree, chosen_by = choose_degree(read.model, read.fitted, highest)
+        say(f"degree {degree} it is: {_listed(chosen_by)}, for degrees 0 to {highest} against the model")
+    else:
+        degree = highest
+    say(f"fitting colours of degree {degree} at {places}")
     if points:
         return _export_points(read, kind, target, chosen(bake(read.model, read.fitted, (0,))[0], crop, min_opacity))
-    degrees = (degree,) if crop is not None else range(degree + 1)
-    baked = {d: chosen(splats, crop, min_opacity) for d, splats in bake(read.model, read.fitted, degrees).items()}
-    say(f"writing {len(baked[degree]):,} Gaussians{' and the background' if sphere else ''}")
-    what = read, baked, degree, sphere, Path(target)
+    degrees = (degree,) if crop is not None else range(highest + 1)
+    bakes = {d: chosen(splats, crop, min_opacity) for d, splats in bake(read.model, read.fitted, degrees).items()}
+    say(f"writing {len(bakes[degree]):,} Gaussians{' and the background' if sphere else ''}")
+    what = read, bakes, degree, sphere, Path(target)
     packed = _pack_splats(*what, kind, spz_version) if isinstance(kind, Format) else _pack_page(*what)
     write_atomic(target, packed.data)
-    report = ExportReport(str(target), len(packed.data), len(packed.before[degree][0]), packed.background, degree)
+    report = ExportReport(
+        str(target),
+        len(packed.data),
+        len(packed.before[degree][0]),
+        background=packed.background,
+        degree=degree,
+        chosen_by=chosen_by,
+    )
     if crop is not None:
         say("nothing is measured, for a part of the scene was cropped")
         return report
@@ -173,7 +169,7 @@ class _Packed:
 
 def _pack_page(read: Source, baked: dict[int, Splats], degree: int, sphere: bool, target: Path) -> _Packed:
     picture = background_picture(read.model) if sphere else None
-    data = page(read, baked[degree], picture, target.stem)
+    data = baked_page(read, baked[degree], picture, target.stem)
     before = {d: (splats, picture) for d, splats in baked.items()}
     return _Packed(data, before, decode_page(data, str(target)))
 
@@ -256,34 +252,5 @@ def _export_points(read: Source, kind: Kind, target: str | os.PathLike[str], spl
     return ExportReport(str(target), len(data), len(splats), cameras=len(read.cameras))
 
 
-def page_of(source: str | os.PathLike[str], degree: int = MAX_DEGREE) -> bytes:
-    """The page that shows a `.hyrf` model in a browser, as `export` writes it to .html.
-
-    Raises:
-        HyrfError: the file cannot be read.
-    """
-    read = Source.read(source)
-    picture = background_picture(read.model) if read.model.config.background else None
-    return page(read, bake(read.model, read.fitted, (degree,))[degree], picture, Path(source).stem)
-
-
-def page(read: Source, splats: Splats, picture: np.ndarray | None, title: str) -> bytes:
-    """The page that shows splats of a model.
-
-    Args:
-        read: the model.
-        splats: what it was baked to.
-        picture: (H, 2H, 3) its background, see `background_picture`; None for its solid colour.
-        title: of the page.
-    """
-    cameras = [camera for _, camera in read.cameras] or [camera for camera, _ in read.measured]
-    return encode_page(
-        splats,
-        title=title,
-        cameras=evenly_spaced(cameras, PAGE_CAMERAS),
-        up=read.up,
-        center=read.center,
-        background=picture,
-        solid=read.model.config.solid,
-        near=RenderSettings().near * read.model.config.frame.scale,
-    )
+def _listed(scores: dict[int, float]) -> str:
+    return ", ".join(f"{score:.2f}" for score in scores.values()) + " dB"

@@ -251,7 +251,7 @@ def test_demo_ends_with_a_table_and_a_picture(tmp_path):
         )
     )
     json.dumps(result.to_dict(), allow_nan=False)
-    assert len(result.table()) == 5
+    assert len(result.table()) == 6
 
 
 # -- what users get wrong --------------------------------------------------------------------------------------------

@@ -130,8 +130,14 @@ def _cases() -> list[Case]:
         Case("decompress packed.hyrf -o {}", "old/a.hyrf", REFUSED, REPLACED),
         Case("render model.hyrf --orbit 1 -o {}", "old/pictures", REFUSED, REPLACED),
         Case("evaluate model.hyrf --data hall --pictures {}", "old/pictures", REFUSED, REPLACED),
-        *(Case("export model.hyrf --sh-degree 0 -o {}", f"old/a{ending}", REFUSED, REPLACED) for ending in KINDS),
-        Case("export model.hyrf -o {}", "old/colmap", REFUSED, REPLACED),
+        *(
+            Case("export model.hyrf --baked --sh-degree 0 -o {}", f"old/a{ending}", REFUSED, REPLACED)
+            for ending in KINDS
+        ),
+        Case("export model.hyrf -o {}", "old/a.html", REFUSED, REPLACED),
+        Case("export model.hyrf --colmap -o {}", "old/colmap", REFUSED, REPLACED),
+        Case("export model.hyrf -o {}", "old/player", REFUSED, REPLACED),
+        Case("export model.hyrf named.json -o {}", "old/gallery", REFUSED, REPLACED),
         Case("import ball.ply --steps 1 --size 16 -o {}", "old/a.hyrf", REFUSED, REPLACED),
         Case("bench model.hyrf -o {}", "old/a.png", REFUSED, WRITTEN),
         Case("bench model.hyrf -o new.png --json {}", "old/a.json", REFUSED, WRITTEN),
@@ -142,7 +148,9 @@ def _cases() -> list[Case]:
         Case("render model.hyrf --orbit 1 -o {}", "hall/images", REFUSED, REPLACED),
         Case("render model.hyrf --orbit 1 -o {}", "blender", REFUSED, WRITTEN),
         Case("evaluate model.hyrf --data hall --pictures {}", "nerfstudio/images", REFUSED, REPLACED),
-        Case("export model.hyrf -o {}", "hall", REFUSED, REPLACED),
+        Case("export model.hyrf --colmap -o {}", "hall", REFUSED, REPLACED),
+        Case("export model.hyrf -o {}", "hall", REFUSED, WRITTEN),
+        Case("export model.hyrf packed.hyrf -o {}", "hall", REFUSED, WRITTEN),
         Case("compress packed.hyrf -o {} --profile paper", "hall/small.hyrf", REFUSED, WRITTEN),
         Case("decompress packed.hyrf -o {}", "nerfstudio/images/back.hyrf", REFUSED, WRITTEN),
         Case("export model.hyrf --sh-degree 0 -o {}", "blender/train/a.ply", REFUSED, WRITTEN),
@@ -241,7 +249,8 @@ def _make_foreign(folder: Path, photo: str) -> None:
 
     scored = f"{Path(photo).stem}.png"
     names = [f"a{ending}" for ending in (".hyrf", ".png", ".json", ".md", *KINDS)]
-    names += ["colmap/sparse/0/cameras.bin", "pictures/0000.png", f"pictures/{scored}", f"report/{FILES[0]}"]
+    names += ["colmap/sparse/0/cameras.bin", "player/index.html", "gallery/index.html"]
+    names += ["pictures/0000.png", f"pictures/{scored}", f"report/{FILES[0]}"]
     for path in (*(f"old/{name}" for name in names), f"old/demo/{DEMO[0]}", "run/metrics.json"):
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_bytes(b"of another program")

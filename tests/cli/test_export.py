@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import re
@@ -36,7 +37,7 @@ def model(tmp_path_factory):
 
 
 def test_export_says_what_it_does_and_prints_what_was_lost(model, tmp_path):
-    result = succeeded("export", model, "-o", tmp_path / "a.ply")
+    result = succeeded("export", model, "-o", tmp_path / "a.ply", "--sh-degree", 3)
     size, splats = (tmp_path / "a.ply").stat().st_size, read_splats(tmp_path / "a.ply")
     rows = re.findall(r"^(degree \d|the file, degree \d) +(\d+\.\d\d)$", result.stdout, re.MULTILINE)
     assert [name for name, _ in rows] == ["degree 0", "degree 1", "degree 2", "degree 3", "the file, degree 3"]
@@ -59,7 +60,7 @@ def test_identical_pictures_are_json_too(tmp_path):
     provenance = {"cameras": kept_cameras(ring(1))}
     save(small_model([[0, 0, 0]], opacity_logits=-80.0), tmp_path / "unseen.hyrf", provenance=provenance)
     report = json.loads(succeeded("export", tmp_path / "unseen.hyrf", "-o", tmp_path / "a.ply", "--json").stdout)
-    assert report["psnr"] == report["by_degree"]["3"] == 100
+    assert report["psnr"] == report["by_degree"]["3"] == report["chosen_by"]["3"] == 100
 
 
 def test_photos_are_scored_if_given(model, data, tmp_path):
@@ -80,7 +81,43 @@ def test_options_choose_what_is_written(model, tmp_path):
 def test_cameras_and_points_are_counted(model, tmp_path):
     assert succeeded("export", model, "-o", tmp_path / "a.json").stdout.endswith(" bytes, 4 cameras\n")
     assert succeeded("export", model, "-o", tmp_path / "a.points.ply").stdout.endswith(" 40 Gaussians, 4 cameras\n")
-    assert succeeded("export", model, "-o", tmp_path / "colmap").stdout.endswith(" bytes, 4 cameras\n")
+    assert succeeded("export", model, "-o", tmp_path / "colmap", "--colmap").stdout.endswith(" bytes, 4 cameras\n")
+
+
+def test_the_degree_is_chosen_and_the_choice_is_told(model, tmp_path):
+    result = succeeded("export", model, "-o", tmp_path / "a.ply")
+    assert [line.split()[0] for line in result.stderr.splitlines()] == [
+        *("choosing", "degree", "fitting", "writing", "measuring")
+    ]
+    (degree,) = re.findall(r"^degree (\d) it is: .* for degrees 0 to 3 against the model$", result.stderr, re.MULTILINE)
+    assert read_splats(tmp_path / "a.ply").degree == int(degree) and f"the file, degree {degree} " in result.stdout
+
+
+def test_a_page_holds_the_model_unless_it_shall_be_baked(model, tmp_path):
+    for name, options in (("a.html", ()), ("b.html", ("--baked", "--sh-degree", "0"))):
+        succeeded("export", model, "-o", tmp_path / name, *options)
+    native, baked = ((tmp_path / name).read_bytes() for name in ("a.html", "b.html"))
+    assert base64.b64encode(model.read_bytes()[:300]) in native
+    assert base64.b64encode(model.read_bytes()[:300]) not in baked and b'"kind": "splats"' in baked
+    result = succeeded("export", model, "-o", tmp_path / "a.html", "--overwrite")
+    size = (tmp_path / "a.html").stat().st_size
+    assert result.stdout == f"{tmp_path / 'a.html'}: {size:,} bytes, 40 Gaussians, as they are: nothing is baked\n"
+    assert "goes along as it is" in result.stderr
+
+
+def test_folders_are_players_and_galleries(model, data, tmp_path):
+    succeeded("export", "-o", tmp_path / "empty")
+    succeeded("export", model, "-o", tmp_path / "player")
+    report = json.loads(succeeded("export", model, model, "-o", tmp_path / "gallery", "--json").stdout)
+    assert (report["gaussians"], report["native"]) == (80, True)
+    assert {path.name for path in (tmp_path / "player").iterdir()} >= {"index.html", "scene.hyrf", "poster.jpg"}
+    assert not (tmp_path / "empty" / "scene.hyrf").exists()
+    assert {path.name for path in (tmp_path / "gallery").iterdir()} >= {"player.html", "model.hyrf", "model-2.hyrf"}
+    options = ("-o", tmp_path / "scored", "--data", data, "--data", data)
+    succeeded("export", model, model, *options)
+    assert (tmp_path / "scored" / "index.html").read_text().count(" dB on ") == 2
+    assert "--overwrite" in refused("export", model, "-o", tmp_path / "player")
+    succeeded("export", model, "-o", tmp_path / "player", "--overwrite")
 
 
 WRONG = {
@@ -100,6 +137,12 @@ WRONG = {
     "NaN opacity": (("-o", "a.ply", "--min-opacity", "nan"), "opacity of nan"),
     "crop of cameras": (("-o", "a.json", "--crop", "0,0,0,1,1,1"), "cameras only"),
     "no photos": (("-o", "a.ply", "--data", "none"), "none"),
+    "degree of a model": (("-o", "a.html", "--sh-degree", "1"), "--baked"),
+    "crop of a player": (("-o", "player", "--crop", "0,0,0,1,1,1"), "--baked"),
+    "baked player": (("-o", "player", "--baked"), "--baked"),
+    "COLMAP file": (("-o", "a.ply", "--colmap"), "a COLMAP model is a folder"),
+    "two models": (("second.hyrf", "-o", "a.ply"), "several models make a gallery"),
+    "photos of two": (("-o", "player", "--data", "a", "--data", "b"), "given 2 times, for 1 models"),
 }
 
 
@@ -119,10 +162,17 @@ def test_models_that_cannot_be_read_are_one_sentence(command, model, tmp_path, m
     (tmp_path / "damaged.hyrf").write_bytes(data)
     (tmp_path / "short.hyrf").write_bytes(data[:100])
     (tmp_path / "photo.hyrf").write_bytes(b"\x89PNG")
+    (tmp_path / "empty.ply").touch()
+    names = ("damaged.hyrf",) if command == "export" else ("empty.ply", "none.ply")  # a page tells of damage itself
     options = ("-o", "a.ply") if command == "export" else ("--no-browser",)
-    for name in ("damaged.hyrf", "short.hyrf", "photo.hyrf", "none.hyrf", "."):
+    for name in (*names, "short.hyrf", "photo.hyrf", "none.hyrf", "."):
         assert name in refused(command, name, *options)
     assert not (tmp_path / "a.ply").exists()
+
+
+def test_a_file_without_a_model_is_one_sentence(tmp_path):
+    assert "no MODEL" in refused("export", "-o", tmp_path / "a.ply")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_help_names_every_ending():
@@ -137,19 +187,37 @@ def test_help_names_every_ending():
 
 
 @pytest.mark.usefixtures("signals")
-def test_view_serves_the_page_at_a_free_port_until_ctrl_c(model):
-    command = [sys.executable, "-m", "hyrfpack", "view", str(model), "--sh-degree", "0", "--no-browser"]
+@pytest.mark.parametrize("ending", [".hyrf", ".ply"])
+def test_view_serves_the_player_and_the_file_at_a_free_port_until_ctrl_c(ending, model, tmp_path):
+    file = model
+    if ending != ".hyrf":
+        file = tmp_path / "cloud.ply"
+        succeeded("export", model, "-o", file, "--sh-degree", 0)
+    command = [sys.executable, "-m", "hyrfpack", "view", str(file), "--no-browser"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             address = process.stdout.readline().strip()
             assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", address)
             with urllib.request.urlopen(address, timeout=10) as answer:
                 page = answer.read()
+            asked = urllib.request.Request(f"{address}scene{ending}", headers={"Range": "bytes=8-99"})
+            with urllib.request.urlopen(asked, timeout=10) as answer:
+                status, part = answer.status, answer.read()
         finally:
             os.kill(process.pid, signal.SIGINT)
         said, told = process.communicate(timeout=20)
-    assert page.startswith(b"<!DOCTYPE html>") and b"<title>model" in page
+    assert page.startswith(b"<!DOCTYPE html>") and f"<title>{file.stem}</title>".encode() in page
+    assert (status, part) == (206, file.read_bytes()[8:100])
     assert (process.returncode, said) == (0, "") and "Traceback" not in told
+
+
+def test_view_decodes_nothing_and_loads_no_torch(model):
+    program = (
+        "import sys, hyrfpack.web.view as v; v.serve = lambda page, files, **more: print(len(page), list(files));"
+        f"v.view({str(model)!r}, open_browser=False, say=print); print('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.endswith("['scene.hyrf']\nFalse\n")
 
 
 def test_view_refuses_a_port_in_use_and_no_port(model):
@@ -167,5 +235,5 @@ def test_view_opens_the_browser_where_it_says(model, monkeypatch):
     opened = []
     monkeypatch.setattr("hyrfpack.web.serve.webbrowser.open", opened.append)
     monkeypatch.setattr("hyrfpack.web.serve.ThreadingHTTPServer.serve_forever", lambda server: None)
-    result = CliRunner().invoke(main, ["view", str(model), "--sh-degree", "0"])
+    result = CliRunner().invoke(main, ["view", str(model)])
     assert result.exit_code == 0 and opened == [result.stdout.strip()]

@@ -17,11 +17,10 @@ from hyrfpack.cameras.capture import kept_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
-from hyrfpack.export import ExportReport, export, pipeline
+from hyrfpack.export import ExportReport, pipeline
 from hyrfpack.export.bake import bake
-from hyrfpack.export.kinds import ENDINGS, chosen, kind_of
+from hyrfpack.export.kinds import COLMAP, ENDINGS, PLAYER, chosen, kind_of
 from hyrfpack.export.measure import likeness
-from hyrfpack.export.pipeline import page_of
 from hyrfpack.export.source import Source
 from hyrfpack.format import load, save
 from hyrfpack.model import Frame
@@ -34,6 +33,12 @@ POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
 FOUR = ring(4)
 CROP = (-0.3, -10, -10, 0.4, 10, 0.2)
 SPLATS = (*FORMATS, ".html")
+
+
+def export(source, target, **options) -> ExportReport:
+    """With colours of degree 3 and pages of splats, where nothing else is said; a name without ending is for COLMAP."""
+    kind = {"baked": str(target).endswith(".html"), "colmap": str(target).endswith("colmap")}
+    return hyrfpack.export(source, target, **{"degree": 3, **kind, **options})
 
 
 def moved(camera: Camera, unit: float, center) -> Camera:
@@ -144,11 +149,6 @@ def test_the_same_export_gives_the_same_bytes(sphere, tmp_path):
         assert first.read_bytes() == second.read_bytes(), ending
 
 
-def test_the_page_that_is_served_is_the_page_that_is_written(sphere, tmp_path):
-    export(sphere, tmp_path / "sphere.html", degree=1)
-    assert page_of(sphere, 1) == (tmp_path / "sphere.html").read_bytes()
-
-
 # -- choices ---------------------------------------------------------------------------------------------------------
 
 
@@ -224,7 +224,7 @@ def test_the_psnr_is_that_of_the_file(ending, plain, tmp_path):
 def test_a_file_that_lost_something_scores_less(plain, tmp_path, monkeypatch):
     form = FORMATS[".ply"]
     lossy = replace(form, decode=lambda *arguments: form.decode(*arguments)[:20])
-    monkeypatch.setattr(pipeline, "kind_of", lambda target: lossy)
+    monkeypatch.setattr(pipeline, "kind_of", lambda *target: lossy)
     report = export(plain, tmp_path / "a.ply")
     assert report.psnr < report.by_degree[3] - 3
 
@@ -348,6 +348,7 @@ def test_a_compact_file_is_baked_and_measured_around_the_scene(compact, tmp_path
 
 def test_the_ending_names_the_format():
     assert [kind_of(f"a/b{ending}").ending for ending in ENDINGS] == list(ENDINGS)
+    assert kind_of("a/b") is PLAYER and kind_of("a/b", colmap=True) is COLMAP
     for name, ending in {"A/B.PLY": ".ply", "a.b/c": "", "my.scene.spz": ".spz"}.items():
         assert kind_of(name).ending == ending
     for name in ("a.xyz", "model.hyrf", "a.ply.txt"):
@@ -355,6 +356,8 @@ def test_the_ending_names_the_format():
             kind_of(name)
     with pytest.raises(HyrfError, match="compressed PLY is read, not written"):
         kind_of("a.compressed.ply")
+    with pytest.raises(HyrfError, match=r"^a\.ply: a COLMAP model is a folder"):
+        kind_of("a.ply", colmap=True)
 
 
 WRONG = [
@@ -419,7 +422,7 @@ def test_packages_that_are_not_there_are_missed_before_the_bake(
 ):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(HyrfError, match=rf"pip install {package}'$"):
-        export(plain, tmp_path / f"a{ending}")
+        export(plain, tmp_path / f"a{ending}", colmap=not ending)
 
 
 @pytest.mark.parametrize("failing", ["encode", "decode", "background_splats"])
@@ -430,7 +433,7 @@ def test_what_goes_wrong_leaves_the_old_file_as_it_was(failing, sphere, tmp_path
     if failing == "background_splats":
         monkeypatch.setattr(pipeline, failing, fail)
     else:
-        monkeypatch.setattr(pipeline, "kind_of", lambda target: replace(FORMATS[".ply"], **{failing: fail}))
+        monkeypatch.setattr(pipeline, "kind_of", lambda *target: replace(FORMATS[".ply"], **{failing: fail}))
     (tmp_path / "a.ply").write_bytes(b"old")
     with pytest.raises(HyrfError, match="^no$"):
         export(sphere, tmp_path / "a.ply", degree=0)

@@ -1,65 +1,206 @@
-"""A page is served to this machine alone, until interrupted."""
+"""A page and its file are served to this machine alone, in ranges if asked, until interrupted."""
 
 from __future__ import annotations
 
+import http.client
 import os
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
-import urllib.error
-import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.web.serve import serve
+from hyrfpack.web import serve as serving
+from hyrfpack.web.serve import PIECE, serve
 
 PAGE = b"<!DOCTYPE html><title>served</title>"
+DATA = np.random.default_rng(0).bytes(3 * PIECE + 17)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    path = tmp_path / "room.hyrf"
+    path.write_bytes(DATA)
+    return path
+
+
+@pytest.fixture
+def port(scene: Path) -> Iterator[int]:
+    """Of a server with a page and a file."""
+    with serving._server("127.0.0.1", 0) as server:
+        server.page, server.files = PAGE, {"/scene.hyrf": scene}
+        thread = threading.Thread(target=server.serve_forever, args=(0.02,))
+        thread.start()
+        yield server.server_port
+        server.shutdown()
+        thread.join()
+
+
+def ask(port: int, path: str = "/scene.hyrf", method: str = "GET", **headers: str) -> tuple[int, dict[str, str], bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    try:
+        connection.request(method, path, headers={name.replace("_", "-"): value for name, value in headers.items()})
+        answer = connection.getresponse()
+        return answer.status, dict(answer.headers), answer.read()
+    finally:
+        connection.close()
+
+
+def test_page_and_file_are_served_and_nothing_else(port, scene):
+    status, headers, body = ask(port, "/?content=any")
+    assert (status, headers["Content-Type"], body) == (200, "text/html; charset=utf-8", PAGE)
+    status, headers, body = ask(port)
+    assert (status, headers["Content-Type"], body) == (200, "application/octet-stream", DATA)
+    assert headers["Accept-Ranges"] == "bytes" and headers["ETag"] and headers["X-Content-Type-Options"] == "nosniff"
+    for path in ("/other", f"/{scene.name}", "/../room.hyrf", "/%2e%2e/room.hyrf", str(scene)):
+        assert ask(port, path)[0] == 404, path
+    assert ask(port, method="POST")[0] == 501
+
+
+def test_a_head_is_the_answer_without_its_body(port):
+    for path, length in (("/", len(PAGE)), ("/scene.hyrf", len(DATA))):
+        status, headers, body = ask(port, path, "HEAD")
+        assert (status, headers["Content-Length"], body) == (200, str(length), b"")
+
+
+END = len(DATA) - 1
+RANGES = {
+    "bytes=0-0": (0, 0),
+    "bytes=5-9": (5, 9),
+    f"bytes={PIECE - 1}-{2 * PIECE}": (PIECE - 1, 2 * PIECE),
+    "bytes=100-": (100, END),
+    "bytes=-7": (END - 6, END),
+    f"bytes=-{10 * len(DATA)}": (0, END),
+    f"bytes=10-{10 * len(DATA)}": (10, END),
+    f"bytes={END}-": (END, END),
+}
+
+
+@pytest.mark.parametrize("asked", RANGES)
+def test_a_range_is_what_was_asked_for(asked, port):
+    first, last = RANGES[asked]
+    status, headers, body = ask(port, Range=asked)
+    assert (status, headers["Content-Range"], body) == (
+        206,
+        f"bytes {first}-{last}/{len(DATA)}",
+        DATA[first : last + 1],
+    )
+
+
+@pytest.mark.parametrize("asked", [f"bytes={len(DATA)}-", f"bytes={10**30}-", "bytes=-0"])
+def test_a_range_beyond_the_end_is_refused_with_the_length(asked, port):
+    status, headers, body = ask(port, Range=asked)
+    assert (status, headers["Content-Range"], body) == (416, f"bytes */{len(DATA)}", b"")
+
+
+@pytest.mark.parametrize("asked", ["bytes=9-5", "bytes=", "bytes=-", "bytes=a-b", "lines=0-1", "bytes=0-1,5-6", "٣-٤"])
+def test_a_range_that_makes_no_sense_is_passed_over(asked, port):
+    status, _, body = ask(port, Range=asked.encode().decode("latin-1"))
+    assert (status, body) == (200, DATA)
+
+
+def test_a_file_that_changed_is_sent_whole_to_who_asks_for_the_rest_of_the_old_one(port, scene):
+    tag = ask(port)[1]["ETag"]
+    assert ask(port, Range="bytes=10-", If_Range=tag)[0] == 206
+    scene.write_bytes(DATA[:1000])
+    status, headers, body = ask(port, Range="bytes=10-", If_Range=tag)
+    assert (status, body) == (200, DATA[:1000]) and headers["ETag"] != tag
+
+
+def test_a_file_that_is_gone_is_not_found_until_it_is_back(port, scene):
+    scene.unlink()
+    assert ask(port)[0] == ask(port, method="HEAD")[0] == 404
+    scene.mkdir()
+    assert ask(port)[0] == 404
+    scene.rmdir()
+    scene.write_bytes(b"again")
+    assert ask(port)[2] == b"again"
+
+
+def test_an_empty_file_is_empty(port, scene):
+    scene.write_bytes(b"")
+    assert ask(port)[::2] == (200, b"") and ask(port, Range="bytes=0-")[0] == 416
+
+
+def test_a_file_that_shrinks_while_it_is_sent_ends_the_connection_short(port, scene):
+    with scene.open("r+b") as file:
+        file.truncate(1 << 28)  # more than sockets hold
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    connection.request("GET", "/scene.hyrf")
+    answer = connection.getresponse()
+    os.truncate(scene, PIECE)
+    with pytest.raises(http.client.IncompleteRead):
+        answer.read()
+    connection.close()
+
+
+def test_a_large_file_is_not_held_in_memory(tmp_path):
+    large = tmp_path / "large.hyrf"
+    with large.open("wb") as file:
+        file.truncate(1 << 30)
+    program = """
+import resource, socket, sys, threading
+from hyrfpack.web import serve
+from pathlib import Path
+with serve._server("127.0.0.1", 0) as server:
+    server.files = {"/scene.hyrf": Path(sys.argv[1])}
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with socket.create_connection(("127.0.0.1", server.server_port)) as client:
+        client.sendall(b"GET /scene.hyrf HTTP/1.0\\r\\n\\r\\n")
+        total = 0
+        while piece := client.recv(1 << 20):
+            total += len(piece)
+    print(total, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+    server.shutdown()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program, large], capture_output=True, text=True, check=True, timeout=120
+    )
+    total, grown = map(int, done.stdout.split())
+    assert total > 1 << 30 and grown < 32 << 10  # kB
 
 
 @pytest.mark.usefixtures("signals")
-def test_the_page_is_served_to_the_browser_until_an_interrupt_which_is_no_error(monkeypatch: pytest.MonkeyPatch):
+def test_it_serves_the_browser_until_an_interrupt_which_is_no_error(monkeypatch: pytest.MonkeyPatch):
     said, seen = [], []
 
     def visit(address: str) -> None:
         try:
             seen.append(address)
-            with urllib.request.urlopen(address + "?at=any", timeout=10) as answer:
-                seen.append((answer.headers["Content-Type"], answer.read()))
-            with urllib.request.urlopen(urllib.request.Request(address, method="HEAD"), timeout=10) as answer:
-                seen.append((answer.headers["Content-Length"], answer.read()))
-            try:
-                urllib.request.urlopen(address + "other", timeout=10)
-            except urllib.error.HTTPError as error:
-                seen.append(error.code)
+            seen.append(ask(int(address.rsplit(":")[-1].strip("/")), "/")[2])
         finally:
             os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr("webbrowser.open", visit)
-    serve(lambda: PAGE, open_browser=True, say=said.append)
-
-    assert said[0].startswith("http://127.0.0.1:")
-    assert seen == [said[0], ("text/html; charset=utf-8", PAGE), (str(len(PAGE)), b""), 404]
+    serve(PAGE, open_browser=True, say=said.append)
+    assert said[0].startswith("http://127.0.0.1:") and seen == [said[0], PAGE]
 
 
 def test_a_port_in_use_is_one_sentence():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(HyrfError, match=rf"^port {port} of 127.0.0.1 is taken by another program; [^\n]*$"):
-            serve(lambda: PAGE, port=port, open_browser=False, say=lambda address: None)
+            serve(PAGE, port=port, open_browser=False, say=lambda address: None)
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "no such name", "a" * 70])
 def test_an_address_that_is_not_ours_is_one_sentence(host):
     with pytest.raises(HyrfError, match=rf"^nothing can listen at port 0 of {host} [^\n]*$"):
-        serve(lambda: PAGE, host=host, open_browser=False, say=lambda address: None)
+        serve(PAGE, host=host, open_browser=False, say=lambda address: None)
 
 
 @pytest.mark.parametrize("host", ["", " "])
 def test_no_address_is_one_sentence_and_does_not_mean_all(host):
     with pytest.raises(HyrfError, match="not an address to listen at.*127.0.0.1.*0.0.0.0"):
-        serve(lambda: PAGE, host=host, open_browser=False, say=lambda address: None)
+        serve(PAGE, host=host, open_browser=False, say=lambda address: None)
 
 
 @pytest.mark.usefixtures("signals")
@@ -77,5 +218,5 @@ def test_a_browser_that_goes_away_is_nobodys_news(capsys: pytest.CaptureFixture,
     monkeypatch.setattr(
         "webbrowser.open", lambda address: threading.Thread(target=visit_in_a_hurry, args=[address]).start()
     )
-    serve(lambda: bytes(20_000_000), open_browser=True, say=lambda address: None)
+    serve(bytes(20_000_000), open_browser=True, say=lambda address: None)
     assert capsys.readouterr().err == ""

@@ -23,7 +23,7 @@ from hyrfpack.export.background import background_picture, background_splats
 from hyrfpack.export.bake import bake
 from hyrfpack.export.kinds import PAGE
 from hyrfpack.export.measure import Likeness, likeness
-from hyrfpack.export.pipeline import page
+from hyrfpack.export.pages import baked_page as page
 from hyrfpack.export.source import Source
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats, concatenate

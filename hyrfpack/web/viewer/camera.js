@@ -1,13 +1,12 @@
-// Cameras. The page's axes are those of SPZ (right, up, back), its origin and unit are `scene.center` and `scene.unit`
-// of the world; a view is a pinhole camera in them: rows (right, down, forward), translation, eye, fx, fy, cx, cy.
+// Cameras. The page's axes are the world's, its origin and unit are `scene.center` and `scene.unit` of it; a view is a
+// pinhole camera in them: rows (right, down, forward), translation, eye, fx, fy, cx, cy.
 
-const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
-const sub = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
-const mul = (a, s) => [a[0] * s, a[1] * s, a[2] * s];
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const unit = (a) => mul(a, 1 / (Math.hypot(...a) || 1));
-const turned = (a) => [a[0], -a[1], -a[2]]; // world axes to the page's and back
+export const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
+export const sub = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+export const mul = (a, s) => [a[0] * s, a[1] * s, a[2] * s];
+export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+export const unit = (a) => mul(a, 1 / (Math.hypot(...a) || 1));
 
 // A vector turned about a unit axis (Rodrigues).
 function rotate(vector, axis, angle) {
@@ -15,38 +14,46 @@ function rotate(vector, axis, angle) {
   return add(add(mul(vector, c), mul(cross(axis, vector), Math.sin(angle))), mul(axis, dot(axis, vector) * (1 - c)));
 }
 
-const LARGEST_PICTURE = 8192; // pixels a side
+const RIGID = 1e-3; // that rows of a pose may be off being at right angles and of length 1
 
-// The view of a camera of the world: {width, height, fx, fy, cx, cy, camera_from_world: 4 x 4 rows}.
-function viewOf({ width, height, fx, fy, cx, cy, camera_from_world: pose }, scene) {
-  const numbers = [width, height, fx, fy, cx, cy, ...(pose ?? []).slice(0, 3).flat()];
-  if (numbers.length !== 18 || !numbers.every(Number.isFinite)) {
-    throw new Error("it needs width, height, fx, fy, cx, cy and camera_from_world (4 x 4)");
+const isRow = (row) => Array.isArray(row) && row.length === 4 && row.every(Number.isFinite);
+
+function isRigid(rows) {
+  const near = (a, b, wanted) => Math.abs(dot(a, b) - wanted) <= RIGID;
+  const right = rows.every((a, i) => rows.every((b, j) => near(a, b, i === j ? 1 : 0)));
+  return right && dot(cross(rows[0], rows[1]), rows[2]) > 0;
+}
+
+// The view of a camera of the world: {width, height, fx, fy, cx, cy, camera_from_world: 4 x 4 rows}; the last row may
+// be left out. Throws an Error with a sentence where that is none.
+export function viewOf({ width, height, fx, fy, cx, cy, camera_from_world: pose }, scene) {
+  const posed = Array.isArray(pose) && [3, 4].includes(pose.length) && pose.every(isRow);
+  if (!posed || ![width, height, fx, fy, cx, cy].every(Number.isFinite)) {
+    throw new Error("it needs width, height, fx, fy, cx, cy and camera_from_world (4 x 4), all of them numbers");
   }
-  if (![width, height].every((side) => Number.isInteger(side) && side > 0 && side <= LARGEST_PICTURE)) {
-    throw new Error(`width and height must be whole numbers up to ${LARGEST_PICTURE}`);
+  if (![width, height].every((side) => Number.isInteger(side) && side > 0)) {
+    throw new Error("width and height must be whole numbers above 0");
   }
-  const rows = pose.slice(0, 3).map(turned);
+  if (!(fx > 0 && fy > 0)) throw new Error("fx and fy must be above 0");
+  const rows = pose.slice(0, 3).map((row) => row.slice(0, 3));
+  if (!isRigid(rows)) throw new Error("the first three columns of camera_from_world must be a rotation");
   const translation = pose.slice(0, 3).map((row) => (dot(row, scene.center) + row[3]) / scene.unit);
   const eye = [0, 1, 2].map((k) => -rows.reduce((sum, row, r) => sum + row[k] * translation[r], 0));
   return { rows, translation, eye, width, height, fx, fy, cx, cy };
 }
 
 // The camera of the world of a view: the inverse of `viewOf`.
-function cameraOf({ rows, translation, width, height, fx, fy, cx, cy }, scene) {
-  const world = rows.map((row, r) => {
-    const there = turned(row);
-    return [...there, translation[r] * scene.unit - dot(there, scene.center)];
-  });
+export function cameraOf({ rows, translation, width, height, fx, fy, cx, cy }, scene) {
+  const world = rows.map((row, r) => [...row, translation[r] * scene.unit - dot(row, scene.center)]);
   return { width, height, fx, fy, cx, cy, camera_from_world: [...world, [0, 0, 0, 1]] };
 }
 
 // What one looks through: a view that can be moved.
-class Eye {
+export class Eye {
   // `views` tell how large the scene is.
   constructor(scene, views) {
-    this.up = turned(scene.up);
-    this.middle = turned(sub(scene.target, scene.center)).map((value) => value / scene.unit);
+    this.up = scene.up;
+    this.middle = mul(sub(scene.target, scene.center), 1 / scene.unit);
     const distances = views.map((view) => Math.hypot(...sub(view.eye, this.middle))).sort((a, b) => a - b);
     this.size = distances[distances.length >> 1];
   }
@@ -59,6 +66,12 @@ class Eye {
     const ahead = dot(sub(this.middle, this.position), this.rows[2]);
     this.pace = Math.max(ahead, 0.3 * this.size) || 1; // cameras among the scene look past its middle
     this.target = add(this.position, mul(this.rows[2], this.pace));
+  }
+
+  // Where it is, to be taken up again by `Object.assign`.
+  get pose() {
+    const { position, rows, focal, pace, target } = this;
+    return { position, rows, focal, pace, target };
   }
 
   // The view in a picture of some size. A photo's picture and a window of another shape show equally large areas.

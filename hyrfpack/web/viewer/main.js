@@ -1,251 +1,239 @@
-// The page: puts scene, worker, renderer, eye and controls together, and draws when something has changed.
+// The page: puts player, controls, panel and the place where the scene comes from together.
 
-const SETTLED = 200; // ms after the last move until the picture is drawn at full resolution
-const FRAME = 33; // ms that a frame may take while moving before it is drawn coarser
-const COARSEST = 0.2;
-const DENSEST = 2; // device pixels a CSS pixel
-const LONGEST_STEP = 0.1; // s that a held key flies in one frame
+import { compactCamera, parseCamera, readHash, readSearch, webAddress } from "./address.js";
+import { Controls } from "./controls.js";
+import { Help } from "./help.js";
+import { Damper, Glide, Turntable, calm } from "./motion.js";
+import { announce, dismiss, fail, progress, remark, toast } from "./notes.js";
+import { Panel } from "./panel.js";
+import { element, textOf } from "./parts.js";
+import { payload } from "./payload.js";
+import { Player } from "./player.js";
+import { savePicture, shareCamera } from "./share.js";
+import { chosenFile, fetchedFile } from "./source.js";
 
-const element = (name) => document.getElementById(name);
-const textOf = (name) => element(name).textContent;
+const FADE = 600; // ms, see style.css
+const IGNORED = { wheel: "Click the scene, then the wheel zooms.", finger: "Tap the scene, then fingers move it." };
 
-const lost = () => new Error("The graphics device was taken away from this page; reload the page to go on.");
+// A page around this one that has put it into a <hyrf-viewer> is told of loads and errors.
+const tellFrame = (hyrf, message = "") => window.parent !== window && window.parent.postMessage({ hyrf, message }, "*");
 
-function fail(error) {
-  element("loading").hidden = true;
-  element("message").textContent = error.message;
-  element("message").hidden = false;
+// A picture until there is something to see.
+function showPoster(address) {
+  if (!address) return;
+  const poster = element("poster") ?? Object.assign(document.createElement("img"), { id: "poster", alt: "" });
+  poster.src = address;
+  document.body.append(poster);
 }
 
-class Page {
-  constructor() {
-    this.scene = JSON.parse(textOf("scene"));
-    this.canvas = element("view");
-    this.renderer = new Renderer(this.canvas, this.scene);
-    this.splats = new Splats(this.scene);
-    this.cameras = this.scene.cameras.map((camera) => viewOf(camera, this.scene));
-    this.eye = new Eye(this.scene, this.cameras);
-    this.frames = 0; // drawn so far
-    this.moved = -Infinity; // when
-    this.began = null; // when the frame that is being drawn was begun
-    this.coarse = 1; // times the chosen resolution, while moving
-    this.scheduled = false;
-    this.loaded = false;
-    this.stale = true; // the canvas does not show the view
-    this.unsorted = true; // the order is not that of the view
-    this.controls = new Controls(this.canvas, this.eye, {
-      changed: () => this.changed(),
-      pick: (x, y) => this.pick(x, y),
-      press: (key) => this.press(key),
-    });
-    this.panel();
-    this.choose(0);
-    this.canvas.addEventListener("webglcontextlost", () => {
-      this.loaded = false;
-      fail(lost());
-    });
-    new ResizeObserver(() => this.wake()).observe(this.canvas);
-    addEventListener("resize", () => this.wake()); // also to a screen of other density
-  }
+// Once there is, it comes up over the picture.
+function appear(player) {
+  if (player.times.first === null && !player.calm) return requestAnimationFrame(() => appear(player));
+  document.body.classList.add("there");
+  setTimeout(() => element("poster")?.remove(), FADE);
+}
 
-  async load() {
-    const picture = element("background");
-    const [unpacked] = await Promise.all([this.splats.unpack((part) => (element("bar").value = part)), picture?.decode()]);
-    if (this.renderer.gl.isContextLost()) throw lost();
-    this.renderer.load(unpacked, picture);
-    this.loaded = true;
-    element("loading").hidden = true;
-    this.fit();
-    this.resort();
-  }
+function showRing(x, y) {
+  const ring = element("ring");
+  Object.assign(ring.style, { left: `${x}px`, top: `${y}px` });
+  ring.hidden = true;
+  ring.getBoundingClientRect(); // so that its animation begins anew
+  ring.hidden = false;
+  ring.onanimationend = () => (ring.hidden = true);
+}
 
-  // ---- drawing
+function start() {
+  const asked = readSearch(location.search);
+  document.body.classList.toggle("bare", asked.noui);
+  showPoster(asked.poster);
+  const inside = element("scene") ? JSON.parse(textOf("scene")) : null;
+  const beside = element("content") ? JSON.parse(textOf("content")) : null;
 
-  get scale() {
-    const chosen = element("resolution").value / 100;
-    return this.moving && element("automatic").checked ? Math.max(COARSEST, chosen * this.coarse) : chosen;
-  }
+  const player = new Player(element("view"), inside);
+  const damper = new Damper(player), glide = new Glide(player), turntable = new Turntable(player), help = new Help();
+  let own = true, nextOwn = true; // what is shown, what is opened is the page's or the address's, not a person's
+  let title = inside ? (asked.title ?? inside.title) : document.title, next = title; // that of what is shown, is opened
+  let number = 0; // of what was opened
+  let picture = null;
 
-  get moving() {
-    return this.controls.active || performance.now() - this.moved < SETTLED;
-  }
+  // ---- moving
 
-  // Give the canvas the window's size. That blanks it, so it is drawn to at once.
-  fit() {
-    const dense = Math.min(devicePixelRatio, DENSEST);
-    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((side) => Math.max(1, Math.round(side * dense)));
-    if (this.canvas.width === width && this.canvas.height === height) return;
-    [this.canvas.width, this.canvas.height] = [width, height];
-    this.stale = this.unsorted = true;
-  }
+  const choose = (camera) => {
+    if (player.scene && camera < player.cameras.length) glide.to(() => player.choose(camera));
+  };
 
-  changed() {
-    this.moved = performance.now();
-    this.stale = this.unsorted = true;
-    this.wake();
-  }
+  const pick = (x, y) => {
+    if (player.pick(x, y)) showRing(x, y);
+  };
 
-  redraw() {
-    this.stale = true;
-    this.wake();
-  }
-
-  wake() {
-    if (this.scheduled || !this.loaded) return;
-    this.scheduled = true;
-    requestAnimationFrame((now) => this.frame(now));
-  }
-
-  frame(now) {
-    this.scheduled = false;
-    if (!this.loaded) return;
-    if (this.renderer.busy()) return this.wake();
-    this.fit();
-    if (this.began !== null) this.measure(now - this.began);
-    this.began = null;
-    if (this.controls.advance(Math.min(LONGEST_STEP, (now - (this.before ?? now)) / 1000))) this.changed();
-    this.before = this.controls.active ? now : null;
-    this.resort();
-    const moving = this.moving, scale = this.scale;
-    if (this.stale || this.shown !== scale) {
-      this.renderer.draw(this.view(), scale);
-      this.frames++;
-      this.began = now;
-      this.stale = false;
-      this.shown = scale;
-    }
-    if (moving || this.began !== null) this.wake();
-    else this.took = null;
-  }
-
-  // A frame took so many ms, waiting for the screen included.
-  measure(took) {
-    this.took = 0.8 * (this.took ?? took) + 0.2 * took;
-    if (!this.moving) return;
-    element("speed").textContent = `${Math.round(1000 / this.took)} fps`;
-    if (element("automatic").checked) {
-      const wish = this.coarse * Math.min(1.15, Math.max(0.7, Math.sqrt(FRAME / took)));
-      // Small changes would only make the picture swim.
-      if (took > 1.3 * FRAME || took < 0.7 * FRAME) this.coarse = Math.min(1, Math.max(COARSEST, wish));
-    }
-  }
-
-  view() {
-    return this.eye.view(this.canvas.width, this.canvas.height);
-  }
-
-  async resort() {
-    if (!this.unsorted || this.splats.busy) return;
-    this.unsorted = false;
-    this.take(await this.splats.sort(this.view()));
-    this.redraw();
-  }
-
-  take({ order, drawn }) {
-    if (this.loaded) this.renderer.sorted(order, drawn);
-    this.splats.reuse(order);
-  }
-
-  // ---- what a person does
-
-  choose(number) {
-    this.camera = (number + this.cameras.length) % this.cameras.length;
-    element("cameras").selectedIndex = this.camera;
-    this.eye.stand(this.cameras[this.camera]);
-    this.changed();
-  }
-
-  pick(x, y) {
-    if (!this.loaded) return;
-    const { width, height } = this.canvas, view = this.view();
-    const across = width / this.canvas.clientWidth, down = height / this.canvas.clientHeight;
-    const depth = this.renderer.pick(view, x * across, y * down, this.eye.depth);
-    if (depth !== null) this.eye.target = this.eye.point(...this.controls.fromMiddle(x, y), depth);
-    this.changed();
-  }
-
-  press(key) {
-    const actions = {
-      N: () => this.choose(this.camera + 1),
-      P: () => this.choose(this.camera - 1),
-      R: () => this.choose(this.camera),
-      F: () => this.fullscreen(),
-      H: () => this.toggle(),
-      "?": () => element("help").showModal(),
+  // Stand where a text from the address says.
+  const stand = (text, glides) => {
+    const { number: camera, view, depth } = parseCamera(text, player.scene);
+    const move = () => {
+      if (camera !== undefined) return player.choose(camera);
+      player.eye.stand(view);
+      if (depth) player.eye.target = player.eye.point(0, 0, depth);
+      player.changed();
     };
-    actions[key]?.();
-  }
+    if (glides) glide.to(move);
+    else move();
+  };
 
-  fullscreen() {
-    if (document.fullscreenElement) document.exitFullscreen();
-    else document.documentElement.requestFullscreen?.().catch(() => {});
-  }
-
-  toggle() {
-    const panel = element("panel");
-    panel.hidden = !panel.hidden;
-    element("toggle").setAttribute("aria-expanded", String(!panel.hidden));
-  }
-
-  panel() {
-    element("count").textContent = `${this.scene.count.toLocaleString("en")} splats`;
-    element("cameras").append(...this.cameras.map((_, number) => new Option(`Camera ${number + 1} of ${this.cameras.length}`)));
-    element("cameras").onchange = (event) => this.choose(event.target.selectedIndex);
-    element("previous").onclick = () => this.press("P");
-    element("next").onclick = () => this.press("N");
-    element("reset").onclick = () => this.press("R");
-    element("fullscreen").onclick = () => this.press("F");
-    element("fullscreen").hidden = !document.fullscreenEnabled;
-    element("ask").onclick = () => this.press("?");
-    element("toggle").onclick = () => this.press("H");
-    if (matchMedia("(max-width: 520px)").matches) this.toggle(); // it would cover the scene
-    element("automatic").onchange = () => this.redraw();
-    element("resolution").oninput = (event) => {
-      element("percent").textContent = `${event.target.value}%`;
-      this.redraw();
-    };
-  }
-
-  // ---- from outside
-
-  // Stand at a camera of the world and draw exactly its picture, for `pixels` to return.
-  async show(camera) {
-    await this.ready;
-    const view = viewOf(camera, this.scene);
-    this.eye.stand(view);
-    this.changed();
-    this.take(await this.splats.sort(view));
-    this.picture = this.renderer.read(view);
-    this.stale = this.unsorted = true;
-    this.wake();
-  }
-
-  // Stand where the address says, if it does.
-  async hash() {
-    const [name, value] = location.hash.slice(1).split("=", 2);
-    if (name !== "camera") return;
+  const follow = (text, glides) => {
+    if (text === null || !player.scene) return;
     try {
-      await this.show(JSON.parse(decodeURIComponent(value)));
-      element("message").hidden = this.loaded; // what was said of the address before
+      stand(text, glides);
+      if (glides) dismiss();
     } catch (error) {
-      throw new Error(`The address names no camera that can be used: ${error.message}.`);
+      fail(error);
     }
-  }
+  };
+
+  const turn = (on) => {
+    turntable.turn(on);
+    element("turn").setAttribute("aria-pressed", String(on));
+  };
+
+  const whenThere = (action) => () => player.loaded && action();
+  const panel = new Panel(player, {
+    choose,
+    N: () => choose((player.camera + 1) % player.cameras.length),
+    P: () => choose((player.camera + player.cameras.length - 1) % player.cameras.length),
+    R: () => choose(player.camera),
+    O: () => pick(player.canvas.clientWidth / 2, player.canvas.clientHeight / 2),
+    T: () => turn(!turntable.on),
+    F: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.())?.catch(() => {}),
+    L: whenThere(() => shareCamera(compactCamera(player.eye, player.scene), own)),
+    C: whenThere(async () => savePicture(await player.capture(), title)),
+    H: () => panel.toggle(),
+    "?": () => help.show(),
+    Escape: dismiss,
+  });
+  const acted = () => {
+    glide.stop();
+    turntable.pause();
+    help.acted();
+    player.wake();
+  };
+  const controls = new Controls(player, damper, {
+    acted, pick, press: (key) => panel.press(key), ignored: (kind) => toast(IGNORED[kind]),
+  });
+  player.movers.push(controls, damper, glide, turntable);
+
+  // ---- what the player tells
+
+  player.addEventListener("progress", ({ detail }) => progress(detail));
+  player.addEventListener("said", ({ detail }) => remark(detail));
+  player.addEventListener("failed", ({ detail }) => fail(detail));
+  player.addEventListener("stood", ({ detail }) => player.loaded && announce(`Camera ${detail + 1} of ${player.cameras.length}`));
+  player.addEventListener("opened", ({ detail }) => {
+    for (const mover of [damper, glide]) mover.stop();
+    [title, own] = [next, nextOwn];
+    panel.describe(detail, title);
+    if (own) follow(readHash(location.hash) ?? asked.camera, false);
+  });
+  player.addEventListener("counted", ({ detail }) => panel.describe(detail, title)); // all layers of a file are here
+  player.addEventListener("loaded", () => {
+    document.body.classList.remove("empty"); // the page's own scene may come after a file that failed
+    appear(player);
+    help.greet();
+    if (!player.whole) return;
+    element("loading").hidden = true;
+    announce(`${title} is shown.`);
+  });
+
+  // ---- where the scene comes from
+
+  // `bring`: a promise of {name, stream}. `called`: what the scene is called, if not as the file.
+  // `given`: by the page or its address.
+  const open = async (bring, called = null, given = true) => {
+    const mine = ++number;
+    dismiss();
+    document.body.classList.remove("empty");
+    try {
+      progress({ what: "loading", part: 0 });
+      const file = await bring();
+      if (mine !== number) return;
+      [next, nextOwn] = [called ?? file.name.replace(/\.\w+$/, ""), given];
+      await player.open(file);
+      tellFrame("load");
+    } catch (error) {
+      if (mine !== number) return; // another file was chosen meanwhile
+      document.body.classList.toggle("empty", !player.loaded);
+      throw error;
+    }
+  };
+
+  const openFile = (file) => {
+    if (!file) return;
+    open(async () => chosenFile(file), null, false).catch(fail);
+  };
+
+  // From where to look at a file beside the page, {cameras, up, target}, where the page says so.
+  const stageOf = (address) => {
+    const stages = Object.entries(beside?.stages ?? {});
+    return stages.find(([name]) => new URL(encodeURI(name), document.baseURI).href === address)?.[1] ?? null;
+  };
+
+  const first = async () => {
+    if (inside) {
+      panel.describe(inside, title);
+      follow(readHash(location.hash) ?? asked.camera, false);
+      await player.load(payload(), element("background"));
+      tellFrame("load");
+      return;
+    }
+    const address = asked.content ?? (beside?.content ? webAddress(beside.content, "content") : null);
+    if (address) return open(async () => ({ ...(await fetchedFile(address)), stage: stageOf(address) }), asked.title ?? (asked.content ? null : beside.title));
+    element("loading").hidden = true;
+    document.body.classList.add("empty");
+  };
+
+  element("file").onchange = ({ target }) => {
+    openFile(target.files[0]);
+    target.value = ""; // the same file may be chosen again
+  };
+  for (const button of document.querySelectorAll(".choose")) button.onclick = () => element("file").click();
+  addEventListener("dragover", (event) => {
+    if (!event.dataTransfer.types.includes("Files")) return;
+    event.preventDefault();
+    document.body.classList.add("dropping");
+  });
+  addEventListener("dragleave", ({ relatedTarget }) => relatedTarget ?? document.body.classList.remove("dropping"));
+  addEventListener("drop", (event) => {
+    event.preventDefault();
+    document.body.classList.remove("dropping");
+    openFile(event.dataTransfer.files[0]);
+  });
+  addEventListener("hashchange", () => follow(readHash(location.hash), true));
+  element("dismiss").onclick = element("enough").onclick = dismiss;
+  if (asked.autorotate && !calm()) turn(true);
+
+  const ready = first();
+  ready.catch((error) => {
+    fail(error);
+    tellFrame("error", error.message);
+  });
+  if (asked.wrong.length) fail(new Error(asked.wrong.join(" ")));
+
+  // For scripts. Cameras are {width, height, fx, fy, cx, cy, camera_from_world: 4 x 4}, OpenCV axes, the world's units.
+  window.hyrfpack = {
+    ready, // a promise of the scene
+    show: async (camera) => { // stands there and draws; a promise
+      await ready;
+      picture = await player.show(camera);
+    },
+    pixels: () => picture, // RGB bytes of what `show` drew last, top row first
+    camera: () => player.viewed, // of the window
+    frames: () => player.frames, // how many the window has been given
+    player,
+  };
 }
 
 try {
-  const page = new Page();
-  page.ready = page.load();
-  page.ready.then(() => page.hash()).catch(fail);
-  addEventListener("hashchange", () => page.hash().catch(fail));
-  // For scripts. Cameras are {width, height, fx, fy, cx, cy, camera_from_world: 4 x 4}, OpenCV axes, the world's units.
-  window.hyrfpack = {
-    ready: page.ready, // a promise of the scene
-    show: (camera) => page.show(camera), // stands there and draws; a promise
-    pixels: () => page.picture, // RGB bytes of what `show` drew last, top row first
-    camera: () => cameraOf(page.view(), page.scene), // of the window
-    frames: () => page.frames, // how many the window has been given
-  };
+  start();
 } catch (error) {
+  document.body.classList.add("bare"); // nothing can be moved
   fail(error);
+  tellFrame("error", error.message);
 }

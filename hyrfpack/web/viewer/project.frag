@@ -1,15 +1,18 @@
 #version 300 es
 // Projects splats to the picture, one splat a fragment: the mathematics of hyrfpack/ops/rasterize/reference.py.
-// Splats are as SPZ version 3 packs them.
+// Splats are as pack.js and geometry.frag pack them.
 precision highp float;
 precision highp int;
 precision highp usampler2D;
 precision highp usampler2DArray;
 
-uniform usampler2D u_places; // x, y, z as float32; rotation
-uniform usampler2D u_looks; // 3 log scales and opacity; red, green, blue
+uniform usampler2D u_places; // x, y, z as float32; opacity and log scale z
+uniform usampler2D u_shapes; // quaternion w, x; y, z; log scales x, y; red, green, blue in 11, 11 and 10 bits
 uniform usampler2DArray u_harmonics; // bytes, 16 a layer: coefficient after coefficient, red, green, blue of each
 uniform int u_degree;
+uniform float u_range; // of coefficients
+uniform usampler2D u_colors; // instead: halves red, green; blue, from colors.frag
+uniform bool u_colored; // take these
 uniform int u_count;
 uniform bool u_antialiased;
 uniform mat3 u_rotation; // camera from page
@@ -26,28 +29,13 @@ layout(location = 1) out uvec4 o_look; // covariance yy; its determinant; halves
 
 const float LOW_PASS = 0.3;
 const float COMPENSATION_MIN = 2.5e-5;
-const float BAND_0 = 0.28209479177387814;
 
 float byte_of(uint word, int place) {
     return float((word >> (8 * place)) & 255u);
 }
 
-// The three smallest components in 10 bits each, sign and magnitude; above them which of x, y, z, w was left out.
-vec4 quaternion(uint packed) {
-    int largest = int(packed >> 30);
-    vec4 quat = vec4(0.0);
-    for (int i = 3; i >= 0; --i) {
-        if (i == largest) continue;
-        float magnitude = float(packed & 511u) * (0.70710678118654752 / 511.0);
-        quat[i] = (packed & 512u) != 0u ? -magnitude : magnitude;
-        packed >>= 10;
-    }
-    quat[largest] = sqrt(max(0.0, 1.0 - dot(quat, quat)));
-    return normalize(quat);
-}
-
 mat3 rotation(vec4 q) {
-    float x = q.x, y = q.y, z = q.z, w = q.w;
+    float w = q.x, x = q.y, y = q.z, z = q.w;
     return mat3(
         1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
         2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
@@ -62,7 +50,7 @@ vec3 coefficient(int k) {
     vec3 bytes = vec3(
         byte_of(words[i >> 2], i & 3), byte_of(words[(i + 1) >> 2], (i + 1) & 3), byte_of(words[(i + 2) >> 2], (i + 2) & 3)
     );
-    return (bytes - 128.0) / 128.0;
+    return (bytes - 128.0) / 128.0 * u_range;
 }
 
 // Bands 1 to 3 with the Condon-Shortley phase, m = -l ... l.
@@ -105,14 +93,17 @@ void main() {
         && all(lessThan(focal * p.xy, (u_size + margin - principal) * p.z));
     if (!inside) return;
 
-    uvec2 look = texelFetch(u_looks, place, 0).xy;
-    vec3 scales = exp(vec3(byte_of(look.x, 0), byte_of(look.x, 1), byte_of(look.x, 2)) / 16.0 - 10.0);
-    float opacity = byte_of(look.x, 3) / 255.0;
+    uvec4 shape = texelFetch(u_shapes, place, 0);
+    vec2 last = unpackUnorm2x16(packed.w);
+    float opacity = last.x;
+    vec3 scales = exp(vec3(unpackUnorm2x16(shape.z), last.y) * 44.0 - 22.0);
+    vec4 quat = vec4(unpackSnorm2x16(shape.x), unpackSnorm2x16(shape.y));
+    quat /= max(length(quat), 1e-12);
 
     vec2 slope = p.xy / p.z;
     vec2 slack = 0.15 * u_size / focal;
     vec2 clamped = clamp(slope, -principal / focal - slack, (u_size - principal) / focal + slack);
-    mat3 axes = u_rotation * rotation(quaternion(packed.w));
+    mat3 axes = u_rotation * rotation(quat);
     mat3 rows = transpose(mat3(axes[0] * scales.x, axes[1] * scales.y, axes[2] * scales.z));
     vec3 first = focal.x / p.z * (rows[0] - clamped.x * rows[2]);
     vec3 second = focal.y / p.z * (rows[1] - clamped.y * rows[2]);
@@ -123,9 +114,16 @@ void main() {
     float filtered = determinant + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS;
     if (u_antialiased) opacity *= sqrt(max(determinant / filtered, COMPENSATION_MIN));
 
-    vec3 color = 0.5 + BAND_0 / 0.15 * (vec3(byte_of(look.y, 0), byte_of(look.y, 1), byte_of(look.y, 2)) / 255.0 - 0.5);
-    if (u_degree > 0) color += harmonics(place, normalize(mean - u_eye));
-    color = u_pick > 0.0 ? vec3(p.z / (p.z + u_pick)) : max(color, 0.0);
+    vec3 color;
+    if (u_colored) {
+        uvec2 halves = texelFetch(u_colors, place, 0).xy;
+        color = vec3(unpackHalf2x16(halves.x), unpackHalf2x16(halves.y).x);
+    } else {
+        uvec3 levels = uvec3(shape.w, shape.w >> 11, shape.w >> 22) & uvec3(2047u, 2047u, 1023u);
+        color = vec3(levels) * 3.0 / vec3(2047.0, 2047.0, 1023.0) - 1.0;
+        if (u_degree > 0) color += harmonics(place, normalize(mean - u_eye));
+    }
+    color = u_pick > 0.0 ? vec3(p.z / (p.z + u_pick)) : clamp(color, 0.0, 100.0); // far below what halves hold
 
     o_shape = uvec4(floatBitsToUint(focal * slope + principal), floatBitsToUint(vec2(xx + LOW_PASS, xy)));
     o_look = uvec4(

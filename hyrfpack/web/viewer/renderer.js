@@ -1,71 +1,81 @@
 // Draws splats with WebGL 2: project (one fragment a splat), blend (one quad a splat, farthest first), resolve (over
 // the background).
 
-const TEXTURE_WIDTH = 2048; // every WebGL 2 has it
+import { Graphics } from "./graphics.js";
+import { SPHERE_RADIUS, TEXTURE_WIDTH } from "./layout.js";
+
+const LARGEST_PICTURE = 8192; // pixels a side that are read back
 const QUADS = 1024; // an instance: drivers are slow with many small instances
 
-class Renderer {
+export class Renderer {
   // Throws an Error with a sentence where the browser cannot do it.
-  constructor(canvas, scene) {
-    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
-    if (!gl) throw new Error("This browser offers no WebGL 2, which drawing needs; switch it on or take another browser.");
+  constructor(canvas) {
+    const wishes = { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" };
+    const gl = canvas.getContext("webgl2", wishes);
+    if (!gl) throw new Error("This browser offers no WebGL 2, which drawing needs; switch it on or take another one.");
+    gl.getError(); // of a context that was lost before
     this.gl = gl;
-    this.scene = scene;
+    this.graphics = new Graphics(gl);
+    const side = gl.getParameter(gl.MAX_TEXTURE_SIZE), sides = gl.getParameter(gl.MAX_VIEWPORT_DIMS) ?? [0, 0];
+    this.largest = [...sides].map((most) => Math.min(most, side)); // width and height of a picture
     // Thousands of layers are blended: 8 bits would round away what faint ones add.
     this.fine = Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
     gl.getExtension("WEBGL_provoking_vertex")?.provokingVertexWEBGL(0x8e4d); // the first: free of cost everywhere
-    this.project = this.program("whole.vert", "project.frag");
-    this.blend = this.program("blend.vert", "blend.frag");
-    this.resolve = this.program("whole.vert", "resolve.frag");
+    this.project = this.graphics.program("whole.vert", "project.frag");
+    this.blend = this.graphics.program("blend.vert", "blend.frag");
+    this.resolve = this.graphics.program("whole.vert", "resolve.frag");
 
     // Two triangles for each of the quads of one instance.
-    const corners = Uint32Array.from({ length: 6 * QUADS }, (_, k) => 4 * Math.floor(k / 6) + [0, 1, 2, 2, 1, 3][k % 6]);
-    this.quads = gl.createVertexArray();
+    const corner = (k) => 4 * Math.floor(k / 6) + [0, 1, 2, 2, 1, 3][k % 6];
+    const corners = Uint32Array.from({ length: 6 * QUADS }, (_, k) => corner(k));
+    this.quads = this.graphics.keep(gl.createVertexArray(), "VertexArray");
     gl.bindVertexArray(this.quads);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.graphics.keep(gl.createBuffer(), "Buffer"));
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
-    this.nothing = gl.createVertexArray();
+    gl.bindVertexArray(null); // fragments are drawn without any
 
-    this.background = this.texture(gl.TEXTURE_2D, gl.RGBA8, 1, 1);
+    this.unused = { u_colors: this.graphics.texture(gl.TEXTURE_2D, gl.RG32UI, 1, 1) };
+    this.unusedLayers = { u_harmonics: this.graphics.texture(gl.TEXTURE_2D_ARRAY, gl.RGBA32UI, 1, 1, 1) };
+    this.plain = this.graphics.texture(gl.TEXTURE_2D, gl.RGBA8, 1, 1);
+    this.content = null;
     this.drawn = 0;
   }
 
-  // Take what the worker unpacked, and the background's picture where there is one.
-  load({ places, looks, harmonics, antialiased, height }, picture) {
-    const gl = this.gl;
-    if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
-      throw new Error(`These are ${this.scene.count.toLocaleString("en")} splats, more than this device can draw.`);
-    }
-    const size = [TEXTURE_WIDTH, height];
-    this.antialiased = antialiased;
-    this.places = this.texture(gl.TEXTURE_2D, gl.RGBA32UI, ...size);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ...size, gl.RGBA_INTEGER, gl.UNSIGNED_INT, places);
-    this.looks = this.texture(gl.TEXTURE_2D, gl.RG32UI, ...size);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ...size, gl.RG_INTEGER, gl.UNSIGNED_INT, looks);
-    const layers = this.scene.degree;
-    this.harmonics = this.texture(gl.TEXTURE_2D_ARRAY, gl.RGBA32UI, ...(layers ? size : [1, 1]), layers || 1);
-    if (layers) gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, 0, ...size, layers, gl.RGBA_INTEGER, gl.UNSIGNED_INT, harmonics);
+  // Make all that drawing splats (`Splats` or `Fields`) of a scene takes, for `show`; they are freed with the splats.
+  // `picture`: of the background, see `background`.
+  stage(content, scene, picture) {
+    const { gl } = this, { graphics } = content, size = [TEXTURE_WIDTH, content.height];
+    const order = graphics.texture(gl.TEXTURE_2D, gl.R32UI, ...size);
+    const shapes = graphics.texture(gl.TEXTURE_2D, gl.RGBA32UI, ...size);
+    const appearances = graphics.texture(gl.TEXTURE_2D, gl.RGBA32UI, ...size);
+    const projection = graphics.framebuffer(shapes, appearances);
+    const behind = picture ? this.background(graphics, picture) : null;
+    return { content, scene, order, shapes, appearances, projection, projectionSize: size, picture: behind };
+  }
 
-    this.order = this.texture(gl.TEXTURE_2D, gl.R32UI, ...size);
-    this.shapes = this.texture(gl.TEXTURE_2D, gl.RGBA32UI, ...size);
-    this.appearances = this.texture(gl.TEXTURE_2D, gl.RGBA32UI, ...size);
-    this.projection = this.framebuffer(this.shapes, this.appearances);
-    this.projectionSize = size;
+  // Draw what was staged from now on. What was before is freed.
+  show(staged) {
+    this.content?.dispose();
+    Object.assign(this, staged);
+    this.drawn = 0;
+  }
 
-    if (picture) {
-      this.background = this.texture(gl.TEXTURE_2D, gl.RGBA8, picture.naturalWidth, picture.naturalHeight);
-      gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
-      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, gl.RGBA, gl.UNSIGNED_BYTE, picture);
-      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.REPEAT);
-      this.smooth(gl.TEXTURE_2D);
-    }
-    this.sphere = Boolean(picture);
-    if (gl.getError() !== gl.NO_ERROR) throw new Error("The scene does not fit into the memory of the graphics device.");
+  // A texture of a picture of all directions: an image, or {width, height, rgba}.
+  background(graphics, picture) {
+    const { gl } = this;
+    const size = [picture.naturalWidth ?? picture.width, picture.naturalHeight ?? picture.height];
+    const texture = graphics.texture(gl.TEXTURE_2D, gl.RGBA8, ...size);
+    gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
+    if (picture.rgba) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ...size, gl.RGBA, gl.UNSIGNED_BYTE, picture.rgba);
+    else gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, gl.RGBA, gl.UNSIGNED_BYTE, picture);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.REPEAT);
+    graphics.smooth();
+    return texture;
   }
 
   // Take an order: indices of splats, farthest first, of which the first `drawn` count; whole rows of the texture.
   sorted(order, drawn) {
-    const gl = this.gl, rows = Math.ceil(drawn / TEXTURE_WIDTH);
+    const { gl } = this, rows = Math.ceil(drawn / TEXTURE_WIDTH);
     gl.bindTexture(gl.TEXTURE_2D, this.order);
     if (rows) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, TEXTURE_WIDTH, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
     this.drawn = drawn;
@@ -78,23 +88,34 @@ class Renderer {
     this.over(view, size, null);
   }
 
-  // Draw a view and read it: RGB, top row first.
+  // Draw a view and read it: RGB, top row first. Throws an Error with a sentence where the device cannot.
   read(view) {
-    const gl = this.gl, { width, height } = view;
-    const texture = this.texture(gl.TEXTURE_2D, gl.RGBA8, width, height);
-    const target = this.framebuffer(texture);
+    const { gl, graphics } = this, { width, height } = view;
+    this.check(view);
+    gl.getError(); // of anything before
+    const texture = graphics.texture(gl.TEXTURE_2D, gl.RGBA8, width, height);
+    const target = graphics.framebuffer(texture);
     this.splats(view);
     this.over(view, [width, height], target);
     const rgba = new Uint8Array(4 * width * height);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
-    gl.deleteFramebuffer(target);
-    gl.deleteTexture(texture);
+    const refused = gl.getError() !== gl.NO_ERROR && !gl.isContextLost();
+    for (const object of [target, texture]) graphics.free(object);
+    if (width > gl.drawingBufferWidth || height > gl.drawingBufferHeight) this.release();
+    if (refused) throw new Error(`The device cannot draw a picture of ${width} x ${height}; ask for a smaller one.`);
     return rgba.filter((_, place) => (place & 3) !== 3);
+  }
+
+  // Throws an Error with a sentence where a view's picture is too large.
+  check({ width, height }) {
+    const [wide, high] = this.largest.map((side) => Math.min(side, LARGEST_PICTURE));
+    if (width <= wide && height <= high) return;
+    throw new Error(`Pictures here are ${wide} x ${high} pixels at most; ask for a smaller one.`);
   }
 
   // How deep what is seen at a pixel lies, null where there is nothing. `scale` of depths of interest.
   pick(view, x, y, scale) {
-    const gl = this.gl;
+    const { gl } = this;
     const place = [Math.floor(x), Math.floor(y), 1, 1];
     this.splats(view, scale, place);
     const found = this.fine ? new Float32Array(4) : new Uint8Array(4);
@@ -106,7 +127,7 @@ class Renderer {
 
   // Whether the last frame is still being drawn.
   busy() {
-    const gl = this.gl;
+    const { gl } = this;
     if (!this.fence) return false;
     if (gl.getSyncParameter(this.fence, gl.SYNC_STATUS) !== gl.SIGNALED && !gl.isContextLost()) return true;
     gl.deleteSync(this.fence);
@@ -116,7 +137,7 @@ class Renderer {
 
   // Blend the splats of a view; with `pick`, depths instead of colours, at the pixels of `part` (x, y, width, height).
   splats(view, pick = 0, part = [0, 0, view.width, view.height]) {
-    const gl = this.gl, { width, height } = view;
+    const { gl, graphics, blend } = this, { width, height } = view;
     this.projections(view, pick);
     this.reserve(width, height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.layers);
@@ -125,56 +146,60 @@ class Renderer {
     gl.scissor(...part);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    gl.useProgram(this.blend.program);
-    this.bind(this.blend, { u_order: this.order, u_shapes: this.shapes, u_projected: this.appearances });
-    gl.uniform2f(this.blend.u_size, width, height);
-    gl.uniform1i(this.blend.u_drawn, this.drawn);
-    gl.uniform1i(this.blend.u_quads, QUADS);
+    gl.useProgram(blend.program);
+    graphics.bind(blend, { u_order: this.order, u_shapes: this.shapes, u_projected: this.appearances });
+    gl.uniform2f(blend.u_size, width, height);
+    gl.uniform1i(blend.u_drawn, this.drawn);
+    gl.uniform1i(blend.u_quads, QUADS);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.quads);
     const instances = Math.ceil(this.drawn / QUADS);
     if (instances) gl.drawElementsInstanced(gl.TRIANGLES, 6 * QUADS, gl.UNSIGNED_INT, 0, instances);
+    gl.bindVertexArray(null);
     gl.disable(gl.BLEND);
     gl.disable(gl.SCISSOR_TEST);
   }
 
   projections(view, pick) {
-    const gl = this.gl, p = this.project, { rows } = view;
+    const { gl, graphics, project: p, content, scene } = this, { colors, harmonics } = content;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.projection);
     gl.viewport(0, 0, ...this.projectionSize);
     gl.useProgram(p.program);
-    this.bind(p, { u_places: this.places, u_looks: this.looks });
-    this.bind(p, { u_harmonics: this.harmonics }, gl.TEXTURE_2D_ARRAY, 2);
-    gl.uniform1i(p.u_degree, this.scene.degree);
-    gl.uniform1i(p.u_count, this.scene.count);
-    gl.uniform1i(p.u_antialiased, this.antialiased);
-    gl.uniformMatrix3fv(p.u_rotation, true, rows.flat());
+    const colored = colors ? { u_colors: colors } : this.unused;
+    graphics.bind(p, { u_places: content.places, u_shapes: content.shapes, ...colored });
+    graphics.bind(p, harmonics ? { u_harmonics: harmonics } : this.unusedLayers, gl.TEXTURE_2D_ARRAY, 3);
+    gl.uniform1i(p.u_colored, colors ? 1 : 0);
+    gl.uniform1i(p.u_degree, content.degree ?? 0);
+    gl.uniform1f(p.u_range, content.range ?? 1);
+    gl.uniform1i(p.u_count, content.count);
+    gl.uniform1i(p.u_antialiased, content.antialiased);
+    gl.uniformMatrix3fv(p.u_rotation, true, view.rows.flat());
     gl.uniform3fv(p.u_translation, view.translation);
     gl.uniform3fv(p.u_eye, view.eye);
     gl.uniform4f(p.u_intrinsics, view.fx, view.fy, view.cx, view.cy);
     gl.uniform2f(p.u_size, view.width, view.height);
-    gl.uniform1f(p.u_near, this.scene.near);
-    gl.uniform1f(p.u_tolerance, this.scene.tolerance);
+    gl.uniform1f(p.u_near, scene.near);
+    gl.uniform1f(p.u_tolerance, scene.tolerance);
     gl.uniform1f(p.u_pick, pick);
-    gl.bindVertexArray(this.nothing);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
   over(view, used, target) {
-    const gl = this.gl, r = this.resolve;
+    const { gl, graphics, resolve: r, scene, content } = this, picture = content.panorama?.texture ?? this.picture;
+    const { center, radius } = sphereOf(scene);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
     gl.viewport(0, 0, view.width, view.height);
     gl.useProgram(r.program);
-    this.bind(r, { u_splats: this.layered, u_background: this.background });
+    graphics.bind(r, { u_splats: this.layered, u_background: picture ?? this.plain });
     gl.uniform2f(r.u_used, ...used);
-    gl.uniform1i(r.u_sphere, this.sphere);
-    gl.uniform3fv(r.u_solid, this.scene.solid);
-    gl.uniformMatrix3fv(r.u_world, false, view.rows.flatMap(turned)); // rows read as columns: transposed
+    gl.uniform1i(r.u_pictured, picture ? 1 : 0);
+    gl.uniform3fv(r.u_from, view.eye.map((value, axis) => (value - center[axis]) / radius));
+    gl.uniform3fv(r.u_solid, scene.solid);
+    gl.uniformMatrix3fv(r.u_world, false, view.rows.flat()); // rows read as columns: transposed
     gl.uniform4f(r.u_intrinsics, view.fx, view.fy, view.cx, view.cy);
     gl.uniform2f(r.u_size, view.width, view.height);
-    gl.uniform1i(r.u_upright, target === null);
-    gl.bindVertexArray(this.nothing);
+    gl.uniform1i(r.u_upright, target === null ? 1 : 0);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     if (target === null && !this.fence) {
       this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
@@ -184,72 +209,33 @@ class Renderer {
 
   // A target for the splats, at least so large.
   reserve(width, height) {
-    const gl = this.gl;
-    const [w, h] = this.reserved ?? [0, 0];
+    const { gl, graphics } = this, [w, h] = this.reserved ?? [0, 0];
     if (width <= w && height <= h) return;
+    this.release();
     this.reserved = [Math.max(w, width), Math.max(h, height)];
-    if (this.layered) gl.deleteTexture(this.layered);
-    if (this.layers) gl.deleteFramebuffer(this.layers);
-    this.layered = this.texture(gl.TEXTURE_2D, this.fine ? gl.RGBA16F : gl.RGBA8, ...this.reserved);
-    this.smooth(gl.TEXTURE_2D);
-    this.layers = this.framebuffer(this.layered);
+    this.layered = graphics.texture(gl.TEXTURE_2D, this.fine ? gl.RGBA16F : gl.RGBA8, ...this.reserved);
+    graphics.smooth();
+    this.layers = graphics.framebuffer(this.layered);
   }
 
-  texture(kind, format, width, height, depth) {
-    const gl = this.gl, texture = gl.createTexture();
-    gl.bindTexture(kind, texture);
-    if (depth) gl.texStorage3D(kind, 1, format, width, height, depth);
-    else gl.texStorage2D(kind, 1, format, width, height);
-    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(kind, name, gl.NEAREST);
-    for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(kind, name, gl.CLAMP_TO_EDGE);
-    return texture;
+  release() {
+    for (const object of [this.layered, this.layers]) this.graphics.free(object);
+    this.layered = this.layers = this.reserved = null;
   }
 
-  smooth(kind) {
-    const gl = this.gl;
-    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(kind, name, gl.LINEAR);
+  dispose() {
+    this.content?.dispose();
+    this.graphics.dispose();
+    this.gl.deleteSync(this.fence ?? null);
+    this.content = this.fence = null;
   }
+}
 
-  framebuffer(...textures) {
-    const gl = this.gl, framebuffer = gl.createFramebuffer();
-    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-    const places = textures.map((_, number) => gl.COLOR_ATTACHMENT0 + number);
-    places.forEach((place, number) => gl.framebufferTexture2D(gl.FRAMEBUFFER, place, gl.TEXTURE_2D, textures[number], 0));
-    gl.drawBuffers(places);
-    return framebuffer;
-  }
-
-  bind(program, textures, kind = this.gl.TEXTURE_2D, first = 0) {
-    const gl = this.gl;
-    Object.entries(textures).forEach(([name, texture], number) => {
-      gl.activeTexture(gl.TEXTURE0 + first + number);
-      gl.bindTexture(kind, texture);
-      gl.uniform1i(program[name], first + number);
-    });
-    gl.activeTexture(gl.TEXTURE7); // nothing is bound here by others
-  }
-
-  // A program and its uniforms by name.
-  program(...names) {
-    const gl = this.gl, program = gl.createProgram();
-    for (const name of names) {
-      const shader = gl.createShader(name.endsWith(".vert") ? gl.VERTEX_SHADER : gl.FRAGMENT_SHADER);
-      gl.shaderSource(shader, textOf(name));
-      gl.compileShader(shader);
-      gl.attachShader(program, shader);
-    }
-    gl.linkProgram(program);
-    if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
-      const logs = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader)).join(" ");
-      throw new Error(`The graphics driver refuses ${names.join(" and ")}: ${gl.getProgramInfoLog(program)} ${logs}`);
-    }
-    const found = { program };
-    for (let k = 0; k < gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS); k++) {
-      const { name } = gl.getActiveUniform(program, k);
-      found[name] = gl.getUniformLocation(program, name);
-    }
-    return found;
-  }
+// The sphere that the background lies on, in the page's units; a radius of Infinity where nothing is said of it.
+function sphereOf({ kind, sphere, center, unit }) {
+  if (kind === "hyrf") return { center: [0, 0, 0], radius: SPHERE_RADIUS };
+  if (!sphere) return { center: [0, 0, 0], radius: Infinity };
+  return { center: sphere.center.map((value, axis) => (value - center[axis]) / unit), radius: sphere.radius / unit };
 }
 
 // A view in a picture of another resolution.

@@ -5,8 +5,9 @@ precision highp sampler2D; // else lowp, which phones take at its word
 
 uniform sampler2D u_splats; // premultiplied, row 0 on top; a part of it is in use
 uniform vec2 u_used; // its size in texels
-uniform bool u_sphere; // the background is a picture, else a colour
-uniform sampler2D u_background; // equirectangular
+uniform bool u_pictured; // the background is a picture, else a colour
+uniform sampler2D u_background; // equirectangular, on a sphere
+uniform vec3 u_from; // the eye in units of the sphere's radius, from its centre
 uniform vec3 u_solid;
 uniform mat3 u_world; // world from camera
 uniform vec4 u_intrinsics; // fx, fy, cx, cy in pixels of the target
@@ -17,7 +18,10 @@ out vec4 o_color;
 
 const float PI = 3.14159265358979;
 
-vec3 background(vec3 d) {
+// Along a ray: what the sphere shows where it ends.
+vec3 background(vec3 ray) {
+    float along = dot(u_from, ray);
+    vec3 d = normalize(u_from + (sqrt(max(along * along - dot(u_from, u_from) + 1.0, 0.0)) - along) * ray);
     float longitude = atan(d.x, d.z), latitude = asin(clamp(-d.y, -1.0, 1.0));
     return texture(u_background, vec2(0.5 + longitude / (2.0 * PI), 0.5 - latitude / PI)).rgb;
 }
@@ -27,6 +31,6 @@ void main() {
     vec2 texel = clamp(pixel / u_size * u_used, vec2(0.5), u_used - 0.5);
     vec4 splats = texture(u_splats, texel / vec2(textureSize(u_splats, 0)));
     vec3 behind = u_solid;
-    if (u_sphere) behind = background(normalize(u_world * vec3((pixel - u_intrinsics.zw) / u_intrinsics.xy, 1.0)));
+    if (u_pictured) behind = background(normalize(u_world * vec3((pixel - u_intrinsics.zw) / u_intrinsics.xy, 1.0)));
     o_color = vec4(splats.rgb + (1.0 - splats.a) * behind, 1.0);
 }

@@ -1,0 +1,46 @@
+"""Which degree of spherical harmonics a scene wants: more can be worse where few cameras say what colours do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hyrfpack.cameras.between import small_camera
+from hyrfpack.export.bake import bake
+from hyrfpack.export.measure import likeness
+from hyrfpack.export.source import FEW, MEASURED
+from hyrfpack.model import HybridModel
+from hyrfpack.scene import Camera, evenly_spaced
+
+# Every ninth of the cameras, from the fifth on, is not fitted but chosen by; of those that `Source` makes up,
+# which stand three above one another, it is a middle one.
+KEPT_BACK = slice(4, None, 9)
+TOLERANCE = 0.2  # dB that a lower degree, which takes fewer bytes, may score less than the best
+
+
+def choose_degree(model: HybridModel, cameras: Sequence[Camera], highest: int) -> tuple[int, dict[int, float]]:
+    """The lowest degree of harmonics, 0 to `highest`, that looks as good as any, and the score of each, dB.
+
+    The model is baked at all degrees with every ninth of the cameras kept back, and its pictures (of at most 512
+    pixels, without the background) are compared with the model's from those. Where there are too few cameras to spare
+    one (fewer than FEW), all are fitted and compared: nothing then tells a degree that fits too well from a good one.
+
+    Args:
+        model: on the CPU.
+        cameras: that colours shall be fitted at, world units; none of those that a result will be judged by.
+        highest: degree to think of, 0 to 3.
+    """
+    fitted, kept = list(cameras), list(cameras)
+    if len(cameras) >= FEW:
+        kept = fitted[KEPT_BACK]
+        del fitted[KEPT_BACK]
+    baked = bake(model, fitted, range(highest + 1))
+    contenders = {str(degree): (splats, None) for degree, splats in baked.items()}
+    views = [(small_camera(camera), None) for camera in evenly_spaced(kept, MEASURED)]
+    found = likeness(model, contenders, views, sphere=False)
+    scores = {degree: found[str(degree)].model for degree in baked}
+    return lowest_as_good(scores), scores
+
+
+def lowest_as_good(scores: dict[int, float]) -> int:
+    """The lowest degree whose score is within TOLERANCE of the best."""
+    return min(degree for degree, score in scores.items() if score >= max(scores.values()) - TOLERANCE)

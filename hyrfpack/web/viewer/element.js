@@ -1,0 +1,77 @@
+// <hyrf-viewer src="scene.hyrf" camera="2" poster="scene.jpg" autorotate noui>: the player beside this script, in a frame.
+// `src` and `poster` are relative to the page that the element is on. Events: "load", "error" (detail: a sentence).
+
+const PLAYER = new URL("index.html", document.currentScript?.src ?? scriptAddress());
+const LOOK = ":host { display: block; aspect-ratio: 4 / 3; } :host([hidden]) { display: none; } iframe { display: block; width: 100%; height: 100%; border: 0; }";
+
+// A module is told by no one where it lies.
+function scriptAddress() {
+  const scripts = [...document.querySelectorAll("script[src]")].map(({ src }) => src);
+  return scripts.find((address) => new URL(address).pathname.endsWith("/hyrf-viewer.js")) ?? document.baseURI;
+}
+
+class HyrfViewer extends HTMLElement {
+  static observedAttributes = ["src", "camera", "poster", "title", "autorotate", "noui"];
+
+  constructor() {
+    super();
+    const style = new CSSStyleSheet(); // a page's policy may forbid style elements
+    style.replaceSync(LOOK);
+    this.frame = document.createElement("iframe");
+    this.frame.allow = "fullscreen; clipboard-write";
+    this.frame.sandbox = "allow-scripts allow-same-origin allow-downloads";
+    const root = this.attachShadow({ mode: "open" });
+    root.adoptedStyleSheets = [style];
+    root.append(this.frame);
+    this.hear = this.hear.bind(this);
+  }
+
+  connectedCallback() {
+    addEventListener("message", this.hear);
+    this.follow();
+  }
+
+  disconnectedCallback() {
+    removeEventListener("message", this.hear);
+  }
+
+  attributeChangedCallback() {
+    if (this.isConnected) this.follow();
+  }
+
+  // Once for all attributes that change together. Another camera only changes what follows #, so that nothing is loaded anew.
+  async follow() {
+    if (this.following) return;
+    this.following = true;
+    await null;
+    this.following = false;
+    const address = new URL(PLAYER);
+    for (const [name, asked] of [["src", "content"], ["poster", "poster"]]) {
+      const value = this.getAttribute(name);
+      if (!value) continue;
+      try {
+        address.searchParams.set(asked, new URL(value, document.baseURI));
+      } catch {
+        this.tell("error", `${name} is no address of a file: ${value}`);
+      }
+    }
+    if (this.title) address.searchParams.set("title", this.title);
+    for (const name of ["autorotate", "noui"]) {
+      if (this.hasAttribute(name)) address.searchParams.set(name, "");
+    }
+    if (this.hasAttribute("camera")) address.hash = `camera=${this.getAttribute("camera")}`;
+    this.frame.title = this.title || "3D scene";
+    if (this.frame.src !== address.href) this.frame.src = address;
+  }
+
+  hear({ source, data }) {
+    if (source !== this.frame.contentWindow || !["load", "error"].includes(data?.hyrf)) return;
+    this.tell(data.hyrf, String(data.message ?? ""));
+  }
+
+  tell(name, detail) {
+    this.dispatchEvent(new CustomEvent(name, { detail }));
+  }
+}
+
+if (!customElements.get("hyrf-viewer")) customElements.define("hyrf-viewer", HyrfViewer);

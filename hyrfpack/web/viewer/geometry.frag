@@ -1,0 +1,35 @@
+// Opacity, scales and rotation of each Gaussian, which no view changes.
+uniform sampler2D u_explicit; // x, y, z; opacity logit
+uniform sampler2D u_logits; // colour logits; scale logit
+uniform bool u_product; // the scale rule, else the sum
+uniform bool u_grows; // the largest scale, outwards
+
+layout(location = 0) out uvec4 o_place; // as project.frag has them
+layout(location = 1) out uvec4 o_shape;
+
+vec3 log_sigmoid(vec3 x) {
+    return min(x, 0.0) - log(1.0 + exp(-abs(x)));
+}
+
+void main() {
+    ivec2 place = ivec2(gl_FragCoord.xy);
+    vec4 own = texelFetch(u_explicit, place, 0);
+    float logit = texelFetch(u_logits, place, 0).w;
+    begin(BIAS_1);
+    add_place(own.xyz, INPUTS, 2 * CELLS);
+    rectify();
+    vec4 first = WEIGHT(BIAS_3), last = WEIGHT(BIAS_3 + 1);
+    for (int group = 0; group < 2 * CELLS; ++group) {
+        vec4 units = second(group);
+        first += MATRIX(MATRIX_3 + 4 * group) * units;
+        last += MATRIX(MATRIX_3 + 8 * CELLS + 4 * group) * units;
+    }
+    vec3 scales = u_product ? log_sigmoid(first.yzw) + log_sigmoid(vec3(logit)) : log_sigmoid(first.yzw + logit);
+    if (u_grows) scales += log(max(1.0, norm(own.xyz / u_half_extent)));
+    scales = (scales + 22.0) / 44.0;
+    vec4 quat = last + vec4(1.0, 0.0, 0.0, 0.0);
+    quat /= max(length(quat), 1e-12);
+    float opacity = 1.0 / (1.0 + exp(-first.x - own.w));
+    o_place = uvec4(floatBitsToUint(own.xyz), packUnorm2x16(vec2(opacity, scales.z)));
+    o_shape = uvec4(packSnorm2x16(quat.xy), packSnorm2x16(quat.zw), packUnorm2x16(scales.xy), 0u);
+}

@@ -1,0 +1,118 @@
+// Splats and models as the shaders read them: texels of textures that are TEXTURE_WIDTH wide.
+
+import { decoderLayout, gridLevels } from "../hyrf/grids.js";
+import { TEXTURE_WIDTH } from "./layout.js";
+
+const CELL = 8; // hidden units that are kept together
+
+const rowsOf = (count) => Math.max(1, Math.ceil(count / TEXTURE_WIDTH));
+
+const unorm16 = (value) => Math.round(65535 * Math.min(1, Math.max(0, value)));
+const snorm16 = (value) => Math.round(32767 * Math.min(1, Math.max(-1, value))) & 0xffff;
+const pair16 = (low, high) => (low | (high << 16)) >>> 0;
+const logScale = (scale) => unorm16((Math.log(scale) + 22) / 44);
+const step = (color, most) => Math.round((most * (Math.min(2, Math.max(-1, color)) + 1)) / 3);
+
+// Textures of splats (see viewer/formats): places and shapes, 4 words a splat, harmonics, 4 words a splat and layer.
+export function packSplats(splats) {
+  const { count, degree, antialiased, positions, scales, quats, opacities, colors, harmonics, range } = splats;
+  const height = rowsOf(count), capacity = TEXTURE_WIDTH * height;
+  const floats = new Uint32Array(positions.buffer, positions.byteOffset, 3 * count);
+  const places = new Uint32Array(4 * capacity), shapes = new Uint32Array(4 * capacity);
+  for (let i = 0, p = 0, q = 0; i < count; i++, p += 3, q += 4) {
+    places[q] = floats[p];
+    places[q + 1] = floats[p + 1];
+    places[q + 2] = floats[p + 2];
+    places[q + 3] = pair16(unorm16(opacities[i]), logScale(scales[p + 2]));
+    shapes[q] = pair16(snorm16(quats[q]), snorm16(quats[q + 1]));
+    shapes[q + 1] = pair16(snorm16(quats[q + 2]), snorm16(quats[q + 3]));
+    shapes[q + 2] = pair16(logScale(scales[p]), logScale(scales[p + 1]));
+    const red = step(colors[p], 2047), green = step(colors[p + 1], 2047), blue = step(colors[p + 2], 1023);
+    shapes[q + 3] = red | (green << 11) | (blue << 22);
+  }
+  const others = count ? harmonics.length / count : 0;
+  const layered = new Uint8Array(16 * capacity * degree); // a layer holds 16 bytes of each splat
+  for (let i = 0, at = 0; i < count; i++) {
+    for (let b = 0; b < others; b++) layered[16 * ((b >> 4) * capacity + i) + (b & 15)] = harmonics[at++];
+  }
+  return { count, height, degree, range, antialiased, places, shapes, harmonics: new Uint32Array(layered.buffer) };
+}
+
+// A model of hyrf/index.js for fields.js.
+export function packModel({ config, count, positions, colorLogits, scaleLogits, opacityLogits, geometry, radiance }) {
+  const height = rowsOf(count);
+  const explicit = new Float32Array(4 * TEXTURE_WIDTH * height), logits = new Float32Array(4 * TEXTURE_WIDTH * height);
+  for (let i = 0, p = 0, q = 0; i < count; i++, p += 3, q += 4) {
+    explicit[q] = positions[p];
+    explicit[q + 1] = positions[p + 1];
+    explicit[q + 2] = positions[p + 2];
+    explicit[q + 3] = opacityLogits[i];
+    logits[q] = colorLogits[p];
+    logits[q + 1] = colorLogits[p + 1];
+    logits[q + 2] = colorLogits[p + 2];
+    logits[q + 3] = scaleLogits[i];
+  }
+  const field = (which, { table, decoder }) => ({
+    table,
+    levels: gridLevels(config[which]).map((level) => [level.resolution, level.first, level.rows, Number(level.dense)]),
+    decoder: packDecoder(decoder, decoderLayout(config, which)),
+  });
+  return {
+    count, height, explicit, logits,
+    balls: rowBalls(positions, count),
+    geometry: field("geometry", geometry),
+    radiance: field("radiance", radiance),
+    cells: Math.ceil(config.hidden / CELL),
+    sh: config.direction_encoding === "sh",
+    halfExtent: config.frame.half_extent,
+    product: config.scale_rule === "product",
+    grows: config.scale_grows,
+    antialiased: config.antialiased,
+    background: config.background,
+    finest: config.radiance.finest,
+  };
+}
+
+// A decoder's numbers by fours, hidden units filled up to whole cells: bias 1, the weights of each input, bias 2, for
+// each four units of the second hidden layer the weights of each of the first, bias 3, likewise. {numbers, and the
+// place of each part in fours}.
+function packDecoder(decoder, [first, second, last]) {
+  const width = CELL * Math.ceil(first.outputs / CELL), ends = 4 * Math.ceil(last.outputs / 4);
+  const places = { BIAS_1: 0, INPUTS: width / 4 };
+  places.BIAS_2 = places.INPUTS + (first.inputs * width) / 4;
+  places.MATRIX_2 = places.BIAS_2 + width / 4;
+  places.BIAS_3 = places.MATRIX_2 + (width * width) / 4;
+  places.MATRIX_3 = places.BIAS_3 + ends / 4;
+  const WEIGHTS = places.MATRIX_3 + (ends * width) / 4, numbers = new Float32Array(4 * WEIGHTS);
+  const bias = (layer, at) => numbers.set(decoder.subarray(layer.bias, layer.bias + layer.outputs), 4 * at);
+  const weight = (layer, output, input) => decoder[layer.matrix + output * layer.inputs + input];
+  bias(first, places.BIAS_1);
+  bias(second, places.BIAS_2);
+  bias(last, places.BIAS_3);
+  for (let i = 0; i < first.inputs; i++) {
+    for (let o = 0; o < first.outputs; o++) numbers[4 * places.INPUTS + i * width + o] = weight(first, o, i);
+  }
+  for (const [layer, at] of [[second, places.MATRIX_2], [last, places.MATRIX_3]]) {
+    for (let o = 0; o < layer.outputs; o++) {
+      const group = o - (o % 4);
+      for (let i = 0; i < layer.inputs; i++) numbers[4 * at + group * width + 4 * i + (o % 4)] = weight(layer, o, i);
+    }
+  }
+  return { numbers, places: { ...places, WEIGHTS } };
+}
+
+// For each row of a texture a ball around its Gaussians' positions: x, y, z, radius.
+function rowBalls(positions, count) {
+  const balls = new Float32Array(4 * rowsOf(count));
+  for (let row = 0; row * TEXTURE_WIDTH < count; row++) {
+    const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+    const end = 3 * Math.min(count, (row + 1) * TEXTURE_WIDTH);
+    for (let p = 3 * row * TEXTURE_WIDTH; p < end; p++) {
+      low[p % 3] = Math.min(low[p % 3], positions[p]);
+      high[p % 3] = Math.max(high[p % 3], positions[p]);
+    }
+    const half = [0, 1, 2].map((axis) => high[axis] / 2 - low[axis] / 2);
+    balls.set([...half.map((side, axis) => low[axis] + side), Math.hypot(...half)], 4 * row);
+  }
+  return balls;
+}

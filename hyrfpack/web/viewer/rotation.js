@@ -1,0 +1,38 @@
+// Rotations as unit quaternions (w, x, y, z), for what lies between two of them and for short addresses.
+
+// Of a matrix with these rows.
+export function quatOf([[a, b, c], [d, e, f], [g, h, i]]) {
+  // From the largest of four, so that nothing is divided by little.
+  const squares = [1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i];
+  const largest = squares.indexOf(Math.max(...squares));
+  const quat = [
+    [squares[0], h - f, c - g, d - b],
+    [h - f, squares[1], b + d, c + g],
+    [c - g, b + d, squares[2], f + h],
+    [d - b, c + g, f + h, squares[3]],
+  ][largest];
+  return normalizedQuat(quat[0] < 0 ? quat.map((value) => -value) : quat);
+}
+
+// The rows of its matrix.
+export function rowsOf([w, x, y, z]) {
+  return [
+    [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+  ];
+}
+
+export function normalizedQuat(quat) {
+  const length = Math.hypot(...quat);
+  return quat.map((value) => value / length);
+}
+
+// The rotation a part of the way from one to another, the shorter way round.
+export function slerp(from, to, part) {
+  const cosine = from.reduce((sum, value, k) => sum + value * to[k], 0), sign = cosine < 0 ? -1 : 1;
+  const angle = Math.acos(Math.min(1, Math.abs(cosine)));
+  if (angle < 1e-6) return to;
+  const [a, b] = [Math.sin((1 - part) * angle), sign * Math.sin(part * angle)];
+  return normalizedQuat(from.map((value, k) => a * value + b * to[k]));
+}

@@ -1,0 +1,57 @@
+// What a player has to know of a file that is opened by itself: the scene, as pages have it in JSON.
+
+import { backgroundColors } from "../hyrf/fields.js";
+import { viewpointOf } from "../hyrf/viewpoint.js";
+import { SPHERE_RADIUS } from "./layout.js";
+
+const NEAR_PLANE = 0.01; // hyrfpack.render's defaults: local units; of half the picture's size
+const CULL_BAND = 0.3;
+const SAMPLED_SPLATS = 10000;
+const PICTURE_ROWS = 128;
+
+export function modelScene({ metadata, config, count }, name) {
+  const { cameras, up, target } = viewpointOf(metadata), { center, scale } = config.frame;
+  return {
+    kind: "hyrf", title: name, count, center, unit: scale, near: NEAR_PLANE, tolerance: CULL_BAND, up, target,
+    solid: config.solid, cameras,
+  };
+}
+
+// Splats say nothing of cameras: one looks at their middle, from as far as befits most of them.
+export function splatsScene({ count, center, unit, positions }, name) {
+  const step = Math.max(1, Math.floor(count / SAMPLED_SPLATS)), axes = [[], [], []];
+  for (let i = 0; i < count; i += step) axes.forEach((values, axis) => values.push(positions[3 * i + axis]));
+  const middle = axes.map((values) => percentile(values, 0.5));
+  const reach = axes.map((values, axis) => percentile(values.map((value) => Math.abs(value - middle[axis])), 0.9));
+  const size = Math.max(...reach) || 1;
+  const target = middle.map((value, axis) => center[axis] + unit * value);
+  const viewpoint = viewpointOf({ config: { frame: { center: target, scale: size * unit } } });
+  return {
+    kind: "splats", title: name, count, center, unit, near: NEAR_PLANE * size, tolerance: CULL_BAND,
+    up: viewpoint.up, target, solid: [0, 0, 0], cameras: viewpoint.cameras,
+  };
+}
+
+const percentile = (values, part) => Float32Array.from(values).sort()[Math.floor(part * (values.length - 1))] ?? 0;
+
+// The background of a model as a picture of all directions from its middle, for devices that cannot make it themselves:
+// {width, height, rgba}, equirectangular; null where there is none.
+export function backgroundPicture(model) {
+  if (!model.config.background) return null;
+  const height = PICTURE_ROWS, width = 2 * height, directions = new Float32Array(3 * width * height);
+  for (let v = 0, at = 0; v < height; v++) {
+    const latitude = Math.PI * (0.5 - (v + 0.5) / height);
+    for (let u = 0; u < width; u++) {
+      const longitude = Math.PI * ((2 * (u + 0.5)) / width - 1);
+      directions[at++] = Math.cos(latitude) * Math.sin(longitude);
+      directions[at++] = -Math.sin(latitude);
+      directions[at++] = Math.cos(latitude) * Math.cos(longitude);
+    }
+  }
+  const colors = backgroundColors(model, directions.map((value) => SPHERE_RADIUS * value), directions);
+  const rgba = new Uint8Array(4 * width * height).fill(255);
+  for (let k = 0; k < width * height; k++) {
+    for (let c = 0; c < 3; c++) rgba[4 * k + c] = Math.round(255 * colors[3 * k + c]);
+  }
+  return { width, height, rgba };
+}

@@ -1,0 +1,91 @@
+"""The degree of harmonics follows the scene; the cameras that it is chosen by are not those that judge the result."""
+
+from __future__ import annotations
+
+import pytest
+from scenes import ring, small_model
+
+from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.paths import Viewpoint
+from hyrfpack.errors import HyrfError
+from hyrfpack.export import degree as degrees
+from hyrfpack.export import export, pipeline
+from hyrfpack.export.degree import choose_degree, lowest_as_good
+from hyrfpack.export.source import Source
+from hyrfpack.format import save
+from hyrfpack.splats.files import read_splats
+
+POSITIONS = [[0.1, 0.2, 0.3], [-0.4, 0.1, 0.0], [0.2, -0.5, 0.1], [0.0, 0.4, -0.3]]
+
+
+def written(path, fields: float, cameras):
+    """A model whose colours follow the direction if `fields` is not 0."""
+    model = small_model(POSITIONS, fields=fields, direction_encoding="sh")
+    save(model, path, provenance={"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json()})
+    return path
+
+
+def test_colours_that_follow_no_direction_take_degree_0(tmp_path):
+    source = written(tmp_path / "m.hyrf", 0.0, ring(20))
+    report = export(source, tmp_path / "a.spz")
+    assert report.degree == read_splats(tmp_path / "a.spz").degree == 0
+    assert list(report.chosen_by) == list(report.by_degree) == [0, 1, 2, 3]
+
+
+def test_colours_that_follow_the_direction_take_more_and_the_reason_is_told(tmp_path):
+    source, said = written(tmp_path / "m.hyrf", 4.0, ring(40)), []
+    report = export(source, tmp_path / "a.ply", say=said.append)
+    assert report.degree >= 2 and report.degree == lowest_as_good(report.chosen_by)
+    told = f"degree {report.degree} it is: {', '.join(f'{score:.2f}' for score in report.chosen_by.values())} dB"
+    assert any(sentence.startswith(told) for sentence in said)
+
+
+def test_a_degree_that_is_given_is_not_questioned(tmp_path, monkeypatch):
+    monkeypatch.setattr(pipeline, "choose_degree", lambda *arguments: pytest.fail("it was chosen"))
+    source = written(tmp_path / "m.hyrf", 0.0, ring(20))
+    assert (export(source, tmp_path / "a.ply", degree=2).degree, export(source, tmp_path / "a.splat").degree) == (2, 0)
+    with pytest.raises(HyrfError, match="degree 4"):
+        export(source, tmp_path / "a.ply", degree=4)
+
+
+@pytest.mark.parametrize(("scores", "lowest"), [
+    ([40.0, 40.1, 40.15, 40.2], 0),
+    ([30.0, 43.56, 43.0, 42.05], 1),
+    ([30.0, 35.0, 36.0, 36.19], 2),
+    ([30.0, 31.0, 32.0, 33.0], 3),
+    ([40.0], 0),
+])  # fmt: skip
+def test_the_lowest_degree_as_good_as_any_is_taken(scores, lowest):
+    assert lowest_as_good(dict(enumerate(scores))) == lowest
+
+
+@pytest.mark.parametrize("count", [4, 16, 60])
+def test_cameras_are_kept_back_unless_there_are_too_few_and_the_measured_ones_never_count(count, tmp_path, monkeypatch):
+    fitted, judged = [], []
+
+    def watched_bake(model, cameras, which):
+        fitted.extend(camera.position.tobytes() for camera in cameras)
+        return bake(model, cameras, which)
+
+    def watched_likeness(model, contenders, views, **options):
+        judged.extend(camera.position.tobytes() for camera, _ in views)
+        return likeness(model, contenders, views, **options)
+
+    bake, likeness = degrees.bake, degrees.likeness
+    monkeypatch.setattr(degrees, "bake", watched_bake)
+    monkeypatch.setattr(degrees, "likeness", watched_likeness)
+    source = Source.read(written(tmp_path / "m.hyrf", 1.0, ring(count)))
+    choose_degree(source.model, source.fitted, 3)
+    allowed = {camera.position.tobytes() for camera in source.fitted}
+    measured = {camera.position.tobytes() for camera, _ in source.measured}
+    assert judged and set(fitted) | set(judged) == allowed
+    if count >= 16:
+        assert not measured & (set(fitted) | set(judged))
+    if len(source.fitted) >= 16:
+        assert not set(fitted) & set(judged)
+
+
+def test_a_crop_is_of_the_degree_of_the_whole(tmp_path):
+    source = written(tmp_path / "m.hyrf", 4.0, ring(40))
+    whole, part = export(source, tmp_path / "a.ply"), export(source, tmp_path / "b.ply", crop=(-9, -9, -9, -0.1, 9, 9))
+    assert part.degree == whole.degree and part.gaussians == 1 and part.chosen_by == whole.chosen_by

@@ -1,0 +1,133 @@
+"""Pages with the model itself inside: nothing is lost, what would change it is refused, and bad files go nowhere."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+from scenes import ball_scene, ring, small_model
+
+import hyrfpack
+from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.paths import Viewpoint
+from hyrfpack.errors import HyrfError, HyrfFormatError
+from hyrfpack.export import export
+from hyrfpack.export.pages import POSTER_BYTES
+from hyrfpack.export.poster import encode_poster
+from hyrfpack.format import load, save
+from hyrfpack.render import render
+from hyrfpack.web.html import payload_of
+
+POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    """Forty Gaussians before a background sphere, and twenty cameras around them."""
+    path, cameras = tmp_path_factory.mktemp("models") / "model.hyrf", ring(20, width=96, height=64)
+    kept = {"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json()}
+    save(small_model(POSITIONS, fields=2.0, background=True, solid=(0.1, 0.2, 0.3)), path, provenance=kept)
+    return path
+
+
+@pytest.fixture(scope="module")
+def compact(model, tmp_path_factory):
+    path = tmp_path_factory.mktemp("compact") / "compact.hyrf"
+    hyrfpack.compress(model, path)
+    return path
+
+
+def test_the_page_holds_the_file_and_what_is_known_of_it(model, tmp_path):
+    report = export(model, tmp_path / "room.html")
+    page = (tmp_path / "room.html").read_bytes()
+    scene, inside = payload_of(page, "page")
+    assert inside == model.read_bytes() and b"<title>room</title>" in page
+    frame = load(model).config.frame
+    assert (scene["kind"], scene["title"], scene["count"]) == ("hyrf", "room", 40)
+    assert (scene["center"], scene["unit"], scene["solid"]) == (list(frame.center), frame.scale, [0.1, 0.2, 0.3])
+    first = np.array(scene["cameras"][0]["camera_from_world"])
+    assert len(scene["cameras"]) == 12 and np.allclose(first, ring(20)[0].camera_from_world, atol=1e-6)
+    assert (report.native, report.bytes, report.gaussians) == (True, len(page), 40)
+    assert (report.views, report.psnr, report.by_degree, report.chosen_by) == (0, None, {}, {})
+
+
+def test_the_same_export_gives_the_same_bytes(model, tmp_path):
+    (tmp_path / "again").mkdir()
+    for path in (tmp_path / "a.html", tmp_path / "again" / "a.html"):
+        export(model, path)
+    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "again" / "a.html").read_bytes()
+
+
+def test_the_poster_is_what_the_first_camera_sees(model, tmp_path):
+    export(model, tmp_path / "a.html")
+    (data,) = re.findall(
+        rb'id="poster" alt="" src="data:image/webp;base64,([^"]*)"', (tmp_path / "a.html").read_bytes()
+    )
+    poster = Image.open(io.BytesIO(base64.b64decode(data)))
+    seen = render(load(model), ring(20, width=96, height=64)[0]).rgb.numpy().clip(0, 1)
+    assert poster.size == (96, 64) and np.abs(np.asarray(poster) / 255 - seen).mean() < 0.03
+
+
+@pytest.mark.parametrize(("form", "most"), [("WEBP", 3000), ("JPEG", 3000), ("WEBP", 100)])
+def test_a_poster_takes_no_more_bytes_than_it_may(form, most):
+    noise = Image.fromarray(np.random.default_rng(0).integers(0, 255, (360, 480, 3), np.uint8))
+    data = encode_poster(noise, form, most)
+    assert len(data) <= most and Image.open(io.BytesIO(data)).format == form
+    plain = Image.new("RGB", (480, 360), (10, 20, 30))
+    assert Image.open(io.BytesIO(encode_poster(plain, form, POSTER_BYTES))).size == (480, 360)
+
+
+def test_a_file_that_keeps_no_cameras_is_seen_from_around_or_from_its_photos(compact, tmp_path):
+    export(compact, tmp_path / "a.html")
+    export(compact, tmp_path / "b.html", data=ball_scene(5))
+    made_up, photos = (payload_of((tmp_path / name).read_bytes(), name)[0] for name in ("a.html", "b.html"))
+    assert len(made_up["cameras"]) == 12 and len(photos["cameras"]) == 5
+    assert np.allclose(photos["cameras"][0]["camera_from_world"], ball_scene(5).train[0].camera.camera_from_world)
+
+
+def test_a_file_that_could_be_smaller_goes_along_and_that_is_said(model, compact, tmp_path):
+    said = []
+    export(compact, tmp_path / "a.html", say=said.append)
+    assert said == []
+    export(model, tmp_path / "a.html", say=said.append)
+    size = model.stat().st_size
+    assert said == [f"{model} goes along as it is, {size:,} bytes; 'hyrfpack compress' makes it smaller"]
+
+
+@pytest.mark.parametrize("target", ["a.html", "player"])
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"degree": 1}, "--sh-degree"),
+        ({"crop": (0, 0, 0, 1, 1, 1)}, "--crop"),
+        ({"min_opacity": 0.1}, "--min-opacity"),
+        ({"background": False}, "--no-background"),
+        ({"background": False, "degree": 0}, "--sh-degree and --no-background"),
+    ],
+)
+def test_what_would_change_the_model_is_refused_and_baked_is_named(target, options, name, model, tmp_path):
+    with pytest.raises(HyrfError, match=rf"^[^\n]*{target}: [^\n]* {name} [^\n]*--baked$"):
+        export(model, tmp_path / target, **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_baked_player_folder_is_refused(model, tmp_path):
+    with pytest.raises(HyrfError, match=r"player: [^\n]*--baked[^\n]*\.html$"):
+        export(model, tmp_path / "player", baked=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("target", ["a.html", "player"])
+def test_files_that_cannot_be_loaded_go_nowhere(target, compact, tmp_path):
+    data = compact.read_bytes()
+    damaged = bytearray(data)
+    damaged[-20] ^= 1
+    for bad in (bytes(damaged), data[: len(data) // 2], b"", b"\x89PNG"):
+        (tmp_path / "bad.hyrf").write_bytes(bad)
+        with pytest.raises(HyrfFormatError, match=r"^[^\n]*bad\.hyrf: [^\n]*$"):
+            export(tmp_path / "bad.hyrf", tmp_path / target)
+        assert [path.name for path in tmp_path.iterdir()] == ["bad.hyrf"]

@@ -1,0 +1,93 @@
+"""The list of scenes: plain HTML without scripts, in which nothing that it is told is HTML."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from hyrfpack.web.gallery import Card, encode_gallery, size_of
+
+HOSTILE = "\"><script>alert(1)</script>'&{{style}}"
+
+
+class Elements(HTMLParser):
+    """Tags with their attributes, and the text in them."""
+
+    def __init__(self, page: bytes) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict]] = []
+        self.text = ""
+        self.feed(page.decode())
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        self.text += data
+
+    def of(self, tag: str) -> list[dict]:
+        return [attributes for name, attributes in self.found if name == tag]
+
+
+def test_each_scene_is_a_card_with_a_link():
+    cards = [
+        Card("room", "room.hyrf", "room.jpg", 12_345, 86_000, "25.07 dB on 12 held-out photos"),
+        Card("hall", "hall.spz", None, 1, 1_500_000),
+    ]
+    page = Elements(encode_gallery("scenes", cards, "player.html"))
+    assert [link["href"] for link in page.of("a")] == [
+        "player.html?content=room.hyrf&poster=room.jpg",
+        "player.html?content=hall.spz",
+    ]
+    assert [image["src"] for image in page.of("img")] == ["room.jpg"] and page.of("img")[0]["alt"] == ""
+    assert "12,345 Gaussians · 86 kB · 25.07 dB on 12 held-out photos" in page.text
+    assert "1 Gaussians · 1.5 MB" in page.text
+    assert len(page.of("h1")) == 1 and len(page.of("h2")) == len(page.of("li")) == 2
+
+
+def test_a_gallery_runs_no_script_and_takes_nothing_for_html():
+    data = encode_gallery(HOSTILE, [Card(HOSTILE, HOSTILE, HOSTILE, 1, 1, HOSTILE)], "player.html")
+    page = Elements(data)
+    assert not page.of("script") and b"{{style}}" in data
+    (policy,) = (meta["content"] for meta in page.of("meta") if meta.get("http-equiv"))
+    assert "default-src 'none'" in policy and "script-src" not in policy and "unsafe" not in policy
+    assert {tag for tag, _ in page.found} <= {
+        *("html", "head", "meta", "title", "link", "style", "body", "main", "h1", "ul", "li", "img", "h2", "a", "p"),
+    }
+
+
+def test_a_gallery_is_shared_with_its_first_picture_and_follows_the_light():
+    cards = [Card("a", "a.hyrf", None, 1, 1), Card("b", "b.hyrf", "b.jpg", 1, 1)]
+    data = encode_gallery("scenes", cards, "player.html").decode()
+    assert '<meta property="og:image" content="b.jpg">' in data and "2 scenes" in data
+    assert "prefers-color-scheme: dark" in data
+
+
+def luminance(color: str) -> float:
+    """Relative luminance (WCAG 2) of #rgb or #rrggbb."""
+    digits = color[1:] if len(color) == 7 else "".join(2 * digit for digit in color[1:])
+    parts = [int(digits[at : at + 2], 16) / 255 for at in (0, 2, 4)]
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+
+
+def test_text_stands_out_in_light_and_dark():
+    data = encode_gallery("scenes", [], "player.html").decode()
+    schemes = re.findall(r":root \{([^}]*)\}", data)
+    assert len(schemes) == 2
+    for scheme in schemes:
+        colors = dict(re.findall(r"--(\w+): (#\w+);", scheme))
+        for ink in ("ink", "dim"):
+            for ground in ("page", "card"):
+                light, dark = sorted((luminance(colors[ink]), luminance(colors[ground])), reverse=True)
+                assert (light + 0.05) / (dark + 0.05) >= 4.5, (ink, ground)
+
+
+@pytest.mark.parametrize(
+    ("length", "said"),
+    [(1, "1 kB"), (85_952, "86 kB"), (999_400, "999 kB"), (999_500, "1.0 MB"), (2**30, "1,073.7 MB")],
+)
+def test_sizes_are_in_units_that_people_think_in(length, said):
+    assert size_of(length) == said

@@ -1,0 +1,440 @@
+"""What a person is shown and can do besides moving: panel, messages, help, links, pictures; with keys alone, too."""
+
+from __future__ import annotations
+
+import base64
+import io
+import itertools
+import json
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from web.pages import (
+    Browser,
+    camera,
+    cloud,
+    drawn,
+    eye,
+    json_of,
+    message,
+    opened,
+    page_of,
+    psnr,
+    rested,
+    settled,
+    shown,
+    until,
+)  # fmt: skip
+from web.scripts import run_script
+
+from hyrfpack.web.html import decode_page
+
+PHONE = {"dense": 2.0, "phone": True}
+
+
+@pytest.fixture(autouse=True)
+def usual(browser: Browser) -> Iterator[None]:
+    """Tests may change the window and what a person prefers."""
+    yield
+    browser.resize(240, 180)
+    browser.prefer()
+
+
+def hidden(browser: Browser, name: str) -> bool:
+    return browser.evaluate(f"!document.getElementById('{name}').checkVisibility()")
+
+
+# ---- what stands where
+
+
+@pytest.mark.parametrize("size", [(390, 844), (844, 390), (600, 400), (1280, 800)], ids=str)
+def test_the_panel_is_open_only_where_there_is_room(browser: Browser, tmp_path: Path, size: tuple[int, int]):
+    browser.resize(*size)
+    opened(browser, tmp_path, page_of(cloud(50)))
+    assert hidden(browser, "panel") == (size != (1280, 800))
+    assert not hidden(browser, "toggle")
+    browser.evaluate("document.getElementById('toggle').click()")
+    expanded = browser.evaluate("document.getElementById('toggle').getAttribute('aria-expanded')")
+    assert expanded == str(not hidden(browser, "panel")).lower() == str(size != (1280, 800)).lower()
+
+
+@pytest.mark.parametrize("size", [(800, 600), (390, 844), (844, 390), (320, 480)], ids=str)
+def test_nothing_overlaps_or_sticks_out_whatever_is_said(browser: Browser, tmp_path: Path, size: tuple[int, int]):
+    browser.resize(*size)
+    opened(browser, tmp_path, page_of(cloud(50), title="a_very_long_name_of_a_scene " * 8 + "without_any_space" * 9))
+    browser.evaluate(
+        "document.getElementById('hint').hidden = false,"
+        "document.getElementById('remark').textContent = 'Drawn with harmonics: this device is too weak.',"
+        "document.getElementById('remark').hidden = document.getElementById('panel').hidden = false"
+    )
+    browser.evaluate("location.hash = 'camera=no'")
+    assert "camera" in message(browser)
+    browser.evaluate("document.getElementById('loading').hidden = false")
+    boxes = browser.evaluate(
+        "['panel', 'toggle', 'loading', 'hint', 'remark', 'message'].map((name) => {"
+        "  const box = document.getElementById(name).getBoundingClientRect();"
+        "  return [name, box.left, box.top, box.right, box.bottom];"
+        "})"
+    )
+    for name, left, top, right, bottom in boxes:
+        assert left >= 0 and top >= 0 and right <= size[0] and bottom <= size[1] and right - left > 20, name
+    for (one, *a), (other, *b) in itertools.combinations(boxes, 2):
+        if {one, other} & {"panel"} and size[1] < 500:
+            continue  # a panel that a person opens on a small phone covers what it must
+        assert a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1], f"{one} overlaps {other}"
+
+
+def test_the_panel_tells_what_is_shown(browser: Browser, tmp_path: Path):
+    browser.resize(1280, 800)
+    opened(browser, tmp_path, page_of(cloud(1500), title="<b>& co"))
+    text = "document.getElementById('{}').textContent"
+    assert browser.evaluate(text.format("title")) == "<b>& co"
+    assert browser.evaluate(text.format("count")) == "1,500 splats"
+    ends = time.monotonic() + 20
+    while not re.fullmatch(r"\d+ fps", browser.evaluate(text.format("speed"))):
+        assert time.monotonic() < ends, "it tells no speed"
+        browser.press("w", seconds=0.5)  # a frame may take longer than this
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_stands_out_in_light_and_dark(browser: Browser, tmp_path: Path, scheme: str):
+    browser.prefer(scheme)
+    browser.resize(1280, 800)
+    opened(browser, tmp_path, page_of(cloud(3)))
+    script = """(() => {
+        const style = getComputedStyle(document.documentElement);
+        const context = new OffscreenCanvas(1, 1).getContext("2d", { willReadFrequently: true });
+        const read = (layers) => {
+            for (const layer of layers) {
+                context.fillStyle = layer.startsWith("--") ? style.getPropertyValue(layer) : layer;
+                context.fillRect(0, 0, 1, 1);
+            }
+            return [...context.getImageData(0, 0, 1, 1).data.slice(0, 3)];
+        };
+        return ["white", "black"].flatMap((scene) => [
+            [read(["--ink"]), read([scene, "--glass"])], [read(["--dim"]), read([scene, "--glass"])],
+            [read(["--ink"]), read([scene, "--glass", "--button"])],
+            [read(["--accent"]), read([scene, "--glass", "--button"])],
+            [read(["--dim"]), read(["--solid"])], [read(["--ink"]), read(["--page"])],
+        ]);
+    })()"""
+    for ink, paper in browser.evaluate(script):
+        light, dark = sorted(map(luminance, (ink, paper)), reverse=True)
+        assert (light + 0.05) / (dark + 0.05) >= 4.5, (ink, paper)
+    dark_page = luminance(browser.evaluate(script)[-1][1]) < 0.1
+    assert dark_page == (scheme == "dark")
+
+
+def luminance(color: list[int]) -> float:
+    """Relative luminance of sRGB bytes (WCAG 2)."""
+    values = np.array(color) / 255
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def test_noui_leaves_the_canvas_and_messages(browser: Browser, tmp_path: Path):
+    browser.resize(1280, 800)
+    opened(browser, tmp_path, page_of(cloud(50)), "?noui#camera=77")
+    assert all(hidden(browser, name) for name in ("panel", "toggle", "hint", "invitation", "loading"))
+    assert "no camera 77, only 3" in message(browser) and not hidden(browser, "message")
+
+
+# ---- messages
+
+
+def test_a_message_can_be_dismissed_by_button_and_escape_and_a_good_address_takes_it_away(
+    browser: Browser, tmp_path: Path
+):
+    browser.resize(480, 360)
+    opened(browser, tmp_path, page_of(cloud(50)), "#camera={}")
+    assert "needs width" in message(browser)
+    browser.evaluate("document.getElementById('dismiss').click()")
+    assert hidden(browser, "message")
+    for bad, way_out in {
+        "%zz": lambda: browser.press("Escape"),
+        "0": lambda: browser.evaluate("location.hash = 'camera=2'"),
+    }.items():
+        browser.evaluate(f"location.hash = 'camera={bad}'")
+        assert "names no camera that can be used" in message(browser)
+        box = browser.evaluate("document.getElementById('message').getBoundingClientRect().top")
+        assert box > 200, "it covers the middle"
+        way_out()
+        until(browser, "document.getElementById('message').hidden")
+
+
+BAD_CAMERAS = {
+    "0": "no camera 0, only 3", "4": "no camera 4, only 3", "-1": "9 numbers", "1,2,3": "9 numbers",
+    "1,2,3,0,0,0,0,1": "no unit quaternion", "1,2,3,1,0,0,0,1e9": "focal length", "1,2,3,1,0,0,0,nan": "9 numbers",
+    "1,2,3,1,0,0,0,": "9 numbers", "{": "names no camera", "[1]": "9 numbers", "null": "9 numbers",
+    '{"width": 1}': "needs width", "%E0%A4%A": "names no camera", "<b>x</b>": "9 numbers",
+}  # fmt: skip
+
+
+def test_every_bad_camera_is_one_sentence_and_the_scene_is_there(browser: Browser, tmp_path: Path):
+    opened(browser, tmp_path, page_of(cloud(50)))
+    home = eye(browser)
+    for text, words in BAD_CAMERAS.items():
+        browser.evaluate(f"location.hash = 'camera=' + {json.dumps(text)}")
+        said = message(browser)
+        assert words in said and said.startswith("The address names no camera that can be used: "), text
+        browser.press("Escape")
+        until(browser, "document.getElementById('message').hidden")
+        np.testing.assert_array_equal(eye(browser).camera_from_world, home.camera_from_world)
+    assert browser.complaints() == []
+
+
+# ---- the address, there and back
+
+
+def test_a_shared_link_leads_back_to_the_same_view(browser: Browser, tmp_path: Path):
+    opened(browser, tmp_path, page_of(cloud()))
+    browser.drag((120, 90), (161, 103))
+    browser.mouse("mouseWheel", 60, 150, deltaX=0, deltaY=-150)
+    browser.drag((120, 90), (107, 93), button="right")
+    before = eye(browser)
+    browser.press("l")
+    until(browser, "!document.getElementById('toast').hidden")
+    fragment = browser.evaluate("location.hash")
+    assert len(fragment) < 110, fragment
+    opened(browser, tmp_path, page_of(cloud()), fragment)
+    after = eye(browser)
+    assert np.linalg.norm(after.position - before.position) < 1e-4
+    assert np.abs(after.rotation - before.rotation).max() < 1e-4
+    assert after.fx == pytest.approx(before.fx, rel=1e-4)
+    turned = [(120, 90), (160, 90)]
+    browser.drag(*turned)  # about the same point
+    there = eye(browser)
+    opened(browser, tmp_path, page_of(cloud()), "#camera=" + json_of(before))
+    browser.drag(*turned)
+    assert np.linalg.norm(there.position - eye(browser).position) < 0.5
+    assert browser.complaints() == []
+
+
+def test_links_are_as_exact_in_any_unit_and_however_a_camera_is_turned(tmp_path: Path):
+    rng = np.random.default_rng(5)
+    cases = []
+    for _ in range(300):
+        rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        rotation *= np.sign(np.linalg.det(rotation))
+        unit = float(10.0 ** rng.uniform(-5, 6))
+        case = {
+            "rows": rotation.tolist(),
+            "eye": (rng.normal(size=3) * 3).tolist(),
+            "fy": float(rng.uniform(100, 3000)),
+        }
+        cases.append({**case, "unit": unit, "center": (rng.normal(size=3) * unit * 10).tolist()})
+    (tmp_path / "cases.json").write_text(json.dumps(cases))
+    answers = run_script(Path(__file__).with_name("links.mjs"), tmp_path / "cases.json")
+    for case, answer in zip(cases, answers, strict=True):
+        wanted = answer["wanted"]
+        assert np.abs(np.array(answer["rows"]) - case["rows"]).max() < 1e-5, answer
+        assert np.abs(np.array(answer["eye"]) - case["eye"]).max() < 1e-5 * wanted["pace"], answer
+        assert answer["focal"] == pytest.approx(wanted["focal"], rel=1e-5)
+        assert answer["depth"] == pytest.approx(wanted["depth"], rel=1e-4) and len(answer["text"]) < 140, answer
+
+
+def test_where_the_clipboard_is_closed_the_link_stands_there_to_be_copied(browser: Browser, tmp_path: Path):
+    with browser.before_every_page("Object.defineProperty(Navigator.prototype, 'clipboard', { value: undefined })"):
+        opened(browser, tmp_path, page_of(cloud(50)))
+        browser.press("l")
+        until(browser, "!document.getElementById('toast').hidden")
+        selected = "((field) => field.value.slice(field.selectionStart, field.selectionEnd))(document.activeElement)"
+        assert browser.evaluate(selected) == browser.evaluate("location.href")
+        home = eye(browser)
+        browser.press("w", seconds=0.1)  # typed into the field
+        assert np.array_equal(eye(browser).camera_from_world, home.camera_from_world)
+        browser.press("Escape")
+        assert hidden(browser, "toast")
+
+
+def test_a_copied_link_is_what_the_address_says(browser: Browser, tmp_path: Path):
+    clipboard = "{ value: { writeText: async (text) => { window.copied = text; } } }"
+    with browser.before_every_page(f"Object.defineProperty(Navigator.prototype, 'clipboard', {clipboard})"):
+        opened(browser, tmp_path, page_of(cloud(50)))
+        browser.press("l")
+        until(browser, "window.copied !== undefined")
+        assert browser.evaluate("copied === location.href && location.hash.startsWith('#camera=')")
+        assert "copied" in browser.evaluate("document.getElementById('done').textContent")
+
+
+@pytest.mark.parametrize("where", ["?camera=2", "#camera=2", "?camera=3#camera=2"])
+def test_the_address_can_name_a_camera_by_its_number(browser: Browser, tmp_path: Path, where: str):
+    opened(browser, tmp_path, page_of(cloud(50)), where)
+    np.testing.assert_allclose(eye(browser).camera_from_world, camera(1.5).camera_from_world, atol=1e-9)
+    assert browser.evaluate("document.getElementById('cameras').selectedIndex") == 1
+
+
+def test_the_address_can_name_the_title(browser: Browser, tmp_path: Path):
+    opened(browser, tmp_path, page_of(cloud(50)), "?title=%3Ci%3Emine")
+    assert browser.evaluate("document.title") == "<i>mine"
+    assert browser.evaluate("document.getElementById('title').children.length") == 0
+
+
+# ---- pictures
+
+
+def test_a_picture_is_what_the_window_shows(browser: Browser, tmp_path: Path):
+    script = (
+        "const make = URL.createObjectURL; URL.createObjectURL = (blob) => { window.saved = blob; return make(blob); };"
+        "HTMLAnchorElement.prototype.click = function () { window.named = this.download; }"
+    )
+    with browser.before_every_page(script):
+        page = page_of(cloud(), title="a/scene: 1")
+        settled(opened(browser, tmp_path, page))
+        browser.press("c")
+        until(browser, "window.named !== undefined")
+        assert browser.evaluate("named") == "a_scene_ 1.png"
+        text = "((bytes) => btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join('')))"
+        data = base64.b64decode(browser.evaluate(f"saved.arrayBuffer().then((all) => {text}(new Uint8Array(all)))"))
+    with Image.open(io.BytesIO(data)) as picture:
+        assert picture.format == "PNG"
+        seen = np.asarray(picture.convert("RGB"), np.float64)
+    at = eye(browser)
+    assert seen.shape == (at.height, at.width, 3) == (180, 240, 3)
+    assert psnr(seen, drawn(decode_page(page, "page")[0], at)) > 40
+    assert np.abs(shown(browser, at) - seen).max() <= 3
+
+
+POSTER = base64.b64decode(b"UklGRh4AAABXRUJQVlA4TBEAAAAvAAAAAAdQ//73v/+BiOh/AAA=")  # one pixel
+
+
+def test_a_poster_is_there_until_something_is_seen(browser: Browser, tmp_path: Path):
+    (tmp_path / "page.html").write_bytes(page_of(cloud(), poster=POSTER))
+    watch = (
+        "addEventListener('DOMContentLoaded', () => { window.posters = [Boolean(document.getElementById('poster'))]; })"
+    )
+    with browser.before_every_page(watch):
+        browser.open((tmp_path / "page.html").as_uri())
+    browser.evaluate("hyrfpack.ready")
+    assert browser.evaluate("posters") == [True]
+    until(browser, "!document.getElementById('poster') && hyrfpack.player.times.first !== null")
+
+
+def test_without_webgl_the_poster_stays_with_a_sentence_and_no_buttons(browser: Browser, tmp_path: Path):
+    browser.resize(1280, 800)
+    (tmp_path / "page.html").write_bytes(page_of(cloud(50), poster=POSTER))
+    with browser.before_every_page("HTMLCanvasElement.prototype.getContext = () => null"):
+        browser.open((tmp_path / "page.html").as_uri())
+        assert "no WebGL 2" in message(browser)
+    assert not hidden(browser, "poster")
+    assert all(hidden(browser, name) for name in ("panel", "toggle", "loading"))
+    assert browser.evaluate("document.getElementById('message').getBoundingClientRect().top") > 600
+
+
+# ---- help
+
+
+def test_help_is_for_what_a_person_has_at_hand(browser: Browser, tmp_path: Path):
+    parts = (
+        "[...document.querySelectorAll('#help [data-with]')].filter((part) => part.checkVisibility())"
+        ".map((part) => part.dataset.with)"
+    )
+    browser.resize(390, 844, **PHONE)
+    opened(browser, tmp_path, page_of(cloud(3)))
+    ask = "document.querySelector('[data-key=\"?\"]').click()"
+    browser.evaluate(ask)
+    assert browser.evaluate(parts) == ["touch"]
+    browser.press("Escape")
+    browser.evaluate(ask)  # a keyboard has been used meanwhile
+    assert browser.evaluate(parts) == ["touch", "keys"]
+    browser.resize(1280, 800)
+    opened(browser, tmp_path, page_of(cloud(3)))
+    browser.press("?")
+    assert browser.evaluate(parts) == ["mouse", "keys"]
+
+
+def test_a_first_visit_has_a_hint_that_the_first_act_takes_away(browser: Browser, tmp_path: Path):
+    opened(browser, tmp_path, page_of(cloud(3)))
+    browser.evaluate("localStorage.clear()")
+    opened(browser, tmp_path, page_of(cloud(3)))
+    assert browser.evaluate("document.getElementById('hint').textContent").startswith("Drag to turn")
+    assert not hidden(browser, "hint")
+    browser.drag((120, 90), (125, 90))
+    until(browser, "document.getElementById('hint').hidden")
+    opened(browser, tmp_path, page_of(cloud(3)))
+    assert hidden(browser, "hint")
+
+
+def test_a_page_without_storage_works(browser: Browser, tmp_path: Path):
+    with browser.before_every_page(
+        "Object.defineProperty(window, 'localStorage', { get() { throw new Error('no'); } })"
+    ):
+        opened(browser, tmp_path, page_of(cloud(3)))
+        assert not hidden(browser, "hint")
+        browser.drag((120, 90), (125, 90))
+        until(browser, "document.getElementById('hint').hidden")
+    assert browser.complaints() == []
+
+
+# ---- keys alone, and ears alone
+
+
+def test_the_tab_key_reaches_everything_shows_where_it_is_and_leaves(browser: Browser, tmp_path: Path):
+    browser.resize(1280, 800)
+    opened(browser, tmp_path, page_of(cloud(50)))
+    browser.evaluate("(localStorage.setItem('hyrfpack.hinted', '1'), document.querySelector('details').open = true)")
+    wanted = browser.evaluate(
+        "[...document.querySelectorAll('canvas, button, select, summary, input')].filter((it) => it.checkVisibility()"
+        " && !it.disabled).map((it) => (it.dataset.number = Math.random(), it.dataset.number))"
+    )
+    assert len(wanted) == 15
+    met = []
+    for _ in range(len(wanted)):
+        browser.press("Tab")
+        number, outline = browser.evaluate(
+            "((it) => [it.dataset.number, getComputedStyle(it).outlineStyle])(document.activeElement)"
+        )
+        met.append(number)
+        assert outline != "none", "one cannot see where the focus is"
+    assert met == wanted
+    browser.press("Tab")
+    assert browser.evaluate("document.activeElement === document.body || !document.hasFocus()"), "a trap"
+
+
+def test_keys_press_every_button(browser: Browser, tmp_path: Path):
+    browser.resize(1280, 800)
+    opened(browser, tmp_path, page_of(cloud(50)))
+    keys = browser.evaluate("[...document.querySelectorAll('[data-key]')].map((button) => button.dataset.key)")
+    assert sorted(keys) == sorted("PNRTLC?FH")
+    for key, effect in {
+        "t": "document.getElementById('turn').getAttribute('aria-pressed') === 'true'",
+        "3": "document.getElementById('cameras').selectedIndex === 2",
+        "9": "document.getElementById('cameras').selectedIndex === 2",
+        "h": "document.getElementById('panel').hidden",
+        "l": "!document.getElementById('toast').hidden",
+        "?": "document.getElementById('help').open",
+    }.items():
+        browser.press(key)
+        until(browser, effect)
+    browser.press("Escape")
+    until(browser, "!document.getElementById('help').open")
+
+
+def test_those_who_hear_the_page_are_told_what_happens(browser: Browser, tmp_path: Path):
+    watch = (
+        "addEventListener('DOMContentLoaded', () => { window.heard = [];"
+        "  const status = document.getElementById('status');"
+        "  new MutationObserver(() => heard.push(status.textContent)).observe(status, { childList: true });"
+        "})"
+    )
+    with browser.before_every_page(watch):
+        opened(browser, tmp_path, page_of(cloud(50), title="bonsai"))
+    browser.evaluate("hyrfpack.player.settled.then(() => true)")
+    heard = browser.evaluate("heard")
+    assert any("percent" in sentence for sentence in heard) and heard[-1] == "bonsai is shown."
+    assert len(heard) < 16, "it chatters"
+    browser.press("n")
+    rested(browser)
+    assert browser.evaluate("heard.at(-1)") == "Camera 2 of 3"
+    nameless = browser.evaluate(
+        "[...document.querySelectorAll('button, select, input:not([hidden]), canvas, progress')].filter((it) =>"
+        " !(it.getAttribute('aria-label') || it.textContent.trim() || it.labels?.length)).map((it) => it.outerHTML)"
+    )
+    assert nameless == []
+    live = "[...document.querySelectorAll('[role=status], [role=alert]')].map((it) => it.id)"
+    assert {"status", "message", "done"} <= set(browser.evaluate(live))

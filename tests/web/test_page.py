@@ -1,0 +1,220 @@
+"""The page's file: whole, small and safe, whatever is inside; what is put in comes out."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import io
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hyrfpack.cameras.paths import look_at
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.model import Frame
+from hyrfpack.scene import Camera
+from hyrfpack.splats.splats import Splats, normalized_quats
+from hyrfpack.web.html import decode_page, encode_native, encode_page, payload_of
+from hyrfpack.web.player import encode_player, player_page
+
+UP, CENTER = np.array([0.0, -1.0, 0.0]), np.array([1000.0, -50.0, 20.0])
+FRAME = Frame((1000.0, -50.0, 20.0), 4.0, (1.0, 1.0, 1.0))
+TITLE = '</title><script>alert("x")</script>{{script}}'
+PAGE_BYTES = 90_000  # of a page besides its file in base64
+
+
+def cloud(count: int = 1500) -> Splats:
+    """Splats of all shapes around CENTER, far from the origin."""
+    rng = np.random.default_rng(1)
+    harmonics = rng.normal(size=(count, 16, 3)) * np.array([0.8] + [0.12] * 15)[:, None]
+    shapes = np.exp(rng.normal(-3.3, 0.8, (count, 3))), normalized_quats(rng.normal(size=(count, 4)))
+    return Splats(CENTER + rng.normal(size=(count, 3)) * 0.5, *shapes, rng.uniform(size=count), harmonics)
+
+
+def stage(**more: object) -> dict:
+    pose = look_at(CENTER + np.array([1.5, -0.75, -1.8]), CENTER, UP)
+    cameras = [Camera(120, 90, 110.0, 110.0, 60.0, 45.0, pose)]
+    return {"title": "a scene", "cameras": cameras, "up": UP, "center": CENTER, "solid": (0.2, 0.3, 0.1), **more}
+
+
+def baked(splats: Splats | None = None, **more: object) -> bytes:
+    return encode_page(cloud() if splats is None else splats, **stage(**{"near": 0.01, "background": None, **more}))
+
+
+def native(data: bytes = b"a model", **more: object) -> bytes:
+    return encode_native(data, count=1234, frame=FRAME, **stage(**more))
+
+
+def packed_texts(page: bytes) -> dict[str, str]:
+    """The player's scripts and shaders, unpacked."""
+    (packed,) = re.findall(rb'id="player">([^<]*)<', page)
+    return json.loads(gzip.decompress(base64.b64decode(packed)))
+
+
+def policy(page: bytes) -> dict[str, str]:
+    (content,) = re.findall(rb'http-equiv="Content-Security-Policy" content="([^"]*)"', page)
+    return dict(directive.split(" ", 1) for directive in content.decode().split("; "))
+
+
+PAGES = {
+    "native": lambda: native(title=TITLE, poster=b"picture"),
+    "baked": lambda: baked(title=TITLE, poster=b"picture", background=np.full((4, 8, 3), 0.5)),
+    "player": lambda: encode_player(TITLE, content="scene.hyrf", poster="poster.jpg", description=TITLE),
+    "served": lambda: encode_player(TITLE, content="scene.hyrf", fetches="'self'"),
+}
+
+
+@pytest.mark.parametrize("kind", PAGES)
+def test_a_page_is_the_same_bytes_each_time_and_runs_only_what_its_policy_names(kind):
+    page = PAGES[kind]()
+    assert page == PAGES[kind]()
+    (script,) = re.findall(r"<script>(.*?)</script>", page.decode(), re.DOTALL)
+    allowed = policy(page)
+    hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (
+        script,
+        packed_texts(page)["main.js"],
+    )]  # fmt: skip
+    assert allowed["script-src"] == " ".join(f"'sha256-{value}'" for value in hashes)
+    assert allowed["default-src"] == "'none'" and "unsafe" not in str(allowed)
+    assert not re.search(r"\son\w+=", page.decode()), "an inline handler"
+
+
+@pytest.mark.parametrize("kind", PAGES)
+def test_a_title_cannot_break_out_of_the_page(kind):
+    text = PAGES[kind]().decode()
+    assert '<script>alert("x")' not in text and "&lt;script&gt;alert" in text and "{{script}}" in text
+
+
+@pytest.mark.parametrize("kind", ["native", "baked"])
+def test_a_page_with_a_scene_inside_names_no_other_file_and_may_fetch_nothing(kind):
+    page = PAGES[kind]()
+    assert not re.search(rb'(src|href)="(?!data:)', page) and b"og:image" not in page
+    assert not re.search(r"import\(|\bhttps?://", "".join(packed_texts(page).values()))
+    assert "connect-src" not in policy(page) and policy(page)["img-src"] == "data: blob:"
+
+
+def test_a_player_may_fetch_what_its_address_names_and_a_served_one_only_from_its_server():
+    hosted, served = policy(PAGES["player"]()), policy(PAGES["served"]())
+    assert hosted["connect-src"] == "'self' https: http:" and hosted["img-src"] == "'self' https: http: data: blob:"
+    assert served["connect-src"] == "'self'" and served["img-src"] == "'self' data: blob:"
+
+
+def test_a_player_is_told_what_lies_beside_it():
+    page = encode_player("room", content="scene.hyrf", poster="poster.jpg", description="a & b").decode()
+    assert (
+        '<script type="text/plain" id="content">{"content": "scene.hyrf", "title": "room", "stages": {}}</script>'
+        in page
+    )
+    assert '<img id="poster" alt="" src="poster.jpg">' in page
+    assert '<meta property="og:image" content="poster.jpg">' in page
+    assert '<meta property="og:description" content="a &amp; b">' in page
+    empty = encode_player("empty").decode()
+    assert 'id="content"' not in empty and 'id="poster"' not in empty and 'id="scene"' not in empty
+
+
+@pytest.mark.parametrize(("readers", "most"), [(False, 50_500), (True, 58_500)])
+def test_the_player_alone_is_small(readers, most):
+    assert len(gzip.compress(player_page("hyrfpack", [], "a player", readers=readers))) <= most
+
+
+def test_a_native_page_is_little_more_than_its_file():
+    data = np.random.default_rng(0).bytes(86_000)
+    assert len(native(data, poster=bytes(9_000))) <= len(data) * 4 / 3 + PAGE_BYTES
+
+
+@pytest.mark.parametrize("length", [0, 1, 2, 3, 1000, 10_000])
+def test_the_file_inside_a_native_page_is_the_file(length, monkeypatch):
+    monkeypatch.setattr("hyrfpack.web.player.BLOCK", 3000)
+    data = np.random.default_rng(0).bytes(length)
+    page = native(data)
+    scene, inside = payload_of(page, "page")
+    assert inside == data and page.count(b'class="payload"') == -(-length // 3000)
+    assert (scene["kind"], scene["title"], scene["count"], len(scene["cameras"])) == ("hyrf", "a scene", 1234, 1)
+    assert (scene["center"], scene["unit"], scene["near"]) == ([1000.0, -50.0, 20.0], 4.0, 0.01)
+
+
+def test_a_poster_is_in_the_page():
+    file = io.BytesIO()
+    Image.new("RGB", (8, 4)).save(file, "WEBP")
+    (address,) = re.findall(
+        rb'<img id="poster" alt="" src="data:image/webp;base64,([^"]*)"', native(poster=file.getvalue())
+    )
+    assert base64.b64decode(address) == file.getvalue()
+
+
+@pytest.mark.parametrize("page", [native, baked])
+def test_a_page_needs_a_camera(page):
+    with pytest.raises(ValueError, match="camera"):
+        page(cameras=[])
+
+
+# --- splats -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_page_holds_its_splats_as_finely_as_spz_far_from_the_origin_and_in_any_unit():
+    for factor in (1e-6, 1.0, 1e6):
+        splats = cloud(300)
+        splats = replace(splats, positions=splats.positions * factor, scales=splats.scales * np.float32(factor))
+        back, _ = decode_page(baked(splats), "page")
+        extent = np.ptp(splats.positions, axis=0).max()
+        assert np.abs(back.positions - splats.positions).max() < extent * 2**-21
+        assert np.abs(np.log(back.scales / splats.scales)).max() < 1 / 31
+        assert np.abs(back.opacities - splats.opacities).max() < 1 / 500
+        assert back.degree == 3
+
+
+def test_many_splats_come_in_blocks_that_unpack_apart(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("hyrfpack.web.player.BLOCK", 3000)
+    page = baked()
+    assert page.count(b'class="payload"') > 10 and len(decode_page(page, "page")[0]) == 1500
+
+
+@pytest.mark.parametrize("data", [b"", b"<html>", b'<script type="text/plain" id="scene">{}</script>', native()])
+def test_what_is_no_page_of_splats_is_refused_in_one_sentence(data: bytes):
+    with pytest.raises(HyrfDataError, match=r"^x\.html: this is not a page"):
+        decode_page(data, "x.html")
+
+
+def test_damaged_pages_give_splats_or_one_sentence():
+    page = baked(cloud(20))
+    rng = np.random.default_rng(0)
+    places = [match.span(1) for match in re.finditer(rb'(?:id="scene"|class="payload")>([^<]*)<', page)]
+    for _ in range(300):
+        damaged, (first, last) = bytearray(page), places[rng.integers(2)]
+        damaged[rng.integers(first, last)] = rng.integers(256)
+        try:
+            decode_page(bytes(damaged), "x.html")
+        except HyrfDataError as error:
+            assert str(error).startswith("x.html: ") and "\n" not in str(error)
+
+
+def test_the_viewers_endings_of_splats_are_those_that_hyrfpack_reads():
+    from hyrfpack.splats.files import READ
+    from hyrfpack.web.player import SPLATS
+
+    assert set(SPLATS) == set(READ)
+
+
+def test_the_page_and_its_parts_are_installed_with_the_package():
+    import hyrfpack.web
+
+    folder = Path(hyrfpack.web.__file__).parent
+    listed = (folder.parents[1] / "pyproject.toml").read_text()
+    for entry in folder.rglob("*"):
+        if entry.is_file() and entry.suffix not in (".py", ".pyc"):
+            place = entry.relative_to(folder)
+            pattern = f"{place.parent}/*" if len(place.parts) > 1 else place.name
+            assert f'"{pattern}"' in listed, entry
+
+
+def test_a_player_is_told_from_where_to_look_at_the_files_beside_it():
+    seen = {"cameras": [], "up": [0, -1, 0], "target": [0, 0, 0]}
+    page = encode_player("a", stages={"a </script>.hyrf": seen}).decode()
+    (beside,) = re.findall(r'<script type="text/plain" id="content">([^<]*)</script>', page)
+    assert json.loads(beside) == {"content": None, "title": "a", "stages": {"a </script>.hyrf": seen}}
