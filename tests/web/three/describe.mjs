@@ -1,0 +1,43 @@
+// `node describe.mjs MODEL.hyrf DEGREE`, in a folder where three, hyrf.js and hyrf-three.js are: what of a file arrives
+// in a scene of three.js, in the axes of the file's world, and where its first camera looks from.
+
+import { readFile } from "node:fs/promises";
+
+import { PerspectiveCamera, Scene, Vector3 } from "three/webgpu";
+
+import { loadHyrf, lookFrom } from "./hyrf-three.js";
+
+const [file, degree] = process.argv.slice(2), scene = new Scene(), told = [];
+let early = null;
+const onCoarse = (some) => (early = some.children[0].children.filter((child) => child.isGaussianSplat).length);
+const bytes = new Uint8Array(await readFile(file));
+const options = { degree: Number(degree), onCoarse, onProgress: (done) => told.push(done) };
+const object = await loadHyrf(bytes, options), camera = new PerspectiveCamera();
+scene.add(object);
+scene.updateMatrixWorld(true);
+lookFrom(camera, object);
+
+const meshes = [];
+object.traverse((child) => child.isGaussianSplat && meshes.push(child));
+const [{ splatGeometry: geometry, matrixWorld }] = meshes, position = geometry.getAttribute("position");
+const world = matrixWorld.clone().premultiply(object.matrixWorld.clone().invert());
+const places = Array.from({ length: position.count }, (_, i) => {
+  return new Vector3().fromBufferAttribute(position, i).applyMatrix4(world).toArray();
+});
+const numbers = (name) => Array.from(geometry.getAttribute(name)?.array ?? []);
+const bytesOf = (band) => Array.from(new Uint8Array(Uint32Array.from(numbers(`sphericalHarmonics${band}`)).buffer));
+const sphere = object.children[0].children.find((child) => !child.isGaussianSplat);
+console.log(JSON.stringify({
+  early, told,
+  meshes: meshes.length,
+  places,
+  covariances: numbers("covariance"),
+  colors: numbers("color"),
+  bands: [1, 2, 3].map(bytesOf),
+  unit: Math.cbrt(world.determinant()),
+  eye: object.worldToLocal(camera.position.clone()).toArray(),
+  forward: camera.getWorldDirection(new Vector3()).transformDirection(object.matrixWorld.clone().invert()).toArray(),
+  up: new Vector3(...object.userData.hyrf.up).transformDirection(object.matrixWorld).toArray(),
+  fov: camera.fov,
+  sphere: sphere ? Array.from(sphere.material.map.image.data) : null,
+}));
