@@ -15,14 +15,6 @@ _EXPORT = re.compile(r"^export (?=(?:async )?function|class|const|let)")
 _NAME = re.compile(r"^(?:export )?(?:async )?(?:function\*?|class|const|let) ([\w$]+)", re.MULTILINE)
 _BLOCK = re.compile(r"^[ \t]*/\*(?:(?!\*/).)*\*/[ \t]*$", re.DOTALL | re.MULTILINE)
 _TRAILING = re.compile(r"\s+// [^\"'`]*$")
-# Strings, templates (without others in them) and regular expressions, which stay as they are; and white space.
-_KEPT_OR_SPACE = re.compile(
-    r"""("(?:[^"\\\n]|\\.)*"|'(?:[^'\\\n]|\\.)*'|`(?:[^`\\]|\\.)*`"""
-    r"|(?:(?<=[=(,:\[!&|?{};])|(?<=[=(,:\[!&|?{};>] )|(?<=return ))"
-    r"/(?![/*])(?:[^/\\\n\[]|\\.|\[(?:[^\]\\\n]|\\.)*\])+/)"
-    r"|\s+",
-    re.DOTALL,
-)
 _OUT = re.compile(r"</script|<!--", re.IGNORECASE)  # what ends a script element, or changes where it ends
 
 
@@ -68,25 +60,10 @@ def bundle(entry: str) -> str:
         placed[path] = "\n".join(lines)
 
     place(entry)
-    script = '"use strict";\n' + squeezed("\n".join(text for text in placed.values() if text))
+    script = '"use strict";\n' + "\n".join(text for text in placed.values() if text)
     if match := _OUT.search(script):
         raise ValueError(f"{entry}: '{match[0]}' in a script would end the page's script element; write it otherwise")
     return script
-
-
-def squeezed(script: str) -> str:
-    """JavaScript, with a semicolon after each statement that wants one, without needless white space."""
-
-    def keep(match: re.Match[str]) -> str:
-        before, after = script[match.start() - 1 : match.start()], script[match.end() : match.end() + 1]
-        if match[1]:
-            return match[1]
-        if "\n" in match[0]:
-            return "" if before in tuple("{};,([") else "\n"
-        words = all(re.match(r"[\w$]", letter) for letter in (before, after))
-        return " " if words or (before in ("+", "-") and after in ("+", "-")) else ""
-
-    return _KEPT_OR_SPACE.sub(keep, script)
 
 
 def bare_script(text: str) -> str:

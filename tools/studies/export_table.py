@@ -23,7 +23,7 @@ from hyrfpack.export.background import background_picture, background_splats
 from hyrfpack.export.bake import bake
 from hyrfpack.export.kinds import PAGE
 from hyrfpack.export.measure import Likeness, likeness
-from hyrfpack.export.pages import baked_page as page
+from hyrfpack.export.pages import baked_page
 from hyrfpack.export.source import Source
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats, concatenate
@@ -85,7 +85,7 @@ def row(
 ) -> None:
     """Write, read, score and print one file."""
     if name == PAGE.ending:
-        data, write = timed(lambda: page(source, baked[degree], picture, "scene"))
+        data, write = timed(lambda: baked_page(source, baked[degree], picture, "scene"))
         back, read = timed(lambda: decode_page(data, name))
     else:
         form = FORMATS[name.split()[0]]

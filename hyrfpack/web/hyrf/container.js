@@ -10,11 +10,11 @@ import { HyrfFormatError, damagedFile, groupedDigits, newerFile, quotedText } fr
  * }} Entry
  */
 
-const MAGIC_BYTES = [0x89, 0x48, 0x59, 0x52, 0x46, 0x0d, 0x0a, 0x0a];
+export const MAGIC_BYTES = [0x89, 0x48, 0x59, 0x52, 0x46, 0x0d, 0x0a, 0x0a];
 const MAJOR_VERSION = 1;
-const HEADER_BYTES = 48;
-const ENTRY_BYTES = 40;
-const MOST_SECTIONS = 1024;
+export const HEADER_BYTES = 48;
+export const ENTRY_BYTES = 40;
+export const MOST_SECTIONS = 1024;
 const MOST_BYTES = 2 ** 34; // of a file, and of what it decodes to
 // Decoded bytes that a file may promise: so many for each of its own, and some that are free.
 const EXPANSION = 1024;

@@ -11,6 +11,7 @@
 //       {order: {ticket, number, order, drawn}}
 //       {error}                           why it cannot be read, said as soon as that is certain
 
+import { ENTRY_BYTES, HEADER_BYTES, MAGIC_BYTES, MOST_SECTIONS } from "../hyrf/container.js";
 import { fitHarmonics } from "../hyrf/harmonics.js";
 import { describe, read } from "../hyrf/index.js";
 import { viewpointOf } from "../hyrf/viewpoint.js";
@@ -22,14 +23,13 @@ import { DepthSort } from "./sort.js";
 const PATIENCE = 150; // ms that the rest of a file may take to come before its first layer is shown
 const DEGREE = 3; // of harmonics
 const LARGEST_FILE = 2 ** 32; // bytes of files that do not say themselves how long they are
-const MARK = [0x89, 0x48, 0x59, 0x52, 0x46]; // a model begins so
-const FIXED_PART = 48, SECTION_PART = 40, MOST_PARTS = 1024; // of a model's header: bytes, bytes a section, sections
+const MARK = MAGIC_BYTES.slice(0, 5); // a model begins so, also where a transfer has spoilt the line ends after it
 
 let readSplats = null;
 let wanted = null;
 let pieces = [];
 let length = 0;
-let head = new Uint8Array(FIXED_PART + SECTION_PART * MOST_PARTS); // first bytes, until what it is is known
+let head = new Uint8Array(HEADER_BYTES + ENTRY_BYTES * MOST_SECTIONS); // first bytes, until what it is is known
 let kind = null; // "model" or "other", once that is known
 let most = Infinity; // bytes that the file can have
 let first = Infinity; // bytes of a model's first layer, where they are worth showing alone
@@ -109,9 +109,9 @@ function learn(bytes, before) {
     head = null;
     return;
   }
-  if (length < FIXED_PART) return;
+  if (length < HEADER_BYTES) return;
   const parts = new DataView(head.buffer).getUint32(36, true);
-  if (parts <= MOST_PARTS && length < FIXED_PART + SECTION_PART * parts) return;
+  if (parts <= MOST_SECTIONS && length < HEADER_BYTES + ENTRY_BYTES * parts) return;
   const told = describe(there);
   kind = "model";
   most = told.length;
