@@ -29,12 +29,21 @@ class HyrfDataError(HyrfError):
     """Photos, poses or points on disk cannot be used as they are."""
 
 
+class HyrfNoPosesError(HyrfDataError):
+    """There are photos, or a video, and no poses: these have to be estimated first."""
+
+
 class HyrfFormatError(HyrfError):
     """A `.hyrf` file is damaged, hostile, or made by a newer version."""
 
 
 class HyrfTrainingError(HyrfError):
     """Training cannot start or cannot go on (a loss that is not finite, a checkpoint that does not fit)."""
+
+
+def reason_of(error: Exception, longest: int = 120) -> str:
+    """What another library says of an error, for a place in a sentence of ours: its first line, or else its kind."""
+    return str(error).splitlines()[0][:longest] if str(error) else type(error).__name__
 
 
 @contextmanager

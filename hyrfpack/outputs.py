@@ -19,10 +19,16 @@ from hyrfpack.errors import HyrfError
 if TYPE_CHECKING:
     from hyrfpack.scene import Scene
 
-READABLE = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")  # pictures that are taken for photos
-PICTURES = (*READABLE, ".bmp", ".heic", ".heif", ".avif", ".dng")  # and those that people keep photos as, too
+# Pictures that are taken for photos; where a name has no ending, the first of these that is there is meant.
+READABLE = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".avif", ".jp2", ".heic", ".heif", ".hif")
+PICTURES = (*READABLE, ".dng")  # and those that people keep photos as, too
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv")
+ARCHIVES = (".zip", ".r3d")  # sets that are one file
 TABLES = tuple(f"{table}{kind}" for table in ("cameras", "images", "points3D") for kind in (".bin", ".txt"))
-POSES = ("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json")
+POSES = (
+    *("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json"),
+    *("poses_bounds.npy", "bundle.out", "cameras.xml", "metadata", "keyframes"),
+)
 MODELS = ("sparse", "colmap/sparse")  # folders of COLMAP models
 LONGEST_NAME, LONGEST_PATH = 255, 4095  # bytes, of common systems
 
@@ -62,7 +68,8 @@ class Outputs:
             self._folders |= _identities([folder])
         if scene is not None:
             self._files |= _identities(scene.files)
-            self._folders |= _identities(_folders_between(scene.path, scene.files))
+            beside = (file for file in scene.files if not file.lower().endswith(ARCHIVES))
+            self._folders |= _identities(_folders_between(scene.path, beside))
 
     def file(self, path: StrPath, *endings: str) -> None:
         """Check one file to be written, whose name must have one of the endings, if any are given."""

@@ -173,7 +173,7 @@ class Scene:
 
     Attributes:
         path: the folder it was read from.
-        layout: "colmap", "blender" or "nerfstudio".
+        layout: one of `hyrfpack.data.LAYOUTS`, "colmap" or "nerfstudio" for instance.
         train, test: views, sorted by name; disjoint.
         points: (P, 3) float64 world positions; P may be 0.
         point_colors: (P, 3) float32 RGB in [0, 1].

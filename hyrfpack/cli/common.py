@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -24,7 +25,18 @@ Command = TypeVar("Command", bound=Callable)
 PATH = click.Path(path_type=Path)
 SEED = click.IntRange(0, 2**64 - 1)  # hyrfpack.train.config.LARGEST_SEED, without loading torch
 PRECISIONS = ("mixed", "float32")  # hyrfpack.train.PRECISIONS, without loading torch
-LAYOUTS = ("colmap", "blender", "nerfstudio")
+_SIZE = re.compile(r"([0-9.]+)\s*([kmg]?)b?", re.IGNORECASE)
+LAYOUTS = (  # hyrfpack.data.LAYOUTS, without loading numpy
+    "colmap",
+    "blender",
+    "nerfstudio",
+    "llff",
+    "metashape",
+    "bundler",
+    "realityscan",
+    "polycam",
+    "record3d",
+)
 
 
 class _OutputPath(click.ParamType):
@@ -39,6 +51,25 @@ class _OutputPath(click.ParamType):
 
 
 OUTPUT = _OutputPath()
+
+
+class _Bytes(click.ParamType):
+    """A size such as 2MB, 350k or 1500000; k, M and G are powers of 1000."""
+
+    name = "size"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        match = _SIZE.fullmatch(str(value).strip())
+        try:
+            size = int(float(match[1]) * 1000 ** " kmg".index(match[2].lower() or " ")) if match else 0
+        except (ValueError, OverflowError):
+            size = 0
+        if size < 1:
+            self.fail(f"'{value}' is not a size; write it as 2MB, 350kB or 1500000", param, ctx)
+        return size
+
+
+SIZE = _Bytes()
 
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace files that are there; what the command reads is never replaced."

@@ -1,15 +1,22 @@
-"""Readers: a folder of posed photos -> Scene, one file a format."""
+"""Readers: a folder of posed photos, or a .zip of it -> Scene, one file a format."""
 
 from __future__ import annotations
 
 import os
+import shlex
+from dataclasses import replace
 from pathlib import Path
 
+from hyrfpack.data.archive import is_archive, unpacked
 from hyrfpack.data.cache import PictureCache
-from hyrfpack.errors import HyrfDataError
+from hyrfpack.data.folder import list_photos
+from hyrfpack.data.layouts import LAYOUTS
+from hyrfpack.data.places import find_set
+from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
+from hyrfpack.outputs import PICTURES, VIDEOS
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 
-__all__ = ["PictureCache", "load_scene"]
+__all__ = ["LAYOUTS", "PictureCache", "load_scene", "pose_commands"]
 
 
 def load_scene(
@@ -21,17 +28,21 @@ def load_scene(
     model: str | None = None,
     max_size: int = DEFAULT_MAX_SIZE,
 ) -> Scene:
-    """Read a folder of posed photos; pictures are decoded later, one by one, by `View.load`.
+    """Read posed photos; pictures are decoded later, one by one, by `View.load`.
 
     Args:
-        path: the folder. Known layouts: COLMAP (`sparse/0`, `sparse`, or `colmap/sparse/0`, binary or text, beside
-            `images/`), Blender (`transforms_train.json`), nerfstudio and instant-ngp (`transforms.json`).
+        path: the folder, or a .zip (.r3d) of it, which is unpacked among the user's caches. Known layouts: COLMAP
+            (`sparse/0`, `sparse`, or `colmap/sparse/0`, binary or text, beside `images/`), Blender
+            (`transforms_train.json`), nerfstudio and instant-ngp (`transforms.json`), LLFF (`poses_bounds.npy`),
+            Metashape (cameras as .xml), Bundler (`bundle.out`), RealityScan (camera parameters as .csv), Polycam
+            (`keyframes/`) and Record3D (`metadata`). Where it holds no poses itself but one folder in it does, that is
+            read. Panoramas of the whole sphere become six photos.
             Masks in `masks/` beside the photos are honoured (0 = ignored pixel).
         test_every: hold out every n-th of the sorted names, beginning with the first; 0 holds out none.
             A split of the set's own counts instead.
         images: take the photos from this folder ("images_2"); intrinsics follow the size of its files.
-        layout: "colmap", "blender" or "nerfstudio"; None takes the first of these that is there and says so in
-            `Scene.notes` when there was a choice.
+        layout: one of LAYOUTS, "colmap" or "nerfstudio" for instance; None takes the first of them that is there and
+            says so in `Scene.notes` when there was a choice.
         model: name of the folder of a COLMAP model ("1" for `sparse/1`); None takes the one with the most photos and
             says so in `Scene.notes` when there was a choice.
         max_size: shrink photos with more pixels than this on the longer side to so many, as they are decoded; cameras
@@ -41,6 +52,7 @@ def load_scene(
         The scene in the frame and units of its files.
 
     Raises:
+        HyrfNoPosesError: there are photos, or it is a video, and there are no poses.
         HyrfDataError: the folder cannot be used; one sentence says what, where, and what to do.
         ValueError: an unknown `layout`, a negative `test_every` or `max_size`.
 
@@ -54,40 +66,85 @@ def load_scene(
         raise ValueError(f"test_every must be 0 or more, not {test_every}")
     if max_size < 0:
         raise ValueError(f"max_size must be 0 (photos as they are) or more, not {max_size}")
-    if layout not in (None, "colmap", "blender", "nerfstudio"):
-        raise ValueError(f"no layout '{layout}'; there are colmap, blender, nerfstudio")
-    folder = Path(path)
-    if not os.path.exists(folder):  # methods of Path raise where a name is too long
-        raise HyrfDataError(f"{folder}: no such folder; check the path")
-    if not os.path.isdir(folder):
-        raise HyrfDataError(f"{folder}: a file, not a folder; give the folder that holds photos and poses")
-
-    from hyrfpack.data.blender import read_blender
-    from hyrfpack.data.colmap import find_models, read_colmap
-    from hyrfpack.data.nerfstudio import read_nerfstudio
-
-    there = {
-        "colmap": bool(find_models(folder)),
-        "blender": os.path.isfile(folder / "transforms_train.json"),
-        "nerfstudio": os.path.isfile(folder / "transforms.json"),
-    }
-    found = [name for name, present in there.items() if present]
-    if not found or (layout is not None and not there[layout]):
-        raise HyrfDataError(
-            f"{folder}: no {layout + ' ' if layout else ''}poses found (looked for a COLMAP model in sparse/0, "
-            "transforms_train.json and transforms.json); give the folder that holds them"
-        )
+    if layout not in (None, *LAYOUTS):
+        raise ValueError(f"no layout '{layout}'; there are {', '.join(LAYOUTS)}")
+    given = Path(path)
+    notes: list[str] = []
+    folder, found = _find_set(_folder_of(given, notes), layout, notes)
+    if not found or layout not in (None, *found):
+        raise _no_poses(given, folder, layout, other=bool(found))
     chosen = layout or found[0]
-    if chosen == "blender" and images is not None:
-        raise HyrfDataError(f"{folder}: a Blender-style set names its own pictures; leave out the folder '{images}'")
-    if chosen != "colmap" and model is not None:
+    reader, options = LAYOUTS[chosen], {"images": images, "model": model}
+    if images is not None and "images" not in reader.options:
+        raise HyrfDataError(f"{folder}: a {chosen} set names its own pictures; leave out the folder '{images}'")
+    if model is not None and "model" not in reader.options:
         raise HyrfDataError(f"{folder}: the {chosen} layout has no COLMAP models to choose from; leave out '{model}'")
-    if chosen == "colmap":
-        scene = read_colmap(folder, test_every=test_every, images=images, model=model, max_size=max_size)
-    elif chosen == "blender":
-        scene = read_blender(folder, test_every=test_every, max_size=max_size)
-    else:
-        scene = read_nerfstudio(folder, test_every=test_every, images=images, max_size=max_size)
+    wanted = {name: options[name] for name in reader.options}
+    scene = reader.read(folder, test_every=test_every, max_size=max_size, **wanted)
     if len(found) > 1:
-        scene.notes.insert(0, f"poses are there as {' and '.join(found)}; {chosen} was taken")
-    return scene
+        notes.append(f"poses are there as {' and '.join(found)}; {chosen} was taken")
+    scene.notes[:0] = notes
+    return replace(scene, files=(*scene.files, str(given))) if is_archive(given) else scene
+
+
+def _folder_of(given: Path, notes: list[str]) -> Path:
+    """The folder that was given, or that the archive that was given is unpacked into, which a note says."""
+    if not os.path.exists(given):  # methods of Path raise where a name is too long
+        raise HyrfDataError(f"{given}: no such folder; check the path")
+    if is_archive(given):
+        folder = unpacked(given)
+        notes.append(f"{given.name} was unpacked into {folder}, where it is found again")
+        return folder
+    if not os.path.isdir(given):
+        if given.suffix.lower() in VIDEOS:
+            raise HyrfNoPosesError(f"{given}: a video has no poses; {pose_commands(given)}")
+        if given.suffix.lower() in PICTURES:
+            raise HyrfDataError(f"{given}: one photo, not a folder of photos; give the folder that it is in")
+        raise HyrfDataError(f"{given}: a file, not a folder; give the folder that holds photos and poses, or its .zip")
+    return given
+
+
+def _find_set(folder: Path, layout: str | None, notes: list[str]) -> tuple[Path, list[str]]:
+    """The folder itself, or the one in it that holds poses, which a note says; and the layouts that they are there as.
+
+    Where a layout is asked for, one that holds poses of that layout.
+    """
+
+    def holds(folder: Path) -> bool:
+        found = _layouts_in(folder)
+        return bool(found) if layout is None else layout in found
+
+    inside = None if holds(folder) else find_set(folder, holds)
+    if inside is not None:
+        notes.append(f"the set in {inside.relative_to(folder)} was taken")
+    return inside or folder, _layouts_in(inside or folder)
+
+
+def _layouts_in(folder: Path) -> list[str]:
+    """The layouts that a folder's poses are there as."""
+    return [name for name, reader in LAYOUTS.items() if reader.is_there(folder)]
+
+
+def _no_poses(given: Path, folder: Path, layout: str | None, other: bool) -> HyrfDataError:
+    """What is to be raised where no poses are found, or just others than those of the layout that was asked for."""
+    photos = [] if other or layout else list_photos(folder)
+    if photos:
+        return HyrfNoPosesError(f"{given}: no poses found for the {len(photos)} photos; {pose_commands(given)}")
+    marks = [LAYOUTS[layout].mark] if layout else [reader.mark for reader in LAYOUTS.values()]
+    kind = f"{layout} " if layout else ""
+    return HyrfDataError(
+        f"{given}: no {kind}poses found (looked for {', '.join(marks)}); give the folder that holds them"
+    )
+
+
+def pose_commands(path: str | os.PathLike[str]) -> str:
+    """The commands that photos or a video without poses want, in words for the end of a sentence.
+
+    Example:
+        >>> pose_commands("a.mp4")
+        "'hyrfpack poses a.mp4 -o SCENE' estimates them, and 'hyrfpack make a.mp4 -o scene.html' goes the whole way"
+    """
+    name = shlex.quote(os.fspath(path))
+    return (
+        f"'hyrfpack poses {name} -o SCENE' estimates them, and 'hyrfpack make {name} -o scene.html' goes the whole way"
+    )

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from hyrfpack.data.equirectangular import FACES, Face, FaceFile, face_lens, face_size
+from hyrfpack.data.folder import list_pictures
+from hyrfpack.data.masks import find_masks
+from hyrfpack.data.names import nearest
 from hyrfpack.data.pictures import (
     Header,
     PhotoFile,
-    is_picture_name,
     read_header,
+    read_orientation,
     read_pixels,
     same_aspect,
     shrunk_size,
@@ -32,10 +36,12 @@ class Photo:
     Attributes:
         name: its path below the picture folder.
         path: the file.
-        header: what the file says.
+        header: what the file says, of the picture turned as `orientation` says.
         lens: as calibrated; its size may differ from the file's by a uniform scale.
         camera_from_world: (4, 4) OpenCV pose, not yet checked.
-        mask: the file of its mask, if any.
+        mask: the file of its mask, if the poses name one.
+        orientation: of EXIF, that stored pixels are turned by because the camera was calibrated so.
+        face: of the panorama that the file holds, once it is cut; name, header and lens are then the face's.
     """
 
     name: str
@@ -44,6 +50,8 @@ class Photo:
     lens: Lens
     camera_from_world: np.ndarray
     mask: Path | None = None
+    orientation: int = 1
+    face: Face | None = None
 
 
 def make_scene(
@@ -82,12 +90,14 @@ def make_scene(
         raise HyrfDataError(
             f"{path}: its poses are of no photo at all; reconstruct again, or correct lists of file names"
         )
-    photos = sorted(photos, key=lambda photo: photo.name)
+    photos = _turned(sorted(photos, key=lambda photo: photo.name), notes)
     for first, second in zip(photos, photos[1:], strict=False):
         if first.name == second.name:
             raise HyrfDataError(f"{path}: photo {first.name} is listed twice; remove one of the entries")
     if test_names is None:
         test_names = {photo.name for photo in photos[::test_every]} if test_every else set()
+    photos, mask_notes = (photos, []) if masks is None else _masked(photos, masks)
+    photos, test_names = _cut(photos, test_names)
     views = [_make_view(photo, max_size) for photo in photos]
     train = [view for view in views if view.name not in test_names]
     test = [view for view in views if view.name in test_names]
@@ -96,12 +106,35 @@ def make_scene(
             f"{path}: all {len(test)} photos are held out for testing and none is left to train on; "
             "add photos or hold out fewer (0 holds out none)"
         )
-    notes += _same_poses(views)
+    notes += [*_same_poses(views), *_told(photos, max_size, mask_notes)]
+    points, point_colors = _finite_points(points, point_colors, notes)
+    read = [file for photo in photos for file in (photo.path, photo.mask) if file is not None]
+    files = tuple(str(file) for file in (*tables, *read))
+    see_through = _see_through(photos, max_size)
+    return Scene(str(path), layout, train, test, points, point_colors, see_through, notes, files, max_size)
+
+
+def _masked(photos: list[Photo], folder: Path) -> tuple[list[Photo], list[str]]:
+    """Photos with their masks from a folder, where the poses name none; notes about masks of no photo."""
+    used = {photo.mask for photo in photos if photo.mask is not None}
+    found = find_masks(folder, [(photo.name, photo.header.size) for photo in photos if photo.mask is None], used)
+    return [replace(photo, mask=found.of.get(photo.name, photo.mask)) for photo in photos], found.notes
+
+
+def _cut(photos: list[Photo], held_out: Set[str]) -> tuple[list[Photo], set[str]]:
+    """Photos with the faces of panoramas in place of these, and the names of those of them that are held out."""
+    parts = {photo.name: _faces(photo) if photo.lens.model == "equirectangular" else [photo] for photo in photos}
+    names = {part.name for name in held_out for part in parts.get(name, ())}
+    return [part for cut in parts.values() for part in cut], names
+
+
+def _told(photos: list[Photo], max_size: int, about_masks: list[str]) -> list[str]:
+    """Notes about what is done to photos as they are loaded."""
+    notes = []
     masked = sum(photo.mask is not None for photo in photos)
     if masked:
         notes.append(f"{masked} of {len(photos)} photos have a mask")
-    if masks is not None:
-        notes += _stray_masks(masks, photos)
+    notes += about_masks
     bent = sum(photo.lens.distorted for photo in photos)
     if bent:
         notes.append(f"{bent} of {len(photos)} photos are undistorted as they are loaded")
@@ -112,20 +145,12 @@ def make_scene(
             f"{len(shrunk)} of {len(photos)} photos are shrunk from up to {width} x {height} to {max_size} pixels on "
             "the longer side; --max-size 0 keeps them"
         )
-    points, point_colors = _finite_points(points, point_colors, notes)
-    read = [file for photo in photos for file in (photo.path, photo.mask) if file is not None]
-    files = tuple(str(file) for file in (*tables, *read))
-    see_through = _see_through(photos, max_size)
-    return Scene(str(path), layout, train, test, points, point_colors, see_through, notes, files, max_size)
+    return notes
 
 
-def safe_name(text: str) -> str:
-    """A photo's name as a relative path that stays below the folder it is joined to."""
-    parts = [part for part in PurePosixPath(text.replace("\\", "/")).parts if part not in ("..", "/")]
-    return "/".join(parts)
-
-
-def check_found(path: Path, photos: list[Photo], missing: list[str], where: str) -> list[str]:
+def check_found(
+    path: Path, photos: list[Photo], missing: list[str], where: str, unclear: Sequence[str] = ()
+) -> list[str]:
     """The note about listed photos that are not on disk; no note when none is missing.
 
     Args:
@@ -133,10 +158,16 @@ def check_found(path: Path, photos: list[Photo], missing: list[str], where: str)
         photos: found.
         missing: those that are not, as paths below `path`.
         where: they are listed.
+        unclear: those of the missing that `names.Matches` calls so.
 
     Raises:
         HyrfDataError: no photo was found; the sentence says what was looked for and what is there instead.
     """
+    if unclear and not photos:
+        raise HyrfDataError(
+            f"{path}: which file is which of the {len(missing)} photos that {where} lists is unclear, because "
+            f"{min(unclear)} fits more than one file, or its file more than one name; name the files as the poses do"
+        )
     if missing and not photos:
         raise HyrfDataError(
             f"{path}: none of the {len(missing)} photos that {where} lists is on disk (looked for {min(missing)}; "
@@ -153,12 +184,14 @@ def check_found(path: Path, photos: list[Photo], missing: list[str], where: str)
 def _there(path: Path, name: str) -> str:
     """What lies where a photo was looked for, in words."""
     folder = PurePosixPath(name).parent
+    like = nearest(name, list_pictures(path))
+    near = f"; the nearest by name is {like.relative_to(path)}" if like else ""
     try:
         endings = Counter(entry.suffix or "other" for entry in (path / folder).iterdir() if entry.is_file())
-    except OSError:
-        return f"there is no folder {folder}"
+    except (OSError, ValueError):  # ValueError: no folder can be called so
+        return f"there is no folder {folder}{near}"
     held = ", ".join(f"{count} {ending} files" for ending, count in endings.most_common(3))
-    return f"{'that folder' if folder.parts else 'the folder'} holds {held or 'no file'}"
+    return f"{'that folder' if folder.parts else 'the folder'} holds {held or 'no file'}{near}"
 
 
 def _same_poses(views: list[View]) -> list[str]:
@@ -175,21 +208,53 @@ def _same_poses(views: list[View]) -> list[str]:
     ]
 
 
-def _stray_masks(folder: Path, photos: list[Photo]) -> list[str]:
-    """A note about masks that are of no photo, or about a folder that is nearly called as the one of masks is."""
-    used = {photo.mask for photo in photos}
-    if folder.is_dir():
-        there = sorted(file for file in folder.rglob("*") if is_picture_name(file.name))
-        stray = [str(file.relative_to(folder)) for file in there if file not in used]
-        if not stray:
-            return []
-        return [
-            f"{len(stray)} of {len(there)} masks in {folder.name} are of no posed photo, {stray[0]} first; "
-            "masks are named as their photos"
-        ]
-    if used == {None} and (folder.parent / "mask").is_dir():
-        return [f"the folder mask is not read; masks belong into {folder.name}"]
-    return []
+def _turned(photos: list[Photo], notes: list[str]) -> list[Photo]:
+    """Photos turned by EXIF where the cameras were calibrated on upright pictures, which sizes tell.
+
+    Where a quarter turn makes a photo fit its camera, and as it is stored it does not, that is how it was calibrated.
+    Upside-down and square photos fit either way: they are taken as those of the set that do tell.
+    """
+
+    def fits(photo: Photo) -> bool:
+        return same_aspect(*photo.header.size, photo.lens.width, photo.lens.height)
+
+    def fits_turned(photo: Photo) -> bool:
+        return same_aspect(*photo.header.size[::-1], photo.lens.width, photo.lens.height)
+
+    if all(fits(photo) for photo in photos):
+        return photos
+    told = {photo.path: read_orientation(photo.path) for photo in photos}
+    upright = {p.path for p in photos if told[p.path] >= 5 and fits_turned(p) and not fits(p)}
+    stored = {p.path for p in photos if told[p.path] >= 5 and fits(p) and not fits_turned(p)}
+    if upright and not stored:
+        upright |= {photo.path for photo in photos if told[photo.path] != 1 and fits(photo)}
+    if upright:
+        notes.append(
+            f"{len(upright)} of {len(photos)} photos are turned as their EXIF orientation says, for their cameras were "
+            "calibrated on upright pictures"
+        )
+    return [
+        replace(photo, header=photo.header.turned(told[photo.path]), orientation=told[photo.path])
+        if photo.path in upright
+        else photo
+        for photo in photos
+    ]
+
+
+def _faces(photo: Photo) -> list[Photo]:
+    """A panorama as photos of its six faces: "street.jpg" becomes "street_front.jpg" and so on."""
+    size = face_size(photo.header.width)
+    name = photo.name.removesuffix(photo.path.suffix)
+    faces = []
+    for face in FACES:
+        pose = photo.camera_from_world.copy()
+        with np.errstate(invalid="ignore", over="ignore"):
+            pose[:3] = face.rotation @ pose[:3]
+        called, header = f"{name}_{face.name}{photo.path.suffix}", Header(size, size, False)
+        faces.append(
+            replace(photo, name=called, header=header, lens=face_lens(size), camera_from_world=pose, face=face)
+        )
+    return faces
 
 
 def _make_view(photo: Photo, max_size: int) -> View:
@@ -207,23 +272,27 @@ def _make_view(photo: Photo, max_size: int) -> View:
     size = shrunk_size(*header.size, max_size)
     if size != (lens.width, lens.height):
         lens = lens.scaled(*size)
+    whole = header.size if photo.face is None else read_header(photo.path).size
     if photo.mask is not None:
         mask = read_header(photo.mask)
-        if not same_aspect(mask.width, mask.height, header.width, header.height):
+        sizes = {mask.size, mask.turned(photo.orientation).size}
+        if not any(same_aspect(*shape, *whole) for shape in sizes):
             raise HyrfDataError(
-                f"{photo.mask}: the mask is {mask.width} x {mask.height} but its photo {header.width} x "
-                f"{header.height}; make it the photo's size"
+                f"{photo.mask}: the mask is {mask.width} x {mask.height} but its photo {whole[0]} x "
+                f"{whole[1]}; make it the photo's size"
             )
     pose = _rigid(photo.camera_from_world, photo.path)
     camera = Camera(*size, lens.fx, lens.fy, lens.cx, lens.cy, pose)
-    return View(photo.name, camera, PhotoFile(photo.path, header.size, lens, photo.mask))
+    if photo.face is not None:
+        return View(photo.name, camera, FaceFile(photo.path, whole, photo.face, size[0], photo.mask))
+    return View(photo.name, camera, PhotoFile(photo.path, header.size, lens, photo.mask, photo.orientation))
 
 
 def _is_sane(lens: Lens) -> bool:
     """Finite numbers and a field of view that a lens can have: far wider bounds than any real one needs."""
     size = max(lens.width, lens.height)
     return (
-        bool(np.isfinite((lens.fx, lens.fy, lens.cx, lens.cy, *lens.coefficients)).all())
+        bool(np.isfinite((lens.fx, lens.fy, lens.cx, lens.cy, lens.skew, *lens.coefficients)).all())
         and min(lens.width, lens.height) >= 1
         and all(1e-3 * size <= focal <= 1e5 * size for focal in (lens.fx, lens.fy))
         and max(abs(lens.cx), abs(lens.cy)) <= 1e3 * size
@@ -248,7 +317,7 @@ def _see_through(photos: list[Photo], max_size: int) -> bool:
 
     def alpha(photo: Photo) -> np.ndarray:
         size = shrunk_size(*photo.header.size, max_size)
-        pixels = read_pixels(photo.path, None if size == photo.header.size else size)[1]
+        pixels = read_pixels(photo.path, None if size == photo.header.size else size, photo.orientation)[1]
         assert pixels is not None  # only photos with an alpha channel are asked
         return pixels
 

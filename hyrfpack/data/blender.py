@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
 
-from hyrfpack.data.assemble import Photo, check_found, make_scene, safe_name
-from hyrfpack.data.pictures import find_picture, read_header
+from hyrfpack.data.assemble import Photo, check_found, make_scene
+from hyrfpack.data.names import PictureIndex
+from hyrfpack.data.pictures import read_header
 from hyrfpack.data.transforms import focal_from_angle, number, pose_from_opengl, read_json
 from hyrfpack.data.undistort import Lens
 from hyrfpack.errors import HyrfDataError
@@ -54,17 +55,18 @@ def _read_split(path: Path, split: str, notes: list[str]) -> list[Photo]:
         raise HyrfDataError(f"{file}: has no 'camera_angle_x', so the focal length is unknown; add it")
     photos: list[Photo] = []
     missing: list[str] = []
+    index = PictureIndex(path)
+    matches = index.match(frame["file_path"] for frame in content["frames"])
     for frame in content["frames"]:
-        picture = find_picture(path / frame["file_path"])
+        picture = matches.found.get(frame["file_path"])
         if picture is None:
             missing.append(str(PurePosixPath(frame["file_path"])))
             continue
         header = read_header(picture)
         focal = focal_from_angle(angle, header.width, file)
         lens = Lens(header.width, header.height, focal, focal, header.width / 2, header.height / 2)
-        name = safe_name(frame["file_path"])
-        if not name.endswith(picture.suffix):
-            name += picture.suffix
+        name = index.name_of(picture, frame["file_path"])
         photos.append(Photo(name, picture, header, lens, pose_from_opengl(frame, file)))
-    notes += check_found(path, photos, missing, file.name)
+    notes += matches.notes
+    notes += check_found(path, photos, missing, file.name, matches.unclear)
     return photos

@@ -2,38 +2,25 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from hyrfpack.data.assemble import Photo, check_found, make_scene, safe_name
+from hyrfpack.data.assemble import Photo, check_found, make_scene
 from hyrfpack.data.colmap_binary import check_binary_model
-from hyrfpack.data.pictures import find_mask, find_picture, mask_folder, read_header
+from hyrfpack.data.colmap_tidy import names_in_text, tidied
+from hyrfpack.data.folder import times_smaller
+from hyrfpack.data.masks import mask_folder
+from hyrfpack.data.names import PictureIndex, safe_name
+from hyrfpack.data.pictures import read_header
+from hyrfpack.data.places import TABLES, find_photo_folder, find_workspace, folders_of
+from hyrfpack.data.points import read_ply
 from hyrfpack.data.undistort import Lens, brown
-from hyrfpack.errors import HyrfDataError, needs_package
+from hyrfpack.errors import HyrfDataError, needs_package, reason_of
 from hyrfpack.scene import Scene
-
-_MODEL_FOLDERS = ("sparse", "colmap/sparse")
-_TABLES = ("cameras", "images", "points3D")
-
-
-def find_models(path: Path) -> list[Path]:
-    """The folders below `path` that hold a COLMAP model (any of its files): those in `sparse/` by number, then by name,
-    then `sparse/` itself; or the same in `colmap/sparse/`."""
-
-    def holds_model(folder: Path) -> bool:
-        return any(os.path.isfile(folder / f"{table}{kind}") for table in _TABLES for kind in (".bin", ".txt"))
-
-    for parent in (path / name for name in _MODEL_FOLDERS):
-        inside = [entry for entry in parent.iterdir() if entry.is_dir()] if os.path.isdir(parent) else []
-        inside.sort(key=lambda entry: (int(entry.name) if entry.name.isdecimal() else math.inf, entry.name))
-        models = [folder for folder in (*inside, parent) if holds_model(folder)]
-        if models:
-            return models
-    return []
 
 
 def read_colmap(path: Path, *, test_every: int, images: str | None, model: str | None, max_size: int) -> Scene:
@@ -42,7 +29,8 @@ def read_colmap(path: Path, *, test_every: int, images: str | None, model: str |
     Args:
         path: the scene folder.
         test_every, max_size: see `load_scene`.
-        images: the folder of photos; "images" when None. Intrinsics follow the size of the files in it.
+        images: the folder of photos; None takes the one that `find_photo_folder` finds. Intrinsics follow the size of
+            the files in it.
         model: name of the folder of the model; None takes the one with the most photos.
 
     Returns:
@@ -51,27 +39,35 @@ def read_colmap(path: Path, *, test_every: int, images: str | None, model: str |
     Raises:
         HyrfDataError: the model or the photos cannot be used.
     """
-    tables, notes = _choose_model(path, model)
-    picture_folder = path / (images or "images")
-    if not picture_folder.is_dir():
-        there = ", ".join(sorted(entry.name for entry in path.iterdir() if entry.is_dir()))
-        raise HyrfDataError(f"{path}: no photo folder '{picture_folder.name}'; there are the folders {there}")
-
+    base, models = find_workspace(path)
+    tables, notes = _choose_model(path, models, model)
     cameras, posed, unposed, points, colors = _read_model(tables)
+    names = [safe_name(name) for name, _, _ in posed]
+    folder = _photo_folder(path, base, images, names)
+    shown = Path(os.path.relpath(folder, path))  # which may lie elsewhere
+    if base not in (path, path / "colmap"):
+        notes.append(f"poses were taken from {tables.relative_to(path)}")
+    if images is None and shown != Path("images"):
+        smaller = ", smaller copies that intrinsics are brought to the size of" if times_smaller(folder.name) else ""
+        notes.append(f"photos were taken from {'the folder itself' if folder == path else shown}{smaller}")
     if unposed:
         notes.append(f"{unposed} photos were never registered and were skipped")
-    masks = mask_folder(path, picture_folder.name)
+    if not len(points):
+        notes.append(
+            f"the model in {tables.relative_to(path)} has no points; training starts from random places instead"
+        )
+    pictures = PictureIndex(folder)
+    matches = pictures.match(names)
     photos: list[Photo] = []
     missing: list[str] = []
-    for name, camera_id, pose in posed:
-        name = safe_name(name)
-        file = find_picture(picture_folder / name)
+    for name, (_, camera_id, pose) in zip(names, posed, strict=True):
+        file = matches.found.get(name)
         if file is None:
-            missing.append(str(PurePosixPath(images or "images") / name))
+            missing.append(str(PurePosixPath(shown) / name))
             continue
-        mask = find_mask(masks, name)
-        photos.append(Photo(name, file, read_header(file), cameras[camera_id], pose, mask))
-    notes += check_found(path, photos, missing, str(tables.relative_to(path)))
+        photos.append(Photo(pictures.name_of(file, name), file, read_header(file), cameras[camera_id], pose))
+    notes += matches.notes
+    notes += check_found(path, photos, missing, str(tables.relative_to(path)), matches.unclear)
     return make_scene(
         path,
         "colmap",
@@ -81,26 +77,43 @@ def read_colmap(path: Path, *, test_every: int, images: str | None, model: str |
         points=points,
         point_colors=colors,
         tables=sorted(file for file in tables.iterdir() if file.is_file()),
-        masks=masks,
+        masks=mask_folder(path if folder == path else folder.parent, folder.name),
         notes=notes,
     )
 
 
-def _choose_model(path: Path, name: str | None) -> tuple[Path, list[str]]:
+def _photo_folder(path: Path, base: Path, images: str | None, names: Sequence[str]) -> Path:
+    if images is not None:
+        there = next((place / images for place in (path, base) if os.path.isdir(place / images)), None)
+        if there is None:
+            raise HyrfDataError(f"{path}: no photo folder '{images}'; {folders_of(path)}")
+        return there
+    found = find_photo_folder(base) or find_photo_folder(path)
+    if found is None:  # several folders of photos: those of the cameras of a rig, where the names begin with them
+        found = next((place for place in (base, path) if any(os.path.isfile(place / name) for name in names)), None)
+    if found is None:
+        raise HyrfDataError(
+            f"{path}: no photo folder 'images' beside the COLMAP model, and no other that is clearly meant; "
+            f"{folders_of(path)}; name the one of the photos with --images, or give the folder that holds both"
+        )
+    return found
+
+
+def _choose_model(path: Path, models: Sequence[Path], name: str | None) -> tuple[Path, list[str]]:
     """The model of a name, or the one with the most photos, and a note where there was a choice."""
-    models = find_models(path)
     if not models:
-        raise HyrfDataError(f"{path}: no COLMAP model in {' or '.join(_MODEL_FOLDERS)}; run the reconstruction first")
+        raise HyrfDataError(f"{path}: no COLMAP model in sparse or colmap/sparse; run the reconstruction first")
     if name is None and len(models) == 1:
         return models[0], []
-    sizes = {model.name: _registered(model) for model in models}
-    there = ", ".join(f"{model} ({size} photos)" for model, size in sizes.items())
-    chosen = max(models, key=lambda model: sizes[model.name])  # the first of the largest
+    sizes = {model: _registered(model) for model in models}
+    there = ", ".join(f"{model.name} ({size} photos)" for model, size in sizes.items())
+    chosen = max(models, key=lambda model: sizes[model])  # the first of the largest
     why = "with the most photos; --model takes another"
     if name is not None:
-        if name not in sizes:
+        named = [model for model in models if model.name == name]
+        if not named:
             raise HyrfDataError(f"{path}: there is no COLMAP model '{name}'; name one of those that are there: {there}")
-        chosen, why = next(model for model in models if model.name == name), "as asked for"
+        chosen, why = named[0], "as asked for"
     return chosen, [f"there are {len(models)} COLMAP models: {there}; {chosen.name} was taken, {why}"]
 
 
@@ -113,7 +126,7 @@ def _registered(model: Path) -> int:
         stated = _stated_count(model / "images.txt")
         if stated is not None:
             return stated
-        with (model / "images.txt").open(encoding="utf-8", errors="replace") as lines:
+        with (model / "images.txt").open(encoding="utf-8-sig", errors="replace") as lines:
             return (sum(not line.startswith("#") for line in lines) + 1) // 2  # two lines a photo
     except OSError:
         return 0
@@ -156,37 +169,51 @@ def _read_model(model: Path) -> tuple[dict[int, Lens], list, int, np.ndarray, np
         check_binary_model(model)
     with needs_package("pycolmap", f"{model}: reading COLMAP models"):
         import pycolmap
+    names = names_in_text(model / "images.txt") if kind == ".txt" else {}
     try:
-        reconstruction = pycolmap.Reconstruction(str(model))
-        images = list(reconstruction.images.values())
-        posed = [(image.name, image.camera_id, _pose(image)) for image in images if image.has_pose]
+        with tidied(model, kind) as folder:
+            reconstruction = pycolmap.Reconstruction(str(folder))
+        images = reconstruction.images
+        posed = [
+            (names[key] if key in names else image.name, image.camera_id, _pose(image))
+            for key, image in images.items()
+            if image.has_pose
+        ]
         cameras = {
             key: lens_from_colmap(camera.model.name, camera.width, camera.height, camera.params)
             for key, camera in reconstruction.cameras.items()
         }
         table = [point for _, point in sorted(reconstruction.points3D.items())]
         points = np.array([point.xyz for point in table]).reshape(-1, 3)
-        colors = np.array([point.color for point in table], np.float32).reshape(-1, 3)
+        colors = np.array([point.color for point in table], np.float32).reshape(-1, 3) / 255
     except HyrfDataError as error:
         raise HyrfDataError(f"{model}: {error}") from error
     except Exception as error:  # pycolmap hands on whatever its C++ checks throw.
-        reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
-        raise HyrfDataError(f"{model}: the model's tables do not fit together ({reason}); export it again") from error
+        raise HyrfDataError(
+            f"{model}: the model's tables do not fit together ({reason_of(error, 160)}); export it again"
+        ) from error
     if kind == ".txt":
-        for name, count in zip(_TABLES, (len(cameras), len(images), len(points)), strict=True):
+        for name, count in zip(TABLES, (len(cameras), len(images), len(points)), strict=True):
             _check_text_count(model / f"{name}.txt", count)
+    if not len(points) and (model / "points3D.ply").is_file():
+        points, colors = read_ply(model / "points3D.ply")
     unknown = next((name for name, camera_id, _ in posed if camera_id not in cameras), None)
     if unknown is not None:
         raise HyrfDataError(f"{model}: photo {unknown} has a camera that the model lacks; export the model again")
-    return cameras, posed, len(images) - len(posed), points, colors / 255
+    return cameras, posed, len(images) - len(posed), points, colors
 
 
 def _model_kind(model: Path) -> str:
-    kind = ".bin" if any((model / f"{table}.bin").is_file() for table in _TABLES) else ".txt"
-    for table in _TABLES:
-        if not (model / f"{table}{kind}").is_file():
-            raise HyrfDataError(f"{model / (table + kind)}: missing; export the whole COLMAP model again")
-    return kind
+    """What the tables end in. Points may be missing: some programs write them as PLY, some leave them out."""
+
+    def missing(kind: str) -> list[str]:
+        return [f"{table}{kind}" for table in TABLES[:2] if not (model / f"{table}{kind}").is_file()]
+
+    for kind in (".bin", ".txt"):
+        if not missing(kind):
+            return kind
+    kind = ".bin" if any((model / f"{table}.bin").is_file() for table in TABLES) else ".txt"
+    raise HyrfDataError(f"{model / missing(kind)[0]}: missing; export the whole COLMAP model again")
 
 
 def _pose(image) -> np.ndarray:
@@ -198,13 +225,15 @@ def _pose(image) -> np.ndarray:
 def _stated_count(file: Path) -> int | None:
     """The number of entries that a text table states in a comment, None where it does not."""
     with file.open(encoding="utf-8", errors="replace") as lines:
-        comments = "".join(line for line, _ in zip(lines, range(8), strict=False) if line.startswith("#"))
+        comments = "".join(
+            line for line, _ in zip(lines, range(8), strict=False) if line.lstrip("\ufeff").startswith("#")
+        )
     stated = re.search(r"Number of \w+: (\d{1,18})", comments)
     return int(stated[1]) if stated else None
 
 
 def _check_text_count(file: Path, count: int) -> None:
     """The stated count is the one way to notice that lines are lost."""
-    stated = _stated_count(file)
+    stated = _stated_count(file) if file.is_file() else None
     if stated is not None and stated != count:
         raise HyrfDataError(f"{file}: says {stated} entries but holds {count}; the file is truncated, export it again")

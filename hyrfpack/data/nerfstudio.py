@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import os
-import re
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
-from hyrfpack.data.assemble import Photo, check_found, make_scene, safe_name
-from hyrfpack.data.pictures import Header, find_mask, find_picture, mask_folder, read_header
+from hyrfpack.data.assemble import Photo, check_found, make_scene
+from hyrfpack.data.equirectangular import panorama_lens
+from hyrfpack.data.masks import mask_folder
+from hyrfpack.data.names import Matches, PictureIndex, parts_of, safe_name
+from hyrfpack.data.pictures import Header, read_header
+from hyrfpack.data.places import find_photo_folder, folders_of
+from hyrfpack.data.points import read_ply
 from hyrfpack.data.transforms import focal_from_angle, number, pose_from_opengl, read_json, slashed
 from hyrfpack.data.undistort import Lens, brown
-from hyrfpack.errors import HyrfDataError, needs_package
+from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Scene
 
 _PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+_FISHEYE = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
+_PANORAMA = "EQUIRECTANGULAR"
 _DENOMINATOR = ("k4", "k5", "k6")
 
 
@@ -24,7 +30,8 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None, max_size
     """Read a folder with a transforms.json.
 
     The world is that of the file's matrices. `applied_transform` says how it was turned from the reconstruction's
-    frame; poses and the points of `ply_file_path` are both already turned, so nothing is left to do.
+    frame; poses and the points of `ply_file_path` are both already turned, so nothing is left to do. EQUIRECTANGULAR
+    frames become the faces of a cube; depth maps are not read.
 
     Args:
         path: the scene folder.
@@ -39,33 +46,40 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None, max_size
     content = read_json(file)
     frames = content["frames"]
     if images is not None and not (path / images).is_dir():
-        raise HyrfDataError(f"{path}: no photo folder '{images}'; name one that is there")
+        raise HyrfDataError(f"{path}: no photo folder '{images}'; {folders_of(path)}")
     keep, test_names, notes = _own_split(content, file)
-    strip = _common_folder([frame["file_path"] for frame in frames])
-    masks = mask_folder(path, images or strip.name)
+    frames = [frame for frame in frames if keep is None or PurePosixPath(frame["file_path"]) in keep]
+    strip = _common_folder([frame["file_path"] for frame in content["frames"]])
+    pictures, matches = _find_pictures(path, [frame["file_path"] for frame in frames], strip, images)
+    moved = pictures != path and pictures.name != strip.name
+    masks = PictureIndex(path, photos=False)
+    if moved and images is None:
+        where = "the folder itself" if pictures == path else pictures.name
+        notes.append(f"the photos are not where {file.name} says; those in {where} were taken")
     photos: list[Photo] = []
     missing: list[str] = []
-    test = set()
+    test: set[str] = set()
     for frame in frames:
         listed = PurePosixPath(frame["file_path"])
-        if keep is not None and listed not in keep:
-            continue
-        name = safe_name(str(listed.relative_to(strip)))
-        wanted = listed if images is None else PurePosixPath(images) / name
-        picture = find_picture(path / wanted)
+        picture = matches.found.get(str(listed))
         if picture is None:
-            missing.append(str(wanted))
+            missing.append(str(listed if images is None else PurePosixPath(images, _below(listed, strip))))
             continue
         header = read_header(picture)
-        if not PurePosixPath(name).suffix:
-            name += picture.suffix
+        name = _name(picture, pictures, listed, strip)
         if listed in test_names:
             test.add(name)
-        lens = _lens(content, frame, header, file)
-        mask = _mask(path, masks, frame, name, file)
+        if frame.get("camera_model", content.get("camera_model")) == _PANORAMA:
+            lens = panorama_lens(picture, header)
+        else:
+            if moved:
+                _check_scale_is_known(content, frame, file)
+            lens = _lens(content, frame, header, file)
+        mask = _listed_mask(masks, frame, name, file)
         photos.append(Photo(name, picture, header, lens, pose_from_opengl(frame, file), mask))
-    notes += check_found(path, photos, missing, file.name)
-    points, colors = _read_ply(path, content, file)
+    notes += matches.notes
+    notes += check_found(path, photos, missing, file.name, matches.unclear)
+    points, colors = _read_points(path, content, file)
     tables = [file] if points is None else [file, path / slashed(content["ply_file_path"])]
     return make_scene(
         path,
@@ -77,7 +91,7 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None, max_size
         points=points,
         point_colors=colors,
         tables=tables,
-        masks=masks,
+        masks=mask_folder(path, pictures.name if moved else strip.name),
         notes=notes,
     )
 
@@ -103,7 +117,49 @@ def _common_folder(listed: list[str]) -> PurePosixPath:
     """The first folder of all frames ("images"), which is no part of a photo's name."""
     firsts = {PurePosixPath(name).parts[:1] for name in listed if len(PurePosixPath(name).parts) > 1}
     alone = any(len(PurePosixPath(name).parts) < 2 for name in listed)
-    return PurePosixPath(*next(iter(firsts))) if len(firsts) == 1 and not alone else PurePosixPath()
+    first = PurePosixPath(*next(iter(firsts))) if len(firsts) == 1 and not alone else PurePosixPath()
+    return first if parts_of(str(first)) or first.name == ".." else PurePosixPath()  # no root, no drive
+
+
+def _find_pictures(path: Path, listed: list[str], strip: PurePosixPath, images: str | None) -> tuple[Path, Matches]:
+    """The folder that names count from, and the file of each listed path: where the frames say, or else in `images` or
+    where photos usually are, by their names below the first folder."""
+    listed = [str(PurePosixPath(name)) for name in listed]
+    if images is None:
+        matches = PictureIndex(path).match(listed)
+        elsewhere = None if matches.found or matches.unclear else find_photo_folder(path)
+        if elsewhere is None:
+            return path, matches
+    else:
+        elsewhere = path / images
+    short = {name: _below(PurePosixPath(name), strip) for name in listed}
+    found = PictureIndex(elsewhere).match(short.values())
+    names = {name: file for name in listed if (file := found.found.get(short[name])) is not None}
+    loose, unclear = ([name for name in listed if short[name] in few] for few in (found.loose, found.unclear))
+    return elsewhere, Matches(elsewhere, names, loose, unclear)
+
+
+def _below(listed: PurePosixPath, strip: PurePosixPath) -> str:
+    """A listed path without the first folder that all share, and without what would lead out of a folder."""
+    return safe_name(str(listed.relative_to(strip) if strip.parts else listed))
+
+
+def _name(picture: Path, folder: Path, listed: PurePosixPath, strip: PurePosixPath) -> str:
+    """A photo's name: its path below the folder of photos."""
+    for top in (folder / strip, folder):
+        if picture.is_relative_to(top) and ".." not in picture.relative_to(top).parts:
+            return picture.relative_to(top).as_posix()
+    return _below(listed, strip)
+
+
+def _check_scale_is_known(content: dict[str, Any], frame: dict[str, Any], file: Path) -> None:
+    """Photos of another folder may be smaller than those calibrated, which only 'w' tells, or an angle of view."""
+    entries = {**content, **frame}
+    if entries.get("w") is None and entries.get("camera_angle_x") is None:
+        raise HyrfDataError(
+            f"{file}: has no 'w' and 'h', so focal lengths cannot be brought to the size of photos of another folder; "
+            "add the size that was calibrated"
+        )
 
 
 def _lens(content: dict[str, Any], frame: dict[str, Any], header: Header, file: Path) -> Lens:
@@ -132,7 +188,7 @@ def _lens(content: dict[str, Any], frame: dict[str, Any], header: Header, file: 
     if frame.get("is_fisheye", content.get("is_fisheye", False)):
         model = "OPENCV_FISHEYE"
     k1, k2, k3, k4, k5, k6, p1, p2 = (value(key) or 0.0 for key in ("k1", "k2", "k3", *_DENOMINATOR, "p1", "p2"))
-    if model == "OPENCV_FISHEYE":
+    if model in _FISHEYE:
         return Lens(*pinhole, "fisheye", (k1, k2, k3, k4))
     if model not in _PERSPECTIVE:
         raise HyrfDataError(f"{where} has camera model {str(model)[:40]!r}, which is not supported; undistort it first")
@@ -146,39 +202,21 @@ def _lens(content: dict[str, Any], frame: dict[str, Any], header: Header, file: 
     return Lens(*pinhole, "brown", brown(k1, k2, p1, p2, k3, k4, k5, k6))
 
 
-def _mask(path: Path, folder: Path, frame: dict[str, Any], name: str, file: Path) -> Path | None:
+def _listed_mask(masks: PictureIndex, frame: dict[str, Any], name: str, file: Path) -> Path | None:
     listed = frame.get("mask_path")
     if listed is None:
-        return find_mask(folder, name)
-    mask = find_picture(path / slashed(listed)) if isinstance(listed, str) else None
+        return None
+    mask = masks.find(slashed(listed)) if isinstance(listed, str) else None
     if mask is None:
         raise HyrfDataError(f"{file}: mask {str(listed)[:80]} of {name} is not on disk; restore it or drop 'mask_path'")
     return mask
 
 
-def _read_ply(path: Path, content: dict[str, Any], file: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
+def _read_points(path: Path, content: dict[str, Any], file: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
     listed = content.get("ply_file_path")
     if listed is None:
         return None, None
     ply = path / slashed(str(listed))
     if not isinstance(listed, str) or not os.path.isfile(ply):  # Path.is_file raises where a name is too long
         raise HyrfDataError(f"{file}: points {str(listed)[:80]} are not on disk; restore them or drop 'ply_file_path'")
-    with needs_package("trimesh", f"{ply}: reading points"):
-        import trimesh
-    try:
-        with ply.open("rb") as stream:
-            stated = re.search(rb"element vertex (\d{1,18})\s", stream.read(4096))
-        # A texture that the file names is of no use here, and would be opened.
-        cloud = trimesh.load(str(ply), file_type="ply", process=False, skip_materials=True)
-        points = np.asarray(getattr(cloud, "vertices", np.zeros((0, 3))), dtype=np.float64)
-        mesh = isinstance(cloud, trimesh.Trimesh)
-        rgba = np.asarray(cloud.visual.vertex_colors if mesh else getattr(cloud, "colors", ()))
-        colors = rgba[:, :3] / 255 if rgba.shape == (len(points), 4) else np.full_like(points, 0.5)
-    except Exception as error:  # trimesh raises whatever its parsing meets.
-        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
-        raise HyrfDataError(f"{ply}: the points cannot be read ({reason}); export them again") from error
-    if points.ndim != 2 or points.shape[1:] != (3,) or colors.shape != points.shape:
-        raise HyrfDataError(f"{ply}: the points have no usable positions and colours; export them again")
-    if stated and int(stated[1]) != len(points):
-        raise HyrfDataError(f"{ply}: says {int(stated[1])} points but holds {len(points)}; export them again")
-    return points, colors
+    return read_ply(ply)

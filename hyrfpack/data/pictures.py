@@ -1,24 +1,32 @@
 """Photo files: headers at load time, pixels on demand, shrunk where that was asked for.
 
 Pictures are taken as they are stored: an EXIF orientation is ignored, as structure-from-motion does, because the
-camera was calibrated on the stored pixels.
+camera was calibrated on the stored pixels. Only where sizes prove that it was not, the caller asks for another.
 """
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hyrfpack.data.undistort import Lens, undistort
-from hyrfpack.errors import HyrfDataError, needs_package
+from hyrfpack.errors import HyrfDataError, HyrfError, needs_package, reason_of
 from hyrfpack.outputs import READABLE
 from hyrfpack.scene import Picture
 
-_SUFFIXES = (*READABLE, *map(str.upper, READABLE))
+if TYPE_CHECKING:
+    from PIL.ImageFile import ImageFile
+
 _SIXTEEN_BIT = ("I", "I;16", "I;16B", "I;16L", "I;16N")
+_ORIENTATION = 0x0112  # EXIF's tag
+_TURNS = {2: 0, 3: 3, 4: 1, 5: 5, 6: 4, 7: 6, 8: 2}  # its values -> Pillow's transpositions
+_UNDONE = {6: 8, 8: 6}  # the others undo themselves
+_HEIC = (".heic", ".heif", ".hif")
+_HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 _DRAFT = 2  # times the size asked for that a JPEG is decoded at, at least: 49 dB and more from decoding all of it
 
 
@@ -35,6 +43,10 @@ class Header:
         """(width, height) in pixels."""
         return self.width, self.height
 
+    def turned(self, orientation: int) -> Header:
+        """The same picture turned as an EXIF orientation says."""
+        return replace(self, width=self.height, height=self.width) if orientation >= 5 else self
+
 
 @dataclass(frozen=True)
 class PhotoFile:
@@ -42,25 +54,30 @@ class PhotoFile:
 
     Attributes:
         path: the file.
-        stored: (width, height) of the picture in it.
-        lens: at the size to load, which is the stored one or less.
+        stored: (width, height) of the picture in it, turned as `orientation` says.
+        lens: at the size to load, which is that one or less.
         mask: the file of its mask, if any.
+        orientation: of EXIF, that stored pixels are turned by.
     """
 
     path: Path
     stored: tuple[int, int]
     lens: Lens
     mask: Path | None = None
+    orientation: int = 1
 
     def __call__(self) -> Picture:
         width, height = size = (self.lens.width, self.lens.height)
         shrunk = size != self.stored
-        if shrunk and read_header(self.path).size != self.stored:
+        if shrunk and read_header(self.path).turned(self.orientation).size != self.stored:
             raise self._changed()
-        rgb, alpha = read_pixels(self.path, size if shrunk else None)
+        rgb, alpha = read_pixels(self.path, size if shrunk else None, self.orientation)
         if rgb.shape[:2] != (height, width):
             raise self._changed()
-        mask = None if self.mask is None else read_mask(self.mask, height, width, whole=shrunk)
+        mask = None
+        if self.mask is not None:
+            upright = same_aspect(*read_header(self.mask).size, *self.stored)
+            mask = read_mask(self.mask, height, width, whole=shrunk, orientation=1 if upright else self.orientation)
         picture = Picture(rgb, alpha, mask)
         return undistort(picture, self.lens) if self.lens.distorted else picture
 
@@ -68,29 +85,9 @@ class PhotoFile:
         return HyrfDataError(f"{self.path}: the picture changed its size since the scene was read; read it again")
 
 
-def find_picture(path: Path) -> Path | None:
-    """The file at `path`, or the same name with another or an added picture extension; None if there is none."""
-    candidates = [path, *(Path(f"{path}{suffix}") for suffix in _SUFFIXES)]
-    if path.suffix:
-        candidates += [path.with_suffix(suffix) for suffix in _SUFFIXES]
-    return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
-
-
 def is_picture_name(name: str) -> bool:
-    """Whether a file is called like a picture."""
+    """Whether a file is called like a picture that can be read, and is not hidden."""
     return name.lower().endswith(READABLE) and not name.startswith(".")
-
-
-def mask_folder(root: Path, picture_folder: str) -> Path:
-    """Where the masks of photos in a folder are: `masks/`, or "masks_2" for "images_2" if there is one."""
-    suffix = picture_folder.removeprefix("images")
-    return root / f"masks{suffix}" if suffix and (root / f"masks{suffix}").is_dir() else root / "masks"
-
-
-def find_mask(folder: Path, name: str) -> Path | None:
-    """The mask of photo `name` in a folder: under the same name, the name + ".png", or its stem + ".png"."""
-    candidates = (folder / name, folder / f"{name}.png", (folder / name).with_suffix(".png"))
-    return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
 
 
 def same_aspect(width: int, height: int, of_width: int, of_height: int) -> bool:
@@ -106,23 +103,84 @@ def shrunk_size(width: int, height: int, max_size: int) -> tuple[int, int]:
     return max(1, round(width * max_size / longer)), max(1, round(height * max_size / longer))
 
 
+def opened(path: Path) -> ImageFile:
+    """A picture file opened with Pillow, which has read its header alone; close it after use.
+
+    Sizes and pixels are to be had by `read_header` and `read_pixels`: Pillow turns TIFF files without being asked.
+
+    Raises:
+        HyrfDataError: the file is missing, empty, or no picture.
+        HyrfError: a package that reads it is missing.
+    """
+    with needs_package("pillow", f"{path}: reading pictures"):
+        from PIL import Image
+
+    try:
+        if os.path.getsize(path) == 0:
+            raise HyrfDataError(f"{path}: the picture file is empty (0 bytes); copy it again")
+        _know_heic(path)
+        image = Image.open(path)
+        if image.format == "EPS":  # a program, which Pillow would have Ghostscript run
+            raise HyrfDataError(f"{path}: PostScript is not a photo; save it as PNG or JPEG")
+    except HyrfError:
+        raise
+    except FileNotFoundError as error:
+        raise HyrfDataError(f"{path}: the picture is missing; restore it or read the scene again") from error
+    except PermissionError as error:
+        raise HyrfDataError(f"{path}: the picture may not be read; check its permissions") from error
+    except Exception as error:  # Pillow's header parsers raise whatever they meet.
+        raise HyrfDataError(f"{path}: not a picture that can be read ({reason_of(error)}); replace the file") from error
+    if min(image.size) < 1:
+        raise HyrfDataError(f"{path}: the picture has no pixels ({image.size[0]} x {image.size[1]}); replace the file")
+    return image
+
+
 def read_header(path: Path) -> Header:
-    """Size and kind of a picture file.
+    """Size, as stored, and kind of a picture file.
 
     Raises:
         HyrfDataError: the file is missing, empty, or no picture.
     """
-    with _opened(path) as image:
-        return Header(image.width, image.height, _has_alpha(image))
+    with opened(path) as image:
+        return Header(image.width, image.height, _has_alpha(image)).turned(_done_by_pillow(image))
 
 
-def read_pixels(path: Path, size: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+def read_orientation(path: Path) -> int:
+    """A picture file's EXIF orientation, 1 (as stored) to 8; 1 where it says none.
+
+    Raises:
+        HyrfDataError: the file is missing, empty, or no picture.
+    """
+    with opened(path) as image:
+        try:
+            orientation = _done_by_pillow(image) if image.format == "TIFF" else image.getexif().get(_ORIENTATION, 1)
+        except Exception:  # damaged tags of a good picture
+            return 1
+    return orientation if orientation in _TURNS else 1
+
+
+def says_panorama(path: Path) -> bool:
+    """Whether a picture file's XMP calls it an equirectangular panorama (Google's GPano), as 360-degree cameras do.
+
+    Raises:
+        HyrfDataError: the file is missing, empty, or no picture.
+    """
+    with opened(path) as image:
+        xmp = image.info.get("xmp") or b""
+    xmp = xmp.encode() if isinstance(xmp, str) else bytes(xmp)
+    return b"GPano:ProjectionType" in xmp and b"equirectangular" in xmp
+
+
+def read_pixels(
+    path: Path, size: tuple[int, int] | None = None, orientation: int = 1
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Decode a photo of any kind: grey, palette, 16 bit, with or without alpha.
 
     Args:
         path: the file.
         size: (width, height) to shrink it to, with a Lanczos filter, colours weighed by their alpha; None for the
             size that is stored. JPEG files are not decoded finer than that needs, which takes less time and memory.
+        orientation: of EXIF, 1 to 8, to turn it by; `size` is that of the turned picture.
 
     Returns:
         (H, W, 3) uint8 RGB (straight, grey repeated) and (H, W) uint8 alpha or None.
@@ -130,24 +188,32 @@ def read_pixels(path: Path, size: tuple[int, int] | None = None) -> tuple[np.nda
     Raises:
         HyrfDataError: the file is missing, truncated, or of a kind that has no display values.
     """
-    with _opened(path) as image:
+    with opened(path) as image:
         from PIL import Image
 
         if image.mode == "F":
             raise HyrfDataError(f"{path}: floating-point pictures have no display values; save it as 8-bit PNG")
         try:
             # What a draft covers is its whole size, but for a fraction of a pixel at the right and at the bottom.
-            draft = None if size is None else image.draft(None, (_DRAFT * size[0], _DRAFT * size[1]))
+            stored = size[::-1] if size is not None and orientation >= 5 else size
+            draft = None if stored is None else image.draft(None, (_DRAFT * stored[0], _DRAFT * stored[1]))
+            done = _done_by_pillow(image)
+            if done >= 5:
+                image.filename = ""  # or it is mapped into memory, with the sides of the turned picture
             if image.mode in _SIXTEEN_BIT:
                 wide = np.asarray(image).astype(np.float64)
                 picture = Image.fromarray((np.clip(wide, 0, 65535) / 257 + 0.5).astype(np.uint8))
             else:
                 picture = image.convert("RGBA" if _has_alpha(image) else "RGB")
-            if size is not None:
-                picture = picture.resize(size, Image.Resampling.LANCZOS, box=None if draft is None else draft[1])
+            if done != 1:
+                picture = picture.transpose(Image.Transpose(_TURNS[_UNDONE.get(done, done)]))
+            if stored is not None:
+                picture = picture.resize(stored, Image.Resampling.LANCZOS, box=None if draft is None else draft[1])
+            if orientation != 1:
+                picture = picture.transpose(Image.Transpose(_TURNS[orientation]))
             pixels = np.array(picture)
         except Exception as error:  # Pillow's decoders raise whatever they meet.
-            raise HyrfDataError(f"{path}: cannot decode the picture ({_reason(error)}); replace the file") from error
+            raise HyrfDataError(f"{path}: cannot decode the picture ({reason_of(error)}); replace the file") from error
     if pixels.ndim == 2:
         return np.repeat(pixels[..., None], 3, axis=2), None
     if pixels.shape[2] == 4:
@@ -155,7 +221,7 @@ def read_pixels(path: Path, size: tuple[int, int] | None = None) -> tuple[np.nda
     return pixels, None
 
 
-def read_mask(path: Path, height: int, width: int, *, whole: bool = False) -> np.ndarray:
+def read_mask(path: Path, height: int, width: int, *, whole: bool = False, orientation: int = 1) -> np.ndarray:
     """Decode a mask: 0 is a pixel to ignore.
 
     Args:
@@ -163,11 +229,12 @@ def read_mask(path: Path, height: int, width: int, *, whole: bool = False) -> np
         height, width: to bring it to.
         whole: for photos that are shrunk: a pixel counts if everything that it covers does. Otherwise, and where the
             mask is smaller than asked for, the nearest pixel of the mask decides.
+        orientation: of EXIF, to turn it by.
 
     Returns:
         (height, width) bool.
     """
-    rgb, _ = read_pixels(path)
+    rgb, _ = read_pixels(path, orientation=orientation)
     usable = np.any(rgb, axis=2)
     if usable.shape == (height, width):
         return usable
@@ -187,33 +254,23 @@ def _covered(many: int, few: int) -> np.ndarray:
     return np.stack((starts, ends), 1).ravel()[:-1]  # reduceat lets the last reach to the end by itself
 
 
+def _done_by_pillow(image) -> int:
+    """The orientation that Pillow turns a picture by without being asked, which it does to TIFF files alone."""
+    orientation = image.tag_v2.get(_ORIENTATION, 1) if image.format == "TIFF" else 1
+    return orientation if orientation in _TURNS else 1
+
+
 def _has_alpha(image) -> bool:
     # A grey level that stands for "transparent" in 16-bit pictures is not honoured: it would not survive 8 bits.
     transparent = "transparency" in image.info and image.mode not in _SIXTEEN_BIT
     return transparent or image.mode in ("RGBA", "LA", "PA", "La", "RGBa")
 
 
-def _opened(path: Path):
-    """Open with Pillow; every way in which that fails is one sentence."""
-    with needs_package("pillow", f"{path}: reading pictures"):
-        from PIL import Image
-
-    try:
-        if os.path.getsize(path) == 0:
-            raise HyrfDataError(f"{path}: the picture file is empty (0 bytes); copy it again")
-        image = Image.open(path)
-        if image.format == "EPS":  # a program, which Pillow would have Ghostscript run
-            raise HyrfDataError(f"{path}: PostScript is not a photo; save it as PNG or JPEG")
-    except HyrfDataError:
-        raise
-    except FileNotFoundError as error:
-        raise HyrfDataError(f"{path}: the picture is missing; restore it or read the scene again") from error
-    except Exception as error:  # Pillow's header parsers raise whatever they meet.
-        raise HyrfDataError(f"{path}: not a picture that can be read ({_reason(error)}); replace the file") from error
-    if min(image.size) < 1:
-        raise HyrfDataError(f"{path}: the picture has no pixels ({image.size[0]} x {image.size[1]}); replace the file")
-    return image
-
-
-def _reason(error: Exception) -> str:
-    return str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+def _know_heic(path: Path) -> None:
+    """Have Pillow read HEIC, by a package that need not be there, before the first file of that kind."""
+    with path.open("rb") as stream:
+        start = stream.read(12)
+    if path.suffix.lower() in _HEIC or (start[4:8] == b"ftyp" and start[8:] in _HEIC_BRANDS):
+        with needs_package("pillow-heif", f"{path}: reading HEIC photos"):
+            import pillow_heif
+        pillow_heif.register_heif_opener()

@@ -1,4 +1,4 @@
-"""What Blender-style and nerfstudio-style JSON share: the file, its numbers, its poses."""
+"""What the layouts that keep poses in JSON share: the file, its numbers, its poses."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 from hyrfpack.errors import HyrfDataError
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a transforms file and check that it has a list of frames, each with a path, which gets slashes.
+def read_object(path: Path) -> dict[str, Any]:
+    """Read a JSON file that holds an object.
 
     Raises:
-        HyrfDataError: not to be read, not JSON, or without usable frames.
+        HyrfDataError: not to be read, not JSON, or not an object.
     """
     try:
         content = json.loads(path.read_bytes())
@@ -24,7 +24,19 @@ def read_json(path: Path) -> dict[str, Any]:
         raise HyrfDataError(f"{path}: cannot be read ({error.strerror}); restore the file") from error
     except (ValueError, RecursionError) as error:
         raise HyrfDataError(f"{path}: not valid JSON ({str(error)[:120]}); the file is damaged") from error
-    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(content, dict):
+        raise HyrfDataError(f"{path}: not a JSON object; the file is damaged, or of another program")
+    return content
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a transforms file and check that it has a list of frames, each with a path, which gets slashes.
+
+    Raises:
+        HyrfDataError: not to be read, not JSON, or without usable frames.
+    """
+    content = read_object(path)
+    frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise HyrfDataError(f"{path}: has no list of 'frames'; it is not a transforms file, or it is empty")
     for index, frame in enumerate(frames):
@@ -69,12 +81,19 @@ def pose_from_opengl(frame: dict[str, Any], path: Path) -> np.ndarray:
         raise HyrfDataError(
             f"{path}: frame {frame['file_path'][:80]} has no 4 x 4 'transform_matrix' of numbers; correct or remove it"
         )
-    # Transposing inverts the rotation because it is orthonormal: `make_scene` refuses a pose that is not.
     with np.errstate(invalid="ignore", over="ignore"):
-        rotation = (matrix[:3, :3] * (1, -1, -1)).T
-        pose = np.eye(4)
-        pose[:3, :3] = rotation
-        pose[:3, 3] = -rotation @ matrix[:3, 3]
+        return inverted(matrix[:3, :3] * (1, -1, -1), matrix[:3, 3])
+
+
+def inverted(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """(4, 4) camera_from_world of a camera with OpenCV axes in the columns of `rotation` that stands at `position`.
+
+    Transposing inverts a rotation, if it is one: `make_scene` refuses a pose that is not.
+    """
+    pose = np.eye(4)
+    with np.errstate(invalid="ignore", over="ignore"):
+        pose[:3, :3] = rotation.T
+        pose[:3, 3] = -rotation.T @ position
     return pose
 
 

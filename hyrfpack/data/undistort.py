@@ -23,9 +23,11 @@ class Lens:
     Attributes:
         width, height: picture size in pixels.
         fx, fy, cx, cy: pinhole part, in pixels (pixel centres at .5).
-        model: "pinhole" (no coefficients), "brown" (k1 k2 p1 p2 k3 k4 k5 k6, COLMAP's FULL_OPENCV), or
-            "fisheye" (k1 k2 k3 k4 of the equidistant OPENCV_FISHEYE).
+        model: "pinhole" (no coefficients), "brown" (k1 k2 p1 p2 k3 k4 k5 k6, COLMAP's FULL_OPENCV, and a k7 where
+            there is one), "fisheye" (k1 k2 k3 k4 of the equidistant OPENCV_FISHEYE, and p1 p2 where there are any), or
+            "equirectangular" (the whole sphere, which is cut into faces and never undistorted).
         coefficients: as many as the model has, dimensionless.
+        skew: pixels that the picture is sheared to the right by for each unit of y'. What is undistorted has none.
     """
 
     width: int
@@ -34,24 +36,32 @@ class Lens:
     fy: float
     cx: float
     cy: float
-    model: Literal["pinhole", "brown", "fisheye"] = "pinhole"
+    model: Literal["pinhole", "brown", "fisheye", "equirectangular"] = "pinhole"
     coefficients: tuple[float, ...] = ()
+    skew: float = 0.0
 
     @property
     def distorted(self) -> bool:
-        """Whether straight lines in the world are bent in the photo."""
-        return self.model == "fisheye" or any(self.coefficients)
+        """Whether the photo differs from a pinhole picture: straight lines are bent, or squares sheared."""
+        return self.model == "fisheye" or any(self.coefficients) or self.skew != 0
 
     def scaled(self, width: int, height: int) -> Lens:
         """The same lens for a copy of the photo resized to (width, height); coefficients have no unit and stay."""
         sx, sy = width / self.width, height / self.height
         return replace(
-            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+            skew=self.skew * sx,
         )
 
 
 def brown(k1: float = 0, k2: float = 0, p1: float = 0, p2: float = 0, *higher: float) -> tuple[float, ...]:
-    """Pad Brown coefficients in COLMAP's order (k1 k2 p1 p2 k3 k4 k5 k6) to all eight."""
+    """Pad Brown coefficients in COLMAP's order (k1 k2 p1 p2 k3 k4 k5 k6) to all eight; a ninth is k7."""
     return (k1, k2, p1, p2, *higher, *(0.0,) * (4 - len(higher)))
 
 
@@ -60,10 +70,11 @@ def distort(lens: Lens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.nd
 
     With r^2 = x^2 + y^2, brown is the OpenCV rational model
 
-        d = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
+        d = (1 + k1 r^2 + k2 r^4 + k3 r^6 + k7 r^8) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
         x' = x d + 2 p1 x y + p2 (r^2 + 2 x^2),   y' = y d + 2 p2 x y + p1 (r^2 + 2 y^2)
 
-    and fisheye, with theta = atan r, is (x', y') = (x, y) theta (1 + k1 theta^2 + ... + k4 theta^8) / r.
+    whose k7 is Metashape's and RealityScan's K4. Fisheye, with theta = atan r, is the same with (x, y) theta / r for
+    (x, y), and d = 1 + k1 theta^2 + ... + k4 theta^8. Skew, at last, adds skew / fx y' to x'.
 
     Args:
         lens: the lens.
@@ -73,25 +84,38 @@ def distort(lens: Lens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.nd
         (x', y') of the same shape; the photo's pixel is (fx x' + cx, fy y' + cy).
     """
     if lens.model == "pinhole":
-        return x, y
+        bent_x, bent_y = x, y
+    elif lens.model == "fisheye":
+        r = np.sqrt(x * x + y * y)
+        theta = np.arctan(r)
+        scale = np.divide(_fisheye_angle(lens, theta), r, out=np.ones_like(r), where=r > 1e-9)
+        bent_x, bent_y = x * scale, y * scale
+        if len(lens.coefficients) > 4:
+            flat = np.divide(theta, r, out=np.ones_like(r), where=r > 1e-9)
+            off_x, off_y = _decentred(lens.coefficients[4:6], x * flat, y * flat)
+            bent_x, bent_y = bent_x + off_x, bent_y + off_y
+    else:
+        d = _brown_factor(lens, x * x + y * y)
+        off_x, off_y = _decentred(lens.coefficients[2:4], x, y)
+        bent_x, bent_y = x * d + off_x, y * d + off_y
+    return (bent_x + lens.skew / lens.fx * bent_y if lens.skew else bent_x), bent_y
+
+
+def _decentred(tangential: tuple[float, ...], x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What a lens that stands off the axis, by p1 and p2, adds to (x, y)."""
+    p1, p2 = tangential
     r2 = x * x + y * y
-    if lens.model == "fisheye":
-        r = np.sqrt(r2)
-        scale = np.divide(_fisheye_angle(lens, np.arctan(r)), r, out=np.ones_like(r), where=r > 1e-9)
-        return x * scale, y * scale
-    p1, p2 = lens.coefficients[2:4]
-    d = _brown_factor(lens, r2)
-    return x * d + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * d + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+    return 2 * p1 * x * y + p2 * (r2 + 2 * x * x), 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
 
 
 def _brown_factor(lens: Lens, r2: np.ndarray) -> np.ndarray:
-    k1, k2, _, _, k3, k4, k5, k6 = lens.coefficients
+    k1, k2, _, _, k3, k4, k5, k6, k7 = (*lens.coefficients, 0.0)[:9]
     with np.errstate(divide="ignore", invalid="ignore"):
-        return (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        return (1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k7)))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
 
 
 def _fisheye_angle(lens: Lens, theta: np.ndarray) -> np.ndarray:
-    k1, k2, k3, k4 = lens.coefficients
+    k1, k2, k3, k4 = lens.coefficients[:4]
     t2 = theta * theta
     return theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
 

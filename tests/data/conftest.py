@@ -121,3 +121,9 @@ def nerfstudio_folder(tmp_path, opengl_frames):
 def pictures():
     """write_pictures, the function."""
     return write_pictures
+
+
+@pytest.fixture
+def random_poses():
+    """random_poses(count) -> rotations and translations, camera from world."""
+    return lambda count: [(rotation_of(quaternion), translation) for quaternion, translation in poses_of(count)]

@@ -188,7 +188,7 @@ def _break_duplicate_name(root: Path, folder) -> None:
 
 
 def _break_missing_table(root: Path, folder) -> None:
-    (folder.model / "points3D.bin").unlink()
+    (folder.model / "cameras.bin").unlink()
 
 
 def _break_empty_table(root: Path, folder) -> None:
@@ -196,7 +196,8 @@ def _break_empty_table(root: Path, folder) -> None:
 
 
 def _break_no_photo_folder(root: Path, folder) -> None:
-    shutil.move(root / "images", root / "pictures")
+    shutil.copytree(root / "images", root / "left")
+    shutil.move(root / "images", root / "right")
 
 
 @pytest.mark.parametrize(
@@ -215,9 +216,9 @@ def _break_no_photo_folder(root: Path, folder) -> None:
         (_break_picture_size, "24 x 32"),
         (_break_mask_size, "320 x 32"),
         (_break_duplicate_name, "listed twice"),
-        (_break_missing_table, "points3D.bin"),
+        (_break_missing_table, "cameras.bin: missing"),
         (_break_empty_table, "images.bin"),
-        (_break_no_photo_folder, "pictures"),
+        (_break_no_photo_folder, "there are the folders left, right, sparse; .* --images"),
     ],
 )
 def test_broken_model_gives_one_sentence(tmp_path, colmap_folder, damage, says):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -37,9 +38,9 @@ def notes(root: Path, **options) -> str:
 def test_photos_of_another_kind_are_named_where_none_is_found(tmp_path, colmap_folder):
     colmap_folder(tmp_path)
     for file in (tmp_path / "images").iterdir():
-        file.rename(file.with_suffix(".HEIC"))
+        file.rename(file.with_suffix(".dng"))
 
-    assert "(looked for images/000.png; that folder holds 9 .HEIC files)" in sentence(tmp_path)
+    assert "(looked for images/000.png; that folder holds 9 .dng files)" in sentence(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -230,3 +231,66 @@ def test_a_tidy_set_has_nothing_to_note(nerfstudio_folder, pictures):
 @pytest.mark.parametrize("name", ["x" * 300, "x/" * 3000 + "x", "a\0b"])
 def test_names_that_no_folder_can_have_are_refused(tmp_path, name):
     assert "no such folder" in sentence(tmp_path / name)
+
+
+def test_photos_may_lie_outside_the_folder_of_the_model(tmp_path, colmap_folder):
+    folder = colmap_folder(tmp_path / "set")
+    (tmp_path / "set" / "images").rename(tmp_path / "photos")
+
+    scene = load_scene(tmp_path / "set", images=str(tmp_path / "photos"))
+
+    assert len(scene.views) == folder.count
+
+
+def test_folders_of_several_cameras_may_lie_beside_the_model(tmp_path, colmap_folder, pictures):
+    """image_2 and image_3, as KITTI has them, are no smaller copies."""
+    folder = colmap_folder(tmp_path, count=4, extra=False)
+    folder.names = [f"image_{2 + index % 2}/{index}.png" for index in range(4)]
+    (folder.model / "images.bin").write_bytes(folder.tables()["images.bin"])
+    pictures(tmp_path, folder.names)
+
+    scene = load_scene(tmp_path)
+
+    assert sorted(view.name for view in scene.views) == sorted(folder.names)
+    assert "photos were taken from the folder itself" in scene.notes
+
+
+def test_folders_of_masks_previews_and_depth_maps_are_no_choice(tmp_path, colmap_folder, pictures):
+    folder = colmap_folder(tmp_path, count=4)
+    (tmp_path / "images").rename(tmp_path / "saturday")
+    for other in ("depth", "masks", "thumbs", "stereo"):
+        pictures(tmp_path / other, folder.names)
+
+    assert "photos were taken from saturday" in load_scene(tmp_path).notes
+
+
+def test_folders_of_masks_may_be_links(tmp_path, colmap_folder, pictures):
+    folder = colmap_folder(tmp_path / "set", count=4)
+    pictures(tmp_path / "masks", folder.names)
+    (tmp_path / "set" / "masks").mkdir()
+    (tmp_path / "set" / "masks" / "mine").symlink_to(tmp_path / "masks")
+
+    assert "4 of 4 photos have a mask" in load_scene(tmp_path / "set").notes
+
+
+@pytest.mark.parametrize("name", ["", "images", "masks", "sparse", "sparse/0"])
+@pytest.mark.parametrize("mode", [0o000, 0o444])
+def test_folders_that_may_not_be_read_are_one_sentence(tmp_path, colmap_folder, pictures, name, mode):
+    folder = colmap_folder(tmp_path / "set", count=4)
+    pictures(tmp_path / "set" / "masks", folder.names)
+    place = tmp_path / "set" / name
+    place.chmod(mode)
+    try:
+        if os.access(place, os.R_OK | os.X_OK):
+            pytest.skip("who runs this may read everything")
+        assert "set" in sentence(tmp_path / "set")
+    finally:
+        place.chmod(0o700)
+
+
+@pytest.mark.parametrize("name", ["sparse", "sparse/0"])
+def test_a_model_that_may_not_be_read_is_not_taken_for_none(tmp_path, colmap_folder, monkeypatch, name):
+    colmap_folder(tmp_path, count=4)
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path / name)
+
+    assert f"{tmp_path / name}: the folder may not be read; check its permissions" in sentence(tmp_path)

@@ -58,7 +58,7 @@ def test_forced_layout_that_is_not_there_is_refused(tmp_path, colmap_folder):
     with pytest.raises(HyrfDataError, match="no blender poses"):
         load_scene(tmp_path, layout="blender")
     with pytest.raises(ValueError, match="no layout"):
-        load_scene(tmp_path, layout="llff")
+        load_scene(tmp_path, layout="openmvg")
 
 
 def test_importing_the_readers_loads_no_heavy_library():

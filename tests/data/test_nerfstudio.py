@@ -60,6 +60,7 @@ def test_field_of_view_stands_in_for_the_focal_length(nerfstudio_folder):
         ({"camera_model": "FULL_OPENCV", "k1": 0.1, "k4": 0.2}, "brown", (0.1, 0, 0, 0, 0, 0.2, 0, 0)),
         ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.05}, "fisheye", (0.1, 0, 0, 0.05)),
         ({"is_fisheye": True, "k2": 0.1}, "fisheye", (0, 0.1, 0, 0)),
+        ({"camera_model": "RADIAL_FISHEYE", "k1": 0.1, "k2": 0.2}, "fisheye", (0.1, 0.2, 0, 0)),
         ({"camera_model": "PINHOLE", "k1": 0.1}, "pinhole", ()),
     ],
 )
@@ -187,7 +188,8 @@ def _top(root: Path, **entries) -> None:
         (lambda root: _top(root, fl_x=-3.0), "intrinsics"),
         (lambda root: _top(root, cx=float("inf")), "cx"),
         (lambda root: _top(root, w=640, h=100), "640 x 100"),
-        (lambda root: _top(root, camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR"),
+        (lambda root: _top(root, camera_model="EQUIRECTANGULAR"), "twice as wide as high"),
+        (lambda root: _top(root, camera_model="FISHEYE624"), "FISHEYE624"),
         (lambda root: _top(root, k4=0.1), "k4"),
         (lambda root: _top(root, ply_file_path="gone.ply"), "gone.ply"),
         (lambda root: _top(root, train_filenames=3), "train_filenames"),
@@ -201,7 +203,7 @@ def _top(root: Path, **entries) -> None:
         (lambda root: [file.unlink() for file in (root / "images").iterdir()], "none of the [0-9] photos that"),
         (lambda root: (root / "transforms.json").write_text("[" * 100_000), "JSON"),
         (lambda root: (root / "transforms.json").write_bytes(b"\xff\xfe{"), "JSON"),
-        (lambda root: (root / "transforms.json").write_text("[]"), "frames"),
+        (lambda root: (root / "transforms.json").write_text("[]"), "not a JSON object"),
     ],
 )
 def test_broken_set_gives_one_sentence(nerfstudio_folder, damage, says):

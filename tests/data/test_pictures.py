@@ -1,13 +1,17 @@
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from hyrfpack.data.pictures import find_picture, read_header, read_mask, read_pixels, same_aspect
-from hyrfpack.errors import HyrfDataError
+from hyrfpack.data.pictures import PhotoFile, read_header, read_mask, read_orientation, read_pixels, same_aspect
+from hyrfpack.data.undistort import Lens
+from hyrfpack.errors import HyrfDataError, HyrfError
 
 RAMP = np.arange(48, dtype=np.uint8).reshape(6, 8) * 5
 
@@ -47,13 +51,84 @@ def test_alpha_is_kept_straight(tmp_path, mode):
     assert read_header(tmp_path / "a.png").has_alpha
 
 
-def test_exif_orientation_is_ignored(tmp_path):
+def tagged(path: Path, orientation: int, pixels: np.ndarray) -> Path:
     exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.fromarray(RAMP).save(tmp_path / "a.jpg", exif=exif)
+    exif[0x0112] = orientation
+    Image.fromarray(pixels).save(path, exif=exif)
+    return path
 
-    assert read_pixels(tmp_path / "a.jpg")[0].shape == (6, 8, 3)
-    assert read_header(tmp_path / "a.jpg").width == 8
+
+@pytest.mark.parametrize("ending", ["jpg", "png", "webp", "tif"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_orientation_is_ignored(tmp_path, ending, orientation):
+    tagged(tmp_path / f"a.{ending}", orientation, RAMP)
+    Image.fromarray(RAMP).save(tmp_path / f"b.{ending}")
+
+    np.testing.assert_array_equal(read_pixels(tmp_path / f"a.{ending}")[0], read_pixels(tmp_path / f"b.{ending}")[0])
+    assert read_header(tmp_path / f"a.{ending}").size == (8, 6)
+
+
+@pytest.mark.parametrize("ending", ["png", "tif"])
+@pytest.mark.parametrize(
+    ("orientation", "upright"),  # as the EXIF standard defines where row 0 and column 0 are
+    [
+        (1, RAMP),
+        (2, RAMP[:, ::-1]),
+        (3, RAMP[::-1, ::-1]),
+        (4, RAMP[::-1]),
+        (5, RAMP.T),
+        (6, RAMP[::-1].T),
+        (7, RAMP[::-1, ::-1].T),
+        (8, RAMP[:, ::-1].T),
+    ],
+)
+def test_a_picture_is_turned_where_that_is_asked_for(tmp_path, ending, orientation, upright):
+    path = tagged(tmp_path / f"a.{ending}", orientation, RAMP)
+
+    assert read_orientation(path) == orientation
+    np.testing.assert_array_equal(read_pixels(path, orientation=orientation)[0][..., 0], upright)
+
+
+@pytest.mark.parametrize("ending", ["jpg", "png"])
+def test_a_turned_photo_is_shrunk_as_the_upright_one_is(tmp_path, ending):
+    ramp = np.add.outer(np.arange(120), 2 * np.arange(160)).astype(np.uint8) // 2
+    path = tagged(tmp_path / f"a.{ending}", 6, ramp)
+    lens = Lens(15, 20, 20.0, 20.0, 7.5, 10.0)
+
+    picture = PhotoFile(path, (120, 160), lens, orientation=6)()
+
+    whole = read_pixels(path, orientation=6)[0]
+    expected = np.asarray(Image.fromarray(whole).resize((15, 20), Image.Resampling.LANCZOS), float)
+    assert picture.rgb.shape == (20, 15, 3)
+    assert np.abs(picture.rgb - expected).max() <= (3 if ending == "jpg" else 1)
+
+
+def test_damaged_exif_is_no_orientation(tmp_path):
+    Image.fromarray(RAMP).save(tmp_path / "a.jpg", exif=b"Exif\0\0II*\0\xff\xff\xff\xff")
+    tagged(tmp_path / "b.jpg", 77, RAMP)
+
+    assert read_orientation(tmp_path / "a.jpg") == read_orientation(tmp_path / "b.jpg") == 1
+
+
+def test_heic_photos_are_read_whatever_they_are_called(tmp_path):
+    pytest.importorskip("pillow_heif").register_heif_opener()
+    pixels = np.repeat(RAMP.repeat(8, 0).repeat(8, 1)[..., None], 3, 2)
+    Image.fromarray(pixels).save(tmp_path / "a.heic", quality=95)
+    (tmp_path / "b.jpg").write_bytes((tmp_path / "a.heic").read_bytes())
+
+    for name in ("a.heic", "b.jpg"):
+        assert np.abs(read_pixels(tmp_path / name)[0].astype(float) - pixels).mean() < 6
+        assert read_header(tmp_path / name).size == (64, 48)
+
+
+def test_heic_photos_without_the_package_are_one_sentence(tmp_path, monkeypatch):
+    (tmp_path / "a.HEIC").write_bytes(b"\0\0\0\x18ftypheic" + bytes(40))
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+
+    with pytest.raises(
+        HyrfError, match=r"a\.HEIC: reading HEIC photos needs pillow-heif; run 'pip install pillow-heif'"
+    ):
+        read_header(tmp_path / "a.HEIC")
 
 
 def test_mask_is_resized_by_nearest_neighbour(tmp_path):
@@ -64,14 +139,6 @@ def test_mask_is_resized_by_nearest_neighbour(tmp_path):
     np.testing.assert_array_equal(mask, np.kron([[0, 1], [1, 0]], np.ones((2, 2))).astype(bool))
 
 
-def test_picture_is_found_by_stem(tmp_path):
-    Image.fromarray(RAMP).save(tmp_path / "a.png")
-
-    for name in ("a", "a.png", "a.jpg", "a.JPG"):
-        assert find_picture(tmp_path / name) == tmp_path / "a.png"
-    assert find_picture(tmp_path / "b.png") is None
-
-
 @pytest.mark.parametrize(("width", "height", "same"), [(100, 67, True), (99, 66, True), (67, 100, False)])
 def test_aspect_tolerates_rounding_only(width, height, same):
     assert same_aspect(width, height, 800, 533) is same
@@ -80,7 +147,7 @@ def test_aspect_tolerates_rounding_only(width, height, same):
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_damaged_pictures_raise_nothing_but_data_errors(tmp_path_factory, data):
-    suffix = data.draw(st.sampled_from(["png", "jpg", "webp", "tif"]))
+    suffix = data.draw(st.sampled_from(["png", "jpg", "webp", "tif", "bmp", "avif", "jp2"]))
     path = tmp_path_factory.getbasetemp() / f"damaged.{suffix}"
     Image.fromarray(np.repeat(RAMP[..., None], 3, 2)).save(path)
     content = bytearray(path.read_bytes())
@@ -93,7 +160,7 @@ def test_damaged_pictures_raise_nothing_but_data_errors(tmp_path_factory, data):
 
     try:
         read_header(path)
-        read_pixels(path)
+        read_pixels(path, orientation=read_orientation(path))
     except HyrfDataError as error:
         assert "\n" not in str(error) and path.name in str(error)
 

@@ -1,0 +1,162 @@
+"""Bundler's bundle.out (version 0.3), which many programs export, and the list of photos that belongs to it.
+
+After the line `# Bundle file v0.3` and the numbers of cameras and points, each camera has five lines: f k1 k2, three
+rows of R and t, with P = R X + t. It looks along -z, y is up, and the picture's middle is the principal point: with
+p = -P / P.z the pixel is f (1 + k1 |p|^2 + k2 |p|^4) p from there, y up. f = 0 marks a photo without a pose. Each point
+has three lines: position, colour (0 to 255) and where it was seen. Photos are in the order of the list. The size of the
+photos is not said, so smaller copies of them cannot be told from the photos themselves.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from hyrfpack.data.assemble import make_scene
+from hyrfpack.data.beside import Entry, listed_folder, photos_beside, picture_folder
+from hyrfpack.data.folder import times_smaller
+from hyrfpack.data.pictures import Header
+from hyrfpack.data.undistort import Lens, brown
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.scene import Scene
+
+_MARK = b"# Bundle file v0.3"
+_LISTS = ("list.txt", "*.list.txt", "*list*.txt", "*.lst")
+
+
+def find_bundle(path: Path) -> Path | None:
+    """The bundle file in a folder or in `bundle/` below it: bundle.out, or the first by name."""
+    for folder in (path, path / "bundle"):
+        try:
+            files = sorted(f for f in folder.iterdir() if f.suffix.lower() == ".out" and f.is_file() and _is_bundle(f))
+        except OSError:
+            continue
+        if files:
+            return next((file for file in files if file.name == "bundle.out"), files[0])
+    return None
+
+
+def read_bundler(path: Path, *, test_every: int, max_size: int) -> Scene:
+    """Read a bundle file, its list and the photos.
+
+    Args:
+        path: the scene folder, with the photos in it or in `images/`.
+        test_every, max_size: see `load_scene`.
+
+    Raises:
+        HyrfDataError: a file is missing or cannot be used.
+    """
+    bundle = find_bundle(path)
+    if bundle is None:
+        raise HyrfDataError(f"{path}: no bundle file ('# Bundle file v0.3'); give the folder that holds it")
+    names, listing = _read_list(path, bundle)
+    cameras, points, colors = _read_bundle(bundle)
+    if len(names) != len(cameras):
+        raise HyrfDataError(
+            f"{bundle}: holds {len(cameras)} cameras, but {listing.name} lists {len(names)} photos; export both again"
+        )
+    entries: list[Entry] = []
+    for name, camera in zip(names, cameras, strict=True):
+        focal, k1, k2 = camera[0]
+        if focal == 0:
+            continue
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = camera[1:4], camera[4]
+        pose[1:3] *= -1
+        entries.append((name, partial(_lens, focal, k1, k2), pose))
+    folder = listed_folder(path, names) or _full_size(picture_folder(path, None))
+    photos, masks, notes = photos_beside(path, folder, entries, bundle.name)
+    if len(entries) < len(names):
+        notes.append(f"{len(names) - len(entries)} photos were never registered and were skipped")
+    return make_scene(
+        path,
+        "bundler",
+        photos,
+        test_every=test_every,
+        max_size=max_size,
+        points=points,
+        point_colors=colors,
+        tables=[bundle, listing],
+        masks=masks,
+        notes=notes,
+    )
+
+
+def _full_size(folder: Path) -> Path:
+    """The folder, which must not be one of smaller copies, unless the list says that those were posed."""
+    if times_smaller(folder.name):
+        raise HyrfDataError(
+            f"{folder}: a Bundler file does not say how large its photos are, so copies of another size cannot be "
+            "used; put the photos that were posed into images"
+        )
+    return folder
+
+
+def _lens(focal: float, k1: float, k2: float, _: Path, header: Header) -> Lens:
+    width, height = header.size
+    return Lens(width, height, focal, focal, width / 2, height / 2, "brown", brown(k1, k2))
+
+
+def _is_bundle(file: Path) -> bool:
+    try:
+        with file.open("rb") as stream:
+            return stream.read(len(_MARK)) == _MARK
+    except OSError:
+        return False
+
+
+def _read_list(path: Path, bundle: Path) -> tuple[list[str], Path]:
+    """The photos' names in the order of cameras, and the file that lists them."""
+    folders = dict.fromkeys((bundle.parent, path))
+    lists = (file for folder in folders for pattern in _LISTS for file in sorted(folder.glob(pattern)))
+    listing = next((file for file in lists if file.is_file()), None)
+    if listing is None:
+        raise HyrfDataError(
+            f"{bundle}: the list of its photos is missing (looked for list.txt and *.lst beside it); export it, too"
+        )
+    lines = _text(listing).splitlines()
+    # Bundler's own lists say more of a photo behind its name: 0 and the focal length from EXIF.
+    names = [re.sub(r"\s+0\s+[\d.eE+-]+$", "", line.strip()) for line in lines]
+    return [name for name in names if name and not name.startswith("#")], listing
+
+
+def _read_bundle(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(N, 5, 3) rows of the cameras, (P, 3) points and (P, 3) colours in [0, 1]."""
+    lines = [line for line in _text(file).splitlines() if line.strip() and not line.startswith("#")]
+    try:
+        cameras, points = map(int, lines[0].split()[:2])
+    except (IndexError, ValueError) as error:
+        raise HyrfDataError(f"{file}: does not say how many cameras and points it holds; export it again") from error
+    needed = 1 + 5 * cameras + 3 * points
+    if cameras < 1 or points < 0 or len(lines) < needed:
+        raise HyrfDataError(
+            f"{file}: {cameras} cameras and {points} points take {needed} lines, but there are {len(lines)}; the file "
+            "is truncated, export it again"
+        )
+    first = 1 + 5 * cameras
+    table = _numbers(lines[1:first], file).reshape(cameras, 5, 3)
+    if not np.isfinite(table).all():
+        raise HyrfDataError(f"{file}: a camera in it has numbers that are not finite; export it again")
+    colors = np.clip(_numbers(lines[first + 1 : needed : 3], file) / 255, 0, 1)
+    return table, _numbers(lines[first:needed:3], file), np.nan_to_num(colors, nan=0.5)
+
+
+def _numbers(lines: list[str], file: Path) -> np.ndarray:
+    """(N, 3) float64 of lines with three numbers each."""
+    try:
+        rows = [tuple(map(float, line.split())) for line in lines]
+    except ValueError:
+        rows = [()]
+    if any(len(row) != 3 for row in rows):
+        raise HyrfDataError(f"{file}: a line that should have three numbers has not; export it again")
+    return np.array(rows, np.float64).reshape(-1, 3)
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_bytes().decode("utf-8-sig", errors="replace")
+    except OSError as error:
+        raise HyrfDataError(f"{file}: cannot be read ({error.strerror}); restore the file") from error

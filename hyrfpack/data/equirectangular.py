@@ -1,0 +1,273 @@
+"""Panoramas of the whole sphere (equirectangular): cut into square pinhole pictures, the faces of a cube.
+
+A panorama's camera has the axes of all others, x right, y down, z forward, and forward is its middle. Its pixel (u, v)
+of W x H, H = W / 2, looks along
+
+    longitude = 2 pi (u / W - 1/2) = atan2(x, z),   latitude = pi (v / H - 1/2) = atan2(y, sqrt(x^2 + z^2)),
+
+longitude to the right and latitude downwards. So nerfstudio (EQUIRECTANGULAR, in OpenGL axes) and Metashape (spherical)
+have it, too.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hyrfpack.atomic import replacing
+from hyrfpack.data.pictures import Header, read_header, read_mask, read_pixels, same_aspect, says_panorama
+from hyrfpack.data.undistort import Lens
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.scene import Picture
+
+_QUALITY = 95  # of JPEG files, colours in full
+_GLANCE = (256, 128)  # pixels that a picture is looked at with to tell whether it is a panorama
+
+
+@dataclass(frozen=True)
+class Face:
+    """One side of the cube around a panorama's camera, 90 degrees across.
+
+    Attributes:
+        name: front, right, back, left, up or down.
+        axes: the face's right, down and forward in the panorama's camera: the rows of the rotation that takes a
+            direction from there into the camera of the face.
+    """
+
+    name: str
+    axes: tuple[tuple[int, int, int], tuple[int, int, int], tuple[int, int, int]]
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """(3, 3) face from panorama."""
+        return np.array(self.axes, np.float64)
+
+
+FACES = (
+    Face("front", ((1, 0, 0), (0, 1, 0), (0, 0, 1))),
+    Face("right", ((0, 0, -1), (0, 1, 0), (1, 0, 0))),
+    Face("back", ((-1, 0, 0), (0, 1, 0), (0, 0, -1))),
+    Face("left", ((0, 0, 1), (0, 1, 0), (-1, 0, 0))),
+    Face("up", ((1, 0, 0), (0, 0, 1), (0, -1, 0))),  # the camera tilted up: what was in front is below
+    Face("down", ((1, 0, 0), (0, 0, -1), (0, 1, 0))),
+)
+
+
+@dataclass(frozen=True)
+class FaceFile:
+    """A face of a panorama on disk; calling it loads the Picture.
+
+    Attributes:
+        path: the panorama.
+        stored: (width, height) of it.
+        face: which one.
+        size: pixels of each side of the face.
+        mask: the file of the panorama's mask, if any.
+    """
+
+    path: Path
+    stored: tuple[int, int]
+    face: Face
+    size: int
+    mask: Path | None = None
+
+    def __call__(self) -> Picture:
+        rgb, alpha = read_pixels(self.path)
+        if rgb.shape[1::-1] != self.stored:
+            raise HyrfDataError(f"{self.path}: the picture changed its size since the scene was read; read it again")
+        mask = None
+        if self.mask is not None:
+            whole = read_mask(self.mask, *rgb.shape[:2])
+            row, column = _places(self.face, self.size, *whole.shape)
+            mask = whole[
+                np.clip(np.rint(row), 0, len(whole) - 1).astype(int), np.rint(column).astype(int) % rgb.shape[1]
+            ]
+        if alpha is not None and alpha.min() < 255:
+            alpha = cut_face(alpha[..., None], self.face, self.size)[..., 0]
+        else:
+            alpha = None
+        return Picture(cut_face(rgb, self.face, self.size), alpha, mask)
+
+
+def face_size(width: int) -> int:
+    """Pixels of a face's side at which its middle is as fine as a panorama `width` pixels wide: width / pi."""
+    return max(1, round(width / math.pi))
+
+
+def face_lens(size: int) -> Lens:
+    """The pinhole camera of a face of `size` x `size` pixels: 90 degrees both ways."""
+    return Lens(size, size, size / 2, size / 2, size / 2, size / 2)
+
+
+def cut_face(panorama: np.ndarray, face: Face, size: int) -> np.ndarray:
+    """One face of a panorama as a pinhole picture.
+
+    The panorama is shrunk first where it is finer than the face (Lanczos, across its left and right edge), its rows
+    near the poles are averaged over as many columns as a pixel of the face covers, and then it is sampled (bilinear).
+
+    Args:
+        panorama: (H, 2 H, C) uint8.
+        face: one of FACES.
+        size: pixels of each side of the face.
+
+    Returns:
+        (size, size, C) uint8.
+
+    Raises:
+        ValueError: the panorama is not twice as wide as high.
+
+    Example:
+        >>> from hyrfpack.data.equirectangular import FACES, cut_face
+        >>> sky = np.full((64, 128, 3), 200, np.uint8)
+        >>> cut_face(sky, FACES[4], 32).shape
+        (32, 32, 3)
+    """
+    if not same_aspect(panorama.shape[1], panorama.shape[0], 2, 1):
+        raise ValueError(f"a panorama is twice as wide as high, not {panorama.shape[1]} x {panorama.shape[0]}")
+    panorama = _shrunk(panorama, max(2, 2 * round(size * math.pi / 2)))
+    if face.name in ("up", "down"):
+        panorama = _even_pole(panorama, 0 if face.name == "up" else 1, size)
+    height, width = panorama.shape[:2]
+    row, column = _places(face, size, height, width)
+    top, left = np.floor(row).astype(np.intp), np.floor(column).astype(np.intp)
+    a, b = (column - left)[..., None].astype(np.float32), (row - top)[..., None].astype(np.float32)
+
+    def pixels(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        beyond = (rows < 0) | (rows >= height)  # a pole, behind which the other side comes
+        return panorama[np.clip(rows, 0, height - 1), (columns + beyond * (width // 2)) % width]
+
+    above = pixels(top, left) * (1 - a) + pixels(top, left + 1) * a
+    below = pixels(top + 1, left) * (1 - a) + pixels(top + 1, left + 1) * a
+    return (above * (1 - b) + below * b + 0.5).astype(np.uint8)
+
+
+def cut_panorama(
+    path: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    *,
+    size: int | None = None,
+    faces: Sequence[Face] = FACES,
+) -> list[Path]:
+    """Write the faces of a panorama as JPEG files, "pano_front.jpg" and so on, for structure-from-motion.
+
+    All have the one camera of `face_lens(size)`, and stand at one place: the rotations between them are those of FACES.
+
+    Args:
+        path: the panorama.
+        folder: to write into; made if it is missing. Files of these names are replaced.
+        size: pixels of each side; None takes `face_size` of the panorama.
+        faces: which ones.
+
+    Returns:
+        The files, in the order of `faces`.
+
+    Raises:
+        HyrfDataError: the file cannot be read, or is not twice as wide as high.
+        HyrfError: the files cannot be written.
+
+    Example:
+        >>> from hyrfpack.data.equirectangular import cut_panorama
+        >>> from PIL import Image
+        >>> Image.new("RGB", (128, 64)).save("street.png")
+        >>> [file.name for file in cut_panorama("street.png", "faces")][:2]
+        ['street_front.jpg', 'street_right.jpg']
+    """
+    path = Path(path)
+    width = panorama_lens(path, read_header(path)).width
+    rgb, _ = read_pixels(path)
+    written = []
+    for face in faces:
+        from PIL import Image
+
+        file = Path(folder, f"{path.stem}_{face.name}.jpg")
+        picture = Image.fromarray(cut_face(rgb, face, size or face_size(width)))
+        with replacing(file) as temporary:
+            picture.save(temporary, "JPEG", quality=_QUALITY, subsampling=0)
+        written.append(file)
+    return written
+
+
+def panorama_lens(path: Path, header: Header) -> Lens:
+    """The lens of a panorama that is to be cut. Raises HyrfDataError: it is not twice as wide as high."""
+    width, height = header.size
+    if not same_aspect(width, height, 2, 1):
+        raise HyrfDataError(
+            f"{path}: an equirectangular picture is twice as wide as high, but this one is {width} x {height}; use the "
+            "whole panorama"
+        )
+    focal = width / (2 * math.pi)
+    return Lens(width, height, focal, focal, width / 2, height / 2, "equirectangular")
+
+
+def is_panorama(path: str | os.PathLike[str]) -> bool:
+    """Whether a picture shows the whole sphere: it is twice as wide as high, and says so, or its left edge continues
+    its right one, and its first and its last row, which show one point each, have hardly more than one colour.
+
+    Raises:
+        HyrfDataError: the file is no picture.
+
+    Example:
+        >>> from hyrfpack.data.equirectangular import is_panorama
+        >>> is_panorama("photos/bonsai/images/0000.png")
+        False
+    """
+    header = read_header(Path(path))
+    if header.width != 2 * header.height or header.height < _GLANCE[1]:
+        return False
+    if says_panorama(Path(path)):
+        return True
+    rgb = read_pixels(Path(path), _GLANCE if header.size != _GLANCE else None)[0].astype(np.float32)
+    steps = np.abs(np.diff(rgb, axis=1)).mean(axis=(0, 2))  # between neighbouring columns
+    seam = np.abs(rgb[:, 0] - rgb[:, -1]).mean()
+    spread = rgb.std(axis=1).mean(axis=1)  # of the colours of each row
+    # A row at a pole shows what is within a degree of one point: little is left of the spread of other rows.
+    return bool(seam <= 1.5 * steps.mean() and max(spread[0], spread[-1]) <= max(0.5 * spread.max(), 2.0))
+
+
+def _places(face: Face, size: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of a panorama, pixel centres at integers, that each pixel of a face sees: (size, size) each."""
+    along = ((np.arange(size) + 0.5) * (2 / size) - 1).astype(np.float32)  # good to a thousandth of a pixel
+    right, down = np.broadcast_arrays(along[None, :], along[:, None])
+    x, y, z = np.moveaxis(
+        np.stack((right, down, np.ones_like(right)), axis=-1) @ face.rotation.astype(np.float32), -1, 0
+    )
+    column = (np.arctan2(x, z) / (2 * np.pi) + 0.5) * width - 0.5
+    row = (np.arctan2(y, np.hypot(x, z)) / np.pi + 0.5) * height - 0.5
+    return row, column
+
+
+def _shrunk(panorama: np.ndarray, width: int) -> np.ndarray:
+    """The panorama at most `width` pixels wide, filtered across the edge where it closes."""
+    from PIL import Image
+
+    height, stored = panorama.shape[:2]
+    if stored <= width:
+        return panorama
+    margin = min(stored, 4 * -(-stored // width))  # a Lanczos filter reaches three pixels of the result
+    padded = np.concatenate((panorama[:, -margin:], panorama, panorama[:, :margin]), axis=1)
+    box = (margin, 0, margin + stored, height)
+    parts = [Image.fromarray(padded[..., channel]) for channel in range(panorama.shape[2])]
+    shrunk = [part.resize((width, width // 2), Image.Resampling.LANCZOS, box=box) for part in parts]
+    return np.stack([np.asarray(part) for part in shrunk], axis=-1)
+
+
+def _even_pole(panorama: np.ndarray, pole: int, size: int) -> np.ndarray:
+    """The panorama with rows near a pole (0 above, 1 below) averaged over the columns that a face's pixel covers:
+    W / (pi size cos(latitude)) of them."""
+    panorama = panorama.copy()
+    height, width = panorama.shape[:2]
+    for distance in range(height // 3):
+        half = int(0.5 * width / (math.pi * size * math.sin(math.pi * (distance + 0.5) / height)))
+        half = min(half, (width - 1) // 2)
+        if half == 0:
+            break
+        row = distance if pole == 0 else height - 1 - distance
+        wrapped = np.concatenate((panorama[row, width - half - 1 :], panorama[row], panorama[row, :half]))
+        sums = np.cumsum(wrapped, axis=0, dtype=np.int64)
+        panorama[row] = (sums[2 * half + 1 :] - sums[: -2 * half - 1] + half) // (2 * half + 1)
+    return panorama

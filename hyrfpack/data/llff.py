@@ -1,0 +1,83 @@
+"""LLFF sets: poses_bounds.npy beside folders of photos.
+
+Each row has 17 numbers: a 3 x 5 matrix, row by row, and the nearest and the farthest depth. Its first three columns are
+the camera's axes down, right and backwards in the world, the fourth its position, and the fifth the picture's height,
+width and focal length, all in pixels of the photos that were posed. Rows are in the order of the photos' names.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from hyrfpack.data.assemble import make_scene
+from hyrfpack.data.beside import Entry, photos_beside, picture_folder
+from hyrfpack.data.pictures import is_picture_name
+from hyrfpack.data.transforms import inverted
+from hyrfpack.data.undistort import Lens
+from hyrfpack.errors import HyrfDataError, reason_of
+from hyrfpack.scene import Scene
+
+TABLE = "poses_bounds.npy"
+
+
+def read_llff(path: Path, *, test_every: int, images: str | None, max_size: int) -> Scene:
+    """Read a folder with a poses_bounds.npy; there are no points.
+
+    Args:
+        path: the scene folder.
+        test_every, max_size: see `load_scene`.
+        images: the folder of photos; None takes the one that `picture_folder` finds.
+
+    Raises:
+        HyrfDataError: the table or the photos cannot be used, or they differ in number.
+    """
+    rows = _read_table(path / TABLE)
+    folder, notes = picture_folder(path, images), []
+    if images is None and folder.name != "images":
+        notes.append(f"photos were taken from {folder.name}")
+    try:
+        names = sorted(entry.name for entry in os.scandir(folder) if is_picture_name(entry.name) and entry.is_file())
+    except OSError as error:
+        raise HyrfDataError(f"{folder}: the folder cannot be read ({error.strerror}); check its permissions") from error
+    if len(names) != len(rows):
+        raise HyrfDataError(
+            f"{path / TABLE}: holds the poses of {len(rows)} photos, but {folder.name} holds {len(names)}, and photos "
+            "are matched by their order; leave just those that were posed in that folder"
+        )
+    entries: list[Entry] = []
+    for name, row in zip(names, rows, strict=True):
+        matrix = row[:15].reshape(3, 5)
+        height, width, focal = matrix[:, 4]
+        down, right, back = matrix[:, :3].T
+        lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2)
+        entries.append((name, lens, inverted(np.stack((right, down, -back), 1), matrix[:, 3])))
+    photos, masks, found = photos_beside(path, folder, entries, TABLE)
+    return make_scene(
+        path,
+        "llff",
+        photos,
+        test_every=test_every,
+        max_size=max_size,
+        tables=[path / TABLE],
+        masks=masks,
+        notes=notes + found,
+    )
+
+
+def _read_table(file: Path) -> np.ndarray:
+    """(N, 17) float64, finite, N >= 1, with sizes of at least a pixel."""
+    try:
+        # Mapped, so that a forged shape asks for no memory; no pickles.
+        table = np.load(file, mmap_mode="r", allow_pickle=False)
+    except Exception as error:  # numpy raises whatever the header makes it meet.
+        raise HyrfDataError(f"{file}: not a table that can be read ({reason_of(error)}); restore the file") from error
+    if not isinstance(table, np.ndarray) or table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind not in "fiu":
+        raise HyrfDataError(f"{file}: not a table of 17 numbers for each photo, as LLFF writes it; restore the file")
+    rows = np.array(table, np.float64)
+    sizes = rows[:, [4, 9]]
+    if not len(rows) or not np.isfinite(rows[:, :15]).all() or not ((sizes >= 0.5) & (sizes < 1e6)).all():
+        raise HyrfDataError(f"{file}: a pose or a size in it is not finite, or there is none; estimate the poses again")
+    return rows

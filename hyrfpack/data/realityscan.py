@@ -1,0 +1,157 @@
+"""RealityScan's (RealityCapture's) "Internal/External camera parameters": a .csv file beside the photos.
+
+The first line names the columns: #name, x, y, alt, heading, pitch, roll, f, px, py, k1 to k4, t1, t2. The world's axes
+are east, north and up. A camera with all three angles 0 looks down with its upper side to the north, and
+
+    world_from_camera = Rz(-heading) Rx(pitch) Ry(roll)    in OpenGL's axes (x right, y up, z backward).
+
+f is for a picture 36 wide on its longer side; px and py are parts of that side, from the middle. k1 to k4 are Brown's
+radial coefficients, as in `undistort`.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from hyrfpack.data.assemble import make_scene
+from hyrfpack.data.beside import Entry, first_file, photos_beside, picture_folder, points_beside
+from hyrfpack.data.pictures import Header
+from hyrfpack.data.transforms import inverted
+from hyrfpack.data.undistort import Lens, brown
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.scene import Scene
+
+_POSE = ("x", "y", "alt", "heading", "pitch", "roll")
+_LENS = ("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+_FILM = 36.0  # millimetres on the longer side that f is for
+_EARTH = (6.2e6, 6.5e6)  # metres from its centre to where people take photos, with a margin
+_INSTEAD = "export the registration as COLMAP, Bundler or NeRF transforms instead"
+
+
+def find_realityscan(path: Path) -> Path | None:
+    """The first file by name in a folder that holds camera parameters."""
+    return first_file(path, ".csv", _is_ours)
+
+
+def read_realityscan(path: Path, *, test_every: int, images: str | None, max_size: int) -> Scene:
+    """Read camera parameters, and the points of a `.ply` file beside them that was exported in the same coordinates.
+
+    Args:
+        path: the scene folder.
+        test_every, max_size: see `load_scene`.
+        images: the folder of photos; None takes the one that `picture_folder` finds.
+
+    Raises:
+        HyrfDataError: the parameters or the photos cannot be used.
+    """
+    table = find_realityscan(path)
+    if table is None:
+        raise HyrfDataError(f"{path}: no camera parameters of RealityScan (.csv); {_INSTEAD}")
+    names, values = _read_table(table)
+    poses = np.array([[row[column] for column in _POSE] for row in values])
+    _check_units(poses[:, :3], table)
+    entries: list[Entry] = []
+    for name, row, pose in zip(names, values, poses, strict=True):
+        entries.append((name, partial(_lens, row), _pose(pose)))
+    photos, masks, notes = photos_beside(path, picture_folder(path, images), entries, table.name)
+    points, colors, tables = points_beside(path, photos, notes)
+    return make_scene(
+        path,
+        "realityscan",
+        photos,
+        test_every=test_every,
+        max_size=max_size,
+        points=points,
+        point_colors=colors,
+        tables=[table, *tables],
+        masks=masks,
+        notes=notes,
+    )
+
+
+def _is_ours(file: Path) -> bool:
+    try:
+        with file.open("rb") as stream:
+            return _columns(stream.read(4096).decode("utf-8-sig", errors="replace").split("\n")[0]) is not None
+    except OSError:
+        return False
+
+
+def _columns(header: str) -> list[str] | None:
+    """The names of the columns, None where a needed one is missing."""
+    columns = [name.strip().lstrip("#").lower() for name in header.strip().split(",")]
+    return columns if {"name", *_POSE, "f"} <= set(columns) else None
+
+
+def _read_table(table: Path) -> tuple[list[str], list[dict[str, float]]]:
+    """The photos' names and what the table says of each; columns that are not there are 0."""
+    try:
+        text = table.read_bytes().decode("utf-8-sig", errors="replace")
+    except OSError as error:
+        raise HyrfDataError(f"{table}: cannot be read ({error.strerror}); restore the file") from error
+    header, _, body = text.partition("\n")
+    columns = _columns(header) or []
+    names, values = [], []
+    try:
+        rows = list(csv.reader(io.StringIO(body)))
+    except csv.Error as error:
+        raise HyrfDataError(f"{table}: not a table that can be read ({error}); export it again") from error
+    for number, row in enumerate(rows, 2):
+        if not row or row[0].startswith("#"):
+            continue
+        said = dict(zip(columns, row, strict=False))
+        try:
+            line = {key: float(said.get(key) or 0.0) for key in (*_POSE, *_LENS)}
+        except ValueError:
+            line = {"f": np.nan}
+        if len(row) < len(columns) or not np.isfinite(list(line.values())).all():
+            raise HyrfDataError(
+                f"{table}: line {number} is cut short or has something else for a number; export it again"
+            )
+        if line["t1"] or line["t2"]:
+            raise HyrfDataError(
+                f"{table}: {said['name'][:80]!r} has tangential distortion, which is not read; {_INSTEAD}"
+            )
+        names.append(said["name"].strip())
+        values.append(line)
+    if not names:
+        raise HyrfDataError(f"{table}: lists no photo; align the photos, then export again")
+    return names, values
+
+
+def _check_units(positions: np.ndarray, table: Path) -> None:
+    """Refuse positions in degrees, or from the centre of the Earth, for which the angles mean something else."""
+    with np.errstate(all="ignore"):
+        spread, middle = np.ptp(positions, axis=0), positions.mean(axis=0)
+        geocentric = _EARTH[0] < np.linalg.norm(middle) < _EARTH[1]
+    across = max(spread[:2])
+    degrees = abs(middle[0]) <= 180 and abs(middle[1]) <= 90 and np.hypot(*middle[:2]) > 100 * across
+    if geocentric or (len(positions) > 1 and degrees and spread[2] > 100 * across):
+        raise HyrfDataError(
+            f"{table}: the cameras are in {'geocentric' if geocentric else 'geographic'} coordinates; export them "
+            "again in the grid plane or in local Euclidean ones"
+        )
+
+
+def _pose(pose: np.ndarray) -> np.ndarray:
+    """(4, 4) OpenCV camera_from_world of x, y, alt and heading, pitch, roll in degrees."""
+    sines, cosines = np.sin(np.radians(pose[3:])), np.cos(np.radians(pose[3:]))
+    (sh, sp, sr), (ch, cp, cr) = sines, cosines
+    about_z = np.array([[ch, sh, 0], [-sh, ch, 0], [0, 0, 1]])
+    about_x = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
+    about_y = np.array([[cr, 0, sr], [0, 1, 0], [-sr, 0, cr]])
+    return inverted(about_z @ about_x @ about_y * (1, -1, -1), pose[:3])
+
+
+def _lens(row: dict[str, float], _: Path, header: Header) -> Lens:
+    width, height = header.size
+    side = max(width, height)
+    focal = row["f"] * side / _FILM
+    cx, cy = width / 2 + row["px"] * side, height / 2 + row["py"] * side
+    coefficients = brown(row["k1"], row["k2"], 0, 0, row["k3"], 0, 0, 0, row["k4"])
+    return Lens(width, height, focal, focal, cx, cy, "brown", coefficients)

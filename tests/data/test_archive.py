@@ -1,0 +1,218 @@
+"""Sets that come as a .zip: unpacked once, nothing outside its folder, and every bad one is a sentence."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hyrfpack.data import archive, load_scene
+from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.outputs import Outputs
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory, monkeypatch) -> Path:
+    folder = tmp_path_factory.mktemp("cache")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
+    return folder / "hyrfpack" / "archives"
+
+
+def packed(folder: Path, target: Path, top: str = "") -> Path:
+    with zipfile.ZipFile(target, "w") as content:
+        for file in sorted(path for path in folder.rglob("*") if path.is_file()):
+            content.write(file, top + file.relative_to(folder).as_posix())
+    return target
+
+
+@pytest.fixture
+def zipped(tmp_path, colmap_folder) -> Path:
+    """A small set as one file, and its folder `set` beside it."""
+    colmap_folder(tmp_path / "set", count=4)
+    return packed(tmp_path / "set", tmp_path / "set.zip", "set/")
+
+
+def test_an_archive_reads_as_its_folder(zipped):
+    scene, plain = load_scene(zipped), load_scene(zipped.with_suffix(""))
+
+    assert [view.name for view in scene.views] == [view.name for view in plain.views]
+    for ours, theirs in zip(scene.views, plain.views, strict=True):
+        assert ours.camera == theirs.camera
+        np.testing.assert_array_equal(ours.load().rgb, theirs.load().rgb)
+    assert scene.notes[0].startswith("set.zip was unpacked into ")
+
+
+def test_it_is_unpacked_once_and_anew_where_a_file_is_gone_or_the_archive_is_another(zipped, cache):
+    folder = archive.unpacked(zipped)
+    first = folder / "images" / "000.png"
+    about = os.stat(first)
+
+    assert archive.unpacked(zipped) == folder and os.stat(first).st_mtime_ns == about.st_mtime_ns
+    first.unlink()
+    assert archive.unpacked(zipped) == folder and first.is_file()
+    os.utime(zipped, ns=(1, 1))
+    assert archive.unpacked(zipped) != folder
+    assert sorted(path.name[:4] for path in cache.iterdir()) == ["set-", "set-"]
+
+
+def test_outputs_may_lie_beside_the_archive_and_never_replace_it(zipped):
+    outputs = Outputs(scene=load_scene(zipped), overwrite=True)
+
+    outputs.file(zipped.parent / "small.hyrf")
+    with pytest.raises(HyrfError, match="the output is an input itself"):
+        outputs.file(zipped)
+    with pytest.raises(HyrfError, match="the same command reads what lies in this folder"):
+        outputs.file(archive.unpacked(zipped) / "images" / "new.hyrf")
+
+
+def test_a_home_that_cannot_be_written_is_no_obstacle(zipped, monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", os.devnull + "/none")
+    monkeypatch.setattr(archive.tempfile, "gettempdir", lambda: str(tmp_path / "temporary"))
+    monkeypatch.setattr(archive.tempfile, "tempdir", str(tmp_path))
+
+    assert archive.unpacked(zipped).is_relative_to(tmp_path / "temporary")
+
+
+def test_no_room_is_said_before_anything_is_written(zipped, cache, monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(100, 99, 1))
+
+    with pytest.raises(HyrfDataError, match="do not fit on the disk"):
+        load_scene(zipped)
+    assert list(cache.iterdir()) == []
+
+
+def test_a_disk_that_fills_up_leaves_nothing(zipped, cache, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(shutil, "copyfileobj", full)
+
+    with pytest.raises(HyrfDataError, match="No space left on device"):
+        load_scene(zipped)
+    assert list(cache.iterdir()) == []
+
+
+def test_what_a_killed_process_left_is_removed_after_a_day(zipped, cache):
+    archive.unpacked(zipped)
+    for name in (".partial-old", ".partial-new"):
+        (cache / name).mkdir()
+    os.utime(cache / ".partial-old", (1, 1))
+    os.utime(zipped, ns=(1, 1))
+
+    archive.unpacked(zipped)
+
+    assert not (cache / ".partial-old").exists() and (cache / ".partial-new").exists()
+
+
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        (["a.jpg", "a.jpg"], "twice"),
+        (["a.jpg", "./a.jpg"], "twice"),
+        (["a", "a/b"], "cannot be unpacked"),
+        (["../a"], "outside its folder"),
+        (["a/../../b"], "outside its folder"),
+        (["/a"], "outside its folder"),
+        (["C:/a"], "outside its folder"),
+        (["..\\a"], "outside its folder"),
+        (["a" * 300], "cannot be unpacked"),
+        (["a/"], "holds no file"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_archives_with_such_names_are_refused_and_leave_nothing(names, says, tmp_path, cache):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as content:
+        for name in names:
+            content.writestr(name, "x")
+
+    with pytest.raises(HyrfDataError, match=says) as caught:
+        load_scene(tmp_path / "a.zip")
+    assert "\n" not in str(caught.value) and str(tmp_path / "a.zip") in str(caught.value)
+    assert not cache.exists() or list(cache.iterdir()) == []
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x05\x06" + bytes(10), b"no archive at all"])
+def test_a_file_that_is_only_called_an_archive_is_refused(content, tmp_path):
+    (tmp_path / "a.zip").write_bytes(content)
+
+    with pytest.raises(HyrfDataError, match="the archive is damaged"):
+        load_scene(tmp_path / "a.zip")
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(names=st.lists(st.text(alphabet="ab./\\: \0é", min_size=1, max_size=8), min_size=1, max_size=4, unique=True))
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_no_name_writes_outside_the_folder(names, tmp_path_factory):
+    top = tmp_path_factory.mktemp("zip")
+    place = top / "1" / "2" / "3" / "4"  # deeper than the longest name leads out
+    place.mkdir(parents=True)
+    with zipfile.ZipFile(place / "a.zip", "w") as content:
+        for name in names:
+            info = zipfile.ZipInfo("x")
+            info.filename = name  # as it is: the constructor corrects it
+            content.writestr(info, name)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(place / "cache"))
+        try:
+            folder = archive.unpacked(place / "a.zip")
+        except HyrfDataError as error:
+            assert "\n" not in str(error)
+        else:
+            assert all(path.resolve().is_relative_to(folder) for path in folder.rglob("*"))
+    outside = [path for path in top.rglob("*") if path.is_file() and not path.is_relative_to(place / "cache")]
+    inside = [path for path in (place / "cache").rglob("*") if path.is_file()]
+    assert outside == [place / "a.zip"] and all(len(path.relative_to(place).parts) > 4 for path in inside)
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damaged_archives_are_read_or_refused(zipped, tmp_path_factory, data):
+    content = bytearray(zipped.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        content[at] ^= data.draw(st.integers(1, 255))
+    if data.draw(st.booleans()):
+        content = content[: data.draw(st.integers(0, len(content)))]
+    damaged = tmp_path_factory.mktemp("damaged") / "a.zip"
+    damaged.write_bytes(bytes(content))
+
+    try:
+        archive.unpacked(damaged)
+    except HyrfDataError as error:
+        assert "\n" not in str(error)
+
+
+def test_names_of_a_mac_are_the_ones_it_wrote(tmp_path):
+    """macOS writes UTF-8 and does not set the flag that says so; zipfile then takes it for cp437."""
+
+    class AsMacOSWrites(zipfile.ZipInfo):
+        def _encodeFilenameFlags(self):
+            return self.filename.encode(), self.flag_bits
+
+    with zipfile.ZipFile(tmp_path / "set.zip", "w") as content:
+        content.writestr(AsMacOSWrites("Straße/Müller.txt"), b"1")
+    assert zipfile.ZipFile(tmp_path / "set.zip").namelist() != ["Straße/Müller.txt"]
+
+    assert (archive.unpacked(tmp_path / "set.zip") / "Müller.txt").read_bytes() == b"1"
+
+
+def test_another_process_that_was_faster_is_no_trouble(zipped, monkeypatch):
+    """Whose folder is there by the time that ours is to take its place."""
+    replace = os.replace
+
+    def after_another(partial, folder):
+        shutil.copytree(partial, folder)
+        replace(partial, folder)
+
+    monkeypatch.setattr(os, "replace", after_another)
+
+    folder = archive.unpacked(zipped)
+
+    assert (folder / "images" / "000.png").is_file() and [*folder.parent.iterdir()] == [folder]

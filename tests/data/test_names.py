@@ -1,0 +1,178 @@
+"""Which file a name stands for: the strictest rule that fits one file alone, and never one file for two names."""
+
+from __future__ import annotations
+
+import string
+import unicodedata
+from pathlib import Path, PurePosixPath
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hyrfpack.data.names import PictureIndex, nearest, parts_of
+
+
+def folder_of(root: Path, *names: str) -> Path:
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+    return root
+
+
+@pytest.mark.parametrize(
+    ("listed", "there"),
+    [
+        ("a", "a.png"),
+        ("a.jpg", "a.png"),
+        ("a.JPG", "a.jpg"),
+        ("A.jpg", "a.TIF"),
+        ("a.jpg", "a.jpg.png"),
+        ("a.CR2", "a.jpg"),
+        ("frame.0001", "frame.0001.png"),
+        ("left/a.jpg", "Left/A.png"),
+        ("/home/x/images/a.jpg", "a.jpg"),
+        ("/home/x/images/left/a.jpg", "left/a.webp"),
+        ("C:\\x\\images\\a.jpg", "a.jpg"),
+        ("\\\\server\\x\\a.jpg", "a.jpg"),
+        ("images/a.jpg", "a.jpg"),
+        ("../images/a.jpg", "a.jpg"),
+        ("a.jpg", "left/a.jpg"),
+        (unicodedata.normalize("NFD", "é.jpg"), "é.png"),
+        ("é.jpg", unicodedata.normalize("NFD", "É.jpg")),
+        ("straße.jpg", "STRASSE.jpg"),
+        ("日本.jpg", "日本.heic"),
+        ("a  b .jpg", "a  b .png"),
+    ],
+)
+def test_a_name_finds_the_file_that_it_must_mean(tmp_path, listed, there):
+    folder_of(tmp_path, there, "other.png", "left/other.png")
+
+    assert PictureIndex(tmp_path).find(listed) == tmp_path / there
+
+
+@pytest.mark.parametrize(
+    ("listed", "there"),
+    [
+        ("a.jpg", ["a.png", "a.webp"]),
+        ("a.jpg", ["left/a.jpg", "right/a.jpg"]),
+        ("right/a.jpg", ["left/a.jpg"]),
+        ("a.jpg", ["b.jpg"]),
+        ("a.jpg", ["aa.jpg"]),
+        ("a.0001", ["a.png"]),
+        ("a.jpg", ["a.txt"]),
+        ("a.jpg", ["masks/a.jpg"]),
+        ("a.jpg", [".hidden/a.jpg", ".a.jpg"]),
+        ("", ["a.jpg"]),
+        ("/", ["a.jpg"]),
+        ("x" * 300 + ".jpg", ["a.jpg"]),
+        ("a\0b.jpg", ["a.jpg"]),
+    ],
+)
+def test_what_is_not_clear_is_not_matched(tmp_path, listed, there):
+    folder_of(tmp_path, *there)
+
+    assert PictureIndex(tmp_path).find(listed) is None
+
+
+def test_the_strictest_rule_comes_first(tmp_path):
+    folder_of(tmp_path, "a.jpg", "a.png", "A.JPG", "left/a.jpg")
+
+    index = PictureIndex(tmp_path)
+
+    assert index.find("a.png") == tmp_path / "a.png"
+    assert index.find("x/left/a.jpg") == tmp_path / "left" / "a.jpg"
+
+
+def test_a_file_is_given_to_no_second_name(tmp_path):
+    folder_of(tmp_path, "a.jpg", "b.jpg")
+
+    matches = PictureIndex(tmp_path).match(["a.jpg", "A.png", "left/b.jpg", "right/b.jpg"])
+
+    assert matches.found == {"a.jpg": tmp_path / "a.jpg"}
+    assert matches.unclear == ["left/b.jpg", "right/b.jpg"]
+    assert "2 photos fit more than one file" in matches.notes[0] and "left/b.jpg first" in matches.notes[0]
+
+
+def test_notes_say_how_many_are_called_otherwise_with_an_example(tmp_path):
+    folder_of(tmp_path, "a.jpg", "b.jpg", "c.png")
+
+    matches = PictureIndex(tmp_path).match(["a.jpg", "/x/b.jpg", "c.jpg"])
+
+    assert matches.notes == [
+        "2 of 3 photos are called otherwise than the poses say and were matched by what fits one file alone: "
+        "/x/b.jpg is b.jpg"
+    ]
+
+
+def test_the_nearest_by_name_is_named():
+    files = [Path("photos/IMG_0412.jpg"), Path("photos/DSC_0001.jpg")]
+
+    assert nearest("images/IMG_412.jpeg", files) == files[0]
+    assert nearest("IMG_412.jpeg", []) is None
+
+
+@given(name=st.text())
+def test_parts_never_lead_out_of_a_folder(name):
+    assert all(part not in ("", ".", "..") and "/" not in part and "\\" not in part for part in parts_of(name))
+
+
+part = st.text(alphabet="aAbéÉß.1 ", min_size=1, max_size=3).filter(lambda text: text.strip(". ") == text)
+path = st.lists(part, min_size=1, max_size=3).map("/".join)
+ending = st.sampled_from(["", ".jpg", ".JPG", ".png", ".webp", ".NEF"])
+listed_names = st.lists(
+    st.builds(
+        lambda prefix, name, end, form: prefix + unicodedata.normalize(form, name) + end,
+        st.sampled_from(["", "/home/", "C:\\", "images/", "../"]),
+        path,
+        ending,
+        st.sampled_from(["NFC", "NFD"]),
+    ),
+    max_size=8,
+)
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(names=listed_names, there=st.lists(st.tuples(path, ending), max_size=8))
+def test_matching_is_one_to_one_and_between_like_names(tmp_path_factory, names, there):
+    root = tmp_path_factory.mktemp("index")
+    for name, end in there:
+        try:
+            folder_of(root, name + end)
+        except OSError:  # a folder of that name
+            continue
+
+    matches = PictureIndex(root).match(names)
+
+    by_file: dict[Path, set[tuple[str, ...]]] = {}
+    for name, file in matches.found.items():
+        by_file.setdefault(file.resolve(), set()).add(parts_of(name))
+        assert file.is_file()
+        assert stem(file.name) in (stem(parts_of(name)[-1]), plain(parts_of(name)[-1]))
+    assert all(len(spellings) == 1 for spellings in by_file.values())
+    assert not set(matches.unclear) & set(matches.found)
+
+
+def plain(text: str) -> str:
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", text).casefold())
+
+
+def stem(name: str) -> str:
+    """Independent of the code: what is before the last dot, where letters follow that."""
+    before, dot, after = plain(name).rpartition(".")
+    return before if dot and before and after and after[0] in string.ascii_lowercase else plain(name)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_two_files_that_fit_alike_are_never_chosen_between(tmp_path_factory, data):
+    root = tmp_path_factory.mktemp("twins")
+    name = data.draw(part.filter(lambda text: "." not in text))
+    first, second = data.draw(st.permutations([".png", ".webp", ".bmp", ".tif"]))[:2]
+    folder_of(root, f"{name}{first}", f"{name}{second}")
+
+    listed = data.draw(st.sampled_from(["", "/x/", "images/"])) + f"{name}.jpg"
+
+    matches = PictureIndex(root).match([listed])
+    assert matches.found == {} and matches.unclear == [listed]
+    assert PurePosixPath(listed).name.startswith(name)
