@@ -1,0 +1,88 @@
+"""`hyrfpack poses`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from hyrfpack.cli.common import OUTPUT, PATH, SEED, detail, json_option, note, print_json
+
+if TYPE_CHECKING:
+    from hyrfpack.poses import PosesReport
+
+MATCHING = ("auto", "exhaustive", "sequential", "retrieval")  # hyrfpack.poses.MATCHING, without loading it
+_TOLD = 5  # photos that are named, of each reason that some were left out for
+
+
+@click.command(short_help="Find where photos were taken, or the frames of a video.")
+@click.argument("photos", type=PATH)
+@click.option("-o", "--output", "out", type=OUTPUT, required=True, metavar="SCENE", help="Folder of the scene.")
+@click.option(
+    "--matching",
+    type=click.Choice(MATCHING),
+    default="auto",
+    show_default=True,
+    help="Which photos are compared: all with all, each with those that follow it, or those that look alike; auto "
+    "decides by what the photos are and how many.",
+)
+@click.option("--masks", type=PATH, metavar="FOLDER", help="Masks, named as the photos; black is ignored.")
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Of everything random.")
+@click.option("--overwrite", is_flag=True, help="Replace poses that an earlier run left in SCENE.")
+@json_option
+def poses(
+    photos: Path, out: Path, matching: str, masks: Path | None, seed: int, overwrite: bool, as_json: bool
+) -> None:
+    """Find the poses of PHOTOS, a folder of photos, its .zip, or a video, and make a scene that `hyrfpack train` reads.
+
+    SCENE gets images/ (links to the photos), sparse/0 (a COLMAP model) and poses.json (what came out). PHOTOS may be
+    SCENE itself if its photos are in images/. Ctrl-C keeps what is done, and the same command goes on with it.
+
+    \b
+    Examples:
+      hyrfpack poses photos/ -o scenes/garden
+      hyrfpack poses clip.mp4 -o scenes/clip
+      hyrfpack train scenes/garden -o runs/garden
+    """
+    from hyrfpack.make.display import Display
+    from hyrfpack.make.progress import Reporter
+    from hyrfpack.poses import estimate_poses
+
+    try:
+        with Display() as display:
+            reporter = Reporter(["poses"], display.show)
+            reporter.begin("poses")
+            found = estimate_poses(
+                photos,
+                out,
+                matching=matching,
+                masks=masks,
+                seed=seed,
+                overwrite=overwrite,
+                report=lambda doing, share: reporter.update(share, doing),
+                say=display.say,
+            )
+    except KeyboardInterrupt:
+        note("stopped; the same command goes on from here")
+        click.get_current_context().exit(1)
+    detail("seconds: " + ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in found.seconds.items()))
+    if as_json:
+        print_json(asdict(found) | {"scene": str(found.scene)})
+    else:
+        _print(found)
+
+
+def _print(found: PosesReport) -> None:
+    """What came out, what is in doubt, and what comes next."""
+    click.echo(
+        f"{found.scene}: {found.registered} of {found.photos} photos have a pose, {found.sure} of them for sure; "
+        f"{found.why}"
+    )
+    for reason, count in Counter(found.left_out.values()).most_common():
+        names = [name for name, why in found.left_out.items() if why == reason]
+        more = f" and {count - _TOLD} more" if count > _TOLD else ""
+        click.echo(f"left out, {reason}: {', '.join(names[:_TOLD])}{more}")
+    click.echo(f"next: hyrfpack train {found.scene} -o runs/{found.scene.resolve().name}")

@@ -1,0 +1,72 @@
+"""Two reconstructions held beside each other: known similarities, folds, flips and pieces."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from made_up_poses import circle, line, moved
+from scipy.spatial.transform import Rotation
+
+from hyrfpack.poses.compare import centres, compare, extent
+
+
+@pytest.mark.parametrize("poses", [circle(), line()])
+def test_the_same_cameras_in_another_frame_agree_all(poses):
+    found = compare(poses, moved(poses))
+    assert found.same == set(poses)
+    assert found.distance.max() < 1e-9
+    assert found.scale == pytest.approx(2.5)
+
+
+def test_small_errors_agree_and_large_ones_do_not():
+    exact = circle()
+    rough = moved(circle(noise=0.02))
+    assert compare(rough, exact).same == set(exact)
+    assert len(compare(moved(circle(noise=1.0, seed=2)), exact).same) < 12
+
+
+def test_a_third_that_is_folded_onto_the_rest_is_found():
+    exact = circle()
+    folded = dict(exact)
+    names = sorted(exact)
+    for name, onto in zip(names[16:], names[:8], strict=True):  # a wall taken for another
+        folded[name] = exact[onto]
+    assert compare(moved(folded), exact).same == set(names[:16])
+    assert compare(exact, moved(folded)).same == set(names[:16])
+
+
+def test_cameras_in_the_right_places_that_look_elsewhere_do_not_agree():
+    exact = circle()
+    turned = dict(exact)
+    for name in sorted(exact)[:5]:
+        about = Rotation.from_euler("y", 30, degrees=True).as_matrix() @ exact[name][:, :3]
+        turned[name] = np.column_stack([about, -about @ centres({name: exact[name]})[0]])
+    assert compare(turned, exact).same == set(sorted(exact)[5:])
+
+
+def test_a_mirrored_scene_does_not_agree():
+    exact = circle()
+    mirror = np.diag([1.0, 1.0, -1.0])
+    flipped = {}
+    for name, pose in exact.items():
+        rotation = mirror @ pose[:, :3] @ mirror  # depth reversed, as under weak perspective
+        flipped[name] = np.column_stack([rotation, mirror @ pose[:, 3] + np.array([0, 0, 6.0])])
+    assert len(compare(flipped, exact).same) < len(exact) / 2
+
+
+def test_only_photos_of_both_are_compared_and_two_never_agree():
+    exact = circle()
+    half = {name: pose for name, pose in exact.items() if name < "012"}
+    assert compare(half, exact).same == set(half)
+    two = dict(list(exact.items())[:2])
+    assert compare(two, exact).same == frozenset()
+    assert compare({}, exact).same == frozenset()
+    one_place = {name: np.column_stack([np.eye(3), np.zeros(3)]) for name in exact}
+    assert compare(one_place, exact).same == frozenset()
+    assert compare(exact, one_place).same == frozenset()
+
+
+def test_the_extent_is_the_diagonal_of_the_box_around_the_cameras():
+    assert extent(line(12)) == pytest.approx(11)
+    far = {**circle(100), "astray.jpg": np.column_stack([np.eye(3), [1e6, 0, 0]])}
+    assert extent(far) < 12

@@ -1,0 +1,103 @@
+"""Photos of known poses in, a scene out."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import refused, succeeded
+
+import hyrfpack
+from hyrfpack.poses.compare import compare
+
+
+def poses_of(scene: hyrfpack.Scene) -> dict[str, np.ndarray]:
+    return {view.name: view.camera.camera_from_world[:3] for view in scene.views}
+
+
+def test_all_photos_are_where_they_were_taken(taken, posed):
+    folder, known = taken
+    out, report, _, _ = posed
+    scene = hyrfpack.load_scene(out)
+    assert compare(poses_of(scene), known).same == set(known)
+    assert (report.photos, report.registered, report.left_out) == (len(known), len(known), {})
+    assert report.sure == len(known)
+    assert report.mapper in ("incremental", "global") and report.why.startswith(f"the {report.mapper} mapper was taken")
+
+
+def test_points_lie_on_the_walls_and_have_the_photos_colours(taken, posed):
+    scene = hyrfpack.load_scene(posed[0])
+    found = compare(poses_of(scene), taken[1])
+    points = found.scale * scene.points @ found.rotation.T + found.shift
+    off = np.abs(points).min(axis=1)  # the walls are x = 0, y = 0 and z = 0
+    assert np.median(off) < 0.02
+    assert len(scene.points) > 100
+    assert scene.point_colors.std() > 0.1
+
+
+def test_photos_are_linked_and_products_in_progress_are_gone(taken, posed):
+    folder, known = taken
+    out = posed[0]
+    assert sorted(os.listdir(out)) == ["images", "poses.json", "sparse"]
+    assert all(os.path.samefile(folder / name, out / "images" / name) for name in known)
+    written = json.loads((out / "poses.json").read_text())
+    assert written["registered"] == len(known) and written["why"] == posed[1].why
+
+
+def test_progress_runs_from_nothing_to_all(posed):
+    shares = [share for _, share in posed[2]]
+    assert shares[0] == 0 and shares == sorted(shares) and 0.9 < shares[-1] <= 1
+    assert any("matching pair" in doing for doing, _ in posed[2])
+
+
+def test_poses_that_are_there_are_kept_but_for_overwrite(taken, posed, tmp_path):
+    out = tmp_path / "scene"
+    shutil.copytree(posed[0], out)
+    before = (out / "sparse" / "0" / "images.bin").read_bytes()
+    assert "--overwrite" in refused("poses", taken[0], "-o", out)
+    (out / "poses.json").unlink()
+    assert "poses of another program" in refused("poses", taken[0], "-o", out, "--overwrite")
+    assert (out / "sparse" / "0" / "images.bin").read_bytes() == before
+
+
+def test_a_folder_of_a_scene_gets_poses_in_place_by_the_command(taken, tmp_path):
+    shutil.copytree(taken[0], tmp_path / "images")
+    before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "images").iterdir()}
+    (tmp_path / "poses.json").write_text("{}")  # of poses that were removed
+    result = succeeded("poses", tmp_path, "-o", tmp_path, "--overwrite", "--json")
+    assert json.loads(result.stdout)["registered"] == len(before)
+    assert {path.name: path.stat().st_mtime_ns for path in (tmp_path / "images").iterdir()} == before
+    assert sorted(os.listdir(tmp_path)) == ["images", "poses.json", "sparse"]
+
+
+def test_names_may_hold_spaces_and_any_letters_and_be_as_long_as_files_may(taken, tmp_path):
+    folder = tmp_path / "my photos"
+    names = [f"fähre ({number}).png" for number in range(len(taken[1]) - 1)] + ["x" * 251 + ".png"]
+    folder.mkdir()
+    for name, source in zip(names, sorted(taken[1]), strict=True):
+        shutil.copy(taken[0] / source, folder / name)
+    report = hyrfpack.estimate_poses(folder, tmp_path / "a scene")
+    assert report.sure == len(names)
+    assert {view.name for view in hyrfpack.load_scene(report.scene).views} >= set(names[:-1])
+
+
+def test_the_command_ends_with_what_came_out_and_the_next_one(posed, monkeypatch, tmp_path):
+    out, report, *_ = posed
+    partly = {"a.jpg": "blurred", "b.jpg": "blurred"}
+    made = type(report)(**{**vars(report), "left_out": partly, "scene": Path("scenes/garden")})
+    monkeypatch.setattr("hyrfpack.poses.estimate_poses", lambda *args, **settings: made)
+    said = succeeded("poses", tmp_path, "-o", "scenes/garden").stdout
+    assert f"{report.registered} of {report.photos} photos have a pose, {report.sure} of them for sure" in said
+    assert "left out, blurred: a.jpg, b.jpg" in said
+    assert "next: hyrfpack train scenes/garden -o runs/garden" in said
+
+
+@pytest.mark.parametrize("wrong", [{"matching": "guess"}, {"seed": -1}])
+def test_a_wrong_setting_is_refused_at_once(wrong, taken, tmp_path):
+    with pytest.raises(ValueError, match="matching is 'guess'|seed is -1"):
+        hyrfpack.estimate_poses(taken[0], tmp_path / "scene", **wrong)
+    assert not (tmp_path / "scene").exists()

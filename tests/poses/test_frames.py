@@ -1,0 +1,284 @@
+"""Frames chosen from videos whose motion, blur and repetitions are known, for they are made here."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import ndimage
+
+import hyrfpack
+from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.poses.frames import RECORD, choose_frames, is_video
+from hyrfpack.poses.hdr import HLG, PQ, standard_range
+from hyrfpack.poses.motion import distances, track
+
+av = pytest.importorskip("av")
+
+WIDTH, HEIGHT = 240, 136
+
+
+@pytest.fixture(scope="module")
+def wall() -> np.ndarray:
+    """(H, W, 3) uint8: rectangles of many sizes and colours, larger than a frame."""
+    generator = np.random.default_rng(1)
+    picture = np.full((400, 1600, 3), 128, np.uint8)
+    for _ in range(1500):
+        top, left = generator.integers(0, 400), generator.integers(0, 1600)
+        height, width = generator.integers(4, 60, 2)
+        picture[top : top + height, left : left + width] = generator.integers(10, 245, 3)
+    return picture
+
+
+def seen(wall: np.ndarray, x: float, y: int = 100) -> np.ndarray:
+    """The wall from x on."""
+    left = int(x)
+    pair = wall[y : y + HEIGHT, left : left + WIDTH + 1].astype(np.float32)
+    return (pair[:, :-1] + (x - left) * (pair[:, 1:] - pair[:, :-1])).round().astype(np.uint8)
+
+
+def blurred(picture: np.ndarray, length: int = 7) -> np.ndarray:
+    return ndimage.uniform_filter1d(picture.astype(np.float32), length, axis=1).round().astype(np.uint8)
+
+
+def write(
+    path: Path,
+    frames: list[np.ndarray],
+    *,
+    codec: str = "libx264",
+    times: list[int] | None = None,
+    set_up: Callable = lambda stream: None,
+) -> Path:
+    """A video of frames at 30 a second, or at `times` in milliseconds."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=30, options={"crf": "16"} if codec == "libx264" else {})
+        stream.height, stream.width = frames[0].shape[:2]
+        stream.pix_fmt = "yuv420p"
+        if times:
+            stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
+        set_up(stream)
+        for number, pixels in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), "rgb24")
+            if times:
+                frame.pts, frame.time_base = times[number], Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def unlike(folder: Path, number: int, pixels: np.ndarray) -> float:
+    """Mean difference of a frame on disk from a picture, in levels of luma: its colours are stored at half the size."""
+    with Image.open(folder / f"frame_{number:06d}.jpg") as picture:
+        found = np.asarray(picture.convert("L"), np.float64)
+    expected = np.asarray(Image.fromarray(np.ascontiguousarray(pixels)).convert("L"))
+    assert found.shape == expected.shape
+    return float(np.abs(found - expected).mean())
+
+
+def taken(folder: Path) -> list[int]:
+    """Numbers of the frames on disk."""
+    return sorted(int(path.stem.removeprefix("frame_")) for path in folder.glob("*.jpg"))
+
+
+def test_blurred_and_repeated_frames_are_never_taken(wall, tmp_path):
+    """Every third frame is blurred and every fourth repeated, while the camera moves by 1.5 % of the width a frame."""
+    frames, kinds, places = [], [], []
+    for number in range(80):
+        x = 3.6 * number
+        frames.append(seen(wall, x))
+        kinds.append("sharp")
+        places.append(x)
+        for other, every in (("blurred", 3), ("repeated", 4)):
+            if number % every == 1:
+                frames.append(blurred(seen(wall, x)) if other == "blurred" else frames[-1])
+                kinds.append("blurred" if kinds[-1] == "blurred" else other)
+                places.append(x)
+    video = write(tmp_path / "clip.mp4", frames)
+    report = choose_frames(video, tmp_path / "frames")
+    numbers = taken(tmp_path / "frames")
+    assert report.taken == len(numbers) > 40 and report.of == len(frames)
+    assert "blurred" not in [kinds[number] for number in numbers]
+    assert np.diff([places[number] for number in numbers]).min() > 0  # of frames that repeat another only one
+    assert report.blurred == len(range(1, 80, 3))
+    assert unlike(tmp_path / "frames", numbers[3], frames[numbers[3]]) < 4
+    assert json.loads((tmp_path / "frames" / RECORD).read_text())["frames"] == numbers
+
+
+def test_frames_are_spread_by_motion_and_not_by_time(wall, tmp_path):
+    """Twice as fast in the second half: as many frames from each part of the way."""
+    places = np.concatenate((np.arange(0, 300, 2.0), np.arange(300, 900, 6.0)))
+    video = write(tmp_path / "clip.mp4", [seen(wall, x) for x in places])
+    report = choose_frames(video, tmp_path / "frames", most=40)
+    numbers = taken(tmp_path / "frames")
+    assert 30 <= len(numbers) <= 40
+    steps = np.diff(places[numbers]) / WIDTH
+    assert np.median(steps) == pytest.approx(report.spacing, rel=0.15)
+    slow, fast = (np.median(steps[part]) for part in (places[numbers[1:]] < 300, places[numbers[1:]] > 310))
+    assert fast == pytest.approx(slow, rel=0.5)
+
+
+def test_motion_is_measured_right_and_a_shaking_camera_goes_nowhere(wall):
+    small = [seen(wall, x)[:, :160].mean(axis=2).astype(np.uint8) for x in (10, 12, 15, 21, 35, 45, 33, 20, 10)]
+    found = track(small)
+    expected = np.array([0, 2, 5, 11, 25, 35, 23, 10, 0]) / 160
+    assert distances(found, 0, slice(0, 9)) == pytest.approx(expected, abs=0.006)
+
+
+def test_the_same_call_again_does_nothing_and_an_interrupted_one_goes_on(wall, tmp_path):
+    video = write(tmp_path / "clip.mp4", [seen(wall, 4.0 * number) for number in range(60)])
+    folder = tmp_path / "frames"
+    first = choose_frames(video, folder)
+    before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    removed = sorted(folder.glob("*.jpg"))[5]
+    content = removed.read_bytes()
+    removed.unlink()
+    said: list[tuple[str, float]] = []
+    assert choose_frames(video, folder, report=lambda text, share: said.append((text, share))) == first
+    assert removed.read_bytes() == content
+    assert all(path.stat().st_mtime_ns == time for path, time in before.items() if path != removed)
+    assert "looking at the frames" not in dict(said) and said[-1][1] == 1.0
+    (folder / "mine.jpg").write_bytes(b"kept")
+    fewer = choose_frames(video, folder, most=10)
+    assert fewer.taken <= 10 and len(list(folder.glob("frame_*.jpg"))) == fewer.taken
+    assert (folder / "mine.jpg").read_bytes() == b"kept"
+
+
+def test_progress_only_grows(wall, tmp_path):
+    video = write(tmp_path / "clip.mp4", [seen(wall, 4.0 * number) for number in range(40)])
+    said: list[float] = []
+    choose_frames(video, tmp_path / "frames", report=lambda text, share: said.append(share))
+    assert said == sorted(said) and 0 <= said[0] and said[-1] == 1.0
+
+
+@pytest.mark.parametrize("degrees", [90, 180, -90])
+def test_frames_come_upright(wall, tmp_path, degrees):
+    def turned(stream):
+        if not hasattr(stream, "set_display_rotation"):
+            pytest.skip("this version of PyAV cannot write a rotation")
+        stream.set_display_rotation(degrees)
+
+    frames = [seen(wall, 4.0 * number) for number in range(40)]
+    choose_frames(write(tmp_path / "clip.mp4", frames, set_up=turned), tmp_path / "frames")
+    number = taken(tmp_path / "frames")[2]
+    expected = np.rot90(frames[number], degrees // 90)  # counter-clockwise, as the file says
+    assert unlike(tmp_path / "frames", number, expected) < 4
+
+
+def test_frames_at_uneven_times_are_all_found(wall, tmp_path):
+    times = np.cumsum(np.random.default_rng(2).integers(5, 200, 50)).tolist()
+    frames = [seen(wall, 4.0 * number) for number in range(50)]
+    report = choose_frames(write(tmp_path / "clip.mkv", frames, times=times), tmp_path / "frames")
+    assert report.of == 50
+    number = taken(tmp_path / "frames")[-2]
+    assert unlike(tmp_path / "frames", number, frames[number]) < 4
+
+
+def test_a_truncated_video_gives_what_is_left_and_says_so(wall, tmp_path):
+    video = write(tmp_path / "clip.mkv", [seen(wall, 4.0 * number) for number in range(120)])
+    video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
+    report = choose_frames(video, tmp_path / "frames")
+    assert 20 < report.of < 100
+    assert any("cut off" in note for note in report.notes)
+
+
+def test_a_damaged_video_gives_what_can_be_decoded(wall, tmp_path):
+    video = write(tmp_path / "clip.mkv", [seen(wall, 4.0 * number) for number in range(120)])
+    data = bytearray(video.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 3000] = bytes(3000)
+    video.write_bytes(data)
+    assert choose_frames(video, tmp_path / "frames").taken >= 20
+
+
+def refusal(video: Path, folder: Path) -> str:
+    with pytest.raises(HyrfDataError) as caught:
+        choose_frames(video, folder)
+    assert not folder.exists()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_what_gives_no_photos_is_refused_in_one_sentence(wall, tmp_path):
+    moving = [seen(wall, 4.0 * number) for number in range(60)]
+    whole = write(tmp_path / "whole.mp4", moving)
+    out = tmp_path / "frames"
+    assert "only 3 frames" in refusal(write(tmp_path / "three.mp4", moving[:3]), out)
+    assert "hardly moves" in refusal(write(tmp_path / "still.mp4", [moving[0]] * 60), out)
+    flat = [np.full((HEIGHT, WIDTH, 3), 90, np.uint8)] * 30
+    assert "blurred" in refusal(write(tmp_path / "flat.mp4", flat), out)
+    soft = [ndimage.gaussian_filter(picture, (5, 5, 0)) for picture in moving]
+    assert "blurred" in refusal(write(tmp_path / "soft.mp4", soft), out)
+    cut = tmp_path / "cut.mp4"  # its table of contents is at the end
+    cut.write_bytes(whole.read_bytes()[:-2000])
+    assert "cannot be read as a video" in refusal(cut, out)
+    text = tmp_path / "text.mp4"
+    text.write_text("no video")
+    assert "cannot be read as a video" in refusal(text, out)
+    (tmp_path / "empty.mp4").touch()
+    assert "empty" in refusal(tmp_path / "empty.mp4", out)
+    assert "no such file" in refusal(tmp_path / "nowhere.mp4", out)
+    assert "folder" in refusal(tmp_path, out)
+
+
+def test_a_file_of_sound_alone_is_refused(tmp_path):
+    with av.open(str(tmp_path / "sound.wav"), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.int16), "s16", "mono")
+        frame.sample_rate = 8000
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    assert "no pictures" in refusal(tmp_path / "sound.wav", tmp_path / "frames")
+
+
+def test_without_pyav_the_sentence_names_it(tmp_path, monkeypatch):
+    import sys
+
+    (tmp_path / "clip.mp4").write_bytes(b"x")
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(HyrfError, match="pip install av"):
+        choose_frames(tmp_path / "clip.mp4", tmp_path / "frames")
+
+
+def test_videos_are_known_by_their_endings():
+    assert all(is_video(name) for name in ("a.mp4", "b.MOV", Path("c.webm")))
+    assert not any(is_video(name) for name in ("a.jpg", "mp4", "a.ply"))
+
+
+@pytest.mark.parametrize(
+    ("transfer", "signal", "light"),
+    [(PQ, 0.5806, 203.0), (HLG, 0.75, 203.0), (PQ, 0.4, 32.46), (HLG, 0.25, 1000 * (0.25**2 / 3) ** 1.2)],
+)
+def test_high_dynamic_range_keeps_grey_and_its_light(transfer, signal, light):
+    """Points of the curves as BT.2408 and BT.2100 tabulate them; squeezed above 0.7 of white paper's light."""
+    shown = standard_range(np.full((1, 1, 3), round(signal * 65535), np.uint16), transfer)[0, 0].astype(float)
+    assert np.ptp(shown) <= 1
+    linear = ((shown[0] / 255 + 0.055) / 1.055) ** 2.4 if shown[0] > 10 else shown[0] / 255 / 12.92
+    share = light / 203
+    expected = share if share < 0.7 else 0.7 + 0.3 * ((share - 0.7) / 0.3) / (1 + (share - 0.7) / 0.3)
+    assert linear == pytest.approx(expected, rel=0.03, abs=0.002)
+
+
+def test_high_dynamic_range_clips_nothing():
+    ramp = np.repeat(np.arange(0, 65536, 257, dtype=np.uint16)[None, :, None], 3, axis=2)
+    for transfer in (PQ, HLG):
+        shown = standard_range(ramp, transfer)[0, :, 0].astype(int)
+        assert (np.diff(shown) >= 0).all() and shown[0] == 0 and (shown == 255).sum() < 60
+
+
+def test_poses_of_a_video_that_go_on_still_say_how_many_frames_were_taken(wall, tmp_path):
+    video = write(tmp_path / "clip.mp4", [seen(wall, 4.0 * number) for number in range(60)])
+
+    def stop(doing: str, share: float) -> None:
+        if "features" in doing:
+            raise KeyboardInterrupt
+
+    said: list[list[str]] = [[], []]
+    for sentences in said:
+        with pytest.raises(KeyboardInterrupt):
+            hyrfpack.estimate_poses(video, tmp_path / "scene", report=stop, say=sentences.append)
+    assert said[1] == ["an interrupted estimation goes on", *said[0]]
+    assert "frames were taken" in said[0][0]

@@ -1,0 +1,62 @@
+"""Photos that show all around: cut into faces, which are posed as photos are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from made_up_photos import panorama, place, walls
+from PIL import Image
+
+import hyrfpack
+from hyrfpack.data.equirectangular import FACES
+from hyrfpack.poses.compare import compare
+from hyrfpack.poses.prepare import find_masks, look_at, make_masks
+
+COUNT, HEIGHT = 5, 400
+
+
+@pytest.fixture(scope="module")
+def panoramas(tmp_path_factory):
+    """A folder of panoramas, and the pose of each one's middle."""
+    folder, textures = tmp_path_factory.mktemp("panoramas"), walls()
+    truth = {f"p{number}": place(number / (COUNT - 1)) for number in range(COUNT)}
+    for name, pose in truth.items():
+        Image.fromarray(panorama(pose, textures, HEIGHT, finer=2)).save(folder / f"{name}.jpg", quality=95)
+    return folder, truth
+
+
+def test_the_faces_of_panoramas_are_posed(panoramas, tmp_path):
+    folder, truth = panoramas
+    found = hyrfpack.estimate_poses(folder, tmp_path / "scene")
+    assert found.photos == COUNT * len(FACES)
+    assert f"{COUNT} panoramas were cut into {COUNT * len(FACES)} photos" in found.notes
+    expected = {f"{name}_{face.name}.jpg": face.rotation @ pose for name, pose in truth.items() for face in FACES}
+    views = hyrfpack.load_scene(tmp_path / "scene").views
+    assert {f"p{number}_front.jpg" for number in range(COUNT)} <= {view.name for view in views}
+    poses = {view.name: view.camera.camera_from_world[:3] for view in views}
+    assert len(compare(poses, expected).same) >= COUNT
+    for view in views:  # a quarter of a turn wide
+        assert view.camera.fx == pytest.approx(view.camera.width / 2, rel=0.05)
+
+
+def test_panoramas_are_not_cut_among_the_photos_of_others(panoramas, tmp_path):
+    folder, _ = panoramas
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "images").symlink_to(folder, target_is_directory=True)
+    with pytest.raises(hyrfpack.HyrfDataError, match="shows all around and cannot be cut into photos where it is"):
+        hyrfpack.estimate_poses(tmp_path / "scene", tmp_path / "scene")
+
+
+def test_masks_of_panoramas_are_cut_with_them(panoramas, tmp_path):
+    folder, _ = panoramas
+    mask = np.full((HEIGHT, 2 * HEIGHT), 255, np.uint8)
+    mask[HEIGHT // 2 :] = 0  # what lies below the horizon
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(mask).save(tmp_path / "masks" / "p0.png")
+    photos, left_out = look_at(folder, [folder / "p0.jpg"], in_place=False)
+    assert len(photos) == len(FACES) and not left_out
+    made = make_masks(photos, find_masks(photos, tmp_path / "masks"), tmp_path / "made")
+    usable = {name: np.asarray(Image.open(path).convert("L")) > 0 for name, path in made.items()}
+    assert usable["p0_up.jpg"].all() and not usable["p0_down.jpg"].any()
+    front = usable["p0_front.jpg"]
+    assert front[: len(front) // 2 - 1].all() and not front[len(front) // 2 + 1 :].any()

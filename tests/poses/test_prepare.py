@@ -1,0 +1,207 @@
+"""From files as cameras leave them to a scene's photos: upright, told apart, each once, with their masks."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_up_photos import SIZE, write_photos
+from PIL import Image
+
+import hyrfpack
+from hyrfpack.data.folder import list_photos, photo_facts
+from hyrfpack.data.pictures import read_pixels
+from hyrfpack.poses.job import Device, Job
+from hyrfpack.poses.prepare import Photo, devices_of, find_masks, in_order, look_at, make_images, make_masks
+
+# Pixels of a picture that is stored on its side, and how EXIF says that it is turned upright.
+TURNED = {3: 2, 6: 1, 8: 3}  # orientation: quarter turns, against the clock, from upright to stored
+
+
+def upright(seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    small = Image.fromarray(rng.integers(0, 255, (6, 8, 3), np.uint8))
+    return np.asarray(small.resize((80, 60), Image.Resampling.BICUBIC))
+
+
+def save(path: Path, pixels: np.ndarray, orientation: int = 1, exif: dict | None = None, device: str = "") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tags = Image.Exif()
+    tags[0x0112] = orientation
+    if device:
+        tags[0x0110] = device
+    tags.get_ifd(0x8769).update(exif or {})
+    stored = np.ascontiguousarray(np.rot90(pixels, TURNED.get(orientation, 0)))
+    Image.fromarray(stored).save(path, exif=tags, **({"quality": 95} if path.suffix == ".jpg" else {}))
+    return path
+
+
+def looked_at(folder: Path, in_place: bool = False) -> tuple[list[Photo], dict[str, str]]:
+    return look_at(folder, list_photos(folder), in_place)
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 8])
+@pytest.mark.parametrize("name, written, most", [("a.jpg", "a.jpg", 6.0), ("a.png", "a.png", 0.0)])
+def test_photos_stored_on_their_side_are_written_upright(orientation, name, written, most, tmp_path):
+    save(tmp_path / "in" / name, upright(), orientation)
+    photos, _ = looked_at(tmp_path / "in")
+    make_images(photos, tmp_path / "out")
+    assert [photo.name for photo in photos] == [written]
+    with Image.open(tmp_path / "out" / written) as image:
+        assert image.getexif().get(0x0112, 1) == 1
+        assert np.abs(np.asarray(image).astype(float) - upright()).mean() <= most
+
+
+def test_what_is_upright_is_linked_with_its_bytes(tmp_path):
+    save(tmp_path / "in" / "left" / "a.jpg", upright())
+    photos, _ = looked_at(tmp_path / "in")
+    make_images(photos, tmp_path / "out")
+    assert (tmp_path / "out" / "left" / "a.jpg").samefile(tmp_path / "in" / "left" / "a.jpg")
+
+
+def test_photos_that_differ_in_their_ending_alone_keep_apart(tmp_path):
+    for number, name in enumerate(("a.bmp", "a.jpg", "a.png", "a.webp")):
+        save(tmp_path / "in" / name, upright(number), 6 if name == "a.webp" else 1)
+    save(tmp_path / "in" / "a.jp2", upright(9))  # written anew as a.png, which is taken
+    photos, _ = looked_at(tmp_path / "in")
+    assert len({photo.name for photo in photos}) == 5
+    make_images(photos, tmp_path / "out")
+    assert (tmp_path / "out" / "a.png").samefile(tmp_path / "in" / "a.png")
+
+
+def test_what_is_stored_on_its_side_and_cut_off_is_put_there_to_be_left_out_by_itself(tmp_path):
+    path = save(tmp_path / "in" / "a.jpg", upright(), 6)
+    path.write_bytes(path.read_bytes()[:-500])
+    photos, _ = looked_at(tmp_path / "in")
+    make_images(photos, tmp_path / "out")
+    with pytest.raises(hyrfpack.HyrfDataError, match="cannot decode"):
+        read_pixels(tmp_path / "out" / "a.jpg")
+
+
+def test_printing_inks_stored_on_their_side_become_colours_without_the_profile_of_inks(tmp_path):
+    tags = Image.Exif()
+    tags[0x0112] = 6
+    (tmp_path / "in").mkdir()
+    inks = Image.fromarray(upright()).convert("CMYK")
+    inks.save(tmp_path / "in" / "a.jpg", exif=tags, icc_profile=b"of inks", quality=95)
+    photos, _ = looked_at(tmp_path / "in")
+    make_images(photos, tmp_path / "out")
+    with Image.open(tmp_path / "out" / "a.jpg") as image:
+        assert (image.mode, image.size, image.info.get("icc_profile")) == ("RGB", (60, 80), None)
+
+
+def test_in_place_nothing_is_turned(tmp_path):
+    save(tmp_path / "a.jpg", upright(), 6)
+    photos, _ = looked_at(tmp_path, in_place=True)
+    devices, _ = devices_of(photos, in_place=True)
+    assert devices[0].size == (60, 80)  # as it is stored
+    assert devices_of(photos, in_place=False)[0][0].size == (80, 60)
+
+
+def test_copies_and_unreadable_files_are_left_out_with_the_reason(tmp_path):
+    save(tmp_path / "a.png", upright(1))
+    save(tmp_path / "b.png", upright(2))
+    (tmp_path / "c.png").write_bytes((tmp_path / "a.png").read_bytes())
+    (tmp_path / "d.png").write_bytes(b"nothing")
+    photos, left_out = looked_at(tmp_path)
+    assert [photo.name for photo in photos] == ["a.png", "b.png"]
+    assert left_out["c.png"] == "a copy of a.png"
+    assert left_out["d.png"].startswith("not a picture that can be read")
+
+
+def test_cameras_are_told_apart_by_folder_device_size_and_zoom(tmp_path):
+    tele, wide = {0xA405: 70}, {0xA405: 24}
+    save(tmp_path / "a1.jpg", upright(1), exif=wide, device="One")
+    save(tmp_path / "a2.jpg", upright(2), exif=wide, device="One")
+    save(tmp_path / "b.jpg", upright(3), exif=tele, device="One")
+    save(tmp_path / "c.jpg", upright(4), exif=wide, device="Two")
+    save(tmp_path / "d.jpg", upright(5)[:, :40], exif=wide, device="One")
+    save(tmp_path / "left" / "e.jpg", upright(6), exif=wide, device="One")
+    photos, _ = looked_at(tmp_path)
+    devices, of = devices_of(photos, in_place=False)
+    assert [photo.name for photo in photos] == ["a1.jpg", "a2.jpg", "b.jpg", "c.jpg", "d.jpg", "left/e.jpg"]
+    assert of == (0, 0, 1, 2, 3, 4)
+    # A diagonal of 100 pixels stands for one of 43.27 mm.
+    assert devices[0].focal == pytest.approx(24 / np.hypot(36, 24) * 100)
+
+
+def test_photos_that_follow_each_other(tmp_path):
+    for number in range(4):
+        taken = {0x9003: f"2024:05:01 12:00:0{number}"}
+        save(tmp_path / "burst" / f"IMG_{number}.jpg", upright(number), exif=taken, device="One")
+        save(tmp_path / "walk" / f"IMG_{number}.jpg", upright(number), exif={0x9003: f"2024:05:01 12:0{number}:00"})
+        save(tmp_path / "frames" / f"frame_{number:03d}.png", upright(number))
+        save(tmp_path / "any" / f"{'abcd'[number]}.png", upright(number))
+    ordered = {name: in_order(looked_at(tmp_path / name)[0]) for name in ("burst", "walk", "frames", "any")}
+    assert ordered == {"burst": True, "walk": False, "frames": True, "any": False}
+
+
+def test_masks_are_turned_with_their_photos(tmp_path):
+    save(tmp_path / "photos" / "a.jpg", upright(), 6)
+    save(tmp_path / "photos" / "b.jpg", upright(1))
+    mask = np.zeros((60, 80), np.uint8)
+    mask[:20, :30] = 255
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(np.ascontiguousarray(np.rot90(mask, TURNED[6]))).save(tmp_path / "masks" / "a.png")
+    photos, _ = looked_at(tmp_path / "photos")
+    found = find_masks(photos, tmp_path / "masks")
+    assert list(found) == ["a.jpg"]
+    made = make_masks(photos, found, tmp_path / "made")
+    with Image.open(made["a.jpg"]) as image:
+        assert np.array_equal(np.asarray(image), mask)
+
+
+def test_masked_parts_have_no_features_and_photos_without_a_mask_have_theirs(tmp_path):
+    import pycolmap
+
+    from hyrfpack.poses.features import find_features
+
+    names = list(write_photos(tmp_path / "images", 3))
+    mask = np.full(SIZE[::-1], 255, np.uint8)
+    mask[:, : SIZE[0] // 2] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    (tmp_path / "work").mkdir()
+    masks = {names[0]: str(tmp_path / "mask.png")}
+    job = Job(tmp_path / "images", tmp_path / "work", tuple(names), (Device(SIZE),), (0, 0, 0), masks, "exhaustive", 0)
+    find_features(job, lambda doing, share: None)
+    with pycolmap.Database.open(job.database) as database:
+        masked, free = (np.asarray(database.read_keypoints(number))[:, 0] for number in (1, 2))
+    assert masked.min() >= SIZE[0] // 2 - 1 > free.min()
+    assert len(masked) > 50 and len(free) > 50
+
+
+def test_large_photos_are_posed_on_small_copies_and_the_poses_are_the_large_ones():
+    device = Device((4000, 3000), 3000.0)
+    assert device.working_size == (1600, 1200)
+    assert device.working_focal == 1200.0
+    assert Device((400, 300)).working_size == (400, 300)
+
+
+def test_a_job_is_read_as_it_was_written(tmp_path):
+    devices = (Device((40, 30), 35.0), Device((30, 40)))
+    job = Job(tmp_path, tmp_path / "work", ("a.png", "b/c.png"), devices, (0, 1), {"a.png": "m.png"}, "exhaustive", 7)
+    job.save(tmp_path / "job.json")
+    assert Job.load(tmp_path / "job.json") == job
+
+
+def test_a_set_of_two_cameras_some_on_their_side_becomes_one_scene(tmp_path):
+    folder = tmp_path / "photos"
+    known = write_photos(folder)
+    for number, name in enumerate(sorted(known)):
+        path = folder / name
+        pixels = np.asarray(Image.open(path))
+        path.unlink()
+        if number % 2:
+            save(folder / name.replace(".png", ".jpg"), pixels, 6, device="One")
+        else:
+            save(folder / "right" / name, pixels[:, : 4 * SIZE[0] // 5], device="Two")  # another principal point
+    report = hyrfpack.estimate_poses(folder, tmp_path / "scene")
+    assert report.registered == len(known)
+    assert any("turned upright" in note for note in report.notes)
+    assert any("2 cameras or zooms are told apart" in note for note in report.notes)
+    scene = hyrfpack.load_scene(tmp_path / "scene")
+    assert {(view.camera.width, view.camera.height) for view in scene.views} == {SIZE, (4 * SIZE[0] // 5, SIZE[1])}
+    assert len(json.loads((tmp_path / "scene" / "poses.json").read_text())["made"]) == len(known)
+    assert photo_facts(tmp_path / "scene" / "images" / "photo01.jpg").size == SIZE
