@@ -1,4 +1,4 @@
-"""hyrfpack: posed photos -> a hybrid radiance field -> a small `.hyrf` file -> pictures from anywhere.
+"""hyrfpack: photos or a video -> poses -> a hybrid radiance field -> a small `.hyrf` file -> pictures from anywhere.
 
     import hyrfpack
 
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from hyrfpack.errors import HyrfDataError as HyrfDataError
     from hyrfpack.errors import HyrfError as HyrfError
     from hyrfpack.errors import HyrfFormatError as HyrfFormatError
+    from hyrfpack.errors import HyrfNoPosesError as HyrfNoPosesError
     from hyrfpack.errors import HyrfTrainingError as HyrfTrainingError
     from hyrfpack.evaluate import Evaluation as Evaluation
     from hyrfpack.evaluate import evaluate as evaluate
@@ -53,8 +54,14 @@ if TYPE_CHECKING:
     from hyrfpack.format.codec import CompressionReport as CompressionReport
     from hyrfpack.format.codec import load as load
     from hyrfpack.format.codec import save as save
+    from hyrfpack.make import MakeResult as MakeResult
+    from hyrfpack.make import PhotoSurvey as PhotoSurvey
+    from hyrfpack.make import describe_photos as describe_photos
+    from hyrfpack.make import make as make
     from hyrfpack.model import HybridModel as HybridModel
     from hyrfpack.model import ModelConfig as ModelConfig
+    from hyrfpack.poses import PosesReport as PosesReport
+    from hyrfpack.poses import estimate_poses as estimate_poses
     from hyrfpack.render import Rendering as Rendering
     from hyrfpack.render import RenderSettings as RenderSettings
     from hyrfpack.render import render as render
@@ -77,8 +84,11 @@ _PUBLIC = {
     "HyrfDataError": "hyrfpack.errors",
     "HyrfError": "hyrfpack.errors",
     "HyrfFormatError": "hyrfpack.errors",
+    "HyrfNoPosesError": "hyrfpack.errors",
     "HyrfTrainingError": "hyrfpack.errors",
     "load_scene": "hyrfpack.data",
+    "PosesReport": "hyrfpack.poses",
+    "estimate_poses": "hyrfpack.poses",
     "HybridModel": "hyrfpack.model",
     "ModelConfig": "hyrfpack.model",
     "BenchReport": "hyrfpack.bench",
@@ -90,13 +100,16 @@ _PUBLIC = {
     "DistillConfig": "hyrfpack.distill",
     "DistillReport": "hyrfpack.distill",
     "ExportReport": "hyrfpack.export",
+    "MakeResult": "hyrfpack.make",
+    "PhotoSurvey": "hyrfpack.make",
+    "describe_photos": "hyrfpack.make",
     "CompressionReport": "hyrfpack.format",
     "describe": "hyrfpack.format",
     "load": "hyrfpack.format",
     "save": "hyrfpack.format",
 }
 # Functions that a sub-package has the name of: `hyrfpack.render` is `hyrfpack.render.render`.
-_NAMESAKES = ("bench", "compress", "distill", "evaluate", "export", "render", "train")
+_NAMESAKES = ("bench", "compress", "distill", "evaluate", "export", "make", "render", "train")
 
 __all__ = ["__version__", *_NAMESAKES, *_PUBLIC]
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from made_up_photos import write_photos
 
 import hyrfpack
 from hyrfpack import quant
@@ -41,10 +42,11 @@ FUNCTIONS = dict(public_functions())
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, data: Path) -> Path:
-    """Where the examples run: photos, a run of a few steps, its compressed file and its splats."""
+    """Where the examples run: photos with and without poses, a short run, its compressed file and its splats."""
     root = tmp_path_factory.mktemp("examples")
     (root / "photos").mkdir()
     (root / "photos" / "bonsai").symlink_to(data)
+    write_photos(root / "photos" / "corner")
     scene = hyrfpack.load_scene(data)
     hyrfpack.train(scene, root / "runs" / "bonsai", hyrfpack.TrainConfig(steps=20, max_gaussians=300), quiet=True)
     hyrfpack.compress(root / "runs" / "bonsai" / "model.hyrf", root / "bonsai.hyrf")

@@ -26,10 +26,13 @@ REFUSED = {
     "bench": ("missing.hyrf",),
     "compress": ("missing.hyrf", "out.hyrf"),
     "describe": ("missing.hyrf",),
+    "describe_photos": ("missing",),
     "distill": ("missing.ply", "out.hyrf"),
+    "estimate_poses": ("missing", "out"),
     "export": ("missing.hyrf", "out.spz"),
     "load": ("missing.hyrf",),
     "load_scene": ("missing",),
+    "make": ("missing", "out.html"),
 }
 
 

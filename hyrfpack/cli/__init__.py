@@ -19,7 +19,9 @@ from hyrfpack.cli.demo import demo
 from hyrfpack.cli.export import export
 from hyrfpack.cli.files import compress, decompress, info
 from hyrfpack.cli.imports import import_
+from hyrfpack.cli.make import make
 from hyrfpack.cli.manners import add_manners, is_verbose, mend_streams, note
+from hyrfpack.cli.poses import poses
 from hyrfpack.cli.train import train
 from hyrfpack.cli.view import view
 from hyrfpack.cli.views import evaluate, render
@@ -69,18 +71,25 @@ class _Refusal(click.ClickException):
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(hyrfpack.__version__, prog_name="hyrfpack")
 def main() -> None:
-    """Train hybrid radiance fields from posed photos, pack them into small .hyrf files, render and measure them.
+    """Make small .hyrf files of photos or a video: find poses, train hybrid radiance fields, compress, render, export.
 
     \b
     A first round:
       hyrfpack demo -o demo
-      hyrfpack train photos/bonsai -o runs/bonsai
+      hyrfpack info photos/
+      hyrfpack make photos/ -o scene.html
+
+    \b
+    The same step by step:
+      hyrfpack poses photos/ -o scenes/bonsai
+      hyrfpack train scenes/bonsai -o runs/bonsai
       hyrfpack compress runs/bonsai/model.hyrf -o bonsai.hyrf
-      hyrfpack evaluate bonsai.hyrf --data photos/bonsai
+      hyrfpack evaluate bonsai.hyrf --data scenes/bonsai
     """
 
 
-for _command in (train, compress, decompress, render, evaluate, export, view, import_, bench, info, demo):
+_COMMANDS = (make, poses, train, compress, decompress, render, evaluate, export, view, import_, bench, info, demo)
+for _command in _COMMANDS:
     main.add_command(_command)
     add_manners(_command)
 add_manners(main)

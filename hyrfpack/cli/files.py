@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import shlex
 from dataclasses import asdict
 from pathlib import Path
@@ -14,6 +13,7 @@ import click
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
+    SIZE,
     json_option,
     note,
     number,
@@ -24,7 +24,7 @@ from hyrfpack.cli.common import (
     table,
 )
 from hyrfpack.errors import printable
-from hyrfpack.outputs import Outputs
+from hyrfpack.outputs import ARCHIVES, PICTURES, VIDEOS, Outputs
 
 if TYPE_CHECKING:
     from hyrfpack.format import CompressionReport
@@ -32,23 +32,6 @@ if TYPE_CHECKING:
 
 # Those of hyrfpack.format.codec, without loading torch.
 PROFILES, DEFAULT_PROFILE = ("raw", "paper", "compact"), "compact"
-_SIZE = re.compile(r"([0-9.]+)\s*([kmg]?)b?", re.IGNORECASE)
-
-
-class _Bytes(click.ParamType):
-    """A size such as 2MB, 350k or 1500000; k, M and G are powers of 1000."""
-
-    name = "size"
-
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        match = _SIZE.fullmatch(str(value).strip())
-        try:
-            size = int(float(match[1]) * 1000 ** " kmg".index(match[2].lower() or " ")) if match else 0
-        except (ValueError, OverflowError):
-            size = 0
-        if size < 1:
-            self.fail(f"'{value}' is not a size; write it as 2MB, 350kB or 1500000", param, ctx)
-        return size
 
 
 @click.command(short_help="Pack a model into a small file.")
@@ -70,7 +53,7 @@ class _Bytes(click.ParamType):
     help="Fit the quantised model to the photos for N steps: a smaller file for more time.",
 )
 @click.option("--prune/--no-prune", default=True, help="Leave out Gaussians that pictures do not miss.  [default: do]")
-@click.option("--target-size", type=_Bytes(), metavar="SIZE", help="As good as can be in so many bytes, such as 2MB.")
+@click.option("--target-size", type=SIZE, metavar="SIZE", help="As good as can be in so many bytes, such as 2MB.")
 @click.option(
     "--max-psnr-drop",
     type=click.FloatRange(min=0),
@@ -168,17 +151,45 @@ def decompress(file: Path, output: Path, fraction: float | None, overwrite: bool
     _print_report(output, repack(file, output, fraction=fraction), {}, as_json)
 
 
-@click.command(short_help="Show what a file holds.")
-@click.argument("file", type=PATH)
+@click.command(short_help="Show what a file holds, or what photos are like.")
+@click.argument("path", metavar="FILE", type=PATH)
 @json_option
-def info(file: Path, as_json: bool) -> None:
+def info(path: Path, as_json: bool) -> None:
     """Show what FILE holds: the model, the bytes of each part, and what was chosen in training and why.
+
+    Of a folder of photos, with poses or without, its .zip, or a video: how many there are, their poses and cameras,
+    how sharp and how evenly exposed they are, what is wrong with them and what to do.
 
     \b
     Examples:
       hyrfpack info bonsai.hyrf
       hyrfpack info bonsai.hyrf --json
+      hyrfpack info photos/bonsai
+      hyrfpack info clip.mp4
     """
+    if path.is_dir() or (path.is_file() and path.suffix.lower() in (*ARCHIVES, *VIDEOS, *PICTURES)):
+        _describe_photos(path, as_json)
+    else:
+        _describe_model(path, as_json)
+
+
+def _describe_photos(path: Path, as_json: bool) -> None:
+    from hyrfpack.cli.survey import print_survey
+    from hyrfpack.make.display import Display
+    from hyrfpack.make.progress import Reporter
+    from hyrfpack.make.survey import describe_photos
+
+    with Display() as display:
+        reporter = Reporter(["info"], display.show)
+        reporter.begin("info")
+        survey = describe_photos(path, report=lambda doing, share: reporter.update(share, doing))
+    if as_json:
+        print_json(asdict(survey))
+    else:
+        print_survey(survey)
+
+
+def _describe_model(file: Path, as_json: bool) -> None:
     from hyrfpack.format import describe
 
     facts = describe(file)

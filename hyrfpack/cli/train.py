@@ -20,6 +20,7 @@ from hyrfpack.cli.common import (
     read_scene,
     scene_options,
 )
+from hyrfpack.errors import HyrfNoPosesError
 
 PRESETS = ("auto", "synthetic", "standard", "large", "street")  # hyrfpack.train.PRESETS, without loading torch
 BACKGROUND_COLORS = ("black", "white", "random")
@@ -46,6 +47,7 @@ BACKGROUND_COLORS = ("black", "white", "random")
 @click.option(
     "--cache-mb", type=click.IntRange(min=1), metavar="MB", help="Decoded photos to keep.  [default: RAM / 4]"
 )
+@click.option("--poses", is_flag=True, help="Where DATA has no poses, estimate them first, into RUN/scene.")
 @click.option("--resume", is_flag=True, help="Go on from the run's checkpoint.")
 @click.option("--overwrite", is_flag=True, help="Replace what an earlier run left in the folder.")
 @device_options
@@ -55,17 +57,23 @@ def train(
     out: Path,
     reading: dict[str, Any],
     cache_mb: int | None,
+    poses: bool,
     resume: bool,
     overwrite: bool,
     device: str,
     as_json: bool,
     **settings: Any,
 ) -> None:
-    """Train a model on DATA, a folder of photos and poses (COLMAP, NeRF-synthetic, instant-ngp or nerfstudio).
+    """Train a model on DATA, a folder of photos and poses, or a .zip of it.
+
+    Poses may be COLMAP's, NeRF-synthetic's, nerfstudio's (instant-ngp's), LLFF's, Metashape's, Bundler's,
+    RealityScan's, Polycam's or Record3D's.
+
+    With --poses, DATA may be photos without poses, or a video.
 
     RUN gets model.hyrf, metrics.json, the training curve and pictures of held-out views. Ctrl-C saves a checkpoint
-    and exits with code 1; --resume goes on with it and ends with the same model as an uninterrupted run. So do SIGTERM
-    and a terminal that is closed.
+    and exits with code 1, as SIGTERM and a terminal that is closed do; --resume goes on with it and ends with the same
+    model as an uninterrupted run.
 
     \b
     Examples:
@@ -73,6 +81,7 @@ def train(
       hyrfpack train photos/garden -o runs/garden --images images_4 --steps 30000
       hyrfpack train lego -o runs/lego --background-color white --max-gaussians 50000
       hyrfpack train photos/garden -o runs/garden --images images_4 --steps 30000 --resume
+      hyrfpack train photos/desk -o runs/desk --poses
     """
     if resume and overwrite:
         raise click.UsageError("--resume goes on with a run and --overwrite replaces it; give one of them")
@@ -83,7 +92,12 @@ def train(
     from hyrfpack.train.run import resuming
 
     place = chosen_device(device)
-    scene = read_scene(data, reading)
+    try:
+        scene = read_scene(data, reading)
+    except HyrfNoPosesError:
+        if not poses:
+            raise
+        scene = read_scene(_posed(data, out, reading["images"], resume, overwrite), {**reading, "images": None})
     where = describe_device(place)
     note(f"{scene.layout} scene: {len(scene.train)} photos to train on, {len(scene.test)} held out; on {where}")
     cache = None if cache_mb is None else PictureCache(cache_mb * 2**20)
@@ -102,4 +116,19 @@ def train(
         if scores := metrics.get("evaluation"):
             click.echo(f"held-out views: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}")
     if not result.complete:
+        click.get_current_context().exit(1)
+
+
+def _posed(photos: Path, run: Path, images: str | None, resume: bool, overwrite: bool) -> Path:
+    """The folder of the scene that photos without poses become."""
+    from hyrfpack.make.display import Display
+    from hyrfpack.make.posed import SCENE, posed
+
+    try:
+        with Display() as display:
+            return posed(
+                photos, run, images=images, resume=resume, overwrite=overwrite, report=display.show, say=display.say
+            )
+    except KeyboardInterrupt:
+        note(f"stopped in poses; the same command goes on with {run / SCENE}")
         click.get_current_context().exit(1)

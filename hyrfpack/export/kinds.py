@@ -31,11 +31,12 @@ _KINDS = {kind.ending: kind for kind in (*POINTS, *FORMATS.values(), PAGE, TRANS
 ENDINGS = tuple(_KINDS)
 
 
-def kind_of(target: str | os.PathLike[str], colmap: bool = False) -> Kind:
+def kind_of(target: str | os.PathLike[str], colmap: bool = False, *, others: tuple[str, ...] = ()) -> Kind:
     """What the ending, one of ENDINGS, says is to be written; for a folder or a name without ending a player.
 
     Args:
         colmap: into a folder, a COLMAP model instead.
+        others: endings that the caller knows besides, for the sentence.
 
     Raises:
         HyrfError: it is none of them.
@@ -55,7 +56,8 @@ def kind_of(target: str | os.PathLike[str], colmap: bool = False) -> Kind:
     if os.path.isdir(target) or not Path(name).suffix:
         return PLAYER
     raise HyrfError(
-        f"{target}: the ending names the format; end it in one of {', '.join(ENDINGS)}, or name a folder for a player"
+        f"{target}: the ending names the format; end it in one of {', '.join((*others, *ENDINGS))}, or name a folder "
+        "for a player"
     )
 
 

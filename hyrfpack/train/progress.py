@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from time import monotonic
 
@@ -40,7 +41,7 @@ class ProgressLine:
         self.mse: float | None = None
         self.quiet = quiet or sys.stderr is None
         self.advice = advice
-        self.line = _Line({"steps": f"{done:,}/{steps:,}"}, done / steps)
+        self.line = StatusLine({"steps": f"{done:,}/{steps:,}"}, done / steps)
         self.live: Live | None = None
         if not self.quiet and sys.stderr.isatty():
             console = Console(stderr=True)
@@ -118,20 +119,20 @@ def duration(seconds: float) -> str:
     return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}"
 
 
-class _Line:
-    """What is known of a run, as one line of any terminal's width.
+class StatusLine:
+    """What is known of long work, as one line of any terminal's width.
 
     Attributes:
-        parts: by name, in the order of reading; those that have no room are left out in the order of DROPPED.
+        parts: by name, in the order of reading; those that have no room are left out in the order of `dropped`.
         share: of the run that is done, drawn as a bar where there is room for one.
     """
 
-    def __init__(self, parts: dict[str, str], share: float) -> None:
-        self.parts, self.share = parts, share
+    def __init__(self, parts: dict[str, str], share: float, dropped: Sequence[str] = DROPPED) -> None:
+        self.parts, self.share, self.dropped = parts, share, dropped
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         words, width = dict(self.parts), options.max_width
-        for name in DROPPED:
+        for name in self.dropped:
             if len("  ".join(words.values())) > width:
                 words.pop(name, None)
         steps, *others = words.values()

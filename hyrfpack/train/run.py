@@ -7,7 +7,7 @@ import json
 import signal
 import statistics
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,6 +64,7 @@ def train(
     cache: PictureCache | None = None,
     device: str | torch.device = "auto",
     quiet: bool = False,
+    report: Callable[[int, float, float, int], None] | None = None,
 ) -> TrainResult:
     """Train a model on a scene and leave everything about the run in a folder.
 
@@ -81,6 +82,8 @@ def train(
         device: where to train, see `hyrfpack.device.choose_device`. A run may be resumed on another one. On a GPU
             sums of gradients vary in their last bits from run to run.
         quiet: print nothing.
+        report: told after each step its number, the loss and mean squared error of its view (NaN where all of it is
+            masked) and how many Gaussians there are, in place of the line that is shown otherwise.
 
     Raises:
         HyrfError: the folder holds another run, training cannot start or go on, no photo has a pixel to train on or to
@@ -109,10 +112,14 @@ def train(
     if resume:
         trainer.load(checkpoint)
     with _naming_the_checkpoint(trainer, overwrite):
-        with ProgressLine(config.steps, trainer.step, quiet, _shorter(device)) as line, _stop_requests() as stop:
+        with (
+            ProgressLine(config.steps, trainer.step, quiet or report is not None, _shorter(device)) as line,
+            _stop_requests() as stop,
+        ):
+            tell = report or line.update
             complete = trainer.run(
                 checkpoint=checkpoint,
-                report=lambda t, loss, mse: line.update(t.step, loss, mse, len(t.model)),
+                report=lambda t, loss, mse: tell(t.step, loss, mse, len(t.model)),
                 stop=stop,
                 warn=line.note,
             )

@@ -22,6 +22,7 @@ from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.format import load
 
 COMMANDS = (
+    "make",
     "train",
     "compress",
     "decompress",

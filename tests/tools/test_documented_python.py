@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+
+import numpy as np
 import pytest
+from made_up_photos import FOCAL, SIZE, write_photos
 
 from tools.safety.run_docs import PAGES, python_of, run
 
@@ -19,9 +23,26 @@ def test_the_python_of_a_page_is_its_blocks_each_line_where_it_stands():
     }
 
 
+@pytest.fixture
+def photos(tmp_path):
+    """Photos with poses that are also found without them."""
+    poses = write_photos(tmp_path / "images")
+    frames = [
+        {"file_path": f"images/{name}", "transform_matrix": opengl(pose).tolist()} for name, pose in poses.items()
+    ]
+    camera = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": SIZE[0] / 2, "cy": SIZE[1] / 2, "w": SIZE[0], "h": SIZE[1]}
+    (tmp_path / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
+    return tmp_path
+
+
+def opengl(pose: np.ndarray) -> np.ndarray:
+    """(4, 4) world_from_camera with y up and z backwards, of a (3, 4) camera_from_world."""
+    return np.linalg.inv(np.vstack((pose, (0, 0, 0, 1)))) * (1, -1, -1, 1)
+
+
 @pytest.mark.slow
-def test_every_page_runs_as_written(tmp_path, data, capfd):
-    assert all(run(page, data, 2) for page in PAGES), capfd.readouterr().err
+def test_every_page_runs_as_written(photos, capfd):
+    assert all(run(page, photos, 2) for page in PAGES), capfd.readouterr().err
 
 
 def test_a_page_that_breaks_is_noticed(tmp_path, data):

@@ -104,7 +104,9 @@ def drawn(parts: dict[str, str], width: int, encoding: str = "utf-8") -> str:
     """The line as a terminal shows it."""
     file = Terminal()
     file.encoding = encoding
-    Console(width=width, file=file, force_terminal=True, color_system=None).print(progress._Line(parts, 604 / 3000))
+    Console(width=width, file=file, force_terminal=True, color_system=None).print(
+        progress.StatusLine(parts, 604 / 3000)
+    )
     (line,) = file.getvalue().splitlines()
     return line
 

@@ -1,13 +1,14 @@
-"""Kills train, compress, decompress and render at random moments and checks what is left on the disk.
+"""Kills train, compress, decompress, render and make at random moments and checks what is left on the disk.
 
-    python -m tools.safety.kill                                   50 kills of each command (ten minutes on two cores)
+    python -m tools.safety.kill                                   50 kills of each command (25 minutes on two cores)
     python -m tools.safety.kill --kills 10 --commands compress decompress --seed 3
 
 Each trial starts the real command line over what an earlier run with another seed left, and ends it with SIGKILL: half
 of the trials at a moment drawn evenly from the command's time, half up to 2 ms after the k-th temporary file appears.
 Then every file must hold its old bytes or the whole new ones, and nothing else may be there but temporary files. Where
 there are such, and in every fifth trial, the command is run again (train with --resume where there is a checkpoint): it
-must end with the bytes of an uninterrupted run and leave no temporary file. Exits with 1 on a violation.
+must end with the bytes of an uninterrupted run and leave no temporary file. In the work folder of make, what is made
+anew may be gone. Exits with 1 on a violation.
 """
 
 from __future__ import annotations
@@ -37,14 +38,18 @@ from PIL import Image
 import hyrfpack
 from hyrfpack.atomic import PREFIX, SUFFIX
 from hyrfpack.demo.scene import write_demo_scene
+from hyrfpack.make.state import NAME as RECORD
 from hyrfpack.train.checkpoint import DIGEST_BYTES
 from hyrfpack.train.run import CHECKPOINT, METRICS, MODEL
 
 ENVIRONMENT = {**os.environ, "HYRFPACK_THREADS": "1", "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
-COMMANDS = ("train", "compress", "decompress", "render")  # each works on what those before it made
+COMMANDS = ("train", "compress", "decompress", "render", "make")  # each works on what those before it made
 MOMENTS = ("before", "while writing", "between or after", "too late")
+DRAFT = ["--quality", "draft"]
 TRAINING = ["--steps", "60", "--log2-table-size", "13"]
 FRAMES = 6
+WORK = "out.work"  # of make
+PLACES = ("", "views", WORK, f"{WORK}/run", f"{WORK}/run/views", f"{WORK}/export")  # where files are written
 POLL = 2e-4  # seconds between looks for a temporary file
 AIM = 2e-3  # seconds: the most between the sight of a temporary file and the kill
 RERUN_EVERY = 5
@@ -92,7 +97,7 @@ def watch(process: subprocess.Popen, folder: Path, enough: int | None = None) ->
     """Wait until `enough` temporary files have been seen, or the process has ended; returns how many were seen."""
     seen: set[str] = set()
     while process.poll() is None and (enough is None or len(seen) < enough):
-        for place in (folder, folder / "views"):
+        for place in (folder / name for name in PLACES):
             if place.is_dir():
                 seen.update(name for name in os.listdir(place) if is_stray(name))
         time.sleep(POLL)
@@ -112,14 +117,17 @@ def fault(name: str, data: bytes, case: Case) -> str | None:
     """What is wrong with a file under its final name; None for the old bytes and for the whole new ones."""
     if data == case.old.get(name):
         return None
-    if name != CHECKPOINT and name not in case.new:
+    base = os.path.basename(name)
+    if base != CHECKPOINT and name not in case.new:
         return "nobody asked for this file"
     try:
-        if name == CHECKPOINT:
+        if base == CHECKPOINT:
             same = hashlib.sha256(data[:-DIGEST_BYTES]).digest() == data[-DIGEST_BYTES:]
             torch.load(io.BytesIO(data[:-DIGEST_BYTES]), weights_only=True)
-        elif name == METRICS:
+        elif base == METRICS:
             same = untimed(data) == untimed(case.new[name])
+        elif base == RECORD:
+            same = set(json.loads(data)["stages"]) <= set(json.loads(case.new[name])["stages"])
         else:
             same = data == case.new[name]
             if name.endswith(".hyrf"):
@@ -133,7 +141,7 @@ def fault(name: str, data: bytes, case: Case) -> str | None:
 
 def faults(found: dict[str, bytes], case: Case) -> list[str]:
     """What is wrong with a folder after a kill."""
-    wrong = [f"{name} is gone" for name in case.old if name not in found]
+    wrong = [f"{name} is gone" for name in case.old if name not in found and not name.startswith(f"{WORK}/")]
     for name, data in found.items():
         if not is_stray(name) and (reason := fault(name, data, case)):
             wrong.append(f"{name}: {reason}")
@@ -160,8 +168,12 @@ def rerun(case: Case, out: Path) -> list[str]:
         return [f"run again, it exits with {process.returncode}: {complaint.decode()[-300:]}"]
     after = contents(out)
     wrong = [f"run again: {sentence}" for sentence in faults(after, case)]
-    wrong += [f"run again: {name} is left" for name in after if is_stray(name) or name == CHECKPOINT]
-    wrong += [f"run again: {name} is still the old one" for name in case.new if after[name] == case.old[name]]
+    wrong += [f"run again: {name} is left" for name in after if is_stray(name) or name.endswith(CHECKPOINT)]
+    wrong += [
+        f"run again: {name} is missing or still the old one"
+        for name in case.new
+        if after.get(name) == case.old[name] or name not in after
+    ]
     return wrong
 
 
@@ -206,6 +218,7 @@ def prepare(work: Path, names: Sequence[str]) -> list[Case]:
                 "compress": ["compress", str(model), "-o", str(out / "out.hyrf")],
                 "decompress": ["decompress", str(packed), "-o", str(out / "out.hyrf")],
                 "render": ["render", str(packed), "-o", str(out), "--orbit", str(FRAMES)],
+                "make": ["make", str(scene), "-o", str(out / "out.hyrf"), "--overwrite", "--seed", str(seed), *DRAFT],
             }[name]
 
         case = Case(name, arguments)

@@ -1,0 +1,162 @@
+"""`hyrfpack make`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from hyrfpack.cli.common import (
+    OUTPUT,
+    PATH,
+    SEED,
+    SIZE,
+    chosen_device,
+    json_option,
+    note,
+    number,
+    overwrite_option,
+    print_json,
+)
+from hyrfpack.cli.poses import MATCHING
+
+if TYPE_CHECKING:
+    from hyrfpack.make import MakeResult
+
+QUALITIES = ("draft", "normal", "best")  # hyrfpack.make.QUALITIES, without loading torch
+LISTED = 5  # photos that were left out
+
+
+@click.command(short_help="Photos in, scene out: the whole way.")
+@click.argument("photos", type=PATH)
+@click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="What to make; its ending says what.")
+@click.option("--quality", type=click.Choice(QUALITIES), help="How long to work.  [default: normal]")
+@click.option(
+    "--minutes",
+    type=click.FloatRange(min=0, min_open=True),
+    callback=number,
+    metavar="N",
+    help="Instead of a quality: be ready in about so many minutes, poses included.",
+)
+@click.option("--target-size", type=SIZE, metavar="SIZE", help="As good as can be in so many bytes, such as 2MB.")
+@click.option(
+    "--matching",
+    type=click.Choice(MATCHING),
+    default="auto",
+    show_default=True,
+    help="Which photos are compared with which to find poses, as of 'hyrfpack poses'.",
+)
+@click.option("--images", metavar="NAME", help="Folder of pictures to use, such as images_4.")
+@click.option(
+    "--max-size",
+    type=click.IntRange(min=0),
+    metavar="PIXELS",
+    help="Shrink photos that are larger than this on the longer side; 0 keeps them.  [default: 1600, of a draft 640]",
+)
+@click.option(
+    "--test-every",
+    type=click.IntRange(min=0),
+    metavar="N",
+    help="Hold out every Nth photo for scoring; 0 holds out none.  [default: 8; of fewer than 16 photos, one]",
+)
+@click.option("--work", type=OUTPUT, metavar="DIR", help="Where each stage's product is kept.  [default: FILE's .work]")
+@click.option("--device", metavar="NAME", default="auto", show_default=True, help="Where to train: cpu, cuda, cuda:N.")
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Same seed, same bytes.")
+@overwrite_option
+@json_option
+def make(
+    photos: Path,
+    output: Path,
+    quality: str | None,
+    minutes: float | None,
+    target_size: int | None,
+    matching: str,
+    images: str | None,
+    max_size: int | None,
+    test_every: int | None,
+    work: Path | None,
+    device: str,
+    seed: int,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Make a scene of PHOTOS: estimate poses where there are none, train, compress, score and export.
+
+    PHOTOS is a folder or its .zip, a video, splats of another program (.ply .splat .spz .sog), or a .hyrf file.
+    What FILE is follows from its ending: .hyrf, .html or whatever else 'hyrfpack export' writes; a name without ending
+    is a folder with a player.
+
+    Every stage's product is kept, and after an interruption (Ctrl-C, exit code 1) the same command goes on.
+
+    \b
+    Examples:
+      hyrfpack make photos/ -o scene.html
+      hyrfpack make clip.mp4 -o scene.hyrf --minutes 20
+      hyrfpack make photos/bonsai -o bonsai.spz --quality best
+      hyrfpack make other.ply -o scene.html
+    """
+    if quality is not None and minutes is not None:
+        raise click.UsageError("--quality and --minutes each decide how long to work; give one of them")
+    from hyrfpack.make import Stopped
+    from hyrfpack.make import make as run
+    from hyrfpack.make.display import Display
+
+    place = chosen_device(device)
+    try:
+        with Display() as display:
+            result = run(
+                photos,
+                output,
+                quality=quality or "normal",
+                minutes=minutes,
+                work=work,
+                images=images,
+                max_size=max_size,
+                test_every=test_every,
+                matching=matching,
+                target_bytes=target_size,
+                seed=seed,
+                device=place,
+                overwrite=overwrite,
+                report=display.show,
+                say=display.say,
+            )
+    except Stopped as stop:
+        note(f"stopped in {stop.stage}; the same command goes on")
+        click.get_current_context().exit(1)
+    if as_json:
+        print_json(result.to_dict())
+        return
+    _print(result)
+
+
+def _print(result: MakeResult) -> None:
+    """The end of it in short: doubts about poses were told as they came up, and all figures are in the work folder."""
+    poses = result.poses
+    if poses:
+        sure = f", {poses['sure']} of them sure" if poses["sure"] < poses["registered"] else ""
+        click.echo(f"poses: {poses['registered']} of {poses['photos']} photos{sure}")
+        for name, reason in list(poses["left_out"].items())[:LISTED]:
+            click.echo(f"  left out: {name}, {reason}")
+        if (more := len(poses["left_out"]) - LISTED) > 0:
+            click.echo(f"  left out: {more} more, see {result.work / 'scene' / 'poses.json'}")
+    times = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())
+    click.echo(f"times: {times}; {result.work} keeps what each stage made, and may be deleted")
+    if result.psnr is not None:
+        photos = f"{result.views} photo{'s' if result.views > 1 else ''}"
+        click.echo(f"{photos} held out: PSNR {result.psnr:.2f} dB, SSIM {result.ssim:.4f}")
+    elif result.training:
+        click.echo("no photo is held out, so that nothing is scored")
+    click.echo(f"{result.output}: {result.bytes:,} bytes, {result.gaussians:,} Gaussians; {_where_to_look(result)}")
+
+
+def _where_to_look(result: MakeResult) -> str:
+    """What to do to see it."""
+    output = result.output
+    if output.suffix.lower() == ".html":
+        return "open it in a browser"
+    if output.is_dir():
+        return f"for any web server; see it with 'hyrfpack view {result.model}'"
+    viewable = output.suffix.lower() in (".hyrf", ".ply", ".splat", ".spz", ".sog") and ".points." not in output.name
+    return f"see it with 'hyrfpack view {output if viewable else result.model}'"

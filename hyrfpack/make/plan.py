@@ -1,0 +1,104 @@
+"""How long each stage works: what the words for a quality mean, and what that takes, roughly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from hyrfpack.compress.sensitivity import DRAWN, FEWEST, MOST
+from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
+from hyrfpack.train.config import FULL_STEPS, TrainConfig
+from hyrfpack.train.setup import budget_for
+
+# Seconds, of two CPU cores: for a megapixel that is trained on once, and that is drawn and followed back while packing.
+# Only the first forecast needs them: what is measured on the way takes their place.
+STEP, STEP_GPU, PASS = 0.7, 0.02, 0.6
+POSES = 3.0  # for a photo
+UNKNOWN = 100  # photos, where that is not known yet
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What a word for a quality stands for.
+
+    Attributes:
+        steps: of training on a CPU.
+        gpu_steps: of training on a GPU.
+        max_size: pixels of the longer side that larger photos are shrunk to.
+        finetune_steps: of fitting to the photos while packing.
+        import_steps: of learning from splats of other programs.
+    """
+
+    steps: int
+    gpu_steps: int
+    max_size: int
+    finetune_steps: int
+    import_steps: int
+
+
+QUALITIES = {
+    "draft": Quality(steps=600, gpu_steps=1_000, max_size=640, finetune_steps=0, import_steps=150),
+    "normal": Quality(
+        steps=TrainConfig.steps,
+        gpu_steps=TrainConfig.steps,
+        max_size=DEFAULT_MAX_SIZE,
+        finetune_steps=0,
+        import_steps=500,
+    ),
+    "best": Quality(
+        steps=10_000, gpu_steps=FULL_STEPS, max_size=DEFAULT_MAX_SIZE, finetune_steps=500, import_steps=1_500
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What was decided for a scene.
+
+    Attributes:
+        steps: of training.
+        max_size: of photos, as in `load_scene`.
+        finetune_steps: of packing.
+    """
+
+    steps: int
+    max_size: int
+    finetune_steps: int = 0
+
+
+def passes(gaussians: int) -> int:
+    """How many views packing draws and follows back."""
+    return int(np.clip(DRAWN // max(gaussians, 1), FEWEST, MOST))
+
+
+def megapixels(scene: Scene) -> float:
+    """Of a photo, the mean."""
+    return float(np.mean([view.camera.width * view.camera.height for view in scene.views])) / 1e6
+
+
+def forecast(pixels: float, steps: int, finetune_steps: int, gaussians: int, device: torch.device) -> dict[str, float]:
+    """Seconds that the stages after the poses take, roughly, for photos of so many megapixels."""
+    step = pixels * (STEP if device.type == "cpu" else STEP_GPU)
+    return {
+        "training": 5 + steps * step,
+        "compression": 5 + (passes(gaussians) + 3 * finetune_steps) * pixels * PASS,
+        "scoring": 2 + 10 * pixels,
+        "export": 3.0,
+    }
+
+
+def forecast_scene(scene: Scene, plan: Plan, device: torch.device) -> dict[str, float]:
+    """`forecast` for photos that are known."""
+    gaussians, _ = budget_for(scene, TrainConfig(steps=plan.steps))
+    return forecast(megapixels(scene), plan.steps, plan.finetune_steps, gaussians, device)
+
+
+def forecast_photos(sizes: Sequence[tuple[int, int]], plan: Plan, device: torch.device) -> dict[str, float]:
+    """`forecast` for photos of these (width, height) and for their poses, or where there are none, of a video."""
+    width, height = sizes[0] if sizes else (1920, 1080)
+    shrunk = min(1.0, plan.max_size / max(width, height)) if plan.max_size else 1.0
+    pixels, count = width * height * shrunk**2 / 1e6, len(sizes) or UNKNOWN
+    return {"poses": POSES * count, **forecast(pixels, plan.steps, plan.finetune_steps, 20_000, device)}

@@ -1,0 +1,178 @@
+"""Interrupted at any stage, by Ctrl-C or a kill, the same call goes on and ends with the same bytes."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from hyrfpack.atomic import PREFIX
+from hyrfpack.errors import HyrfError
+from hyrfpack.make import Stopped, make, stages
+from hyrfpack.make.work import interruptible
+
+STAGES = {  # and what does each of them
+    "training": "train",
+    "compression": "compress",
+    "scoring": "evaluate",
+    "export": "export",
+}
+
+
+def products(work: Path) -> dict[str, bytes]:
+    names = ("model.hyrf", "run/model.hyrf", "export/scene.html")
+    return {name: (work / name).read_bytes() for name in names}
+
+
+@pytest.fixture(scope="module")
+def whole_work(posed, tmp_path_factory) -> Path:
+    """The work folder of an uninterrupted call."""
+    return make(posed, tmp_path_factory.mktemp("whole") / "scene.html").work
+
+
+@pytest.fixture(scope="module")
+def whole(whole_work) -> dict[str, bytes]:
+    """What it made."""
+    return products(whole_work)
+
+
+@pytest.mark.parametrize("after", [False, True], ids=["before its work", "after it, before the record of it"])
+@pytest.mark.parametrize("stage", STAGES)
+def test_an_interrupt_in_any_stage_costs_nothing(stage, after, whole, posed, tmp_path, monkeypatch):
+    usual = getattr(stages, STAGES[stage])
+
+    def stop(*arguments, **options):
+        if after:
+            usual(*arguments, **options)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stages, STAGES[stage], stop)
+        with pytest.raises(Stopped) as caught:
+            make(posed, tmp_path / "scene.html")
+    assert caught.value.stage == stage and not (tmp_path / "scene.html").exists()
+    result = make(posed, tmp_path / "scene.html")
+    assert products(result.work) == whole and result.output.read_bytes() == whole["export/scene.html"]
+    assert list(result.kept) == list(STAGES)[: list(STAGES).index(stage)]
+
+
+def test_an_interrupt_amid_training_goes_on_from_the_checkpoint(whole, posed, tmp_path, signals):
+    def stop(progress):
+        if progress.stage == "training" and progress.share > 0.5:
+            signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(Stopped, match="stopped in training"):
+        make(posed, tmp_path / "scene.html", report=stop)
+    assert (tmp_path / "scene.work" / "run" / "checkpoint.pt").is_file()
+    shares = []
+    result = make(posed, tmp_path / "scene.html", report=lambda p: shares.append((p.stage, p.share)))
+    assert next(share for stage, share in shares if stage == "training" and share) > 0.5
+    assert products(result.work) == whole
+
+
+def test_an_interrupt_in_poses_goes_on(photos, poses, tmp_path, monkeypatch):
+    def stop(progress):
+        raise KeyboardInterrupt
+
+    with pytest.raises(Stopped, match="stopped in poses"):
+        make(photos, tmp_path / "scene.html", quality="draft", report=stop)
+    assert make(photos, tmp_path / "scene.html", quality="draft").kept == ()
+    assert make(photos, tmp_path / "scene.ply", quality="draft").kept[0] == "poses"
+
+
+def test_an_output_that_was_copied_in_part_is_gone_on_with(posed, tmp_path, monkeypatch):
+    usual, copies = stages.copy, []
+
+    def stop(source, target):
+        copies.append(target)
+        if len(copies) == 3:
+            raise KeyboardInterrupt
+        usual(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stages, "copy", stop)
+        with pytest.raises(Stopped):
+            make(posed, tmp_path / "player", quality="draft")
+    assert len(list((tmp_path / "player").iterdir())) == 2
+    assert len(list(make(posed, tmp_path / "player", quality="draft").output.iterdir())) == 5
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_signals_interrupt_and_their_handlers_come_back(name, signals):
+    number = getattr(signal, name, signal.SIGTERM)
+    before = signal.getsignal(number)
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        signal.raise_signal(number)
+    assert signal.getsignal(number) is before
+
+
+@contextmanager
+def file_limit(size: int) -> Iterator[None]:
+    """No file of this process may grow past `size` bytes: a write stops in the middle, as on a full disk."""
+    resource = pytest.importorskip("resource", reason="limits are of Unix")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize(
+    "changes, limit, sentence",
+    [
+        ({}, 500, "make.json: "),
+        ({"seed": 1}, 20_000, "training failed: .*run/model.hyrf: "),
+        ({"target_bytes": 2_000_000}, 20_000, "compression failed: .*model.hyrf: "),
+        ({"output": "other.html"}, 20_000, "export failed: .*export/other.html: "),
+        ({"output": "scene.html"}, 20_000, "scene.html: "),  # the copy of what is there
+    ],
+)
+def test_no_room_in_any_stage_is_one_sentence_and_the_same_call_goes_on(
+    changes, limit, sentence, whole_work, posed, tmp_path
+):
+    work = tmp_path / "work"
+    if limit > 500:
+        shutil.copytree(whole_work, work)
+    changes = {"output": "scene.html", **changes, "work": work}
+    output = tmp_path / changes.pop("output")
+    with file_limit(limit), pytest.raises(HyrfError, match=f"{sentence}.*not allowed here"):
+        make(posed, output, **changes)
+    assert not output.exists()
+    assert make(posed, output, **changes).output.exists()
+    assert not [path for path in tmp_path.rglob("*") if path.name.startswith(PREFIX)]
+
+
+CHILD = """
+import sys
+from pathlib import Path
+sys.path[:0] = sys.argv[1:3]
+import conftest, pytest
+conftest.hurry(pytest.MonkeyPatch())
+from hyrfpack.make import make
+make(sys.argv[3], sys.argv[4], report=lambda p: print(p.stage, round(p.share, 2), flush=True))
+"""
+
+
+def start(posed: Path, output: Path) -> subprocess.Popen:
+    here = Path(__file__).parent
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(here.parents[1]), str(here.parent)])}
+    command = [sys.executable, "-c", CHILD, str(here), str(here.parent), str(posed), str(output)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+
+
+def test_a_kill_costs_nothing(whole, posed, tmp_path):
+    child = start(posed, tmp_path / "scene.html")
+    assert any(line.strip() == "training 0.44" for line in child.stdout)
+    child.kill()
+    child.communicate()
+    assert child.returncode == -signal.SIGKILL
+    assert (tmp_path / "scene.work" / "make.json").is_file() and not (tmp_path / "scene.html").exists()
+    assert products(make(posed, tmp_path / "scene.html").work) == whole

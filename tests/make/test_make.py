@@ -1,0 +1,324 @@
+"""The whole way: whatever is given, whatever is asked for, what is refused, and what is done anew."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zipfile
+from pathlib import Path
+
+import pytest
+from commands import hyrfpack, refused, succeeded
+from explicit_balls import ball
+from PIL import Image
+
+from hyrfpack import evaluate, load, load_scene
+from hyrfpack.errors import HyrfError
+from hyrfpack.make import make
+from hyrfpack.make.work import held
+from hyrfpack.splats.formats import ply
+
+ENDINGS = (".hyrf", ".html", ".ply", ".splat", ".spz", ".glb", ".usdz", ".sog", ".points.ply", ".json", "")
+STAGES = ["training", "compression", "scoring", "export"]
+
+
+@pytest.fixture(scope="module")
+def made(posed, tmp_path_factory) -> Path:
+    """The work folder of a scene that was made."""
+    folder = tmp_path_factory.mktemp("made")
+    make(posed, folder / "scene.hyrf")
+    return folder / "scene.work"
+
+
+def copy_of(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "work"))
+
+
+# -- what is given, and what is asked for ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_every_ending_is_made_and_nothing_else_anew(ending, made, posed, tmp_path):
+    result = make(posed, tmp_path / f"out{ending}", work=copy_of(made, tmp_path))
+    assert result.kept == ("training", "compression", "scoring")
+    files = [path for path in result.output.rglob("*") if path.is_file()] or [result.output]
+    assert result.bytes == sum(path.stat().st_size for path in files) > 100
+
+
+def test_photos_without_poses_get_some(photos, poses, tmp_path):
+    said, shares = [], []
+    result = make(photos, tmp_path / "scene.hyrf", say=said.append, report=shares.append)
+    assert poses == [photos]
+    assert list(result.seconds) == ["poses", *STAGES]
+    assert result.poses["left_out"] == {"dark.jpg": "blurred"}
+    assert {progress.stage for progress in shares} == {"poses", *STAGES}
+    assert all(0 <= progress.share <= 1 and progress.left is not None and progress.left >= 0 for progress in shares)
+    assert len(load_scene(result.work / "scene").views) == 18
+
+
+@pytest.mark.parametrize("top", ["", "holiday/"])
+def test_photos_without_poses_may_come_in_an_archive(top, photos, poses, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    with zipfile.ZipFile(tmp_path / "photos.zip", "w") as archive:
+        for photo in photos.iterdir():
+            archive.write(photo, f"{top}{photo.name}")
+    said: list[str] = []
+    make(tmp_path / "photos.zip", tmp_path / "scene.hyrf", quality="draft", say=said.append)
+    (folder,) = poses
+    assert folder.is_relative_to(tmp_path / "cache") and len(list(folder.rglob("*.png"))) == 18
+    assert sum(str(folder) in sentence for sentence in said) == 1
+    assert len(make(tmp_path / "photos.zip", tmp_path / "scene.hyrf", quality="draft").kept) == 5
+
+
+def test_photos_with_poses_are_used_as_they_are(posed, poses, tmp_path):
+    make(posed, tmp_path / "scene.hyrf")
+    assert not poses
+
+
+def test_a_video_gets_poses(poses, tmp_path):
+    (tmp_path / "clip.MP4").write_bytes(b"frames")
+    make(tmp_path / "clip.MP4", tmp_path / "scene.hyrf", quality="draft")
+    assert poses == [tmp_path / "clip.MP4"]
+
+
+def test_splats_of_other_programs_are_imported(tmp_path):
+    (tmp_path / "ball.ply").write_bytes(ply.encode(ball(40)))
+    result = make(tmp_path / "ball.ply", tmp_path / "scene.html", quality="draft")
+    assert list(result.seconds) == ["import", "export"] and result.export["import"]["gaussians_before"] == 40
+    again = make(tmp_path / "ball.ply", tmp_path / "scene.spz", quality="draft")
+    assert again.kept == ("import",)
+
+
+def test_a_model_is_exported(made, tmp_path):
+    result = make(made / "model.hyrf", tmp_path / "scene.html")
+    assert list(result.seconds) == ["export"] and result.gaussians == len(load(made / "model.hyrf"))
+
+
+def test_the_score_is_of_the_packed_model_on_the_photos_held_out(made, posed, tmp_path):
+    result = make(posed, tmp_path / "scene.hyrf", work=copy_of(made, tmp_path))
+    scores = evaluate(load(result.output), load_scene(posed).test)
+    assert (result.psnr, result.ssim, result.views) == (scores.psnr, scores.ssim, 3)
+
+
+@pytest.mark.parametrize("count, held_out", [(3, 0), (8, 1), (15, 1)])
+def test_of_few_photos_few_are_held_out(count, held_out, posed, tmp_path):
+    shutil.copytree(posed, tmp_path / "few")
+    table = tmp_path / "few" / "transforms.json"
+    content = json.loads(table.read_text())
+    content["frames"] = content["frames"][:count]
+    table.write_text(json.dumps(content))
+    result = make(tmp_path / "few", tmp_path / "scene.hyrf", quality="draft")
+    assert result.views == held_out and (result.psnr is None) == (held_out == 0)
+
+
+def test_a_target_size_is_met(made, posed, tmp_path):
+    whole = (made / "model.hyrf").stat().st_size
+    result = make(posed, tmp_path / "scene.hyrf", work=copy_of(made, tmp_path), target_bytes=whole * 3 // 4)
+    assert result.bytes <= whole * 3 // 4 and result.kept == ("training",)
+
+
+# -- what is done anew -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "settings, kept",
+    [
+        ({}, tuple(STAGES)),
+        ({"quality": "best"}, ("training",)),  # as long a training here
+        ({"seed": 1}, ()),
+        ({"test_every": 3}, ()),
+        ({"max_size": 24}, ()),
+        ({"target_bytes": 2_000_000}, ("training",)),
+    ],
+)
+def test_changed_settings_redo_what_depends_on_them(settings, kept, made, posed, tmp_path):
+    result = make(posed, tmp_path / "scene.hyrf", work=copy_of(made, tmp_path), **settings)
+    assert result.kept == kept
+
+
+def test_a_changed_photo_redoes_poses_and_all_else_and_a_moved_folder_nothing(photos, poses, tmp_path):
+    make(photos, tmp_path / "a.hyrf", work=tmp_path / "work", quality="draft")
+    moved = photos.rename(tmp_path / "elsewhere")
+    assert len(make(moved, tmp_path / "a.hyrf", work=tmp_path / "work", quality="draft").kept) == 5
+    Image.new("RGB", (32, 32), "red").save(moved / "0003.png")
+    said: list[str] = []
+    result = make(moved, tmp_path / "b.hyrf", work=tmp_path / "work", quality="draft", say=said.append)
+    assert "poses" not in result.kept and "poses: made anew, for photos changed" in said
+
+
+def test_matching_is_passed_on_and_counts(photos, poses, tmp_path):
+    make(photos, tmp_path / "a.hyrf", quality="draft")
+    result = make(photos, tmp_path / "b.hyrf", work=tmp_path / "a.work", quality="draft", matching="sequential")
+    assert len(poses) == 2 and result.kept == ("training", "compression", "scoring")  # the poses were the same
+
+
+@pytest.mark.parametrize(
+    "name, kept",
+    [("model.hyrf", ("training", "scoring", "export")), ("run/model.hyrf", ("compression", "scoring", "export"))],
+)
+def test_a_product_that_was_damaged_is_made_again(name, kept, made, posed, tmp_path):
+    work = copy_of(made, tmp_path)
+    whole = (work / name).read_bytes()
+    (work / name).write_bytes(whole[:100])
+    result = make(posed, tmp_path / "scene.hyrf", work=work)
+    assert result.kept == kept and (work / name).read_bytes() == whole
+
+
+def test_poses_whose_photos_are_gone_are_estimated_again(photos, poses, tmp_path):
+    work = make(photos, tmp_path / "scene.hyrf", quality="draft").work
+    (work / "scene" / "images" / "0004.png").unlink()
+    said: list[str] = []
+    result = make(photos, tmp_path / "other.hyrf", work=work, quality="draft", say=said.append)
+    assert len(poses) == 2 and result.kept == tuple(STAGES[:-1]) and "poses: made anew, for its files changed" in said
+
+
+def test_made_again_it_is_all_there_and_made_otherwise_it_is_not_replaced_unasked(made, posed, tmp_path):
+    work, output = copy_of(made, tmp_path), tmp_path / "scene.html"
+    make(posed, output, work=work)
+    before = output.read_bytes()
+    assert len(make(posed, output, work=work).kept) == 4
+    with pytest.raises(HyrfError, match="other photos or with other settings.*--overwrite"):
+        make(posed, output, work=work, target_bytes=1_000_000)
+    assert output.read_bytes() == before
+    make(posed, output, work=work, seed=3, overwrite=True)
+    assert output.read_bytes() != before
+
+
+# -- what is refused -------------------------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_is_refused_before_any_work(posed, photos, made, tmp_path, monkeypatch):
+    monkeypatch.setattr("hyrfpack.make.stages.train", None)
+    (tmp_path / "there.html").write_bytes(b"mine")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "letter.txt").write_bytes(b"mine")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "videos").mkdir()
+    (tmp_path / "videos" / "clip.mp4").write_bytes(b"mine")
+    out = tmp_path / "scene.html"
+    for sentence, *arguments in (
+        ("no such file or folder", tmp_path / "nothing", "-o", out),
+        ("the ending names the format", posed, "-o", tmp_path / "scene.xyz"),
+        ("there is a file of this name", posed, "-o", tmp_path / "there.html"),
+        ("is a file, not a folder", posed, "-o", tmp_path / "there.html" / "scene.html"),
+        ("reads what lies in this folder", photos, "-o", photos / "scene.html"),
+        ("the work folder would lie among the photos", photos, "-o", photos / "made" / "scene.html"),
+        ("lie in each other", posed, "-o", tmp_path / "work" / "a.html", "--work", tmp_path / "work"),
+        ("holds something else", posed, "-o", out, "--work", tmp_path / "full"),
+        ("the folder is empty", tmp_path / "empty", "-o", out),
+        ("but clip.mp4; name the video", tmp_path / "videos", "-o", out),
+        ("is a .hyrf file already", made / "model.hyrf", "-o", tmp_path / "a.hyrf"),
+        ("with photos only", made / "model.hyrf", "-o", out, "--minutes", 3),
+        ("give one of them", posed, "-o", out, "--minutes", 3, "--quality", "draft"),
+        ("'cuda:9' is not there", posed, "-o", out, "--device", "cuda:9"),
+    ):
+        assert sentence in refused("make", *arguments)
+    assert not out.exists() and not (tmp_path / "scene.work").exists()
+    assert (tmp_path / "there.html").read_bytes() == b"mine"
+
+
+def test_a_stage_that_fails_names_its_folder_and_keeps_what_is_finished(posed, tmp_path, monkeypatch):
+    def full(*arguments, **options):
+        raise HyrfError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("hyrfpack.make.stages.compress", full)
+        sentence = refused("make", posed, "-o", tmp_path / "scene.html", "--quality", "draft")
+    assert "compression failed: the disk is full; what is finished is kept in" in sentence
+    assert make(posed, tmp_path / "scene.html", quality="draft").kept == ("training",)
+
+
+@pytest.mark.parametrize(
+    "record, reason",
+    [
+        ("", "it is damaged"),
+        ("{", "it is damaged"),
+        ("[]", "it is damaged"),
+        ('{"version": 1, "stages": {"training": 5}}', "it is damaged"),
+        ('{"version": 1, "stages": {"training": {"inputs": {}, "seconds": "1"}}}', "it is damaged"),
+        ('{"version": 1, "stages": {"training": {"inputs": {}, "seconds": 1.0, "files": []}}}', "it is damaged"),
+        ('{"version": 0, "stages": {}}', "another version"),
+    ],
+)
+def test_a_record_that_is_damaged_is_refused(record, reason, posed, tmp_path):
+    (tmp_path / "work").mkdir()
+    (tmp_path / "work" / "make.json").write_text(record)
+    with pytest.raises(HyrfError, match=f"cannot be read .*{reason}.*--work"):
+        make(posed, tmp_path / "scene.hyrf", work=tmp_path / "work")
+
+
+def test_two_calls_in_one_work_folder_are_kept_apart(made, posed, tmp_path):
+    pytest.importorskip("fcntl", reason="locks are of Unix")
+    work = copy_of(made, tmp_path)
+    with held(work), pytest.raises(HyrfError, match="another 'make' is at work.*--work"):
+        make(posed, tmp_path / "scene.hyrf", work=work)
+    assert len(make(posed, tmp_path / "scene.hyrf", work=work).kept) == 4
+
+
+def test_an_output_without_a_name_of_its_own_is_refused_or_the_present_folder(made, tmp_path, monkeypatch):
+    assert "the top of all folders" in refused("make", made / "model.hyrf", "-o", "/")
+    (tmp_path / "player").mkdir()
+    monkeypatch.chdir(tmp_path / "player")
+    succeeded("make", made / "model.hyrf", "-o", ".")
+    assert (tmp_path / "player" / "index.html").is_file() and (tmp_path / "player.work" / "make.json").is_file()
+
+
+# -- the command -----------------------------------------------------------------------------------------------------
+
+
+def test_the_command_tells_what_was_made(photos, poses, tmp_path):
+    result = succeeded("make", photos, "-o", tmp_path / "scene.html", "--quality", "draft")
+    for part in (
+        "poses: 18 of 19 photos, 17 of them sure\n",
+        "left out: dark.jpg, blurred",
+        "times: poses 0 s, training",
+        "3 photos held out: PSNR ",
+        "scene.html: ",
+        "open it in a browser",
+    ):
+        assert part in result.stdout
+    numbers = json.loads(
+        succeeded("make", photos, "-o", tmp_path / "scene.html", "--quality", "draft", "--json").stdout
+    )
+    assert numbers["kept"] == ["poses", *STAGES] and numbers["views"] == 3 and numbers["poses"]["sure"] == 17
+
+
+def test_the_command_says_where_it_was_stopped(posed, tmp_path, monkeypatch):
+    def stop(*arguments, **options):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("hyrfpack.make.stages.evaluate", stop)
+        result = hyrfpack("make", posed, "-o", tmp_path / "scene.html", "--quality", "draft")
+    assert result.exit_code == 1 and result.stdout == ""
+    assert result.stderr.splitlines()[-1] == "stopped in scoring; the same command goes on"
+
+
+# -- train --poses ---------------------------------------------------------------------------------------------------
+
+
+def test_training_on_photos_without_poses_names_the_command(photos, tmp_path):
+    sentence = refused("train", photos, "-o", tmp_path / "run")
+    assert f"{photos}: no poses found for the 18 photos; 'hyrfpack poses {photos} -o SCENE' estimates them" in sentence
+    (tmp_path / "clip.mp4").write_bytes(b"frames")
+    assert "'hyrfpack poses" in refused("train", tmp_path / "clip.mp4", "-o", tmp_path / "run")
+
+
+def test_training_estimates_poses_where_asked_and_once(photos, poses, tmp_path):
+    arguments = ("train", photos, "-o", tmp_path / "run", "--poses", "--steps", 3, "--max-gaussians", 50)
+    succeeded(*arguments)
+    assert (tmp_path / "run" / "model.hyrf").is_file() and (tmp_path / "run" / "scene" / "sparse").is_dir()
+    assert "model.hyrf and 1 more of the files to be written are there" in refused(*arguments)
+    (tmp_path / "run" / "model.hyrf").unlink()
+    (tmp_path / "run" / "metrics.json").unlink()
+    shutil.rmtree(tmp_path / "run" / "views")
+    (tmp_path / "run" / "curve.png").unlink()
+    assert "poses are taken from" in succeeded(*arguments).stderr
+    assert len(poses) == 1
+    succeeded(*arguments, "--overwrite")
+    assert len(poses) == 2
+
+
+def test_a_run_among_photos_without_poses_is_refused(photos, poses, tmp_path):
+    assert "among the photos" in refused("train", photos, "-o", photos / "run", "--poses")
+    assert not poses

@@ -1,0 +1,87 @@
+"""Steps that fit a time follow from what was measured."""
+
+from __future__ import annotations
+
+from time import monotonic
+
+import pytest
+import torch
+
+from hyrfpack.data import PictureCache, load_scene
+from hyrfpack.make import make, minutes
+from hyrfpack.make.minutes import Cost, measure
+from hyrfpack.make.progress import Reporter
+from hyrfpack.make.source import Reading
+from hyrfpack.train.config import FULL_STEPS
+
+COST = Cost(step=0.1, step_per_gaussian=1e-6, decoding=0.01, cpu_pass=0.05, gaussians=5_000)
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def scene(posed):
+    return load_scene(posed)
+
+
+@pytest.mark.parametrize("seconds", [60.0, 300.0, 1500.0])
+def test_the_most_steps_that_fit_are_taken(seconds, scene):
+    steps = COST.steps_within(scene, seconds)
+    assert 1 < steps < FULL_STEPS
+    assert COST.total(scene, steps) <= seconds < COST.total(scene, steps + 1)
+
+
+def test_steps_end_at_a_full_run(scene):
+    assert COST.steps_within(scene, 1e9) == FULL_STEPS
+    assert COST.steps_within(scene, 0.0) == 1
+
+
+def test_more_pixels_take_as_much_longer(scene):
+    four = COST.scaled(4.0)
+    assert four.training(scene, 1000) - COST.training(scene, 1000) == pytest.approx(
+        3 * (COST.training(scene, 1000) - COST.decoding * len(scene.train))
+    )
+
+
+def test_a_line_goes_through_what_is_on_a_line_and_never_falls():
+    counts = list(range(100, 1000, 20))
+    assert minutes._line_through(counts, [0.5 + 1e-3 * n for n in counts]) == pytest.approx((0.5, 1e-3))
+    assert minutes._line_through(counts, [2 - 1e-3 * n for n in counts]) == (pytest.approx(1.16), 0.0)
+    assert minutes._line_through([7] * 9, [0.1] * 9) == (pytest.approx(0.1), 0.0)
+
+
+def test_a_measurement_gives_a_cost_of_this_scene(scene):
+    cost = minutes.pilot(scene, CPU, 0, PictureCache(), 5.0)
+    assert cost.step >= 0 and cost.step_per_gaussian >= 0 and cost.step + cost.step_per_gaussian > 0
+    assert cost.cpu_pass > 0 and cost.decoding >= 0 and cost.gaussians > 0
+
+
+def test_large_photos_are_made_smaller_where_the_time_is_short(posed, scene, monkeypatch):
+    def cost(scene, *_):
+        return Cost(1e-3 * scene.train[0].camera.width ** 2, 0.0, 0.0, 0.0, 100)
+
+    monkeypatch.setattr(minutes, "pilot", cost)
+    monkeypatch.setattr(minutes, "SIZES", (24, 16, 8))
+    said: list[str] = []
+    plans = [
+        measure(
+            posed, Reading(), scene, CPU, monotonic() + s, 0, PictureCache(), Reporter(["training"], None), said.append
+        )
+        for s in (3000.0, 300.0, 100.0)
+    ]
+    assert [plan.max_size for plan in plans] == [1600, 16, 8]
+    assert plans[0].steps > 1000 and "pixels" in said[0]
+
+
+def test_a_time_that_is_over_or_too_short_makes_a_draft_and_says_so(posed, scene):
+    said: list[str] = []
+    for seconds in (-1.0, 0.5):
+        arguments = (posed, Reading(), scene, CPU, monotonic() + seconds, 0, PictureCache())
+        assert measure(*arguments, Reporter(["training"], None), said.append).steps == 6
+    assert "the time is over" in said[0] and "the time is short" in said[1]
+
+
+def test_what_was_decided_is_kept(posed, tmp_path, monkeypatch):
+    first = make(posed, tmp_path / "scene.hyrf", minutes=0.01)
+    assert list(first.seconds)[0] == "measurement"
+    monkeypatch.setattr(minutes, "pilot", None)
+    assert "measurement" in make(posed, tmp_path / "scene.ply", minutes=0.01).kept
