@@ -17,7 +17,7 @@ from hyrfpack.poses.compare import Poses
 from hyrfpack.poses.database import opened, verified_pairs
 from hyrfpack.poses.evidence import Matches, evidence
 from hyrfpack.poses.job import Job
-from hyrfpack.poses.mapping import SMALLEST, THREADS, go_on, read_pieces
+from hyrfpack.poses.mapping import SMALLEST, THREADS, add_points, go_on, read_pieces
 from hyrfpack.poses.process import Tell
 
 _BENT = 0.99  # times the reprojection error with one coefficient of distortion: what four must do better than
@@ -54,7 +54,7 @@ def finish(job: Job, models: list[str], tell: Tell) -> dict[str, Any]:
     other = next((candidate for candidate in best.values() if candidate is not chosen), None)
     model, poses, explained = found[chosen], chosen.poses, chosen.explained
     tell("completing the better one", 0.2)
-    for refine, least in ((partial(go_on, job), 1.0), (_with_fitting_lens, _AS_GOOD)):
+    for refine, least in ((partial(go_on, job), 1.0), (partial(add_points, job), 1.0), (_with_fitting_lens, _AS_GOOD)):
         refined = refine(model)
         its_poses = _poses(job, refined)
         its_explained = evidence(its_poses, _matches(job, refined))

@@ -96,6 +96,18 @@ def go_on(job: Job, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     return max(pieces.values(), key=lambda piece: piece.num_reg_images(), default=model)
 
 
+def add_points(job: Job, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """A copy with the points, too, that only two photos see: training starts from twice as many."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed, options.num_threads = job.seed % 2**31, THREADS
+    options.min_num_matches = FOUND
+    options.triangulation.ignore_two_view_tracks = False
+    options.extract_colors = False
+    return pycolmap.triangulate_points(
+        pycolmap.Reconstruction(model), job.database, job.images, _scratch(job), clear_points=False, options=options
+    )
+
+
 def read_pieces(folder: Path) -> list[pycolmap.Reconstruction]:
     """The pieces that a mapper left, the one with the most photos first; none where the mapper was not run."""
     if not folder.is_dir():

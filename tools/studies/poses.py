@@ -1,7 +1,7 @@
 """Finds the poses of sets whose poses are known, and prints one table: how many are right, and by which mapper.
 
     python -m tools.studies.poses                                   every COLMAP set below ../shared/data
-    python -m tools.studies.poses --sets ngp_fox llff_fern --out /tmp/poses
+    python -m tools.studies.poses --sets ngp_fox llff_fern --out runs/fox
 
 Only the photos are given to the estimation. A photo is right if, after a robust similarity, it is within 2 % of the
 extent of the set's own cameras and 5 degrees of its own pose there. The scenes stay in --out, to be trained on.
@@ -20,16 +20,21 @@ import pycolmap
 
 import hyrfpack
 from hyrfpack.poses.compare import Poses, compare
+from hyrfpack.poses.job import Job
 from hyrfpack.poses.mapping import read_pieces
 from tools.tables import markdown
 
 DATA = Path(os.environ.get("HYRFPACK_DATA") or Path(__file__).parents[3] / "shared" / "data")
 
 
-def read_poses(model: pycolmap.Reconstruction) -> Poses:
-    """(3, 4) camera_from_world by the photo's name, its ending left out."""
+def read_poses(model: pycolmap.Reconstruction, job: Job | None = None) -> Poses:
+    """(3, 4) camera_from_world by the photo's name, its ending left out; of a mapper's own model, as `job` names it."""
     posed = (image for image in model.images.values() if image.has_pose)
-    return {image.name.partition(".")[0]: np.asarray(image.cam_from_world().matrix()) for image in posed}
+    poses = {}
+    for image in posed:
+        name = image.name if job is None else job.names[image.image_id - 1]
+        poses[name.rpartition(".")[0]] = np.asarray(image.cam_from_world().matrix())
+    return poses
 
 
 def measure(folder: Path, out: Path, seed: int) -> dict:
@@ -41,10 +46,11 @@ def measure(folder: Path, out: Path, seed: int) -> dict:
     def look_first(path: Path, **options: bool) -> None:
         """What the mappers made is gone with the products in progress."""
         if Path(path) == out / ".poses" and (out / "poses.json").exists():
+            job = Job.load(out / ".poses" / "job.json")
             for mapper in ("global", "incremental"):
                 runs = []
                 for model in sorted(Path(path).glob(f"{mapper}*/")):
-                    pieces = [read_poses(piece) for piece in read_pieces(model)]
+                    pieces = [read_poses(piece, job) for piece in read_pieces(model)]
                     right = [f"{len(compare(piece, known).same)} of {len(piece)}" for piece in pieces if len(piece) > 2]
                     runs.append(" + ".join(right) or "none")
                 alone[mapper] = "; ".join(runs)
