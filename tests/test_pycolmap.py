@@ -30,16 +30,14 @@ CALLS = {
     "load_scene": "import zlib\nassert zlib.decompress(zlib.compress(bytes(10**6))) == bytes(10**6)",
     "train": "assert hyrfpack.train(scene, 'run', hyrfpack.TrainConfig(steps=3), quiet=True).complete",
     "compress": "hyrfpack.compress('model.hyrf', 'a.hyrf', data=scene)",
-    "save": "hyrfpack.save(hyrfpack.load('model.hyrf'), 'a.hyrf', provenance=hyrfpack.describe('model.hyrf'))",
-    "evaluate": "hyrfpack.evaluate(hyrfpack.load('model.hyrf'), scene.test, pictures='views')",
-    "render": "from hyrfpack.render.files import save_picture, to_image\nimport torch\nwith torch.no_grad():\n"
+    "evaluate, render, save": "hyrfpack.evaluate(hyrfpack.load('model.hyrf'), scene.test, pictures='views')\n"
+    "from hyrfpack.render.files import save_picture, to_image\nimport torch\nwith torch.no_grad():\n"
     "    picture = hyrfpack.render(hyrfpack.load('model.hyrf'), scene.test[0].camera).rgb\n"
-    "save_picture('a.png', to_image(picture))",
-    "export .spz": "hyrfpack.export('model.hyrf', 'a.spz', data=scene)",
-    "export .ply": "hyrfpack.export('model.hyrf', 'a.ply', data=scene)",
-    "export .sog": "hyrfpack.export('model.hyrf', 'a.sog', data=scene)",
-    "export .html": "hyrfpack.export('model.hyrf', 'a.html', data=scene)",
-    "export COLMAP": "hyrfpack.export('model.hyrf', 'colmap', data=scene, colmap=True)",
+    "save_picture('a.png', to_image(picture))\n"
+    "hyrfpack.save(hyrfpack.load('model.hyrf'), 'a.hyrf', provenance=hyrfpack.describe('model.hyrf'))",
+    "export": "for name in ('a.spz', 'a.ply', 'a.sog', 'a.html'):\n"
+    "    hyrfpack.export('model.hyrf', name, data=scene)\n"
+    "hyrfpack.export('model.hyrf', 'colmap', data=scene, colmap=True)",
     "bench": "hyrfpack.bench('model.hyrf', scene, repeats=1, only=['codec'])",
     "distill": "hyrfpack.export('model.hyrf', 'a.ply', data=scene, background=False)\n"
     "hyrfpack.distill('a.ply', 'a.hyrf', hyrfpack.DistillConfig(1, 10, 16, 4, 2))",

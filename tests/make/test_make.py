@@ -18,7 +18,7 @@ from hyrfpack.make import make
 from hyrfpack.make.work import held
 from hyrfpack.splats.formats import ply
 
-ENDINGS = (".hyrf", ".html", ".ply", ".splat", ".spz", ".glb", ".usdz", ".sog", ".points.ply", ".json", "")
+ENDINGS = (".hyrf", ".html", ".spz", ".points.ply", "")  # of each kind one: tests/export has the others
 STAGES = ["training", "compression", "scoring", "export"]
 
 
