@@ -36,6 +36,8 @@ if _TOO_LATE:
 if TYPE_CHECKING:
     from hyrfpack.bench import BenchReport as BenchReport
     from hyrfpack.bench import bench as bench
+    from hyrfpack.compare import ComparisonReport as ComparisonReport
+    from hyrfpack.compare import compare as compare
     from hyrfpack.compress import compress as compress
     from hyrfpack.data import load_scene as load_scene
     from hyrfpack.distill import DistillConfig as DistillConfig
@@ -99,6 +101,7 @@ _PUBLIC = {
     "Evaluation": "hyrfpack.evaluate",
     "DistillConfig": "hyrfpack.distill",
     "DistillReport": "hyrfpack.distill",
+    "ComparisonReport": "hyrfpack.compare",
     "ExportReport": "hyrfpack.export",
     "MakeResult": "hyrfpack.make",
     "PhotoSurvey": "hyrfpack.make",
@@ -109,7 +112,7 @@ _PUBLIC = {
     "save": "hyrfpack.format",
 }
 # Functions that a sub-package has the name of: `hyrfpack.render` is `hyrfpack.render.render`.
-_NAMESAKES = ("bench", "compress", "distill", "evaluate", "export", "make", "render", "train")
+_NAMESAKES = ("bench", "compare", "compress", "distill", "evaluate", "export", "make", "render", "train")
 
 __all__ = ["__version__", *_NAMESAKES, *_PUBLIC]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import doctest
 import importlib
 import inspect
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -49,6 +50,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, data: Path) -> Path:
     write_photos(root / "photos" / "corner")
     scene = hyrfpack.load_scene(data)
     hyrfpack.train(scene, root / "runs" / "bonsai", hyrfpack.TrainConfig(steps=20, max_gaussians=300), quiet=True)
+    shutil.copytree(root / "runs" / "bonsai", root / "runs" / "again")
     hyrfpack.compress(root / "runs" / "bonsai" / "model.hyrf", root / "bonsai.hyrf")
     hyrfpack.export(root / "bonsai.hyrf", root / "bonsai.ply", degree=0, background=False)
     return root

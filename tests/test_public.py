@@ -24,6 +24,7 @@ FUNCTIONS = [name for name in hyrfpack.__all__ if inspect.isfunction(getattr(hyr
 # Calls that are refused at once, by the function itself.
 REFUSED = {
     "bench": ("missing.hyrf",),
+    "compare": (["missing", "other"], "out.html"),
     "compress": ("missing.hyrf", "out.hyrf"),
     "describe": ("missing.hyrf",),
     "describe_photos": ("missing",),

@@ -15,6 +15,7 @@ import click
 
 import hyrfpack
 from hyrfpack.cli.bench import bench
+from hyrfpack.cli.compare import compare
 from hyrfpack.cli.demo import demo
 from hyrfpack.cli.export import export
 from hyrfpack.cli.files import compress, decompress, info
@@ -88,7 +89,9 @@ def main() -> None:
     """
 
 
-_COMMANDS = (make, poses, train, compress, decompress, render, evaluate, export, view, import_, bench, info, demo)
+_COMMANDS = (
+    *(make, poses, train, compare, compress, decompress, render, evaluate, export, view, import_, bench, info, demo),
+)
 for _command in _COMMANDS:
     main.add_command(_command)
     add_manners(_command)

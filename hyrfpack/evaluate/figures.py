@@ -46,10 +46,9 @@ def comparison(photo: Tensor, render: Tensor, mask: Tensor | None = None, captio
         error = np.where(counted, error, 0)
     height, width = error.shape
     size = _panel_size(width, height)
-    panels = [_panel(pixels, size) for pixels in (seen, render.cpu().numpy(), _error_colors(error))]
+    panels = [_panel(pixels, size) for pixels in (seen, render.cpu().numpy(), error_colors(error))]
 
-    text = _font(size[0])
-    line = round(1.6 * text.size)
+    text, line = _font(size[0]), _line(size[0])
     sheet = Image.new("RGB", (3 * size[0] + 2 * GAP, size[1] + 2 * line + GAP), PAPER)
     draw = ImageDraw.Draw(sheet)
     draw.text((GAP, line / 2), caption, INK, text, anchor="lm")
@@ -59,6 +58,25 @@ def comparison(photo: Tensor, render: Tensor, mask: Tensor | None = None, captio
         draw.text((left + size[0] / 2, line + size[1] + line / 2), label, FAINT, text, anchor="mm")
     _color_bar(sheet, draw, text, (2 * (size[0] + GAP), line + size[1], size[0], line))
     return sheet
+
+
+def cut_comparison(sheet: Image.Image) -> list[Image.Image]:
+    """The photo, the render and the error map out of what `comparison` made, without the words around them.
+
+    Raises:
+        ValueError: the picture is not laid out so.
+    """
+    width, rest = divmod(sheet.width - 2 * GAP, 3)
+    top = _line(width) if width > 0 else 0
+    height = sheet.height - 2 * top - GAP
+    if rest or width < 1 or height < 1:
+        raise ValueError("it has not the size of photo, render and error map beside each other")
+    sheet = sheet.convert("RGB")
+    lefts = [column * (width + GAP) for column in range(3)]
+    gaps = [sheet.crop((left - GAP, top, left, top + height)) for left in lefts[1:]]
+    if any(gap.getcolors(1) != [(GAP * height, PAPER)] for gap in gaps):
+        raise ValueError("there are no gaps where photo, render and error map would meet")
+    return [sheet.crop((left, top, left + width, top + height)) for left in lefts]
 
 
 def contact_sheet(rows: Sequence[Image.Image], title: str, lines: Sequence[str]) -> Image.Image:
@@ -104,7 +122,7 @@ def training_curve(records: Sequence[dict], path: str | os.PathLike[str]) -> Non
         values = [record[key] for record in records]
         if key != "gaussians":
             axis.plot(steps, values, color=color, linewidth=0.8, alpha=0.35)
-            values = _running_mean(values)
+            values = running_mean(values)
         axis.plot(steps, values, color=color, linewidth=1.5)
         axis.set_ylabel(label)
         axis.grid(alpha=0.3)
@@ -150,6 +168,17 @@ def save_figure(path: str | os.PathLike[str], figure: Figure, **options: Any) ->
     write_atomic(path, data.getbuffer())
 
 
+def svg_of(figure: Figure) -> str:
+    """A figure as SVG, letters as outlines; the same figure gives the same text."""
+    with _drawing():
+        from matplotlib import rc_context
+
+    data = io.StringIO()
+    with rc_context({"svg.hashsalt": "hyrfpack"}):  # of the names in it
+        figure.savefig(data, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
+    return data.getvalue()
+
+
 def _panel_size(width: int, height: int) -> tuple[int, int]:
     if width > PANEL_WIDTH:
         return PANEL_WIDTH, max(1, round(height * PANEL_WIDTH / width))
@@ -162,13 +191,13 @@ def _panel(pixels: np.ndarray, size: tuple[int, int]) -> Image.Image:
     return image if image.size == size else image.resize(size, Image.Resampling.BOX)
 
 
-def _running_mean(values: Sequence[float]) -> list[float]:
-    """Means over windows that shrink towards the ends."""
+def running_mean(values: Sequence[float]) -> list[float]:
+    """Means over SMOOTHING values on either side and the value itself; the windows shrink towards the ends."""
     reach = [min(SMOOTHING, place, len(values) - 1 - place) for place in range(len(values))]
     return [fmean(values[place - near : place + near + 1]) for place, near in enumerate(reach)]
 
 
-def _error_colors(error: np.ndarray) -> np.ndarray:
+def error_colors(error: np.ndarray) -> np.ndarray:
     """(H, W) errors to (H, W, 3) colours, black at 0 and bright from ERROR_LIMIT on."""
     with _drawing():
         from matplotlib import colormaps
@@ -185,9 +214,14 @@ def _color_bar(
     middle = top + height // 2
     start = left + (width - length) // 2
     ramp = np.broadcast_to(np.linspace(0, ERROR_LIMIT, length), (thickness, length))
-    sheet.paste(_panel(_error_colors(ramp), (length, thickness)), (start, middle - thickness // 2))
+    sheet.paste(_panel(error_colors(ramp), (length, thickness)), (start, middle - thickness // 2))
     draw.text((start - GAP, middle), "error 0", FAINT, text, anchor="rm")
     draw.text((start + length + GAP, middle), f"{ERROR_LIMIT:g}+", FAINT, text, anchor="lm")
+
+
+def _line(width: int) -> int:
+    """Height of a line of words above or below a picture of that width."""
+    return round(1.6 * _font(width).size)
 
 
 def _font(width: int, fraction: float = 0.036, fixed: bool = False) -> ImageFont.FreeTypeFont:

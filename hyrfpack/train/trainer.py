@@ -120,6 +120,7 @@ class Trainer:
                     view, picture = next(views)
                 loss, mse = self._train_step(view, picture)
                 self.elapsed += time.perf_counter() - start
+                self._record(loss, mse)
                 report(self, loss, mse)
                 complete = self.step == self.config.steps
                 stopped = stop() and not complete
@@ -173,11 +174,14 @@ class Trainer:
             self._refuse(view, "a gradient is not finite", self.optimizer.names(flags))
         with self._timed("density"):
             self.density.act(self.step, self.model, self.optimizer)
-        if np.isnan(mse):
-            return value, mse
-        if self.step % max(1, config.steps // RECORDS) == 0 or self.step == config.steps:
-            self.records.append({"step": self.step, "loss": value, "psnr": decibels(mse), "gaussians": len(self.model)})
         return value, mse
+
+    def _record(self, loss: float, mse: float) -> None:
+        """Keep what the step came to for the curve, unless all of its photo is masked."""
+        steps = self.config.steps
+        if not np.isnan(mse) and (self.step % max(1, steps // RECORDS) == 0 or self.step == steps):
+            record = {"step": self.step, "loss": loss, "psnr": decibels(mse), "gaussians": len(self.model)}
+            self.records.append({**record, "seconds": round(self.elapsed, 3)})
 
     def _solid(self) -> np.ndarray | None:
         """The colour behind this step's picture, None when the model has a background of its own."""

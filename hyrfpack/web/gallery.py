@@ -54,7 +54,7 @@ def encode_gallery(title: str, cards: Sequence[Card], player: str) -> bytes:
         "style": style,
         "cards": "\n".join(_card(card, player) for card in cards),
     }
-    return fill("hosted/gallery.html", values)
+    return fill(part("hosted/gallery.html"), values).encode()
 
 
 def _card(card: Card, player: str) -> str:

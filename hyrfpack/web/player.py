@@ -88,7 +88,7 @@ def player_page(
         "script": script,
         "payload": "\n".join(f'<script type="text/plain" class="payload">{block}</script>' for block in blocks),
     }
-    return fill("viewer/page.html", values)
+    return fill(part("viewer/page.html"), values).encode()
 
 
 def content_policy(style: str, scripts: Sequence[str] = (), fetches: str = "") -> str:
@@ -135,12 +135,12 @@ def encode_readme(title: str, entry: str, index: str, *, element: str | None = N
     """
     line = f'  <script src="hyrf-viewer.js"></script> <hyrf-viewer src="{element}"></hyrf-viewer>\n' if element else ""
     values = {"title": title, "version": hyrfpack.__version__, "entry": entry, "index": index, "element": line}
-    return fill("hosted/README.txt", values)
+    return fill(part("hosted/README.txt"), values).encode()
 
 
-def fill(template: str, values: dict[str, str]) -> bytes:
-    """A file below `hyrfpack/web` with each {{name}} in it replaced, UTF-8."""
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], part(template)).encode()
+def fill(template: str, values: dict[str, str]) -> str:
+    """A text with each {{name}} in it replaced."""
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], template)
 
 
 @cache

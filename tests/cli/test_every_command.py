@@ -128,9 +128,11 @@ def _cases() -> list[Case]:
     cases += _inputs("import ball.ply --cameras poses.hyrf -o {}", "poses.hyrf")
     cases += _inputs("import loose -o {}", "loose", "loose/meta.json", "loose/means_l.webp")
     cases += _inputs("import loose/meta.json -o {}", "loose", "loose/meta.json", "loose/means_l.webp")
+    cases += _inputs("compare first second -o {}", "first", "first/metrics.json", "second/model.hyrf", "{world}/first")
     # Files of others, which only --overwrite replaces, and sets of photos that the command does not read.
     cases += [
         Case("train hall -o {} --steps 2 --max-gaussians 50", "run", REFUSED, REPLACED),
+        Case("compare first second -o {}", "old/a.html", REFUSED, REPLACED),
         Case("compress packed.hyrf -o {} --profile paper", "old/a.hyrf", REFUSED, REPLACED),
         Case("compress packed.hyrf -o {} --profile paper", "soft-to-old.hyrf", REFUSED, REPLACED),
         Case("compress model.hyrf -o old/new.hyrf --profile paper --report {}", "old/report", REFUSED, REPLACED),
@@ -163,6 +165,7 @@ def _cases() -> list[Case]:
         Case("export model.hyrf --colmap -o {}", "hall", REFUSED, REPLACED),
         Case("export model.hyrf -o {}", "hall", REFUSED, WRITTEN),
         Case("export model.hyrf packed.hyrf -o {}", "hall", REFUSED, WRITTEN),
+        Case("compare first second -o {}", "hall/new.html", REFUSED, WRITTEN),
         Case("compress packed.hyrf -o {} --profile paper", "hall/small.hyrf", REFUSED, WRITTEN),
         Case("decompress packed.hyrf -o {}", "nerfstudio/images/back.hyrf", REFUSED, WRITTEN),
         Case("export model.hyrf --sh-degree 0 -o {}", "blender/train/a.ply", REFUSED, WRITTEN),
@@ -172,6 +175,7 @@ def _cases() -> list[Case]:
     cases += [
         Case("train hall -o {} --steps 2 --max-gaussians 50", "hall/run", WRITTEN, WRITTEN),
         Case("render model.hyrf --data hall -o {}", "hall/renders", WRITTEN, WRITTEN),
+        Case("compare first second -o {}", "first/comparison.html", WRITTEN, WRITTEN),
         Case("decompress packed.hyrf -o {}", "back.hyrf", WRITTEN, WRITTEN),
         Case("bench model.hyrf --data hall -o {}", "new.png", WRITTEN, WRITTEN),
         Case("demo --steps 1 -o {}", "demo", WRITTEN, WRITTEN),
@@ -212,8 +216,9 @@ def make_world(folder: Path) -> Path:
     _make_blender(folder / "blender", photos, poses["frames"])
 
     _ok("train", nerfstudio, "-o", folder / "trained", "--steps", 3, "--max-gaussians", 40)
-    (folder / "trained" / "model.hyrf").rename(folder / "model.hyrf")
-    shutil.rmtree(folder / "trained")
+    shutil.copy(folder / "trained" / "model.hyrf", folder / "model.hyrf")
+    (folder / "trained").rename(folder / "first")
+    shutil.copytree(folder / "first", folder / "second")
     _ok("compress", folder / "model.hyrf", "-o", folder / "packed.hyrf", "--profile", "paper")
     shutil.copy(folder / "model.hyrf", folder / "named.json")
     (folder / "cameras.json").write_text(cameras_to_json(named))
@@ -329,7 +334,7 @@ def _replace_work(patch: pytest.MonkeyPatch) -> None:
 
 def _forbid_work(patch: pytest.MonkeyPatch) -> None:
     """Whatever is drawn, to learn, measure, bake or score, is an error: refusals come before."""
-    for name in ("bench", "compress", "demo", "distill", "evaluate", "export", "render", "train"):
+    for name in ("bench", "compare", "compress", "demo", "distill", "evaluate", "export", "render", "train"):
         import_module(f"hyrfpack.{name}")
     rasterize = import_module("hyrfpack.ops.rasterize").rasterize
 

@@ -281,4 +281,5 @@ def test_kills_at_random_moments_leave_a_checkpoint_that_resumes_to_the_same_mod
     resumed.run()
 
     assert bytes_of(resumed.model) == bytes_of(whole.model)
-    assert resumed.records == whole.records
+    curves = [[(r["step"], r["loss"], r["gaussians"]) for r in run.records] for run in (resumed, whole)]
+    assert curves[0] == curves[1]

@@ -23,7 +23,7 @@ FLAGS = (
     "--remote-debugging-pipe"
 ).split()
 # What the browser itself does with keys hangs on these.
-NUMBERS = {"Tab": 9, "Enter": 13, "Escape": 27}
+NUMBERS = {"Tab": 9, "Enter": 13, "Escape": 27, "End": 35}
 SHIFT = 8
 TEXTS = {"Enter": {"text": "\r"}}
 SECONDS = 30.0  # that an answer may take

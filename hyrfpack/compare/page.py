@@ -1,0 +1,173 @@
+"""The page itself: one HTML file that holds everything, in which nothing out of files is taken for HTML."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Callable, Sequence
+from importlib.resources import files
+
+import numpy as np
+
+import hyrfpack
+from hyrfpack.compare.curves import draw_curves, keeps_times, line_style
+from hyrfpack.compare.differences import choices_that_differ, notes_that_differ, settings_that_differ
+from hyrfpack.compare.run import Run
+from hyrfpack.compare.views import ComparedView, data_address
+from hyrfpack.errors import printable
+from hyrfpack.evaluate.figures import ERROR_LIMIT, SMOOTHING, error_colors
+from hyrfpack.web.player import content_policy, fill, json_text
+
+INKS = {"light": "#5a6068", "dark": "#a6acb3"}  # of the figure, as --dim in the style
+
+
+def encode_comparison(
+    runs: Sequence[Run], names: Sequence[str], views: Sequence[ComparedView], doubts: Sequence[str]
+) -> bytes:
+    """A page that shows runs side by side.
+
+    Args:
+        runs: two or more.
+        names: what to call them.
+        views: held-out views to look at.
+        doubts: sentences on why the runs cannot be compared by all their numbers.
+
+    Returns:
+        The file, UTF-8. The same arguments give the same bytes.
+    """
+    style, script = _part("style.css"), _part("script.js")
+    values = {
+        "policy": content_policy(style, [script]),
+        "version": hyrfpack.__version__,
+        "title": _escaped(f"{len(runs)} training runs: {', '.join(names)}"),
+        "style": style,
+        "doubts": "\n".join(f'<p class="doubt">{_escaped(sentence)}</p>' for sentence in doubts),
+        "tables": "\n".join(_tables(runs, names, ranked=not doubts)),
+        "legend": _legend(names),
+        "curves": _curves(runs, names),
+        "told": _escaped(_about_curves(runs, names)),
+        "views": _part("views.html") if views else "",
+        "texts": json_text("compared", _compared(runs, names, views)) if views else "",
+        "script": script,
+    }
+    return fill(_part("page.html"), values).encode()
+
+
+def _tables(runs: Sequence[Run], names: Sequence[str], ranked: bool) -> list[str]:
+    """Numbers, and what differs; with `ranked`, the best scores stand out."""
+    numbers = [
+        *_scores("held-out PSNR (dB)", [run.psnr for run in runs], 2, max if ranked else None),
+        *_scores("held-out SSIM", [run.ssim for run in runs], 4, max if ranked else None),
+        *_scores("held-out LPIPS", [run.lpips for run in runs], 4, min if ranked else None),
+        _row("Gaussians", [f"{run.gaussians:,}" for run in runs]),
+    ]
+    for file in dict.fromkeys(file for run in runs for file in run.files):
+        sizes = [f"{run.files[file]:,}" if file in run.files else "-" for run in runs]
+        numbers.append(_row(f"bytes of {file}", sizes))
+    numbers += [
+        _row("seconds of training", [f"{run.seconds:,.1f}" for run in runs]),
+        _row("steps", [f"{run.settings['steps']:,}" for run in runs]),
+        _row("seed", [str(run.settings["seed"]) for run in runs]),
+    ]
+    notes = ["; ".join(notes) or "-" for notes in notes_that_differ(runs)]
+    differing = {
+        "Settings": settings_that_differ(runs),
+        "Choices": choices_that_differ(runs),
+        "Notes": {"on reading the photos": notes} if len(set(notes)) > 1 else {},
+    }
+    tables = [_table("Numbers", names, numbers)]
+    for kind, rows in differing.items():
+        if rows:
+            written = [_row(name, cells) for name, cells in rows.items()]
+            tables.append(_table(f"{kind} that differ", names, written))
+    if same := [kind.lower() for kind, rows in differing.items() if not rows]:
+        tables.append(f'<p class="small">The same in all runs: {", ".join(same)}.</p>')
+    return tables
+
+
+def _table(caption: str, names: Sequence[str], rows: Sequence[str]) -> str:
+    heads = "".join(f'<th scope="col">{_swatch(number)}{_escaped(name)}</th>' for number, name in enumerate(names))
+    return "\n".join([
+        f'<div class="wide"><table><caption>{_escaped(caption)}</caption>',
+        f"<thead><tr><td></td>{heads}</tr></thead>",
+        "<tbody>",
+        *rows,
+        "</tbody></table></div>",
+    ])  # fmt: skip
+
+
+def _scores(name: str, scores: Sequence[float | None], digits: int, best: Callable | None) -> list[str]:
+    """A row of scores if there are any, the best one marked."""
+    there = [round(score, digits) for score in scores if score is not None]
+    if not there:
+        return []
+    cells = ["-" if score is None else f"{score:.{digits}f}" for score in scores]
+    return [_row(name, cells, f"{best(there):.{digits}f}" if best and len(set(there)) > 1 else None)]
+
+
+def _row(name: str, cells: Sequence[str], best: str | None = None) -> str:
+    opened = ('<td class="best">' if cell == best else "<td>" for cell in cells)
+    written = "".join(f"{tag}{_escaped(cell)}</td>" for tag, cell in zip(opened, cells, strict=True))
+    return f'<tr><th scope="row">{_escaped(name)}</th>{written}</tr>'
+
+
+def _legend(names: Sequence[str]) -> str:
+    items = (f"<li>{_swatch(number)}{_escaped(name)}</li>" for number, name in enumerate(names))
+    return f'<ul class="legend">{"".join(items)}</ul>'
+
+
+def _swatch(number: int) -> str:
+    """A piece of a run's line."""
+    color, dashes = line_style(number)
+    dashed = f' stroke-dasharray="{dashes}"' if dashes else ""
+    line = f'<path d="M0 4h26" stroke="{color}" stroke-width="3"{dashed}/>'
+    return f'<svg class="swatch" viewBox="0 0 26 8" aria-hidden="true">{line}</svg>'
+
+
+def _curves(runs: Sequence[Run], names: Sequence[str]) -> str:
+    """The figure, in an ink for light and one for dark."""
+    light, dark = (_address_of_svg(draw_curves(runs, INKS[scheme])) for scheme in ("light", "dark"))
+    told = "Training PSNR over steps, training PSNR over seconds and Gaussians over steps, the table's runs as lines"
+    return (
+        f'<div class="wide"><picture><source media="(prefers-color-scheme: dark)" srcset="{dark}">'
+        f'<img class="curves" src="{light}" alt="{told}"></picture></div>'
+    )
+
+
+def _address_of_svg(svg: str) -> str:
+    return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
+
+
+def _about_curves(runs: Sequence[Run], names: Sequence[str]) -> str:
+    told = f"PSNR is that of the photos trained on, in running means of {2 * SMOOTHING + 1} records."
+    timeless = [name for run, name in zip(runs, names, strict=True) if not keeps_times(run)]
+    if timeless:
+        told += f" No times of single steps were kept of {', '.join(timeless)}: the seconds are spread evenly there."
+    return told
+
+
+def _compared(runs: Sequence[Run], names: Sequence[str], views: Sequence[ComparedView]) -> dict:
+    """What the script shows: of each view the photo and the renders, and the scores of each run."""
+    scores = [{score.name: [score.psnr, score.ssim, score.lpips] for score in run.scores} for run in runs]
+    ramp = (error_colors(np.linspace(0, ERROR_LIMIT, 256)) * 255).round().astype(np.uint8)
+    return {
+        "runs": list(names),
+        "views": [
+            {
+                "name": view.name,
+                "pictures": [data_address(picture) for picture in (view.photo, *view.renders)],
+                "scores": [of_run.get(view.name, [None] * 3) for of_run in scores],
+            }
+            for view in views
+        ],
+        "ramp": base64.b64encode(ramp.tobytes()).decode(),
+        "limit": ERROR_LIMIT,
+    }
+
+
+def _part(name: str) -> str:
+    return files("hyrfpack.compare").joinpath(name).read_text("utf-8")
+
+
+def _escaped(text: str) -> str:
+    return html.escape(printable(text))
