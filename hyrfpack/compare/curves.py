@@ -10,6 +10,7 @@ from hyrfpack.evaluate.figures import blank_figure, running_mean, svg_of
 # Of the runs, in turn (Okabe and Ito's, for all kinds of eyes, those that show on white and on black); then dashed.
 COLORS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9")
 DASHES = ("", "6 3", "2 3")  # of SVG
+INK = "#5a6068"  # as --dim in the style
 
 
 def line_style(number: int) -> tuple[str, str]:
@@ -17,12 +18,8 @@ def line_style(number: int) -> tuple[str, str]:
     return COLORS[number % len(COLORS)], DASHES[number // len(COLORS) % len(DASHES)]
 
 
-def draw_curves(runs: Sequence[Run], ink: str) -> str:
-    """PSNR over steps and over seconds, and Gaussians over steps, as SVG on no ground. No word in it is of a file.
-
-    Args:
-        ink: colour of axes and words.
-    """
+def draw_curves(runs: Sequence[Run]) -> str:
+    """PSNR over steps and seconds, Gaussians over steps, as SVG: on no ground, in INK, and no word of files in it."""
     figure = blank_figure(12, 3.7)
     figure.patch.set_alpha(0)
     by_step, by_time, counts = figure.subplots(1, 3)
@@ -43,10 +40,10 @@ def draw_curves(runs: Sequence[Run], ink: str) -> str:
         axis.patch.set_alpha(0)
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
-        axis.spines[["left", "bottom"]].set_color(ink)
-        axis.tick_params(colors=ink)
-        axis.xaxis.label.set_color(ink)
-        axis.yaxis.label.set_color(ink)
+        axis.spines[["left", "bottom"]].set_color(INK)
+        axis.tick_params(colors=INK)
+        axis.xaxis.label.set_color(INK)
+        axis.yaxis.label.set_color(INK)
     return svg_of(figure)
 
 

@@ -10,7 +10,7 @@ from importlib.resources import files
 import numpy as np
 
 import hyrfpack
-from hyrfpack.compare.curves import draw_curves, keeps_times, line_style
+from hyrfpack.compare.curves import INK, draw_curves, keeps_times, line_style
 from hyrfpack.compare.differences import choices_that_differ, notes_that_differ, settings_that_differ
 from hyrfpack.compare.run import Run
 from hyrfpack.compare.views import ComparedView, data_address
@@ -18,7 +18,7 @@ from hyrfpack.errors import printable
 from hyrfpack.evaluate.figures import ERROR_LIMIT, SMOOTHING, error_colors
 from hyrfpack.web.player import content_policy, fill, json_text
 
-INKS = {"light": "#5a6068", "dark": "#a6acb3"}  # of the figure, as --dim in the style
+DARK_INK = "#a6acb3"  # as --dim in the style, where it is dark
 
 
 def encode_comparison(
@@ -126,7 +126,8 @@ def _swatch(number: int) -> str:
 
 def _curves(runs: Sequence[Run], names: Sequence[str]) -> str:
     """The figure, in an ink for light and one for dark."""
-    light, dark = (_address_of_svg(draw_curves(runs, INKS[scheme])) for scheme in ("light", "dark"))
+    svg = draw_curves(runs)
+    light, dark = (_address_of_svg(svg.replace(INK, ink)) for ink in (INK, DARK_INK))
     told = "Training PSNR over steps, training PSNR over seconds and Gaussians over steps, the table's runs as lines"
     return (
         f'<div class="wide"><picture><source media="(prefers-color-scheme: dark)" srcset="{dark}">'

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from hyrfpack.render.files import file_names
 from hyrfpack.train.run import CHECKPOINT, METRICS, MODEL, VIEWS
 
 LARGEST = 1e15  # no step, count, size or time in the metrics of a run that ever was is larger
-KINDS = {str: "text", list: "a list", dict: "an object"}
+KINDS: dict[type, str] = {str: "text", list: "a list", dict: "an object"}
 
 
 @dataclass(frozen=True)
@@ -172,9 +171,9 @@ def _take(values: Any, name: str, kind: type) -> Any:
 
 
 def _number(values: Any, name: str, kind: type = float, most: float = LARGEST) -> Any:
-    value = values.get(name) if isinstance(values, dict) else None
+    value: Any = values.get(name) if isinstance(values, dict) else None
     right = isinstance(value, int | float if kind is float else int) and not isinstance(value, bool)
-    if not right or not math.isfinite(value) or abs(value) > most:
+    if not right or not abs(value) <= most:  # NaN is not, either
         raise _Broken(f"'{name}' is missing or not a number that can be")
     return value
 

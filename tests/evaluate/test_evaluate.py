@@ -14,7 +14,7 @@ from torch import nn
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
-from hyrfpack.evaluate.figures import ERROR_LIMIT, comparison, contact_sheet, training_curve
+from hyrfpack.evaluate.figures import ERROR_LIMIT, comparison, contact_sheet, cut_comparison, training_curve
 from hyrfpack.evaluate.lpips import LPIPS
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR, psnr, ssim, to_8bit
 from hyrfpack.render.files import render_files
@@ -313,6 +313,23 @@ def test_comparison_hides_errors_under_the_mask():
 def test_comparison_takes_any_size(width, height):
     sheet = comparison(torch.zeros(height, width, 3), torch.ones(height, width, 3), caption="a photo")
     assert 3 * 200 < sheet.width < 2100
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (48, 31), (401, 3), (640, 20)])
+def test_a_comparison_can_be_cut_into_its_pictures_again(width, height):
+    photo, render = two_pictures(height, width)
+    photo, render = to_8bit(photo), to_8bit(render)
+    cut = cut_comparison(comparison(photo, render, caption="a photo"))
+    times = cut[0].width // width
+    for picture, pixels in zip(cut, (photo, render), strict=False):
+        assert picture.size == (times * width, times * height)
+        assert (np.asarray(picture)[::times, ::times] == (pixels * 255).round().numpy()).all()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (16, 40), (616, 200), (1216, 20), (1216, 351)])
+def test_other_pictures_are_not_cut(size):
+    with pytest.raises(ValueError, match="beside each other|would meet"):
+        cut_comparison(Image.new("RGB", size, (0, 0, 0)))
 
 
 def test_contact_sheet_is_wide_enough_for_its_text():

@@ -1,0 +1,316 @@
+"""Runs side by side: what the page says of them, what it shows and what is refused; nothing is taken for HTML."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import io
+import json
+import re
+import shutil
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import refused, succeeded
+from PIL import Image
+from scenes import ball_scene
+
+import hyrfpack
+from hyrfpack.compare.run import read_run, short_names
+from hyrfpack.errors import HyrfError
+from hyrfpack.evaluate.figures import PAPER
+from hyrfpack.scene import Scene
+from hyrfpack.train import TrainConfig
+
+HOSTILE = "<script>alert(1)</script><b a=\"'&{{style}}"
+
+
+def scene(**options) -> Scene:
+    """Balls, of whose eight photos two are held out."""
+    whole = ball_scene(side=24, points=60, **options)
+    return dataclasses.replace(whole, train=whole.train[2:], test=whole.train[:2])
+
+
+def trained(folder: Path, of: Scene | None = None, **settings) -> Path:
+    hyrfpack.train(of or scene(), folder, TrainConfig(steps=12, max_gaussians=60, **settings), quiet=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs a and b, which differ in seed and one setting, and one of another scene; not to be changed."""
+    root = tmp_path_factory.mktemp("runs")
+    trained(root / "a")
+    trained(root / "b", seed=1, ssim_weight=0.3)
+    trained(root / "far", scene(offset=(9, 0, 0), scale=2.0))
+    return root
+
+
+@pytest.fixture
+def runs(originals: Path, tmp_path: Path) -> list[Path]:
+    """Copies of a and b."""
+    return [Path(shutil.copytree(originals / name, tmp_path / name)) for name in "ab"]
+
+
+def metrics(run: Path) -> dict:
+    return json.loads((run / "metrics.json").read_text())
+
+
+def changed(run: Path, change: Callable[[dict], object]) -> Path:
+    values = metrics(run)
+    change(values)
+    (run / "metrics.json").write_text(json.dumps(values))
+    return run
+
+
+class Page(HTMLParser):
+    """Rows of the tables, tags with their attributes, and what the script is given."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.rows: dict[str, list[str]] = {}
+        self.tags: list[tuple[str, dict]] = []
+        self.words = ""
+        self._cells: list[str] = []
+        self.feed(path.read_text("utf-8"))
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        if tag == "tr":
+            self._cells = []
+        if tag in ("td", "th"):
+            self._cells.append("")
+
+    def handle_data(self, data):
+        self.words += data
+        if self.tags and self.tags[-1][0] == "script" and data.startswith('{"runs"'):
+            self.given = json.loads(data)
+        if self._cells:
+            self._cells[-1] += data
+
+    def handle_endtag(self, tag):
+        if tag == "tr":
+            self.rows[self._cells[0]] = self._cells[1:]
+            self._cells = []
+
+    def picture(self, view: int, source: int) -> np.ndarray:
+        data = base64.b64decode(self.given["views"][view]["pictures"][source].partition(",")[2])
+        return np.asarray(Image.open(io.BytesIO(data)))
+
+
+def test_the_page_has_the_numbers_of_all_runs_and_only_the_settings_that_differ(runs, tmp_path):
+    (runs[1] / "small.hyrf").write_bytes(b"x" * 1234)
+    report = hyrfpack.compare(runs, tmp_path / "page.html")
+    page, (a, b) = Page(tmp_path / "page.html"), map(metrics, runs)
+    assert page.rows["held-out PSNR (dB)"] == [f"{run['evaluation']['psnr']:.2f}" for run in (a, b)]
+    assert page.rows["held-out SSIM"] == [f"{run['evaluation']['ssim']:.4f}" for run in (a, b)]
+    assert page.rows["Gaussians"] == ["60", "60"] and page.rows["steps"] == ["12", "12"]
+    assert page.rows["seed"] == ["0", "1"]
+    assert page.rows["bytes of model.hyrf"] == [f"{(run / 'model.hyrf').stat().st_size:,}" for run in runs]
+    assert page.rows["bytes of small.hyrf"] == ["-", "1,234"]
+    assert page.rows["ssim weight"] == ["0.2", "0.3"]
+    assert not {"precision", "device", "density: rounds", "max gaussians"} & set(page.rows)
+    assert "held-out LPIPS" not in page.rows
+    assert report.runs == ["a", "b"] and report.doubts == []
+    assert report.bytes == (tmp_path / "page.html").stat().st_size
+
+
+def test_the_best_score_stands_out_unless_scores_cannot_be_compared(runs, tmp_path):
+    def best(page: Page) -> list[str]:
+        return [name for name, attributes in page.tags if attributes.get("class") == "best"]
+
+    for run, psnr in zip(runs, (20.0, 21.0), strict=True):
+        changed(run, lambda values, psnr=psnr: values["evaluation"].update(psnr=psnr, ssim=0.5))
+    hyrfpack.compare(runs, tmp_path / "page.html")
+    assert '<td class="best">21.00</td>' in (tmp_path / "page.html").read_text()
+    assert best(Page(tmp_path / "page.html")) == ["td"]
+    repaint(runs[1] / "views" / "000.png")
+    hyrfpack.compare(runs, tmp_path / "page.html", overwrite=True)
+    assert best(Page(tmp_path / "page.html")) == []
+
+
+def test_views_are_the_photo_and_each_render_with_their_scores(runs, tmp_path):
+    hyrfpack.compare(runs, tmp_path / "page.html")
+    page = Page(tmp_path / "page.html")
+    assert page.given["runs"] == ["a", "b"] and [view["name"] for view in page.given["views"]] == ["000.png", "001.png"]
+    held_out = scene().test[1]
+    times = 400 // 24  # small pictures are enlarged so many times
+    assert (page.picture(1, 0)[::times, ::times] == held_out.load().rgb).all()
+    for number, run in enumerate(runs):
+        drawn = hyrfpack.render(hyrfpack.load(run / "model.hyrf"), held_out.camera).rgb.clamp(0, 1)
+        assert (page.picture(1, 1 + number)[::times, ::times] == (drawn * 255).round().numpy()).all()
+        score = metrics(run)["evaluation"]["views"][1]
+        assert page.given["views"][1]["scores"][number] == [score["psnr"], score["ssim"], None]
+
+
+def test_only_views_that_all_runs_have_pictures_of_are_shown(runs, tmp_path):
+    (runs[1] / "views" / "000.png").unlink()
+    assert hyrfpack.compare(runs, tmp_path / "page.html").views == ["001.png"]
+    shutil.rmtree(runs[0] / "views")
+    assert hyrfpack.compare(runs, tmp_path / "bare.html").views == []
+    assert 'id="views"' not in (tmp_path / "bare.html").read_text()
+
+
+def test_a_curve_knows_its_seconds_and_one_of_an_earlier_version_is_said_to_have_none(runs, tmp_path):
+    first = metrics(runs[0])["curve"]
+    assert [record.seconds for record in read_run(runs[0]).curve] == [record["seconds"] for record in first]
+    hyrfpack.compare(runs, tmp_path / "page.html")
+    assert "spread evenly" not in Page(tmp_path / "page.html").words
+    changed(runs[1], lambda values: [record.pop("seconds") for record in values["curve"]])
+    hyrfpack.compare(runs, tmp_path / "page.html", overwrite=True)
+    assert "No times of single steps were kept of b" in Page(tmp_path / "page.html").words
+
+
+def test_the_same_runs_give_the_same_bytes_and_a_page_fetches_nothing(runs, tmp_path):
+    pages = [tmp_path / "one.html", tmp_path / "two.html"]
+    for page in pages:
+        hyrfpack.compare(runs, page)
+    text = pages[0].read_text()
+    assert text == pages[1].read_text()
+    assert "default-src 'none'" in text and "unsafe" not in text
+    named = [attributes for _, attributes in Page(pages[0]).tags]
+    addresses = [attributes[name] for attributes in named for name in ("src", "href", "srcset") if name in attributes]
+    assert addresses and all(not address or address.startswith("data:") for address in addresses)
+
+
+def test_nothing_out_of_files_is_taken_for_html(runs, tmp_path):
+    plain = [name for name, _ in Page(Path(hyrfpack.compare(runs, tmp_path / "plain.html").file)).tags]
+    hostile = runs[1].rename(tmp_path / HOSTILE.replace("/", ":"))
+    for run in (runs[0], hostile):
+        (run / "views" / "000.png").rename(run / "views" / f"{HOSTILE.replace('/', '_')}.png")
+
+        def poison(values: dict, run: Path = run) -> None:
+            values["notes"] = [HOSTILE, run.name]
+            values["choices"] = {HOSTILE: run.name}
+            values["settings"] |= {HOSTILE: run.name}
+            values["device"] = HOSTILE + run.name
+            values["evaluation"]["views"][0]["name"] = HOSTILE.replace("/", "_")
+
+        changed(run, poison)
+    (hostile / f"{HOSTILE.replace('/', '_')}.hyrf").write_bytes(b"")
+    hyrfpack.compare([runs[0], hostile], tmp_path / "page.html")
+    page = Page(tmp_path / "page.html")
+    assert {name for name, _ in page.tags} == set(plain)
+    assert [name for name, _ in page.tags].count("script") == plain.count("script") == 2
+    assert page.rows[HOSTILE] == ["a", HOSTILE.replace("/", ":")]
+    assert "alert" not in re.sub(r"&lt;|\\u003c", "", " ".join(str(attributes) for _, attributes in page.tags))
+
+
+# -- what cannot be compared -----------------------------------------------------------------------------------------
+
+
+def repaint(sheet: Path) -> None:
+    """Give a picture another photo: darker, captions and gaps as they were."""
+    pixels = np.array(Image.open(sheet).convert("RGB"))
+    pixels[(pixels != PAPER).any(axis=2)] //= 2
+    Image.fromarray(pixels).save(sheet)
+
+
+def test_other_photos_of_the_same_names_are_said_and_not_shown(runs, originals, tmp_path):
+    repaint(runs[1] / "views" / "001.png")
+    report = hyrfpack.compare(runs, tmp_path / "page.html")
+    (sentence,) = report.doubts
+    assert "'001.png' for one" in sentence and sentence in Page(tmp_path / "page.html").words
+    assert report.views == ["000.png"]
+
+
+def test_other_cameras_are_said(runs, originals, tmp_path):
+    shutil.rmtree(runs[0] / "views")
+    report = hyrfpack.compare([runs[0], originals / "far"], tmp_path / "page.html")
+    assert len(report.doubts) == 1 and "trained from different cameras" in report.doubts[0]
+
+
+@pytest.mark.parametrize("which", [[0], [0, 1]], ids=["one", "all"])
+def test_runs_without_held_out_photos_are_compared_by_the_rest(which, runs, tmp_path):
+    for number in which:
+        changed(runs[number], lambda values: values.pop("evaluation"))
+    report = hyrfpack.compare(runs, tmp_path / "page.html")
+    page = Page(tmp_path / "page.html")
+    assert report.views == [] and len(report.doubts) == 1 and "o photo is held out of" in report.doubts[0]
+    assert ("held-out PSNR (dB)" in page.rows) == (len(which) == 1)
+    assert page.rows["Gaussians"] == ["60", "60"] and "training" in page.words
+
+
+def test_other_held_out_photos_are_refused(runs, tmp_path):
+    changed(runs[1], lambda values: values["evaluation"]["views"].pop())
+    with pytest.raises(HyrfError, match=r"held out of 'b' \(1\) than of 'a' \(2; '001.png' of one of them alone\)"):
+        hyrfpack.compare(runs, tmp_path / "page.html")
+    assert not (tmp_path / "page.html").exists()
+
+
+BROKEN = {
+    "text": ("nothing", "it is no JSON"),
+    "cut": ('{"settings": {"steps": 1', "it is no JSON"),
+    "nested": ("[" * 100_000, "it is no JSON"),
+    "bytes": (b"\xff\xfe", "it is no JSON"),
+    "list": ("[1]", "it is no object"),
+    "nan": ('{"seconds": NaN}', "a number in it is NaN"),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_metrics_that_are_no_metrics_are_one_sentence(kind, runs, tmp_path):
+    text, reason = BROKEN[kind]
+    (runs[1] / "metrics.json").write_bytes(text if isinstance(text, bytes) else text.encode())
+    sentence = refused("compare", *runs, "-o", tmp_path / "page.html")
+    assert f"{runs[1]}/metrics.json: the metrics are damaged ({reason})" in sentence
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda values: values.pop("curve"), "curve"),
+        (lambda values: values.update(curve=[]), "curve"),
+        (lambda values: values["curve"][3].update(psnr="20"), "psnr"),
+        (lambda values: values["curve"][3].update(gaussians=True), "gaussians"),
+        (lambda values: values["curve"].append(7), "step"),
+        (lambda values: values["settings"].update(steps=0), "steps"),
+        (lambda values: values["settings"].pop("seed"), "seed"),
+        (lambda values: values.update(seconds=10**400), "seconds"),
+        (lambda values: values.update(notes="none"), "notes"),
+        (lambda values: values["evaluation"].update(ssim=None), "ssim"),
+        (lambda values: values["evaluation"]["views"][0].pop("name"), "name"),
+    ],
+)  # fmt: skip
+def test_metrics_that_lack_something_are_one_sentence_that_names_it(change, named, runs):
+    with pytest.raises(HyrfError, match=f"metrics are damaged .*'{named}'.*train the run anew"):
+        read_run(changed(runs[0], change))
+
+
+def test_what_is_no_finished_run_is_refused_with_what_to_do(runs, tmp_path):
+    page = tmp_path / "page.html"
+    assert "there is no such folder" in refused("compare", runs[0], tmp_path / "none", "-o", page)
+    assert "name two folders" in refused("compare", runs[0], "-o", page)
+    assert "each once" in refused("compare", *runs, runs[0] / ".." / "a", "-o", page)
+    assert "ends in .html" in refused("compare", *runs, "-o", tmp_path / "page.pdf")
+    assert "the output is an input" in refused("compare", *runs, "-o", runs[0] / "metrics.json", "--overwrite")
+    (runs[0] / "views" / "000.png").write_bytes((runs[0] / "curve.png").read_bytes())
+    assert "remove it, and the view is left out" in refused("compare", *runs, "-o", page)
+    (runs[0] / "model.hyrf").write_bytes(b"nothing")
+    assert f"{runs[0]}/model.hyrf" in refused("compare", *runs, "-o", page)
+    (runs[1] / "checkpoint.pt").touch()
+    assert "finishes it with --resume" in refused("compare", runs[1], runs[0], "-o", page)
+    (runs[0] / "model.hyrf").unlink()
+    assert "there is no model.hyrf" in refused("compare", *runs, "-o", page)
+    assert not page.exists()
+    with pytest.raises(TypeError, match="give a list"):
+        hyrfpack.compare(str(runs[0]), page)
+
+
+def test_the_command_says_what_it_wrote_and_what_is_doubtful(runs, tmp_path):
+    page = tmp_path / "page.html"
+    result = succeeded("compare", *runs, "-o", page)
+    assert f"{page}: 2 runs, 2 held-out views, {page.stat().st_size:,} bytes" in result.stdout and not result.stderr
+    assert "--overwrite" in refused("compare", *runs, "-o", page)
+    changed(runs[0], lambda values: values.pop("evaluation"))
+    result = succeeded("compare", *runs, "-o", page, "--overwrite", "--json")
+    assert json.loads(result.stdout)["runs"] == ["a", "b"] and "No photo is held out of 'a'" in result.stderr
+
+
+def test_runs_are_called_by_as_much_of_their_paths_as_tells_them_apart():
+    assert short_names([Path("/x/runs/a"), Path("/x/runs/b")]) == ["a", "b"]
+    assert short_names([Path("/x/a.work/run"), Path("/x/b.work/run")]) == ["a.work/run", "b.work/run"]
+    assert short_names([Path("/run"), Path("/x/run")]) == ["//run", "x/run"]
