@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,6 +49,7 @@ def compare(runs: Sequence[StrPath], out: StrPath, *, overwrite: bool = False) -
         overwrite: replace the file if it is there.
 
     Raises:
+        TypeError: `runs` is one path.
         HyrfError: there are fewer than two runs or the same one twice, one is not finished or its files are damaged,
             the scores are of different photos, or the page cannot be written, or not without overwriting.
 
@@ -57,10 +59,10 @@ def compare(runs: Sequence[StrPath], out: StrPath, *, overwrite: bool = False) -
         >>> report.runs, report.views, report.doubts
         (['bonsai', 'again'], ['0000.png', '0008.png'], [])
     """
-    if isinstance(runs, str):
-        raise TypeError(f"runs must be several folders, not the text {runs!r}; give a list of them")
+    if isinstance(runs, str | os.PathLike):
+        raise TypeError(f"runs must be several folders, not {os.fspath(runs)!r} alone; give a list of them")
     folders = [Path(run) for run in runs]
-    if len({folder.resolve() for folder in folders}) < max(2, len(folders)):
+    if len({os.path.realpath(folder) for folder in folders}) < max(2, len(folders)):
         raise HyrfError("there are not two different runs to compare; name two folders of runs or more, each once")
     found = [read_run(folder) for folder in folders]
     read = [path for run in found for path in (run.folder / METRICS, run.folder / MODEL, *run.pictures.values())]
