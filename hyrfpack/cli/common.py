@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from hyrfpack.choices import LAYOUTS, PRECISIONS
 from hyrfpack.cli.manners import detail, note
 from hyrfpack.errors import HyrfError
 
@@ -24,19 +25,7 @@ Command = TypeVar("Command", bound=Callable)
 
 PATH = click.Path(path_type=Path)
 SEED = click.IntRange(0, 2**64 - 1)  # hyrfpack.train.config.LARGEST_SEED, without loading torch
-PRECISIONS = ("mixed", "float32")  # hyrfpack.train.PRECISIONS, without loading torch
 _SIZE = re.compile(r"([0-9.]+)\s*([kmg]?)b?", re.IGNORECASE)
-LAYOUTS = (  # hyrfpack.data.LAYOUTS, without loading numpy
-    "colmap",
-    "blender",
-    "nerfstudio",
-    "llff",
-    "metashape",
-    "bundler",
-    "realityscan",
-    "polycam",
-    "record3d",
-)
 
 
 class _OutputPath(click.ParamType):

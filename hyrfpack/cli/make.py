@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from hyrfpack.choices import MATCHING, QUALITIES
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
@@ -19,12 +20,10 @@ from hyrfpack.cli.common import (
     overwrite_option,
     print_json,
 )
-from hyrfpack.cli.poses import MATCHING
 
 if TYPE_CHECKING:
     from hyrfpack.make import MakeResult
 
-QUALITIES = ("draft", "normal", "best")  # hyrfpack.make.QUALITIES, without loading torch
 LISTED = 5  # photos that were left out
 
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import click
 
+from hyrfpack.choices import MATCHING
 from hyrfpack.cli.common import OUTPUT, PATH, SEED, detail, json_option, note, print_json
 
 if TYPE_CHECKING:
     from hyrfpack.poses import PosesReport
 
-MATCHING = ("auto", "exhaustive", "sequential", "retrieval")  # hyrfpack.poses.MATCHING, without loading it
 _TOLD = 5  # photos that are named, of each reason that some were left out for
 
 

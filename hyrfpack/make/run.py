@@ -15,6 +15,7 @@ from hyrfpack.data import PictureCache
 from hyrfpack.data.folder import list_photos, photo_facts
 from hyrfpack.device import choose_device
 from hyrfpack.format import describe
+from hyrfpack.lock import held
 from hyrfpack.make import stages
 from hyrfpack.make.minutes import measure
 from hyrfpack.make.plan import QUALITIES, Plan, forecast_photos, forecast_scene
@@ -22,7 +23,7 @@ from hyrfpack.make.progress import Progress, Reporter
 from hyrfpack.make.request import Request, work_folder
 from hyrfpack.make.source import Reading, Source
 from hyrfpack.make.state import digest_all
-from hyrfpack.make.work import Say, Stopped, Work, held, interruptible
+from hyrfpack.make.work import Say, Stopped, Work, interruptible
 from hyrfpack.outputs import StrPath
 from hyrfpack.scene import Scene
 from hyrfpack.train.config import LARGEST_SEED
@@ -143,7 +144,7 @@ def make(
                 overwrite=overwrite,
             )
             request.check()
-            with held(request.work):
+            with held(request.work, "make", "another with --work"):
                 return _Making(request, began, report, say).run()
         except Stopped:
             raise

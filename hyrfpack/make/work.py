@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from hyrfpack.atomic import make_folder
 from hyrfpack.errors import HyrfError
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.state import State
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
 # What each stage leaves in the work folder; made anew, it goes first.
 PRODUCTS = {
@@ -145,27 +138,3 @@ def interruptible() -> Iterator[None]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-@contextmanager
-def held(folder: Path) -> Iterator[None]:
-    """Make a work folder and keep other calls out of it, where the system can: Windows and some network folders cannot.
-
-    Raises HyrfError: another call is at work there.
-    """
-    make_folder(folder)
-    if fcntl is None:
-        yield
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        with suppress(OSError):
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise HyrfError(
-                    f"{folder}: another 'make' is at work in this folder; wait for it, or name another with --work"
-                ) from None
-        yield
-    finally:
-        os.close(handle)

@@ -54,3 +54,13 @@ def remove(scene: Path, made: Made, read: Collection[Path]) -> None:
         if parent != scene and scene in parent.parents:
             with suppress(OSError):  # there are other files in it
                 os.rmdir(parent)
+
+
+def are_all(scene: Path, name: str, made: Made) -> bool:
+    """Whether a folder of the scene is empty once files of our making are removed, and a real folder."""
+    folder = scene / name
+    if folder.is_symlink() or not folder.is_dir():
+        return False
+    ours = {scene / file for file in made}
+    ours |= {parent for file in ours for parent in file.parents}
+    return ours.issuperset(folder.rglob("*"))

@@ -14,8 +14,8 @@ from PIL import Image
 
 from hyrfpack import evaluate, load, load_scene
 from hyrfpack.errors import HyrfError
+from hyrfpack.lock import held
 from hyrfpack.make import make
-from hyrfpack.make.work import held
 from hyrfpack.splats.formats import ply
 
 ENDINGS = (".hyrf", ".html", ".spz", ".points.ply", "")  # of each kind one: tests/export has the others
@@ -250,7 +250,7 @@ def test_a_record_that_is_damaged_is_refused(record, reason, posed, tmp_path):
 def test_two_calls_in_one_work_folder_are_kept_apart(made, posed, tmp_path):
     pytest.importorskip("fcntl", reason="locks are of Unix")
     work = copy_of(made, tmp_path)
-    with held(work), pytest.raises(HyrfError, match="another 'make' is at work.*--work"):
+    with held(work, "make", "another with --work"), pytest.raises(HyrfError, match="another 'make' is at work.*--work"):
         make(posed, tmp_path / "scene.hyrf", work=work)
     assert len(make(posed, tmp_path / "scene.hyrf", work=work).kept) == 4
 

@@ -1,0 +1,17 @@
+"""Words that settings take: for the rooms that know what they mean, and for the command line, which loads none of them
+to list its options."""
+
+LAYOUTS = (  # of photos and poses: the keys of `hyrfpack.data.LAYOUTS`
+    "colmap",
+    "blender",
+    "nerfstudio",
+    "llff",
+    "metashape",
+    "bundler",
+    "realityscan",
+    "polycam",
+    "record3d",
+)
+MATCHING = ("auto", "exhaustive", "sequential", "retrieval")  # which photos are compared
+PRECISIONS = ("mixed", "float32")  # what a GPU multiplies in
+QUALITIES = ("draft", "normal", "best")  # how long `make` works: the keys of `hyrfpack.make.QUALITIES`
