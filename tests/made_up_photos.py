@@ -66,7 +66,7 @@ def _seen(pose: np.ndarray, directions: np.ndarray, textures: np.ndarray) -> np.
     return seen
 
 
-def write_photos(folder: Path, count: int = 10) -> dict[str, np.ndarray]:
+def write_photos(folder: Path, count: int = 8) -> dict[str, np.ndarray]:
     """Write photos along the arc; returns the pose of each by name."""
     folder.mkdir(parents=True, exist_ok=True)
     textures, poses = walls(), {}

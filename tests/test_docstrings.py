@@ -47,7 +47,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, data: Path) -> Path:
     root = tmp_path_factory.mktemp("examples")
     (root / "photos").mkdir()
     (root / "photos" / "bonsai").symlink_to(data)
-    write_photos(root / "photos" / "corner")
+    write_photos(root / "photos" / "corner", 5)
     scene = hyrfpack.load_scene(data)
     hyrfpack.train(scene, root / "runs" / "bonsai", hyrfpack.TrainConfig(steps=20, max_gaussians=300), quiet=True)
     shutil.copytree(root / "runs" / "bonsai", root / "runs" / "again")

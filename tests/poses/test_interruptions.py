@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from commands import succeeded
 
 import hyrfpack
 from hyrfpack.poses import process
@@ -22,9 +26,8 @@ if sys.orig_argv[-1] == {stage!r} and "hyrfpack.poses.worker" in sys.orig_argv:
 """
 
 
-@pytest.fixture
-def started(monkeypatch) -> list[subprocess.Popen]:
-    """The processes that stages are run in."""
+def watched(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen]:
+    """The processes that stages are run in from now on."""
     found: list[subprocess.Popen] = []
     popen = subprocess.Popen
 
@@ -36,46 +39,58 @@ def started(monkeypatch) -> list[subprocess.Popen]:
     return found
 
 
-def test_what_is_stopped_ends_at_once_and_goes_on_where_it_was(taken, tmp_path, started):
-    out = tmp_path / "scene"
+@pytest.fixture
+def started(monkeypatch) -> list[subprocess.Popen]:
+    return watched(monkeypatch)
 
-    def stop(doing: str, share: float) -> None:
-        if "at once" in doing:
+
+def stop_at(moment: str) -> Callable[[str, float], None]:
+    """A report that interrupts when something is told that holds these words."""
+
+    def report(doing: str, share: float) -> None:
+        if moment in doing:
             raise KeyboardInterrupt
 
+    return report
+
+
+@pytest.fixture(scope="module")
+def stopped(taken, tmp_path_factory) -> Path:
+    """A scene that was stopped after the matching, not to be changed."""
+    out = tmp_path_factory.mktemp("stopped") / "scene"
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        workers = watched(patch)
+        hyrfpack.estimate_poses(taken[0], out, report=stop_at("at once"))
+    assert len(workers) == 3 and all(worker.poll() is not None for worker in workers)
+    return out
+
+
+def test_what_is_stopped_goes_on_where_it_was(taken, stopped, tmp_path):
+    out, kept = tmp_path / "scene", (stopped / ".poses" / "matches.json").stat().st_mtime_ns
+    shutil.copytree(stopped, out)
+    assert os.listdir(out) == [".poses"]
     with pytest.raises(KeyboardInterrupt):
-        hyrfpack.estimate_poses(taken[0], out, report=stop)
-    assert all(worker.poll() is not None for worker in started)
-    kept = (out / ".poses" / "matches.json").stat().st_mtime_ns
-    assert not (out / "sparse").exists()
-
-    seen: list[bool] = []
-
-    def look(doing: str, share: float) -> None:
-        if "one by one" in doing and not seen:
-            seen.append((out / ".poses" / "matches.json").stat().st_mtime_ns == kept)
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        hyrfpack.estimate_poses(taken[0], out, report=look)
-    assert seen == [True]
+        hyrfpack.estimate_poses(taken[0], out, report=stop_at("one by one"))
+    assert (out / ".poses" / "matches.json").stat().st_mtime_ns == kept
     assert (out / ".poses" / "global-0").is_dir()
 
 
-def test_a_worker_that_is_killed_is_one_sentence_and_the_same_call_goes_on(taken, tmp_path, started):
-    out = tmp_path / "scene"
+def test_a_scene_of_ones_own_gets_poses_in_place_also_after_its_worker_was_killed(taken, tmp_path, started):
+    shutil.copytree(taken[0], tmp_path / "images")
+    before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "images").iterdir()}
+    (tmp_path / "poses.json").write_text("{}")  # of poses that were removed
 
     def kill(doing: str, share: float) -> None:
         if "matching pair" in doing:
             started[-1].kill()
 
     with pytest.raises(hyrfpack.HyrfError, match="more memory than there is.*goes on here"):
-        hyrfpack.estimate_poses(taken[0], out, report=kill)
-    said: list[str] = []
-    report = hyrfpack.estimate_poses(taken[0], out, say=said.append)
-    assert "an interrupted estimation goes on" in said
-    assert report.registered == len(taken[1])
-    assert sorted(os.listdir(out)) == ["images", "poses.json", "sparse"]
+        hyrfpack.estimate_poses(tmp_path, tmp_path, overwrite=True, report=kill)
+    result = succeeded("poses", tmp_path, "-o", tmp_path, "--overwrite", "--json")
+    assert "an interrupted estimation goes on" in result.stderr
+    assert json.loads(result.stdout)["registered"] == len(before)
+    assert {path.name: path.stat().st_mtime_ns for path in (tmp_path / "images").iterdir()} == before
+    assert sorted(os.listdir(tmp_path)) == ["images", "poses.json", "sparse"]
 
 
 def test_a_crash_of_the_library_is_one_sentence(taken, tmp_path, monkeypatch):
@@ -85,7 +100,8 @@ def test_a_crash_of_the_library_is_one_sentence(taken, tmp_path, monkeypatch):
         hyrfpack.estimate_poses(taken[0], tmp_path / "scene")
 
 
-def test_where_one_mapper_crashes_the_other_ones_result_is_taken_and_said(taken, tmp_path, monkeypatch):
+def test_where_one_mapper_crashes_the_other_ones_result_is_taken_and_said(taken, stopped, tmp_path, monkeypatch):
+    shutil.copytree(stopped, tmp_path / "scene")
     (tmp_path / "sitecustomize.py").write_text(CRASH.format(stage="global"))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     report = hyrfpack.estimate_poses(taken[0], tmp_path / "scene")

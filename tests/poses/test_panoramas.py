@@ -12,7 +12,7 @@ from hyrfpack.data.equirectangular import FACES
 from hyrfpack.poses.compare import compare
 from hyrfpack.poses.prepare import find_masks, look_at, make_masks
 
-COUNT, HEIGHT = 4, 360
+COUNT, HEIGHT = 3, 320
 
 
 @pytest.fixture(scope="module")
