@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
@@ -22,36 +21,23 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("examples")
 
 
-def run(script: str, folder: Path, *arguments: object) -> str:
-    command = [sys.executable, ROOT / "examples" / script, *map(str, arguments)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+def test_the_scripts_go_from_photos_to_a_file_to_pictures_and_back_from_splats(folder, data, monkeypatch, capsys):
+    def run(script: str, *arguments: object) -> str:
+        monkeypatch.setattr(sys, "argv", [script, *map(str, arguments)])
+        runpy.run_path(str(ROOT / "examples" / script), run_name="__main__")
+        return capsys.readouterr().out
 
-
-def test_the_scripts_go_from_photos_to_a_file_to_pictures_and_back_from_splats(folder, data):
-    said = run("train_and_compress.py", folder, data, "run", "--steps", 5)
+    monkeypatch.chdir(folder)
+    said = run("train_and_compress.py", data, "run", "--steps", 5)
     assert "8 photos to train on, 2 held out" in said and "small.hyrf" in said
 
-    said = run("read_and_render.py", folder, "run/small.hyrf", "frames", "--frames", 2)
+    said = run("read_and_render.py", "run/small.hyrf", "frames", "--frames", 2)
     assert said.startswith("frames: 2 pictures of ")
     assert [Image.open(folder / "frames" / f"{number:04d}.png").size for number in (0, 1)] == [(48, 48)] * 2
 
     (folder / "scene.ply").write_bytes(ply.encode(ball(40)))
-    run(
-        "import_and_compare.py",
-        folder,
-        "scene.ply",
-        "scene.hyrf",
-        "compare.png",
-        "--steps",
-        4,
-        "--psnr",
-        15,
-        "--size",
-        48,
-    )
+    files = ("scene.ply", "scene.hyrf", "compare.png")
+    run("import_and_compare.py", *files, "--steps", 4, "--psnr", 15, "--size", 48)
     width, height = Image.open(folder / "compare.png").size
     assert describe(folder / "scene.hyrf")["gaussians"] > 0 and (width, height) == (2 * 48, 3 * 48)
 

@@ -26,7 +26,7 @@ def test_the_python_of_a_page_is_its_blocks_each_line_where_it_stands():
 @pytest.fixture
 def photos(tmp_path):
     """Photos with poses that are also found without them."""
-    poses = write_photos(tmp_path / "images", 8)
+    poses = write_photos(tmp_path / "images", 5)
     frames = [
         {"file_path": f"images/{name}", "transform_matrix": opengl(pose).tolist()} for name, pose in poses.items()
     ]
