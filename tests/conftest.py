@@ -3,6 +3,7 @@ worlds; `commands`), and what `tools` has."""
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import shutil
@@ -27,6 +28,14 @@ if os.environ["TRITON_INTERPRET"] == "1" and find_spec("triton"):
     from interpreter import patch_once
 
     patch_once()
+
+# Until all tests are collected, nothing becomes garbage, and looking for it takes a third of the time.
+gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture

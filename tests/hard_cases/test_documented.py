@@ -16,15 +16,21 @@ CITATION = re.compile(r"`(tests/[\w/]+\.py)::(test_\w+)(?:\[([^`]+)\])?`")
 
 
 @cache
-def _tests(path: str) -> dict[str, str]:
-    """The source, decorators included, of each test function of a file, by name."""
-    source = (ROOT / path).read_text(encoding="utf-8")
-    functions = (node for node in ast.parse(source).body if isinstance(node, ast.FunctionDef))
-    return {
-        node.name: "\n".join(ast.get_source_segment(source, part) or "" for part in (*node.decorator_list, node))
-        for node in functions
-        if node.name.startswith("test_")
-    }
+def _tree(path: str) -> ast.Module:
+    return ast.parse((ROOT / path).read_text(encoding="utf-8"))
+
+
+@cache
+def _tests(path: str) -> set[str]:
+    """Names of the test functions of a file."""
+    functions = {node.name for node in _tree(path).body if isinstance(node, ast.FunctionDef)}
+    return {name for name in functions if name.startswith("test_")}
+
+
+@cache
+def _strings(path: str) -> set[str]:
+    nodes = (node for node in ast.walk(_tree(path)) if isinstance(node, ast.Constant))
+    return {node.value for node in nodes if isinstance(node.value, str)}
 
 
 def _citations() -> list[tuple[str, str, str]]:
@@ -42,12 +48,7 @@ def test_every_cited_case_exists() -> None:
     """A case is the name in brackets, after the implementation where there is one."""
     missing = set()
     for path, name, case in _citations():
-        strings = {
-            node.value
-            for node in ast.walk(ast.parse((ROOT / path).read_text(encoding="utf-8")))
-            if isinstance(node, ast.Constant) and isinstance(node.value, str)
-        }
-        if case and not strings & {case, case.partition("-")[2]}:
+        if case and not _strings(path) & {case, case.partition("-")[2]}:
             missing.add(f"{path}::{name}[{case}]")
     assert not missing
 
