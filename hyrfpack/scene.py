@@ -6,7 +6,7 @@ Readers in `hyrfpack.data` bring every input to this form; nothing after them kn
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -182,9 +182,11 @@ class Scene:
         files: every file it was read from or will be: tables of poses, points, photos, masks.
         max_size: pixels of the longer side that larger photos are shrunk to; 0 for photos as they are stored, None for
             a scene that was not read from files.
+        tracks: by a view's name, (M,) int64 rows of `points` that the reconstruction found in that photo, ascending;
+            empty where the input does not say. A point may lie outside the picture, which undistortion crops.
 
     Raises:
-        ValueError: a point or its colour is not finite.
+        ValueError: a point or its colour is not finite, or a track is of no point.
     """
 
     path: str
@@ -197,10 +199,16 @@ class Scene:
     notes: list[str] = field(default_factory=list)
     files: tuple[str, ...] = ()
     max_size: int | None = None
+    tracks: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.points).all() and np.isfinite(self.point_colors).all()):
             raise ValueError("points and their colours must be finite; leave out those that are not")
+        for name, rows in self.tracks.items():
+            if rows.dtype != np.int64 or rows.ndim != 1:
+                raise ValueError(f"tracks of {name}: rows are (M,) int64, not {rows.shape} {rows.dtype}")
+            if len(rows) and not 0 <= rows.min() <= rows.max() < len(self.points):
+                raise ValueError(f"tracks of {name}: rows {rows.min()} to {rows.max()} of {len(self.points)} points")
 
     def __repr__(self) -> str:
         return (

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scenes import ball_scene, camera_at, look_at, view_of
@@ -72,6 +74,15 @@ def test_scene_views_are_both_splits_sorted_by_name():
 
     scene = Scene("x", "colmap", [named("b"), named("d")], [named("a"), named("c")], np.zeros((0, 3)), np.zeros((0, 3)))
     assert [view.name for view in scene.views] == ["a", "b", "c", "d"]
+
+
+@pytest.mark.parametrize("rows", [[-1, 0], [0, 100]], ids=str)
+def test_tracks_of_points_that_are_not_there_are_refused(rows):
+    scene = ball_scene(2, points=100)
+    with pytest.raises(ValueError, match=r"tracks of 000\.png: rows -?\d+ to \d+ of 100 points"):
+        dataclasses.replace(scene, tracks={"000.png": np.array(rows)})
+    with pytest.raises(ValueError, match=r"tracks of 000\.png: rows are \(M,\) int64"):
+        dataclasses.replace(scene, tracks={"000.png": np.array(rows, np.float64)})
 
 
 # -- poses -----------------------------------------------------------------------------------------------------------

@@ -42,6 +42,7 @@ class Photo:
         mask: the file of its mask, if the poses name one.
         orientation: of EXIF, that stored pixels are turned by because the camera was calibrated so.
         face: of the panorama that the file holds, once it is cut; name, header and lens are then the face's.
+        sees: (M,) int64 rows of the points that the format says are in the photo; None where it does not say.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Photo:
     mask: Path | None = None
     orientation: int = 1
     face: Face | None = None
+    sees: np.ndarray | None = None
 
 
 def make_scene(
@@ -107,11 +109,11 @@ def make_scene(
             "add photos or hold out fewer (0 holds out none)"
         )
     notes += [*_same_poses(views), *_told(photos, max_size, mask_notes)]
-    points, point_colors = _finite_points(points, point_colors, notes)
+    points, point_colors, tracks = _finite_points(points, point_colors, photos, notes)
     read = [file for photo in photos for file in (photo.path, photo.mask) if file is not None]
     files = tuple(str(file) for file in (*tables, *read))
     see_through = _see_through(photos, max_size)
-    return Scene(str(path), layout, train, test, points, point_colors, see_through, notes, files, max_size)
+    return Scene(str(path), layout, train, test, points, point_colors, see_through, notes, files, max_size, tracks)
 
 
 def _masked(photos: list[Photo], folder: Path) -> tuple[list[Photo], list[str]]:
@@ -252,7 +254,9 @@ def _faces(photo: Photo) -> list[Photo]:
             pose[:3] = face.rotation @ pose[:3]
         called, header = f"{name}_{face.name}{photo.path.suffix}", Header(size, size, False)
         faces.append(
-            replace(photo, name=called, header=header, lens=face_lens(size), camera_from_world=pose, face=face)
+            replace(
+                photo, name=called, header=header, lens=face_lens(size), camera_from_world=pose, face=face, sees=None
+            )
         )
     return faces
 
@@ -326,12 +330,16 @@ def _see_through(photos: list[Photo], max_size: int) -> bool:
 
 
 def _finite_points(
-    points: np.ndarray | None, colors: np.ndarray | None, notes: list[str]
-) -> tuple[np.ndarray, np.ndarray]:
+    points: np.ndarray | None, colors: np.ndarray | None, photos: Sequence[Photo], notes: list[str]
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Points that are finite, their colours, and the rows of them that each photo sees."""
     if points is None or colors is None:
-        return np.zeros((0, 3)), np.zeros((0, 3), np.float32)
+        return np.zeros((0, 3)), np.zeros((0, 3), np.float32), {}
     with np.errstate(over="ignore"):  # float32 is what they are used in
-        finite = np.isfinite(points.astype(np.float32)).all(axis=1)
+        finite: np.ndarray = np.isfinite(points.astype(np.float32)).all(axis=1)
     if not finite.all():
         notes.append(f"{(~finite).sum()} of {len(points)} points are not finite and were dropped")
-    return points[finite].astype(np.float64), colors[finite].astype(np.float32)
+    row = np.cumsum(finite) - 1  # that each point has among those that stay
+    seen = {photo.name: np.unique(photo.sees) for photo in photos if photo.sees is not None}
+    tracks = {name: row[rows[finite[rows]]] for name, rows in seen.items()}
+    return points[finite].astype(np.float64), colors[finite].astype(np.float32), tracks

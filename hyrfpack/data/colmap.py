@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,15 @@ from hyrfpack.data.points import read_ply
 from hyrfpack.data.undistort import Lens, brown
 from hyrfpack.errors import HyrfDataError, needs_package, reason_of
 from hyrfpack.scene import Scene
+
+
+class _Image(NamedTuple):
+    """A registered photo as a model has it: `sees` are rows of its points, None where these are not its own."""
+
+    name: str
+    camera: int
+    camera_from_world: np.ndarray
+    sees: np.ndarray | None
 
 
 def read_colmap(path: Path, *, test_every: int, images: str | None, model: str | None, max_size: int) -> Scene:
@@ -42,7 +52,7 @@ def read_colmap(path: Path, *, test_every: int, images: str | None, model: str |
     base, models = find_workspace(path)
     tables, notes = _choose_model(path, models, model)
     cameras, posed, unposed, points, colors = _read_model(tables)
-    names = [safe_name(name) for name, _, _ in posed]
+    names = [safe_name(image.name) for image in posed]
     folder = _photo_folder(path, base, images, names)
     shown = Path(os.path.relpath(folder, path))  # which may lie elsewhere
     if base not in (path, path / "colmap"):
@@ -60,12 +70,13 @@ def read_colmap(path: Path, *, test_every: int, images: str | None, model: str |
     matches = pictures.match(names)
     photos: list[Photo] = []
     missing: list[str] = []
-    for name, (_, camera_id, pose) in zip(names, posed, strict=True):
+    for name, image in zip(names, posed, strict=True):
         file = matches.found.get(name)
         if file is None:
             missing.append(str(PurePosixPath(shown) / name))
             continue
-        photos.append(Photo(pictures.name_of(file, name), file, read_header(file), cameras[camera_id], pose))
+        lens, pose = cameras[image.camera], image.camera_from_world
+        photos.append(Photo(pictures.name_of(file, name), file, read_header(file), lens, pose, sees=image.sees))
     notes += matches.notes
     notes += check_found(path, photos, missing, str(tables.relative_to(path)), matches.unclear)
     return make_scene(
@@ -161,9 +172,8 @@ def lens_from_colmap(model: str, width: int, height: int, params: np.ndarray) ->
     raise HyrfDataError(f"camera model {model} is not supported; undistort the photos with COLMAP first")
 
 
-def _read_model(model: Path) -> tuple[dict[int, Lens], list, int, np.ndarray, np.ndarray]:
-    """Cameras by id, (name, camera id, (4, 4) pose) of the registered photos, the count of the others, points and
-    their colours."""
+def _read_model(model: Path) -> tuple[dict[int, Lens], list[_Image], int, np.ndarray, np.ndarray]:
+    """Cameras by id, the registered photos, the count of the others, points and their colours."""
     kind = _model_kind(model)
     if kind == ".bin":
         check_binary_model(model)
@@ -174,8 +184,9 @@ def _read_model(model: Path) -> tuple[dict[int, Lens], list, int, np.ndarray, np
         with tidied(model, kind) as folder:
             reconstruction = pycolmap.Reconstruction(str(folder))
         images = reconstruction.images
+        ids = np.array(sorted(reconstruction.points3D), np.uint64)
         posed = [
-            (names[key] if key in names else image.name, image.camera_id, _pose(image))
+            _Image(names[key] if key in names else image.name, image.camera_id, _pose(image), _rows(image, ids))
             for key, image in images.items()
             if image.has_pose
         ]
@@ -197,7 +208,8 @@ def _read_model(model: Path) -> tuple[dict[int, Lens], list, int, np.ndarray, np
             _check_text_count(model / f"{name}.txt", count)
     if not len(points) and (model / "points3D.ply").is_file():
         points, colors = read_ply(model / "points3D.ply")
-    unknown = next((name for name, camera_id, _ in posed if camera_id not in cameras), None)
+        posed = [image._replace(sees=None) for image in posed]
+    unknown = next((image.name for image in posed if image.camera not in cameras), None)
     if unknown is not None:
         raise HyrfDataError(f"{model}: photo {unknown} has a camera that the model lacks; export the model again")
     return cameras, posed, len(images) - len(posed), points, colors
@@ -214,6 +226,12 @@ def _model_kind(model: Path) -> str:
             return kind
     kind = ".bin" if any((model / f"{table}.bin").is_file() for table in TABLES) else ".txt"
     raise HyrfDataError(f"{model / missing(kind)[0]}: missing; export the whole COLMAP model again")
+
+
+def _rows(image, ids: np.ndarray) -> np.ndarray:
+    """Where the points that a photo sees stand among the ascending ids of all."""
+    seen = np.array([point.point3D_id for point in image.get_observation_points2D()], np.uint64)
+    return np.searchsorted(ids, seen[np.isin(seen, ids)]).astype(np.int64)
 
 
 def _pose(image) -> np.ndarray:

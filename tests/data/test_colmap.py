@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -293,3 +294,68 @@ def test_mutated_tables_raise_nothing_but_data_errors(mutable_root, colmap_folde
 
 def _eight_bytes(value: int) -> bytes:
     return struct.pack("<Q", value)
+
+
+# -- tracks ----------------------------------------------------------------------------------------------------------
+
+
+def write_tracks(folder, seen: list[list[int]]) -> None:
+    """Tables whose photo n has found the points seen[n], and a feature of no point."""
+    images, tracks = struct.pack("<Q", folder.count), [b""] * len(folder.points)
+    for number, (quaternion, translation) in enumerate(folder.poses):
+        images += struct.pack("<I4d3dI", number + 1, *quaternion, *translation, 7) + folder.names[number].encode()
+        images += b"\0" + struct.pack("<Q", len(seen[number]) + 1) + struct.pack("<ddq", 1.0, 1.0, -1)
+        for place, point in enumerate(seen[number]):
+            images += struct.pack("<ddQ", 3.0 * place, 5.0, point + 1)
+            tracks[point] += struct.pack("<II", number + 1, place + 1)
+    points = struct.pack("<Q", len(tracks))
+    for number, track in enumerate(tracks):
+        color = (int(c) for c in folder.colors[number])
+        points += struct.pack("<Q3d3BdQ", number + 1, *folder.points[number], *color, 0.5, len(track) // 8) + track
+    (folder.model / "images.bin").write_bytes(images)
+    (folder.model / "points3D.bin").write_bytes(points)
+
+
+SEEN = [[2, 0], [1], [], [0, 1, 2]]
+
+
+@pytest.mark.parametrize("kind", ["binary", "text"])
+def test_tracks_are_the_points_that_each_photo_found(tmp_path, colmap_folder, kind):
+    folder = colmap_folder(tmp_path, count=4)
+    write_tracks(folder, SEEN)
+    if kind == "text":
+        pycolmap.Reconstruction(str(folder.model)).write_text(str(folder.model))
+        for table in folder.model.glob("*.bin"):
+            table.unlink()
+    (tmp_path / "images" / "001.png").unlink()
+
+    tracks = load_scene(tmp_path).tracks
+
+    assert {name: rows.tolist() for name, rows in tracks.items()} == {
+        "000.png": [0, 2],
+        "002.png": [],
+        "003.png": [0, 1, 2],
+    }
+    assert all(rows.dtype == np.int64 for rows in tracks.values())
+
+
+def test_tracks_follow_points_that_are_dropped(tmp_path, colmap_folder):
+    folder = colmap_folder(tmp_path, count=4)
+    folder.points = folder.points.copy()
+    folder.points[1, 2] = np.nan
+    write_tracks(folder, SEEN)
+
+    scene = load_scene(tmp_path)
+
+    assert [scene.tracks[name].tolist() for name in folder.names] == [[0, 1], [], [], [0, 1]]
+    np.testing.assert_array_equal(scene.points, folder.points[[0, 2]])
+
+
+def test_points_of_a_ply_file_have_no_tracks(tmp_path, colmap_folder):
+    folder = colmap_folder(tmp_path)
+    (folder.model / "points3D.bin").unlink()
+    trimesh.PointCloud(np.ones((5, 3))).export(folder.model / "points3D.ply")
+
+    scene = load_scene(tmp_path)
+
+    assert len(scene.points) == 5 and scene.tracks == {}
