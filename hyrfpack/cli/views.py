@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -25,6 +25,9 @@ from hyrfpack.cli.common import (
     table,
 )
 from hyrfpack.outputs import Outputs
+
+if TYPE_CHECKING:
+    from hyrfpack.evaluate import Evaluation, ViewScore
 
 SPLITS = ("test", "train", "all")
 DEFAULT_ORBIT = 60  # frames
@@ -141,7 +144,9 @@ def evaluate(
 ) -> None:
     """Score MODEL, a .hyrf file, against photos it has not seen: PSNR, SSIM, LPIPS, bytes on disk, seconds a frame.
 
-    Renders are rounded to 8 bits before they are scored. LPIPS needs the trained weights of the lpips package:
+    Renders are rounded to 8 bits before they are scored. PSNR is told three times: at the photos' mean exposure, at the
+    one that training photos beside predict, and with colours corrected by the photo itself. LPIPS needs the trained
+    weights of the lpips package:
     torch.save(lpips.LPIPS(net="alex").state_dict(), FILE)
 
     \b
@@ -160,7 +165,7 @@ def evaluate(
     views = split_views(scene, split)
     if pictures is not None:
         Outputs(model, lpips_weights, scene=scene, overwrite=overwrite).folder(pictures, picture_names(views).values())
-    scores = score(loaded, views, lpips_weights=lpips_weights, pictures=pictures)
+    scores = score(loaded, views, training=scene.train, lpips_weights=lpips_weights, pictures=pictures)
     size = os.path.getsize(model)
     width, height = largest_picture(view.camera for view in views)
     if scores.skipped:
@@ -168,9 +173,8 @@ def evaluate(
     if as_json:
         print_json({"bytes": size, "max_size": scene.max_size, "picture_size": [width, height], **scores.to_dict()})
         return
-    rows = [[view.name, f"{view.psnr:.2f}", f"{view.ssim:.4f}", _optional(view.lpips)] for view in scores.views]
-    rows.append(["mean", f"{scores.psnr:.2f}", f"{scores.ssim:.4f}", _optional(scores.lpips)])
-    click.echo(table(["view", "PSNR (dB)", "SSIM", "LPIPS"], rows))
+    rows = [*(_row(view.name, view) for view in scores.views), _row("mean", scores)]
+    click.echo(table(["view", "PSNR (dB)", "predicted", "corrected", "SSIM", "LPIPS"], rows))
     limit = f"--max-size {scene.max_size}" if scene.max_size else "as they are stored"
     click.echo(f"{len(scores.views)} photos of up to {width} x {height} pixels ({limit})")
     click.echo(f"{model}: {size:,} bytes, {scores.gaussians:,} Gaussians, {scores.seconds_per_frame:.4f} s a frame")
@@ -178,5 +182,10 @@ def evaluate(
         click.echo(f"LPIPS: {scores.lpips_reason}")
 
 
-def _optional(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4f}"
+def _row(name: str, scores: ViewScore | Evaluation) -> list[str]:
+    decibels = (scores.psnr, scores.psnr_predicted, scores.psnr_corrected)
+    return [name, *(_optional(value, 2) for value in decibels), f"{scores.ssim:.4f}", _optional(scores.lpips)]
+
+
+def _optional(value: float | None, digits: int = 4) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

@@ -336,7 +336,7 @@ def _finite_points(
     if points is None or colors is None:
         return np.zeros((0, 3)), np.zeros((0, 3), np.float32), {}
     with np.errstate(over="ignore"):  # float32 is what they are used in
-        finite: np.ndarray = np.isfinite(points.astype(np.float32)).all(axis=1)
+        finite = np.all(np.isfinite(points.astype(np.float32)), axis=1)
     if not finite.all():
         notes.append(f"{(~finite).sum()} of {len(points)} points are not finite and were dropped")
     row = np.cumsum(finite) - 1  # that each point has among those that stay

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import torch
 from hyrfpack.checks import check_type
 from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
+from hyrfpack.evaluate.exposure import corrected, expose, fitted_gains, predicted_gains
 from hyrfpack.evaluate.figures import comparison
 from hyrfpack.evaluate.lpips import LPIPS
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
@@ -32,20 +34,27 @@ NO_LPIPS = (
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One held-out view; lpips is None without weights."""
+    """One held-out view, as in `Evaluation`."""
 
     name: str
     psnr: float
+    psnr_predicted: float | None
+    psnr_corrected: float
     ssim: float
     lpips: float | None
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Scores on held-out views; the first three are means over `views`.
+    """Scores on held-out views; the first five are means over `views`.
 
     Attributes:
-        psnr: dB, pooled over each picture's pixels and channels, then averaged over views.
+        psnr: dB, pooled over each picture's pixels and channels, then averaged over views; of renders as they are, at
+            the training photos' mean exposure.
+        psnr_predicted: of renders exposed as training photos near by predict, see
+            `hyrfpack.evaluate.exposure.predicted_gains`: the held-out photo is not looked at. None without such photos.
+        psnr_corrected: of renders brought to the colours of the very photo that they are scored against, see
+            `hyrfpack.evaluate.exposure.corrected`.
         ssim: 11x11 Gaussian window, sigma 1.5.
         lpips: perceptual distance, or None.
         lpips_reason: why lpips is None, or which network made it.
@@ -57,6 +66,8 @@ class Evaluation:
     """
 
     psnr: float
+    psnr_predicted: float | None
+    psnr_corrected: float
     ssim: float
     lpips: float | None
     lpips_reason: str
@@ -75,6 +86,7 @@ def evaluate(
     model: HybridModel,
     views: Sequence[View],
     *,
+    training: Sequence[View] = (),
     lpips_weights: str | os.PathLike[str] | None = None,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     pictures: str | os.PathLike[str] | None = None,
@@ -88,6 +100,7 @@ def evaluate(
     Args:
         model: what to score.
         views: photos to compare with, not used in training.
+        training: photos that were, which the exposure of those is predicted from; two near each of these are rendered.
         lpips_weights: see `hyrfpack.evaluate.lpips`; without it lpips is None.
         settings: how to render.
         pictures: folder for photo | render | error pictures of `picture_count` views spread over `views`.
@@ -104,8 +117,9 @@ def evaluate(
     """
     check_type("model", model, HybridModel)
     check_type("settings", settings, RenderSettings)
-    for view in views if isinstance(views, Sequence) else [views]:
-        check_type("each of the views", view, View)
+    for given in (views, training):
+        for view in given if isinstance(given, Sequence) else [given]:
+            check_type("each of the views", view, View)
     if not views:
         raise HyrfError("there is no view to score; name a split that has photos or a smaller --test-every")
     perceptual = None if lpips_weights is None else LPIPS.load(lpips_weights)
@@ -113,6 +127,12 @@ def evaluate(
     solid = np.array(model.config.solid, dtype=np.float32)
     device = model.gaussians.positions.device
     drawn = picture_names(views, picture_count)
+    trained = {view.name: view for view in training}
+
+    @functools.cache
+    def gains_of(name: str) -> np.ndarray:
+        photo, mask = upload(trained[name].load(), solid, device)
+        return fitted_gains(render(model, trained[name].camera, settings, decoded=decoded).rgb, photo, mask)
 
     render(model, views[0].camera, settings, decoded=decoded)  # compiles kernels and fills caches
     scores: list[ViewScore] = []
@@ -128,28 +148,46 @@ def evaluate(
         rendering = render(model, view.camera, settings, decoded=decoded)
         seconds.append(_now(device) - started)
         image = to_8bit(rendering.rgb)
+        predicted = None
+        if trained.keys() - {view.name}:
+            gains = torch.from_numpy(predicted_gains(view.name, list(trained), gains_of)).to(rendering.rgb)
+            predicted = psnr(to_8bit(expose(rendering.rgb, gains)), reference, mask)
         distance = None
         if perceptual is not None:
             seen = image if mask is None else torch.where(mask[..., None], image, reference)
             distance = perceptual(seen, reference)
-        score = ViewScore(view.name, psnr(image, reference, mask), ssim(image, reference, mask), distance)
+        score = ViewScore(
+            name=view.name,
+            psnr=psnr(image, reference, mask),
+            psnr_predicted=predicted,
+            psnr_corrected=psnr(corrected(image, reference, mask), reference, mask),
+            ssim=ssim(image, reference, mask),
+            lpips=distance,
+        )
         scores.append(score)
         if pictures is not None and number in drawn:
             sheet = comparison(reference, image, mask, _caption(score))
             save_picture(Path(pictures, drawn[number]), sheet)
     if not scores:
         raise HyrfError("the masks of all views leave no pixel to score; check that white means 'use this pixel'")
-    distances = [score.lpips for score in scores if score.lpips is not None]
     return Evaluation(
         psnr=statistics.fmean(score.psnr for score in scores),
+        psnr_predicted=_mean(score.psnr_predicted for score in scores),
+        psnr_corrected=statistics.fmean(score.psnr_corrected for score in scores),
         ssim=statistics.fmean(score.ssim for score in scores),
-        lpips=statistics.fmean(distances) if distances else None,
+        lpips=_mean(score.lpips for score in scores),
         lpips_reason=NO_LPIPS if perceptual is None else f"network {perceptual.name}",
         gaussians=len(model),
         seconds_per_frame=statistics.median(seconds),
         views=scores,
         skipped=skipped,
     )
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    """The mean of those that are there, None of none."""
+    there = [value for value in values if value is not None]
+    return statistics.fmean(there) if there else None
 
 
 def picture_names(views: Sequence[View], count: int = PICTURES) -> dict[int, str]:

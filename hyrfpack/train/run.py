@@ -172,7 +172,7 @@ def _finish(trainer: Trainer, out: Path) -> dict:
         # Scored on the file as it was written, not on what is in memory.
         written = hyrf_format.load(path, trainer.device)
         written.precision = config.precision
-        scores: Evaluation = evaluate(written, scene.test, pictures=out / VIEWS)
+        scores: Evaluation = evaluate(written, scene.test, training=scene.train, pictures=out / VIEWS)
         metrics["evaluation"] = scores.to_dict()
     training_curve(trainer.records, out / CURVE)
     write_atomic(out / METRICS, json.dumps(metrics, indent=1).encode())
