@@ -131,3 +131,23 @@ def small_model(
             part.weights[-1].mul_(fields)
             part.biases[-1].mul_(fields)
     return model
+
+
+def tracks_of(scene: Scene, facing: float = 0.5) -> dict[str, np.ndarray]:
+    """The points of balls that each training photo sees, on the sides that face it: by this cosine at least."""
+    centers = np.argmin(
+        np.abs(np.linalg.norm(scene.points[:, None] - BALL_CENTERS, axis=2) - BALL_RADII), axis=1
+    )  # of the ball that each lies on
+    normals = (scene.points - BALL_CENTERS[centers]) / BALL_RADII[centers, None]
+    tracks = {}
+    for view in scene.train:
+        rays = scene.points - view.camera.position
+        distance = np.linalg.norm(rays, axis=1)
+        rays /= distance[:, None]
+        free = -(rays * normals).sum(1) > facing
+        for ball, (center, radius) in enumerate(zip(BALL_CENTERS, BALL_RADII, strict=True)):
+            along = rays @ (center - view.camera.position)
+            missed = along**2 - np.sum((center - view.camera.position) ** 2) + radius**2 < 0
+            free &= missed | (along > distance) | (centers == ball)
+        tracks[view.name] = np.flatnonzero(free)
+    return tracks

@@ -42,6 +42,9 @@ BACKGROUND_COLORS = ("black", "white", "random")
     show_default=True,
     help="What transparent photos are laid over.",
 )
+@click.option(
+    "--exposure/--no-exposure", default=None, help="Learn each photo's exposure.  [default: where photos differ]"
+)
 @click.option("--antialiased", is_flag=True, help="Compensate small Gaussians for the pixel filter.")
 @click.option("--log2-table-size", type=click.IntRange(4, 24), metavar="B", help="Hash rows a level, as 2^B.")
 @click.option(
@@ -114,7 +117,8 @@ def train(
             f"{metrics['seconds']:.0f} s of training"
         )
         if scores := metrics.get("evaluation"):
-            click.echo(f"held-out views: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}")
+            predicted = f" ({scores['psnr_predicted']:.2f} at the exposure that photos beside them predict)"
+            click.echo(f"held-out views: {scores['psnr']:.2f} dB{predicted}, SSIM {scores['ssim']:.4f}")
     if not result.complete:
         click.get_current_context().exit(1)
 

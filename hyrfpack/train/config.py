@@ -21,7 +21,8 @@ class LearningRates:
     """Adam's step sizes at the first and the last step of a full-length run; exponential in between.
 
     A shorter run has fewer steps to go the same way: its rates are sqrt(FULL_STEPS / steps) times these.
-    Positions are in local units (the frame's longest half-axis is 1), the rest are logits and field weights.
+    Positions are in local units (the frame's longest half-axis is 1), the rest are logits, field weights and
+    logarithms of photos' gains.
     All are positive.
     """
 
@@ -30,6 +31,7 @@ class LearningRates:
     color_logits: tuple[float, float] = (6e-3, 6e-4)
     scale_logits: tuple[float, float] = (1.2e-2, 1.2e-3)
     opacity_logits: tuple[float, float] = (3e-2, 3e-3)
+    exposure: tuple[float, float] = (1e-3, 1e-4)
 
     def __post_init__(self) -> None:
         for group in fields(self):
@@ -92,6 +94,8 @@ class TrainConfig:
         log2_table_size: rows per level of the radiance grid as a power of two (the geometry grid has half);
             None follows the budget. 4 to 24.
         background: whether a background sphere is trained; None lets the preset decide.
+        exposure: whether gains of each photo's colours are learnt beside the model, which then has the photos' mean
+            exposure; None looks at how much the photos differ, see `hyrfpack.train.exposure`.
         background_color: what transparent pictures are laid over: "black", "white" or "random" (a new colour
             every step; the model then has black behind it).
         ssim_weight: w in (1 - w) L1 + w (1 - SSIM).
@@ -108,6 +112,7 @@ class TrainConfig:
     max_gaussians: int | None = None
     log2_table_size: int | None = None
     background: bool | None = None
+    exposure: bool | None = None
     background_color: str = "black"
     antialiased: bool = False
     ssim_weight: float = 0.2
@@ -134,8 +139,9 @@ class TrainConfig:
         check_choice("background_color", self.background_color, BACKGROUND_COLORS)
         check_choice("scale_rule", self.scale_rule, ("sum", "product"))
         check_choice("direction_encoding", self.direction_encoding, ("frequency", "sh"))
-        if self.background is not None:
-            check_bool("background", self.background)
+        for name in ("background", "exposure"):
+            if getattr(self, name) is not None:
+                check_bool(name, getattr(self, name))
         for name in ("antialiased", "scale_grows", "position_gradients"):
             check_bool(name, getattr(self, name))
         check_float("ssim_weight", self.ssim_weight, 0, 1)

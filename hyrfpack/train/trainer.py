@@ -26,6 +26,7 @@ from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.density import DensityControl
+from hyrfpack.train.exposure import exposures_for
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.setup import build_model
 
@@ -68,6 +69,7 @@ class Trainer:
             model, self.budget, self.choices = build_model(scene, config)
         else:
             self.budget = config.max_gaussians or len(model)
+        self.exposures, self.choices["exposure"] = exposures_for(scene, config, self.cache, device)
         self._take(model)
         self.density = DensityControl(config.density, config.steps, self.budget, len(self.model), config.seed, device)
         self.step = 0
@@ -157,21 +159,25 @@ class Trainer:
         for stage, seconds in rendering.seconds.items():
             self.seconds[stage] += seconds
         with self._timed("loss"):
-            loss = photometric_loss(rendering.rgb, target, mask, ssim_weight=config.ssim_weight)
+            image = rendering.rgb if self.exposures is None else self.exposures.exposed(rendering.rgb, view)
+            loss = photometric_loss(image, target, mask, ssim_weight=config.ssim_weight)
         with self._timed("backward"):
             loss.backward()
         with self._timed("density"):
             self.density.observe(rendering, view.camera.width, view.camera.height)
         with self._timed("optimizer"):
             broken = self.optimizer.step(self.step - 1, config.steps)
+            if self.exposures is not None:
+                rate = config.learning_rates.at("exposure", self.step - 1, config.steps)
+                broken = torch.cat((broken, self.exposures.step(rate)[None]))
         with self._timed("loss"):
             # All that the host wants to know of this step, in one wait for the device.
-            error = _mean_square(rendering.rgb.detach() - target, mask)
+            error = _mean_square(image.detach() - target, mask)
             value, mse, *flags = torch.stack((loss.detach(), error, *broken)).tolist()
         if not np.isfinite(value):
             self._refuse(view, "the loss is not finite", self._nonfinite_parameters())
         if any(flags):
-            self._refuse(view, "a gradient is not finite", self.optimizer.names(flags))
+            self._refuse(view, "a gradient is not finite", self._groups(flags))
         with self._timed("density"):
             self.density.act(self.step, self.model, self.optimizer)
         return value, mse
@@ -190,6 +196,11 @@ class Trainer:
         if self.config.background_color == "random":
             return np.random.default_rng((self.config.seed, 1, self.step)).random(3, dtype=np.float32)
         return np.array(self.model.config.solid, np.float32)
+
+    def _groups(self, flags: Sequence[float]) -> list[str]:
+        """The parameter groups with a gradient that is not finite."""
+        count = len(self.optimizer.groups)
+        return self.optimizer.names(flags[:count]) + ["exposure"] * any(flags[count:])
 
     def _nonfinite_parameters(self) -> list[str]:
         return [name for name, p in self.model.named_parameters() if not torch.isfinite(p).all()]
@@ -211,12 +222,15 @@ class Trainer:
 
     def _settings(self) -> dict:
         views = [[view.name, view.camera.width, view.camera.height] for view in self.scene.train]
-        return {**self.config.to_dict(), "views": views, "model": self.model.config.to_dict()}
+        chosen = {"exposure": self.exposures is not None, "model": self.model.config.to_dict()}
+        return {**self.config.to_dict(), "views": views, **chosen}
 
     def save(self, path: Path) -> None:
         """Write the run's state to `path`."""
         tensors: dict[str, Tensor] = {f"model.{name}": p for name, p in self.model.named_parameters()}
         tensors |= {f"adam.{name}": value for name, value in self.optimizer.state_dict().items()}
+        if self.exposures is not None:
+            tensors |= {f"exposure.{name}": value for name, value in self.exposures.state_dict().items()}
         tensors |= {"density.gradients": self.density.gradients, "density.views": self.density.views}
         progress = {"step": self.step, "records": self.records, "seconds": dict(self.seconds), "elapsed": self.elapsed}
         tensors = {name: value.detach().cpu() for name, value in tensors.items()}
@@ -239,6 +253,10 @@ class Trainer:
         self.optimizer.load_state_dict(
             {name.removeprefix("adam."): value for name, value in tensors.items() if name.startswith("adam.")}
         )
+        if self.exposures is not None:
+            self.exposures.load_state_dict(
+                {n.removeprefix("exposure."): value for n, value in tensors.items() if n.startswith("exposure.")}
+            )
         self.density.gradients, self.density.views = (
             tensors[f"density.{name}"].to(self.device) for name in ("gradients", "views")
         )

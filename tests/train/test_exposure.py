@@ -1,0 +1,229 @@
+"""Photos of different exposure: gains that are known are found by tracks, kept through training, and left out of it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from scenes import ball_scene, tracks_of, view_of
+
+from hyrfpack.data import PictureCache
+from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.evaluate import evaluate
+from hyrfpack.scene import Picture, Scene, View
+from hyrfpack.train import TrainConfig, Trainer
+from hyrfpack.train.exposure import PULL, USABLE, Exposures, Observations, gains_from, observe
+
+CPU = torch.device("cpu")
+SHORT = TrainConfig(steps=30, seed=3, max_gaussians=160)
+
+
+def shown(picture: Picture, gains) -> Picture:
+    """A photo whose odds y / (1 - y) are `gains` (one, or three) times as large."""
+    odds = picture.rgb / np.maximum(255.0 - picture.rgb, 1e-9) * gains
+    return dataclasses.replace(picture, rgb=(255 * odds / (1 + odds)).round().astype(np.uint8))
+
+
+def exposed_scene(gains: np.ndarray, side: int = 64, points: int = 300) -> Scene:
+    """Balls in photos of these gains (N, 1) or (N, 3), with tracks."""
+    scene = ball_scene(len(gains), points, side=side)
+    views = [view_of(v.name, v.camera, shown(v.load(), g)) for v, g in zip(scene.train, gains, strict=True)]
+    return dataclasses.replace(scene, train=views, tracks=tracks_of(scene))
+
+
+def alternating(count: int, stops: float = 0.5) -> np.ndarray:
+    """(N, 1) gains that turn middle grey, of which light is the 2.2th power, so many stops lighter and darker."""
+    lighter = 0.5 * 2 ** (np.where(np.arange(count) % 2, -stops, stops) / 2.2)
+    return (lighter / (1 - lighter))[:, None]
+
+
+def centred(gains: np.ndarray) -> np.ndarray:
+    logs = np.log(np.broadcast_to(gains, (len(gains), 3)))
+    return logs - logs.mean(0)
+
+
+# -- by tracks -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("occluded", [0.0, 0.2])
+def test_gains_are_found_beside_points_that_show_something_else(occluded):
+    rng = np.random.default_rng(0)
+    logs = rng.normal(0, 0.4, (12, 3))
+    colors = rng.normal(-0.5, 1, (200, 3))
+    photo, point = np.nonzero(rng.random((12, 200)) < 0.3)
+    logits = logs[photo] + colors[point] + rng.normal(0, 0.03, (len(photo), 3))
+    wrong = rng.random(len(photo)) < occluded
+    logits[wrong] = rng.normal(1, 1, (wrong.sum(), 3))
+
+    found = gains_from(Observations(photo, point, logits), 12)
+
+    np.testing.assert_allclose(found, logs - logs.mean(0), atol=0.04)
+    np.testing.assert_allclose(found.mean(0), 0, atol=1e-12)
+
+
+def test_photos_that_nothing_is_known_of_have_gains_of_one_and_parts_that_share_no_point_keep_apart():
+    photo, point = np.repeat([0, 1, 3, 4], 50), np.tile(np.arange(50), 4) + np.repeat([0, 50], 100)
+    logits = np.repeat([0.3, -0.3, 0.1, -0.1], 50)[:, None] * np.ones(3) + np.linspace(-2, 2, 50)[point % 50, None]
+
+    found = gains_from(Observations(photo, point, logits), 5)
+
+    np.testing.assert_allclose(found, np.array([0.3, -0.3, 0, 0.1, -0.1])[:, None] * np.ones(3), atol=1e-3)
+    assert not gains_from(Observations(photo[:9], point[:9], logits[:9]), 2).any()
+
+
+def test_each_photo_is_read_once_and_what_is_masked_clipped_or_outside_is_left_out():
+    scene, reads = exposed_scene(np.ones((4, 1))), []
+    black, masked, see_through, usual = scene.train
+
+    def changed(view: View, **parts) -> View:
+        picture = dataclasses.replace(view.load(), **parts)
+        return dataclasses.replace(view, load=lambda: reads.append(view.name) or picture)
+
+    views = [
+        changed(black, rgb=np.full((64, 64, 3), USABLE[0] - 1, np.uint8)),
+        changed(masked, mask=np.arange(64)[:, None] < np.full(64, 32)),
+        changed(see_through, alpha=np.full((64, 64), 254, np.uint8)),
+        changed(usual),
+        changed(dataclasses.replace(usual, name="again.png")),
+    ]
+    away = dataclasses.replace(scene.train[0].camera, cx=1e4)
+    views.append(dataclasses.replace(views[-1], name="away.png", camera=away))
+    tracks = {**scene.tracks, "again.png": scene.tracks[usual.name], "away.png": scene.tracks[usual.name]}
+
+    found = observe(dataclasses.replace(scene, train=views, tracks=tracks), PictureCache(0))
+
+    assert len(reads) == len(views)
+    assert set(found.photo) <= {1, 3, 4} and {3, 4} <= set(found.photo)
+    assert (np.bincount(found.point)[found.point] > 1).all()
+
+
+# -- a step ----------------------------------------------------------------------------------------------------------
+
+
+def test_gradients_are_those_of_the_equation_in_float64():
+    views = ball_scene(2).train
+    exposures = Exposures(views, np.array([[0.3, -0.2, 0.1], [-0.3, 0.2, -0.1]]), CPU)
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(7, 5, 3, generator=generator).requires_grad_()
+    weights = torch.rand(7, 5, 3, generator=generator)
+
+    (exposures.exposed(image, views[1]) * weights).sum().backward()
+
+    y, w, logs = image.detach().double(), weights.double(), exposures.values[1].double()
+    odds = y / (1 - y) * logs.exp()
+    shown = odds / (1 + odds)
+    torch.testing.assert_close(
+        exposures._used[1].grad.double(), (w * shown * (1 - shown)).sum((0, 1)), rtol=1e-4, atol=1e-6
+    )
+    expected = w * shown * (1 - shown) / (y * (1 - y))
+    torch.testing.assert_close(image.grad.double(), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_steps_are_adams_with_a_pull_to_one_and_keep_the_mean():
+    views = ball_scene(3).train
+    start = np.array([[0.3, -0.2, 0.1], [-0.1, 0.4, 0.0], [0.2, 0.1, -0.3]])
+    exposures = Exposures(views, start, CPU)
+    torch.testing.assert_close(exposures.values.double().numpy(), start - start.mean(0), rtol=1e-5, atol=1e-6)
+    expected = [torch.from_numpy(row).requires_grad_() for row in start - start.mean(0)]
+    optimizers = [torch.optim.Adam([row], lr=0.01, eps=1e-15) for row in expected]
+    image = torch.rand(5, 4, 3, generator=torch.Generator().manual_seed(1))
+
+    for number in (0, 2, 2, 1, 0, 2):
+        (exposures.exposed(image, views[number]) ** 2).mean().backward()
+        assert not exposures.step(0.01)
+        odds = image.double() / (1 - image.double()) * expected[number].exp()
+        loss = ((odds / (1 + odds)) ** 2).mean() + PULL / 2 * expected[number].square().sum()
+        expected[number].grad = None
+        loss.backward()
+        optimizers[number].step()
+        with torch.no_grad():
+            mean = torch.stack(expected).mean(0)
+            for row in expected:
+                row -= mean
+
+        torch.testing.assert_close(exposures.values.double(), torch.stack(expected).detach(), rtol=1e-4, atol=1e-6)
+        assert exposures.values.mean(0).abs().max() < 1e-7
+
+
+def test_a_gradient_that_is_not_finite_is_told_and_changes_nothing():
+    views = ball_scene(2).train
+    exposures = Exposures(views, np.array([[0.3, 0.3, 0.3], [-0.3, -0.3, -0.3]]), CPU)
+    before = exposures.values.clone()
+    (exposures.exposed(torch.full((2, 2, 3), 0.5), views[0]) * torch.nan).sum().backward()
+
+    assert exposures.step(0.1)
+    assert torch.equal(exposures.values, before)
+
+
+# -- a run -----------------------------------------------------------------------------------------------------------
+
+
+def parameters(trainer: Trainer) -> dict[str, bytes]:
+    return {name: p.detach().numpy().tobytes() for name, p in trainer.model.named_parameters()}
+
+
+def trained(scene: Scene, config: TrainConfig = SHORT) -> Trainer:
+    trainer = Trainer(scene, config)
+    assert trainer.run()
+    return trainer
+
+
+def test_gains_that_are_known_are_found_and_the_model_keeps_the_mean():
+    gains = alternating(8) * np.array([1.1, 1.0, 0.9]) ** np.linspace(-1, 1, 8)[:, None]
+    scene = exposed_scene(gains, side=128)
+
+    trainer = trained(scene, dataclasses.replace(SHORT, steps=60))
+
+    assert trainer.choices["exposure"].startswith("gains of each photo: by their tracks the photos differ by 0.5")
+    np.testing.assert_allclose(trainer.exposures.values, centred(gains), atol=0.05)
+
+
+def test_photos_alike_and_photos_without_tracks_are_trained_as_they_are():
+    alike = exposed_scene(np.ones((6, 1)))
+    for scene, why in ((alike, "0.0"), (dataclasses.replace(alike, tracks={}), "no tracks")):
+        trainer, without = trained(scene), trained(scene, dataclasses.replace(SHORT, exposure=False))
+
+        assert trainer.exposures is None and why in trainer.choices["exposure"]
+        assert without.choices["exposure"] == "off: asked for"
+        assert parameters(trainer) == parameters(without) and trainer.records == without.records
+
+
+def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path):
+    scene, path = exposed_scene(alternating(6)), tmp_path / "checkpoint.pt"
+    whole, first = trained(scene), Trainer(scene, SHORT)
+    assert not first.run(checkpoint=path, stop=lambda: first.step == 17)
+
+    second = Trainer(scene, SHORT)
+    second.load(path)
+    second.run()
+
+    assert parameters(second) == parameters(whole) and second.records == whole.records
+    assert torch.equal(second.exposures.values, whole.exposures.values)
+    with pytest.raises(HyrfTrainingError, match=r"other settings \(exposure\)"):
+        Trainer(scene, dataclasses.replace(SHORT, exposure=False)).load(path)
+
+
+def test_what_exposure_cannot_be_learnt_of():
+    few = Trainer(exposed_scene(alternating(6)), dataclasses.replace(SHORT, steps=5))
+    assert few.exposures is None and few.choices["exposure"] == "off: 5 steps are less than the 6 photos"
+    cut_out = ball_scene(4, alpha=True)
+    assert Trainer(cut_out, SHORT).choices["exposure"] == "off: photos with transparency"
+    with pytest.raises(HyrfTrainingError, match=r"balls: photos with transparency .*leave out --exposure"):
+        Trainer(cut_out, dataclasses.replace(SHORT, exposure=True))
+
+
+def test_exposure_that_drifts_is_predicted_for_photos_held_out():
+    """A cloud passes: half a stop lighter, half a stop darker. Held-out photos are every fourth."""
+    drift = 0.5 * 2 ** (0.5 * np.sin(np.arange(16) / 16 * 2 * np.pi) / 2.2)
+    scene = exposed_scene((drift / (1 - drift))[:, None], side=32)
+    split = dataclasses.replace(
+        scene, train=[v for n, v in enumerate(scene.train) if n % 4 != 2], test=scene.train[2::4]
+    )
+
+    model = trained(split, dataclasses.replace(SHORT, steps=200)).model
+    scores = evaluate(model, split.test, training=split.train)
+
+    assert scores.psnr_predicted > scores.psnr + 1
+    assert scores.psnr_corrected > scores.psnr + 1
