@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import torch
 
@@ -151,3 +153,22 @@ def tracks_of(scene: Scene, facing: float = 0.5) -> dict[str, np.ndarray]:
             free &= missed | (along > distance) | (centers == ball)
         tracks[view.name] = np.flatnonzero(free)
     return tracks
+
+
+def shown(picture: Picture, gains) -> Picture:
+    """A photo whose odds y / (1 - y) are `gains` (one, or three) times as large."""
+    odds = picture.rgb / np.maximum(255.0 - picture.rgb, 1e-9) * gains
+    return dataclasses.replace(picture, rgb=(255 * odds / (1 + odds)).round().astype(np.uint8))
+
+
+def exposed_scene(gains: np.ndarray, side: int = 64, points: int = 300) -> Scene:
+    """Balls in photos of these gains (N, 1) or (N, 3), with tracks."""
+    scene = ball_scene(len(gains), points, side=side)
+    views = [view_of(v.name, v.camera, shown(v.load(), g)) for v, g in zip(scene.train, gains, strict=True)]
+    return dataclasses.replace(scene, train=views, tracks=tracks_of(scene))
+
+
+def alternating(count: int, stops: float = 0.5) -> np.ndarray:
+    """(N, 1) gains that turn middle grey, of which light is the 2.2th power, so many stops lighter and darker."""
+    lighter = 0.5 * 2 ** (np.where(np.arange(count) % 2, -stops, stops) / 2.2)
+    return (lighter / (1 - lighter))[:, None]

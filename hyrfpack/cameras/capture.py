@@ -1,4 +1,4 @@
-"""What a trained model keeps of its photos: their cameras, what it will be looked at from, about, and their size."""
+"""What a trained model keeps of its photos: cameras, viewpoint and size, and whether it has their mean exposure."""
 
 from __future__ import annotations
 
@@ -19,17 +19,28 @@ def kept_cameras(cameras: Sequence[Camera]) -> list[list[float]]:
     return [camera_to_numbers(camera) for camera in evenly_spaced(cameras, KEPT)]
 
 
-def provenance_of(scene: Scene) -> dict:
-    """What the provenance of a model trained on a scene keeps of it, for `Capture`.
+def provenance_of(scene: Scene, mean_exposure: bool = False) -> dict:
+    """What the provenance of a model trained on a scene keeps of it, for `Capture` and `has_mean_exposure`.
 
     `max_size` is left out where reading the photos again with DEFAULT_MAX_SIZE gives the same pictures: a model of
-    small photos is the same file, byte for byte, whether or not there is such a limit.
+    small photos is the same file, byte for byte, whether or not there is such a limit. So is `mean_exposure` where no
+    gains of photos were learnt.
     """
     cameras = [view.camera for view in scene.train]
-    kept = {"viewpoint": Viewpoint.of(cameras).to_json(), "cameras": kept_cameras(cameras)}
+    kept: dict = {"viewpoint": Viewpoint.of(cameras).to_json(), "cameras": kept_cameras(cameras)}
     small = all(max(view.camera.width, view.camera.height) < DEFAULT_MAX_SIZE for view in scene.views)
     needless = scene.max_size is None or (small and scene.max_size == DEFAULT_MAX_SIZE)
-    return kept if needless else {**kept, "max_size": scene.max_size}
+    if not needless:
+        kept["max_size"] = scene.max_size
+    return {**kept, "mean_exposure": True} if mean_exposure else kept
+
+
+def has_mean_exposure(provenance: dict) -> bool:
+    """Whether a model has its photos' mean exposure, gains of each having been learnt beside it, by its provenance.
+
+    Where it has, what differs between a render and a photo is the photo's own exposure, too.
+    """
+    return provenance.get("mean_exposure") is True
 
 
 @dataclass(frozen=True)

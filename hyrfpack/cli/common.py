@@ -194,6 +194,11 @@ def largest_picture(cameras: Iterable[Camera]) -> tuple[int, int]:
     return max(((camera.width, camera.height) for camera in cameras), key=lambda size: size[0] * size[1])
 
 
+def at_predicted_exposure(psnr: float | None) -> str:
+    """What to put behind a PSNR: that of renders exposed as photos beside them predict, where it is known."""
+    return "" if psnr is None else f" ({psnr:.2f} at the exposure that photos beside them predict)"
+
+
 def print_json(values: dict) -> None:
     """Print one JSON object, the only thing a command puts on standard output under --json."""
     click.echo(json.dumps(values, indent=1, allow_nan=False))

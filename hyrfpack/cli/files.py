@@ -240,14 +240,20 @@ def _typed(context: click.Context) -> str:
 
 
 def _scores(before: Path, after: Path, scene: Scene | None) -> dict[str, float]:
-    """Mean PSNR and SSIM on held-out photos of both files, where there are photos."""
+    """Mean PSNR and SSIM on held-out photos of both files, where there are photos; the predicted PSNR, too, where
+    exposures were learnt."""
     if scene is None or not scene.test:
         return {}
+    from hyrfpack.cameras.capture import has_mean_exposure
     from hyrfpack.evaluate import evaluate
-    from hyrfpack.format import load
+    from hyrfpack.format import describe, load
 
-    old, new = (evaluate(load(path), scene.test) for path in (before, after))
-    return {"psnr_before": old.psnr, "psnr": new.psnr, "ssim_before": old.ssim, "ssim": new.ssim}
+    training = scene.train if has_mean_exposure(describe(before)["provenance"]) else ()
+    old, new = (evaluate(load(path), scene.test, training=training) for path in (before, after))
+    scores = {"psnr_before": old.psnr, "psnr": new.psnr, "ssim_before": old.ssim, "ssim": new.ssim}
+    if old.psnr_predicted is not None and new.psnr_predicted is not None:
+        scores |= {"psnr_predicted_before": old.psnr_predicted, "psnr_predicted": new.psnr_predicted}
+    return scores
 
 
 def _print_report(path: Path, report: CompressionReport, scores: dict[str, float], as_json: bool) -> None:
@@ -267,6 +273,11 @@ def _print_report(path: Path, report: CompressionReport, scores: dict[str, float
         click.echo(
             f"held-out photos: PSNR {scores['psnr_before']:.3f} to {scores['psnr']:.3f} dB, "
             f"SSIM {scores['ssim_before']:.4f} to {scores['ssim']:.4f}"
+        )
+    if "psnr_predicted" in scores:
+        click.echo(
+            "at the exposure that photos beside them predict: "
+            f"PSNR {scores['psnr_predicted_before']:.3f} to {scores['psnr_predicted']:.3f} dB"
         )
 
 

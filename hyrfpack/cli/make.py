@@ -13,6 +13,7 @@ from hyrfpack.cli.common import (
     PATH,
     SEED,
     SIZE,
+    at_predicted_exposure,
     chosen_device,
     json_option,
     note,
@@ -144,7 +145,8 @@ def _print(result: MakeResult) -> None:
     click.echo(f"times: {times}; {result.work} keeps what each stage made, and may be deleted")
     if result.psnr is not None:
         photos = f"{result.views} photo{'s' if result.views > 1 else ''}"
-        click.echo(f"{photos} held out: PSNR {result.psnr:.2f} dB, SSIM {result.ssim:.4f}")
+        predicted = at_predicted_exposure(result.psnr_predicted)
+        click.echo(f"{photos} held out: PSNR {result.psnr:.2f} dB{predicted}, SSIM {result.ssim:.4f}")
     elif result.training:
         click.echo("no photo is held out, so that nothing is scored")
     click.echo(f"{result.output}: {result.bytes:,} bytes, {result.gaussians:,} Gaussians; {_where_to_look(result)}")

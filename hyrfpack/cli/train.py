@@ -11,6 +11,7 @@ from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
     SEED,
+    at_predicted_exposure,
     chosen_device,
     detail,
     device_options,
@@ -117,7 +118,7 @@ def train(
             f"{metrics['seconds']:.0f} s of training"
         )
         if scores := metrics.get("evaluation"):
-            predicted = f" ({scores['psnr_predicted']:.2f} at the exposure that photos beside them predict)"
+            predicted = at_predicted_exposure(scores["psnr_predicted"])
             click.echo(f"held-out views: {scores['psnr']:.2f} dB{predicted}, SSIM {scores['ssim']:.4f}")
     if not result.complete:
         click.get_current_context().exit(1)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from copy import deepcopy
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from hyrfpack.compress.quantize import quantize
 from hyrfpack.compress.rate_distortion import ERROR_PER_BIT
@@ -16,6 +17,7 @@ from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.device import upload
 from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.evaluate.exposure import expose, fitted_gains
 from hyrfpack.format.arrays import by_parameter
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.compact.quantized import Quantized
@@ -49,6 +51,7 @@ def finetune(
     steps: int,
     *,
     seed: int = 0,
+    gains: Mapping[str, Tensor] | None = None,
     cache: PictureCache | None = None,
     report: Callable[[int, float], None] = lambda step, loss: None,
 ) -> HybridModel:
@@ -69,6 +72,7 @@ def finetune(
         views: photos to fit.
         steps: optimiser steps, one view each.
         seed: of the order of views.
+        gains: of each photo, that renders are exposed by before they are compared, see `gains_of_photos`.
         cache: holds decoded photos.
         report: called after each step with its number, from 1, and the photometric loss.
 
@@ -93,7 +97,10 @@ def finetune(
             tuned.load_state_dict(dict(by_parameter(quantized.arrays(), tuned)), strict=False)
             solid = None if tuned.config.background else np.array(tuned.config.solid, np.float32)
             target, mask = upload(picture, solid, tuned.gaussians.positions.device)
-            loss = photometric_loss(render(tuned, view.camera).rgb, target, mask)
+            image = render(tuned, view.camera).rgb
+            if gains is not None:
+                image = expose(image, gains[view.name])
+            loss = photometric_loss(image, target, mask)
             loss.backward()
             tuned.load_state_dict(exact)
             _add_rate(tuned, quantized, LOSS_PER_ERROR * ERROR_PER_BIT * plan.distortion_per_number)
@@ -106,6 +113,23 @@ def finetune(
             report(step + 1, float(loss.detach()))
     tuned.gaussians.positions.requires_grad_(True)
     return tuned
+
+
+@torch.no_grad()
+def gains_of_photos(model: HybridModel, views: Sequence[View], cache: PictureCache | None = None) -> dict[str, Tensor]:
+    """The gains of `expose` that bring a model of mean exposure to each photo, by name, (3,) on the model's device.
+
+    The mean of their logarithms is zero, so that a model fitted with them keeps its exposure.
+    """
+    device = model.gaussians.positions.device
+    solid = None if model.config.background else np.array(model.config.solid, np.float32)
+    decoded, logs = model.decode(), []
+    with closing((cache or PictureCache()).stream(views)) as pictures, torch_on_one_thread():
+        for view, picture in pictures:
+            photo, mask = upload(picture, solid, device)
+            logs.append(np.log(fitted_gains(render(model, view.camera, decoded=decoded).rgb, photo, mask)))
+    centred = torch.from_numpy(np.exp(logs - np.mean(logs, 0))).float().to(device)
+    return {view.name: gains for view, gains in zip(views, centred, strict=True)}
 
 
 @torch.no_grad()

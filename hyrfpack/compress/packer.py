@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import warnings
 from collections.abc import Callable, Sequence
@@ -12,10 +13,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from hyrfpack.cameras.capture import Capture
+from hyrfpack.cameras.capture import Capture, has_mean_exposure
 from hyrfpack.checks import check_type
 from hyrfpack.compress.distortion import LIMITS, default_distortion
-from hyrfpack.compress.finetune import finetune
+from hyrfpack.compress.finetune import finetune, gains_of_photos
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.quantize import opacity_error, quantize
 from hyrfpack.compress.search import coarsest, finest
@@ -40,7 +41,7 @@ from hyrfpack.format.sections import COLORS, OPACITIES, POSITIONS, SCALES
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
-from hyrfpack.scene import Camera, Scene, evenly_spaced
+from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 
 FINETUNED = 4.0  # times as much distortion, which fine-tuning takes back
 VERIFIED = 6  # cameras at which a file's pictures are compared with the model's
@@ -85,7 +86,8 @@ def compress(
         finetune_steps: steps of fitting the quantised model to the photos of `data`; buys smaller files with time.
         prune: leave out Gaussians that cost more in bytes than they give to pictures.
         target_bytes: make the file as good as can be within so many bytes.
-        max_psnr_drop: make the file as small as can be for so many dB of mean PSNR on the held-out photos of `data`.
+        max_psnr_drop: make the file as small as can be for so many dB of mean PSNR on the held-out photos of `data`;
+            of `psnr_predicted` (`hyrfpack.Evaluation`) where photos' exposures were learnt beside the model.
         distortion: mean squared error that pictures may get, by estimate; instead of a search.
         say: told what is going on.
         settings: of "paper", see `hyrfpack.format.paper`; `noise` is the old word for `distortion`.
@@ -175,8 +177,10 @@ class Packer:
         if self.finetune_steps:
             assert self.scene is not None
             self.say(f"fine-tuning for {self.finetune_steps:,} steps")
-            steps = self.finetune_steps
-            model = planned = finetune(planned, plan, self.sensitivity, self.scene.train, steps, cache=self.cache)
+            steps, gains = self.finetune_steps, self._gains
+            model = planned = finetune(
+                planned, plan, self.sensitivity, self.scene.train, steps, gains=gains, cache=self.cache
+            )
         quantized = quantize(planned, plan, self.sensitivity, reach=0 if self.finetune_steps else 1)
         data = encode_model(model, "compact", self.provenance, quantized=quantized)
         return Trial(data, added_errors(planned, quantized, self.sensitivity))
@@ -222,11 +226,11 @@ class Packer:
     def within_drop(self, limit: float, start: float) -> tuple[Trial, str]:
         assert self.scene is not None
         views = self.scene.test or self.scene.train
-        before = evaluate(self.model, views).psnr
+        before = self._psnr(self.model, views)
 
         def attempt(distortion: float) -> Trial:
             trial = self.attempt(distortion)
-            lost = before - evaluate(decode_model(trial.data), views).psnr
+            lost = before - self._psnr(decode_model(trial.data), views)
             trial = dataclasses.replace(trial, lost=lost)
             self.say(f"distortion {distortion:.2g}: {len(trial.data):,} bytes, {lost:+.3f} dB lost")
             return trial
@@ -238,6 +242,21 @@ class Packer:
             )
         distortion, trial = answer
         return trial, f"distortion {distortion:.2g} loses {trial.lost:+.3f} of {limit:g} dB on {len(views)} photos"
+
+    @functools.cached_property
+    def _gains(self) -> dict[str, torch.Tensor] | None:
+        """Of the photos to fine-tune on; None where the model has the exposure of each."""
+        assert self.scene is not None
+        if not has_mean_exposure(self.provenance):
+            return None
+        return gains_of_photos(self.model, self.scene.train, self.cache)
+
+    def _psnr(self, model: HybridModel, views: Sequence[View]) -> float:
+        """At the exposure that photos beside each predict, where the model has their mean: what the photos' own
+        exposures add to the error would hide what packing adds."""
+        assert self.scene is not None
+        scores = evaluate(model, views, training=self.scene.train if has_mean_exposure(self.provenance) else ())
+        return scores.psnr if scores.psnr_predicted is None else scores.psnr_predicted
 
     def _trials(self) -> int:
         return FINETUNED_TRIALS if self.finetune_steps else TRIALS

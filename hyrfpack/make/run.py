@@ -43,6 +43,7 @@ class MakeResult:
         work: the folder of every stage's product.
         views: how many held-out photos the model was scored on.
         psnr, ssim: their means; None where there was nothing to score on.
+        psnr_predicted: mean, as in `hyrfpack.Evaluation`; None also where no exposures of photos were learnt.
         poses: what `hyrfpack.estimate_poses` reports; empty where the photos had poses.
         training: steps, Gaussians, bytes and choices of the training; empty where there was none.
         export: what `hyrfpack.export` reports, or `hyrfpack.distill` of splats under "import".
@@ -57,6 +58,7 @@ class MakeResult:
     work: Path
     views: int = 0
     psnr: float | None = None
+    psnr_predicted: float | None = None
     ssim: float | None = None
     poses: dict[str, Any] = field(default_factory=dict)
     training: dict[str, Any] = field(default_factory=dict)
@@ -259,6 +261,7 @@ class _Making:
             work=work.folder,
             views=scores["views"],
             psnr=scores.get("psnr"),
+            psnr_predicted=scores.get("psnr_predicted"),
             ssim=scores.get("ssim"),
             poses=poses or {},
             training=training or {},

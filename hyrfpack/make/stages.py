@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from hyrfpack.atomic import replacing
+from hyrfpack.cameras.capture import has_mean_exposure
 from hyrfpack.compress import compress
 from hyrfpack.data import PictureCache
 from hyrfpack.device import describe_device
@@ -21,7 +22,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
 from hyrfpack.evaluate.metrics import decibels
 from hyrfpack.export import export
-from hyrfpack.format import load
+from hyrfpack.format import describe, load
 from hyrfpack.make.plan import Plan
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.state import digest, digest_all
@@ -200,8 +201,10 @@ def score(work: Work, scene: Scene, device: torch.device) -> dict[str, Any]:
     def act(going_on: bool) -> tuple[dict, list[str]]:
         if not scene.test:
             return {"views": 0}, []
-        scores = evaluate(load(model, device), scene.test)
-        return {"views": len(scores.views), "psnr": scores.psnr, "ssim": scores.ssim}, []
+        training = scene.train if has_mean_exposure(describe(model)["provenance"]) else ()
+        scores = evaluate(load(model, device), scene.test, training=training)
+        means = {name: getattr(scores, name) for name in ("psnr", "psnr_predicted", "ssim")}
+        return {"views": len(scores.views), **means}, []
 
     inputs = {"model": digest(model), "photos": work.state.inputs("training")["photos and poses"], **_split(scene)}
     return work.stage("scoring", inputs, act)

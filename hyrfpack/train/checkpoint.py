@@ -15,7 +15,7 @@ import torch
 from hyrfpack.atomic import write_atomic
 from hyrfpack.errors import HyrfTrainingError
 
-VERSION = 1
+VERSION = 2
 DIGEST_BYTES = 32  # SHA-256 of all that goes before, at the end of the file
 
 
@@ -60,7 +60,9 @@ def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor]
     except Exception as error:  # torch's unpickler raises whatever it meets
         raise HyrfTrainingError(f"{path}: the checkpoint is damaged; delete it and train anew") from error
     if version != VERSION:
-        raise HyrfTrainingError(f"{path}: the checkpoint is of another version of hyrfpack; train anew")
+        raise HyrfTrainingError(
+            f"{path}: the checkpoint is of another version of hyrfpack; train anew with --overwrite"
+        )
     if different:
         raise HyrfTrainingError(
             f"{path}: the run was started with other settings ({', '.join(different)}); "

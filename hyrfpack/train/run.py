@@ -145,7 +145,7 @@ def _finish(trainer: Trainer, out: Path) -> dict:
         "steps": config.steps,
         "seed": config.seed,
         "choices": trainer.choices,
-        **provenance_of(scene),
+        **provenance_of(scene, mean_exposure=trainer.exposures is not None),
         "psnr": statistics.median(record["psnr"] for record in trainer.records[-len(trainer.records) // 10 :]),
     }
     report = hyrf_format.save(model, path, profile="raw", provenance=provenance)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scenes import ball_scene, ring
 
-from hyrfpack.cameras.capture import KEPT, ORBIT, Capture, kept_cameras, provenance_of
+from hyrfpack.cameras.capture import KEPT, ORBIT, Capture, has_mean_exposure, kept_cameras, provenance_of
 from hyrfpack.cameras.paths import Viewpoint, orbit
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera
@@ -33,6 +33,13 @@ def test_what_a_model_keeps_of_a_scene_comes_back():
     assert capture.max_size == 700 and not capture.made_up
     assert capture.viewpoint.to_json() == Viewpoint.of(photographed).to_json()
     assert kept_cameras(capture.cameras) == kept_cameras(photographed)
+
+
+def test_a_mean_exposure_is_told_and_nothing_where_there_is_none():
+    scene = ball_scene(5)
+    assert provenance_of(scene, mean_exposure=True) == {**provenance_of(scene), "mean_exposure": True}
+    assert has_mean_exposure(provenance_of(scene, mean_exposure=True)) and not has_mean_exposure(provenance_of(scene))
+    assert not has_mean_exposure({"mean_exposure": "yes"})
 
 
 def test_of_many_cameras_some_are_kept():

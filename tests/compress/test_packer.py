@@ -232,9 +232,9 @@ def test_options_that_do_not_go_together_are_refused_and_nothing_is_written(opti
 def test_a_loss_that_even_the_finest_file_exceeds_is_refused(trained, scene, tmp_path, monkeypatch):
     scored = running.evaluate
 
-    def worse_each_time(model, views):
+    def worse_each_time(model, views, **options):
         worse_each_time.calls += 1
-        return dataclasses.replace(scored(model, views), psnr=30.0 - worse_each_time.calls)
+        return dataclasses.replace(scored(model, views, **options), psnr=30.0 - worse_each_time.calls)
 
     worse_each_time.calls = 0
     monkeypatch.setattr(running, "evaluate", worse_each_time)

@@ -6,16 +6,18 @@ import json
 import shutil
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 from commands import hyrfpack, refused, succeeded
 from explicit_balls import ball
 from PIL import Image
 
-from hyrfpack import evaluate, load, load_scene
+from hyrfpack import evaluate, load, load_scene, save
 from hyrfpack.errors import HyrfError
 from hyrfpack.lock import held
-from hyrfpack.make import make
+from hyrfpack.make import make, stages
 from hyrfpack.splats.formats import ply
 
 ENDINGS = (".hyrf", ".html", ".spz", ".points.ply", "")  # of each kind one: tests/export has the others
@@ -98,6 +100,21 @@ def test_the_score_is_of_the_packed_model_on_the_photos_held_out(made, posed, tm
     result = make(posed, tmp_path / "scene.hyrf", work=copy_of(made, tmp_path))
     scores = evaluate(load(result.output), load_scene(posed).test)
     assert (result.psnr, result.ssim, result.views) == (scores.psnr, scores.ssim, 3)
+    assert result.psnr_predicted is None  # all photos are of one exposure
+
+
+def test_a_model_of_mean_exposure_is_scored_at_that_of_photos_beside_those_held_out_too(made, posed, tmp_path):
+    save(load(made / "model.hyrf"), tmp_path / "model.hyrf", provenance={"mean_exposure": True})
+    state = SimpleNamespace(inputs=lambda stage: {"photos and poses": ""})
+    work = SimpleNamespace(folder=tmp_path, state=state, stage=lambda name, inputs, act: act(False)[0])
+    scene = load_scene(posed)
+
+    scores = stages.score(work, scene, torch.device("cpu"))
+
+    expected = evaluate(load(tmp_path / "model.hyrf"), scene.test, training=scene.train)
+    assert scores == {
+        "views": 3, "psnr": expected.psnr, "psnr_predicted": expected.psnr_predicted, "ssim": expected.ssim
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("count, held_out", [(3, 0), (8, 1), (15, 1)])
