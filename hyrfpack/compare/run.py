@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.evaluate import ViewScore
 from hyrfpack.format import describe
 from hyrfpack.outputs import StrPath
 from hyrfpack.render.files import file_names
@@ -28,6 +27,16 @@ class Record:
     psnr: float
     gaussians: int
     seconds: float | None
+
+
+@dataclass(frozen=True)
+class Score:
+    """A held-out view: PSNR in dB, SSIM, and LPIPS where it was measured."""
+
+    name: str
+    psnr: float
+    ssim: float
+    lpips: float | None
 
 
 @dataclass(frozen=True)
@@ -63,7 +72,7 @@ class Run:
     psnr: float | None
     ssim: float | None
     lpips: float | None
-    scores: list[ViewScore]
+    scores: list[Score]
     skipped: list[str]
     pictures: dict[str, Path]
     cameras: Any
@@ -149,8 +158,8 @@ def _run(folder: Path, metrics: Any) -> Run:
     )
 
 
-def _score(values: Any) -> ViewScore:
-    return ViewScore(
+def _score(values: Any) -> Score:
+    return Score(
         _take(values, "name", str), _number(values, "psnr"), _number(values, "ssim"), _optional(values, "lpips")
     )
 

@@ -13,9 +13,8 @@ from PIL import Image
 
 from hyrfpack.compare.curves import COLORS, DASHES, line_style
 from hyrfpack.compare.page import encode_comparison
-from hyrfpack.compare.run import Record, Run
+from hyrfpack.compare.run import Record, Run, Score
 from hyrfpack.compare.views import ComparedView
-from hyrfpack.evaluate import ViewScore
 from tools.browser import chromium
 
 NAMES = ["first", 'the "other"']
@@ -25,7 +24,7 @@ def run(psnr: float) -> Run:
     curve = [Record(step, psnr - 1 / step, 100 * step, float(step)) for step in range(1, 9)]
     return Run(
         *(Path(), {"model.hyrf": 10}, 5, 1.0, {"steps": 8, "seed": 0}, {}, "cpu", {}, [], curve, psnr, 0.5, None),
-        *([ViewScore("one.png", psnr, 0.5, None), ViewScore("two.png", psnr, 0.5, None)], [], {}, None),
+        *([Score("one.png", psnr, 0.5, None), Score("two.png", psnr, 0.5, None)], [], {}, None),
     )
 
 
