@@ -123,10 +123,12 @@ def test_the_best_score_stands_out_unless_scores_cannot_be_compared(runs, tmp_pa
         return [name for name, attributes in page.tags if attributes.get("class") == "best"]
 
     for run, psnr in zip(runs, (20.0, 21.0), strict=True):
-        changed(run, lambda values, psnr=psnr: values["evaluation"].update(psnr=psnr, ssim=0.5))
+        scores = {"psnr": psnr, "psnr_predicted": 30 - psnr / 10, "ssim": 0.5}
+        changed(run, lambda values, scores=scores: values["evaluation"].update(scores))
     hyrfpack.compare(runs, tmp_path / "page.html")
-    assert '<td class="best">21.00</td>' in (tmp_path / "page.html").read_text()
-    assert best(Page(tmp_path / "page.html")) == ["td"]
+    text = (tmp_path / "page.html").read_text()
+    assert '<td class="best">21.00</td>' in text and '<td class="best">28.00</td>' in text
+    assert best(Page(tmp_path / "page.html")) == ["td", "td"]
     repaint(runs[1] / "views" / "000.png")
     hyrfpack.compare(runs, tmp_path / "page.html", overwrite=True)
     assert best(Page(tmp_path / "page.html")) == []
