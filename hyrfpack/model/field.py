@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from hyrfpack.model.hash_grid import HashGrid, HashGridConfig
+from hyrfpack.model.hash_grid import HashGrid, HashGridConfig, uniform
 from hyrfpack.ops.mlp import mlp
 
 
@@ -29,7 +29,7 @@ class Field(nn.Module):
         self.biases = nn.ParameterList()
         for fan_in, fan_out in zip(widths, widths[1:], strict=False):
             bound = math.sqrt(6 / (fan_in + fan_out))  # Xavier uniform
-            self.weights.append(nn.Parameter((torch.rand(fan_out, fan_in, generator=generator) * 2 - 1) * bound))
+            self.weights.append(nn.Parameter(uniform(fan_out, fan_in, bound=bound, generator=generator)))
             self.biases.append(nn.Parameter(torch.zeros(fan_out)))
 
     def forward(self, coords: Tensor, extra: Tensor | None = None, *, mixed: bool = False) -> Tensor:

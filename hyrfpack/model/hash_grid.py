@@ -81,13 +81,22 @@ class HashGridConfig:
         return counts
 
 
+def uniform(rows: int, columns: int, *, bound: float, generator: torch.Generator | None = None) -> Tensor:
+    """(rows, columns) numbers drawn from -bound to bound.
+
+    In place: out of place, without storage (on the device "meta", as a file's model is laid out), torch would load its
+    compiler first, which takes longer than reading the file.
+    """
+    return torch.rand(rows, columns, generator=generator).mul_(2).sub_(1).mul_(bound)
+
+
 class HashGrid(nn.Module):
     """A trainable table (rows, 2), all levels one after another."""
 
     def __init__(self, config: HashGridConfig, generator: torch.Generator | None = None) -> None:
         super().__init__()
         self.config = config
-        self.table = nn.Parameter((torch.rand(config.rows, FEATURES, generator=generator) * 2 - 1) * 1e-4)
+        self.table = nn.Parameter(uniform(config.rows, FEATURES, bound=1e-4, generator=generator))
 
     @property
     def features(self) -> int:

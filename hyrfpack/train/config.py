@@ -6,8 +6,8 @@ import math
 from dataclasses import asdict, dataclass, field, fields
 
 from hyrfpack.checks import check_bool, check_choice, check_float, check_int, check_pair
+from hyrfpack.choices import PRECISIONS
 
-PRECISIONS = ("mixed", "float32")
 PRESETS = ("auto", "synthetic", "standard", "large", "street")
 BACKGROUND_COLORS = ("black", "white", "random")
 LARGEST_SEED = 2**64 - 1  # torch's generators take 64 bits

@@ -15,6 +15,7 @@ import os
 import shutil
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -281,26 +282,30 @@ def _ok(*arguments: object) -> None:
 
 def files_of(folder: Path) -> dict[str, str]:
     """What every file and link below a folder is: the SHA-256 of its bytes, where a link points; "" of a folder."""
-    found = {}
-    for place, folders, names in os.walk(folder):
-        for name in (*folders, *names):
-            path = Path(place, name)
-            if path.is_symlink():
-                found[str(path.relative_to(folder))] = f"-> {os.readlink(path)}"
-            else:
-                is_file = path.is_file()
-                content = hashlib.sha256(path.read_bytes()).hexdigest() if is_file else ""
-                found[str(path.relative_to(folder))] = content
+    found, waiting = {}, [""]
+    while waiting:
+        below = waiting.pop()
+        with os.scandir(folder / below) as entries:
+            for entry in entries:
+                name = below + entry.name
+                if entry.is_symlink():
+                    found[name] = f"-> {os.readlink(entry.path)}"
+                elif entry.is_dir():
+                    found[name] = ""
+                    waiting.append(f"{name}/")
+                else:
+                    with open(entry.path, "rb", buffering=0) as file:
+                        found[name] = hashlib.sha256(file.read()).hexdigest()
     return found
 
 
 # -- trying it ---------------------------------------------------------------------------------------------------------
 
 
-def run_case(case: Case, world: Path, overwrite: bool) -> tuple[str, Result]:
-    """Run a case in a world that is the working folder. Returns what came of it, in a word or with what went wrong."""
+def run_case(case: Case, world: Path, before: dict[str, str], overwrite: bool) -> tuple[str, Result]:
+    """Run a case in a world that is the working folder, where `before` is what is there. Returns what came of it, in a
+    word or with what went wrong."""
     output = case.output.format(world=world)
-    before = files_of(world)
     result = hyrfpack(*case.command.format(output).split(), *(["--overwrite"] if overwrite else []))
     after = files_of(world)
 
@@ -346,16 +351,30 @@ def _forbid_work(patch: pytest.MonkeyPatch) -> None:
             patch.setattr(module, "rasterize", draw)
 
 
+class Worlds:
+    """Copies of a world, in a folder: one for each that changes it, and one for all that leave it as it is."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.template = folder, make_world(folder / "template")
+        self.files = files_of(self.template)
+        self._copies = 0
+        self._kept: Path | None = None
+
+    def new(self) -> Path:
+        self._copies += 1
+        return copy_of(self.template, self.folder / str(self._copies))
+
+    @contextmanager
+    def kept(self) -> Iterator[Path]:
+        """The one that is left as it is; nobody gets it again where an error says that it is not."""
+        world, self._kept = self._kept or self.new(), None
+        yield world
+        self._kept = world
+
+
 @pytest.fixture(scope="module")
-def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_world(tmp_path_factory.mktemp("template"))
-
-
-@pytest.fixture
-def world(template: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A world of one's own, which is the working folder."""
-    monkeypatch.chdir(copy_of(template, tmp_path / "world"))
-    return tmp_path / "world"
+def worlds(tmp_path_factory: pytest.TempPathFactory) -> Worlds:
+    return Worlds(tmp_path_factory.mktemp("worlds"))
 
 
 def copy_of(template: Path, folder: Path) -> Path:
@@ -369,15 +388,16 @@ def copy_of(template: Path, folder: Path) -> Path:
 
 @pytest.mark.parametrize("overwrite", [False, True], ids=["plain", "overwrite"])
 @pytest.mark.parametrize("case", CASES, ids=str)
-def test_every_command_keeps_what_a_person_has(case, overwrite, world, monkeypatch):
+def test_every_command_keeps_what_a_person_has(case, overwrite, worlds, monkeypatch):
     expected = case.overwriting if overwrite else case.plain
     _replace_work(monkeypatch)
     if expected == REFUSED:
         _forbid_work(monkeypatch)
 
-    outcome, result = run_case(case, world, overwrite)
-
-    assert outcome == expected, result.output
+    with worlds.kept() if expected == REFUSED else nullcontext(worlds.new()) as world:
+        monkeypatch.chdir(world)
+        outcome, result = run_case(case, world, worlds.files, overwrite)
+        assert outcome == expected, result.output
 
 
 def test_the_table_names_every_command_that_writes():
@@ -387,8 +407,9 @@ def test_the_table_names_every_command_that_writes():
     assert {case.command.split()[0] for case in CASES} == writes
 
 
-def test_a_world_is_one_that_commands_can_read(world):
+def test_a_world_is_one_that_commands_can_read(worlds, monkeypatch):
     """Else they would refuse for another reason."""
+    monkeypatch.chdir(worlds.new())
     for name in SETS:
         _ok("evaluate", "model.hyrf", "--data", name, "--pictures", f"pictures-{name}")
     for source in ("ball.ply", "loose"):
@@ -405,14 +426,14 @@ def markdown_table() -> str:
 
     lines = ["| command | input as output | without --overwrite | with --overwrite |", "|---|---|---|---|"]
     with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        template = make_world(Path(folder, "template"))
+        worlds = Worlds(Path(folder))
         _replace_work(patch)
-        for number, case in enumerate(CASES):
+        for case in CASES:
             cells = []
             for overwrite, expected in ((False, case.plain), (True, case.overwriting)):
-                world = copy_of(template, Path(folder, f"{number}{overwrite}"))
+                world = worlds.new()
                 patch.chdir(world)
-                outcome, _ = run_case(case, world, overwrite)
+                outcome, _ = run_case(case, world, worlds.files, overwrite)
                 cells.append(outcome if outcome == expected else outcome.upper())
                 patch.chdir(folder)
                 shutil.rmtree(world)

@@ -214,13 +214,18 @@ def test_points_flung_far_out_are_pulled_in_along_their_direction():
 NO_SLOPE = pytest.mark.xfail(strict=True, reason="where every sigmoid is saturated, no number seems to matter")
 
 
-@pytest.mark.parametrize("profile", ["raw", "paper", pytest.param("compact", marks=NO_SLOPE)])
-@pytest.mark.parametrize("level", [0, 255], ids=["black", "white"])
-def test_even_pictures_train_to_within_half_a_step_of_8_bits(level, profile):
-    trainer = trained(of_pictures(even(level)))
+@pytest.fixture(scope="module", params=[0, 255], ids=["black", "white"])
+def evenly_trained(request: pytest.FixtureRequest) -> Trainer:
+    """On pictures of one level; not to be changed."""
+    return trained(of_pictures(even(request.param)))
 
-    assert mean_psnr(trainer.model, trainer.scene.train) > HALF_A_STEP
-    assert mean_psnr(through(profile, trainer), trainer.scene.train) > HALF_A_STEP
+
+@pytest.mark.parametrize("profile", ["raw", "paper", pytest.param("compact", marks=NO_SLOPE)])
+def test_even_pictures_train_to_within_half_a_step_of_8_bits(evenly_trained, profile):
+    views = evenly_trained.scene.train
+
+    assert mean_psnr(evenly_trained.model, views) > HALF_A_STEP
+    assert mean_psnr(through(profile, evenly_trained), views) > HALF_A_STEP
 
 
 def scene_with_jumps(*gains: float) -> tuple[Scene, list[View]]:
@@ -265,28 +270,27 @@ def test_two_exposures_of_one_photo_train_to_a_compromise():
 # -- units -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("unit", [2.0**20, 2.0**-20])
-def test_a_unit_that_is_a_power_of_two_changes_no_bit_of_model_and_file(unit):
+def test_a_unit_that_is_a_power_of_two_changes_no_bit_of_model_and_file():
     """Not even rounding tells the unit: of the file, only the frame in the metadata differs."""
-    here, there = (trained(a_scene(scale=scale), 40) for scale in (1.0, unit))
+    here, *there = (trained(a_scene(scale=unit), 40) for unit in (1.0, 2.0**20, 2.0**-20))
+    files = {profile: read_container(file_of(profile, here)) for profile in PROFILES}
 
-    assert all(torch.equal(a, b) for a, b in zip(here.model.parameters(), there.model.parameters(), strict=True))
-    for profile in PROFILES:
-        files = [read_container(file_of(profile, trainer)) for trainer in (here, there)]
-        differing = [s.type for s, t in zip(files[0].sections, files[1].sections, strict=True) if s.data != t.data]
-        assert differing == ["META"]
+    for other in there:
+        assert all(torch.equal(a, b) for a, b in zip(here.model.parameters(), other.model.parameters(), strict=True))
+        for profile, file in files.items():
+            sections = zip(file.sections, read_container(file_of(profile, other)).sections, strict=True)
+            assert [s.type for s, t in sections if s.data != t.data] == ["META"]
 
 
-@pytest.mark.parametrize("profile", LOSSY)
-def test_millimetres_and_kilometres_compress_to_the_same_quality_and_size(profile):
-    qualities, sizes = [], []
-    for scale in (1e3, 1e-3):
-        trainer = trained(a_scene(scale=scale))
-        qualities.append(mean_psnr(through(profile, trainer), trainer.scene.train))
-        sizes.append(len(file_of(profile, trainer)))
+def test_millimetres_and_kilometres_compress_to_the_same_quality_and_size():
+    trainers = [trained(a_scene(scale=scale)) for scale in (1e3, 1e-3)]
+    for profile in LOSSY:
+        files = [file_of(profile, trainer) for trainer in trainers]
+        pairs = zip(files, trainers, strict=True)
+        qualities = [mean_psnr(decode_model(file), trainer.scene.train) for file, trainer in pairs]
 
-    assert qualities[0] == pytest.approx(qualities[1], abs=0.1)
-    assert sizes[0] == pytest.approx(sizes[1], rel=0.01)
+        assert qualities[0] == pytest.approx(qualities[1], abs=0.1), profile
+        assert len(files[0]) == pytest.approx(len(files[1]), rel=0.01), profile
 
 
 def rescaled(scene: Scene, unit: float) -> Scene:
