@@ -110,7 +110,7 @@ def training_curve(records: Sequence[dict], path: str | os.PathLike[str]) -> Non
     Raises:
         HyrfError: the file cannot be written.
     """
-    figure = blank_figure(9, 6, layout="none")  # to measure all words would take longer than to draw them
+    figure = blank_figure(9, 6, layout=None)  # to measure all words would take longer than to draw them
     axes = figure.subplots(3, 1, sharex=True, gridspec_kw=CURVE_MARGINS)
     steps = [record["step"] for record in records]
     for axis, key, label, color in zip(
@@ -148,7 +148,7 @@ def _drawing() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def blank_figure(width: float, height: float, layout: Literal["constrained", "none"] = "constrained") -> Figure:
+def blank_figure(width: float, height: float, layout: Literal["constrained"] | None = "constrained") -> Figure:
     """A matplotlib figure to draw on, drawn by Agg whatever the screen; inches; `layout` as matplotlib has it."""
     with _drawing():
         from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -40,6 +40,8 @@ class Bare:
 sys.meta_path = [Bare if finder is PathFinder else finder for finder in sys.meta_path]
 sys.path.insert(0, {root!r})
 {pictures}
+hyrfpack.load({files!r}[0])
+print(*sys.modules)
 np.savez({out!r}, **{{path: picture(path) for path in {files!r}}})
 print(*sys.modules)
 """
@@ -60,8 +62,8 @@ def required(*roots: str) -> set[str]:
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory) -> dict[str, np.ndarray]:
-    """Pictures of the golden files, drawn where all other packages are missing."""
+def alone(tmp_path_factory) -> tuple[dict[str, np.ndarray], set[str]]:
+    """Pictures of the golden files, drawn where all other packages are missing, and the modules that reading loads."""
     allowed = {*required("torch", "numpy"), "hyrfpack"}
     refused = {
         module
@@ -75,9 +77,10 @@ def alone(tmp_path_factory) -> dict[str, np.ndarray]:
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
 
     assert done.returncode == 0, done.stderr
-    assert not refused & {name.partition(".")[0] for name in done.stdout.split()}
+    to_read, to_draw = (set(line.split()) for line in done.stdout.splitlines())
+    assert not refused & {name.partition(".")[0] for name in to_draw}
     with np.load(out) as pictures:
-        return dict(pictures)
+        return dict(pictures), to_read
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
@@ -88,4 +91,8 @@ def test_golden_files_look_the_same_with_torch_and_numpy_alone(path, alone):
     expected = here["picture"](str(path))
 
     assert np.ptp(expected) > 0.05  # there is something to see
-    np.testing.assert_allclose(alone[str(path)], expected, rtol=0, atol=2e-3)
+    np.testing.assert_allclose(alone[0][str(path)], expected, rtol=0, atol=2e-3)
+
+
+def test_torchs_compiler_is_not_loaded_which_takes_longer_than_a_file(alone):
+    assert "torch" in alone[1] and "torch._dynamo" not in alone[1]

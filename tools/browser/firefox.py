@@ -217,8 +217,10 @@ class Firefox:
             "}",
             width, height, dense, phone,
         )  # fmt: skip
+        # A page that says nothing of its viewport is laid out for a larger window, as on phones.
+        seen = "document.querySelector('meta[name=viewport]') ? [innerWidth, innerHeight] : [outerWidth, outerHeight]"
         ends = time.monotonic() + 5
-        while self.evaluate("[innerWidth, innerHeight]") != [width, height] and time.monotonic() < ends:
+        while self.evaluate(seen) != [width, height] and time.monotonic() < ends:
             time.sleep(0.02)
 
     def _act(self, *sources: dict) -> None:
