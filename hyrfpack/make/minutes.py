@@ -20,11 +20,12 @@ from hyrfpack.make.work import Say
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, Scene, evenly_spaced
-from hyrfpack.train import TrainConfig, Trainer
+from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.config import FULL_STEPS
 from hyrfpack.train.setup import budget_for
 
 PILOT_STEPS = 45  # of a whole small run: from the first Gaussians to the budget
+RISING = DensityConfig(stop=0.6, peak=0.6, excess=1.0)  # from few Gaussians to many, for what one of them takes
 COLD_STEPS = 3  # which compile kernels
 PILOT_SHARE = 0.06  # of the time, for one measurement at most
 USEFUL_STEPS = 1_000  # fewer are only a trial: smaller photos are better
@@ -59,9 +60,9 @@ class Cost:
         return dataclasses.replace(self, step=step, step_per_gaussian=per_gaussian, cpu_pass=cpu)
 
     def training(self, scene: Scene, steps: int) -> float:
-        """Seconds of a training: the count stands for 2 % of it, grows along a line until 60 %, and stands again."""
+        """Seconds of a training, from the number of Gaussians that there are on average."""
         budget, _ = budget_for(scene, TrainConfig(steps=steps))
-        mean = 0.31 * min(budget, len(scene.points) or budget / 2) + 0.69 * budget
+        mean = DensityConfig().mean_count(min(budget, len(scene.points) or budget // 2), budget)
         step = self.step + self.step_per_gaussian * mean
         return SETTLED * steps * step + self.decoding * min(steps, len(scene.train))
 
@@ -145,7 +146,8 @@ def pilot(scene: Scene, device: torch.device, seed: int, cache: PictureCache, se
         seconds: after which it ends in any case, but for the steps that it takes to measure anything.
     """
     budget, _ = budget_for(scene, TrainConfig())
-    trainer = Trainer(scene, TrainConfig(steps=PILOT_STEPS, seed=seed, max_gaussians=budget), cache, device)
+    config = TrainConfig(steps=PILOT_STEPS, seed=seed, max_gaussians=budget, density=RISING)
+    trainer = Trainer(scene, config, cache, device)
     counts: list[int] = []
     working: list[float] = []
     waiting: list[float] = []

@@ -1,7 +1,19 @@
 """Posed photos -> a trained HybridModel in a run folder."""
 
 from hyrfpack.train.config import PRESETS, DensityConfig, LearningRates, TrainConfig
+from hyrfpack.train.density import DensityControl
 from hyrfpack.train.run import TrainResult, train
+from hyrfpack.train.strategy import Strategy
 from hyrfpack.train.trainer import Trainer
 
-__all__ = ["PRESETS", "DensityConfig", "LearningRates", "TrainConfig", "TrainResult", "Trainer", "train"]
+__all__ = [
+    "PRESETS",
+    "DensityConfig",
+    "DensityControl",
+    "LearningRates",
+    "Strategy",
+    "TrainConfig",
+    "TrainResult",
+    "Trainer",
+    "train",
+]

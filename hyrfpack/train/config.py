@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field, fields
+from itertools import pairwise
 
 from hyrfpack.checks import check_bool, check_choice, check_float, check_int, check_pair
 from hyrfpack.choices import PRECISIONS
@@ -52,18 +53,23 @@ class DensityConfig:
 
     Attributes:
         start, stop: density control acts in this part of the run.
+        peak: when there are most Gaussians; before, they become more along a line, and after, fewer.
+        excess: how many there are then, in budgets; at `stop` one budget is left, of those that pictures need most.
+            1 keeps the count at the budget from `peak` on.
         rounds: how many times it acts.
         gradient: least mean absolute gradient of a Gaussian's projected centre (NDC units) to clone or split it.
         split_scale: Gaussians larger than this (local units, divided by max(1, |u|)) are split, others cloned.
         prune_opacity: Gaussians fainter than this are removed.
         prune_scale: Gaussians larger than this (as split_scale) are removed, unless they are more than a tenth of all.
-        resets: how many times opacities are capped at reset_opacity, evenly spread over the part that density
-            control acts in, not counting its end.
+        resets: how many times opacities are capped at reset_opacity, evenly spread over the part in which Gaussians
+            become more, not counting its end.
         reset_opacity: the cap.
     """
 
     start: float = 0.02
-    stop: float = 0.6
+    stop: float = 0.65
+    peak: float = 0.35
+    excess: float = 2.0
     rounds: int = 30
     gradient: float = 2e-4
     split_scale: float = 0.01
@@ -73,13 +79,20 @@ class DensityConfig:
     reset_opacity: float = 0.01
 
     def __post_init__(self) -> None:
-        for name in ("start", "stop", "prune_opacity"):
+        for name in ("start", "stop", "peak", "prune_opacity"):
             check_float(name, getattr(self, name), 0, 1)
         for name in ("gradient", "split_scale", "prune_scale"):
             check_float(name, getattr(self, name))
+        check_float("excess", self.excess, 1)
         check_int("rounds", self.rounds, 1)
         check_int("resets", self.resets, 0)
         check_float("reset_opacity", self.reset_opacity, 1e-6, 1 - 1e-6)  # its logit is finite
+
+    def mean_count(self, initial: int, budget: int) -> float:
+        """How many Gaussians there are on average over a run, if each round finds as many as it may."""
+        most = self.excess * budget
+        corners = (0, initial), (self.start, initial), (self.peak, most), (self.stop, budget), (1, budget)
+        return sum((t1 - t0) * (n0 + n1) / 2 for (t0, n0), (t1, n1) in pairwise(corners))
 
 
 @dataclass(frozen=True)
@@ -90,7 +103,8 @@ class TrainConfig:
         steps: optimiser steps, one view each; every schedule scales with it.
         seed: of view order, initialisation and density control; 0 to LARGEST_SEED.
         preset: the paper's regime, one of PRESETS; "auto" looks at the scene.
-        max_gaussians: budget; None chooses from the pictures' pixels and the steps.
+        max_gaussians: budget, the most that a run ends with; on the way it is exceeded by `DensityConfig.excess`.
+            None chooses from the pictures' pixels and the steps.
         log2_table_size: rows per level of the radiance grid as a power of two (the geometry grid has half);
             None follows the budget. 4 to 24.
         background: whether a background sphere is trained; None lets the preset decide.

@@ -29,6 +29,7 @@ from hyrfpack.train.density import DensityControl
 from hyrfpack.train.exposure import exposures_for
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.setup import build_model
+from hyrfpack.train.strategy import Strategy
 
 RECORDS = 200  # points on the training curve
 
@@ -43,7 +44,7 @@ def shuffled(views: Sequence[View], seed: int, steps: range) -> Iterator[View]:
 
 
 class Trainer:
-    """Holds a run: model, optimiser, density control, and the step they are at.
+    """Holds a run: model, optimiser, strategy of density control, and the step they are at.
 
     Example:
         >>> trainer = Trainer(scene, TrainConfig(steps=2000))
@@ -58,8 +59,14 @@ class Trainer:
         cache: PictureCache | None = None,
         device: torch.device = torch.device("cpu"),  # noqa: B008 - a constant
         model: HybridModel | None = None,
+        strategy: Strategy | None = None,
     ) -> None:
-        """Args: model: to go on with, changed in place; None builds an untrained one that fits the scene."""
+        """Set up a run.
+
+        Args:
+            model: to go on with, changed in place; None builds an untrained one that fits the scene.
+            strategy: what adds and removes Gaussians; None for `DensityControl` as configured.
+        """
         self.scene = scene
         self.config = config
         self.cache = cache or PictureCache()
@@ -71,7 +78,9 @@ class Trainer:
             self.budget = config.max_gaussians or len(model)
         self.exposures, self.choices["exposure"] = exposures_for(scene, config, self.cache, device)
         self._take(model)
-        self.density = DensityControl(config.density, config.steps, self.budget, len(self.model), config.seed, device)
+        self.strategy: Strategy = strategy or DensityControl(
+            config.density, config.steps, self.budget, len(self.model), config.seed, device
+        )
         self.step = 0
         self.saved: int | None = None  # the step that the checkpoint on disk is of
         self.records: list[dict] = []
@@ -151,7 +160,7 @@ class Trainer:
             rendering = render(
                 self.model,
                 view.camera,
-                absgrad=self.density.watching(self.step),
+                absgrad=self.strategy.watching(self.step),
                 solid=None if solid is None else upload_array(solid, self.device),
             )
         except HyrfError:
@@ -164,7 +173,7 @@ class Trainer:
         with self._timed("backward"):
             loss.backward()
         with self._timed("density"):
-            self.density.observe(rendering, view.camera.width, view.camera.height)
+            self.strategy.observe(rendering, view.camera, self.model)
         with self._timed("optimizer"):
             broken = self.optimizer.step(self.step - 1, config.steps)
             if self.exposures is not None:
@@ -179,7 +188,7 @@ class Trainer:
         if any(flags):
             self._refuse(view, "a gradient is not finite", self._groups(flags))
         with self._timed("density"):
-            self.density.act(self.step, self.model, self.optimizer)
+            self.strategy.act(self.step, self.model, self.optimizer)
         return value, mse
 
     def _record(self, loss: float, mse: float) -> None:
@@ -223,7 +232,7 @@ class Trainer:
     def _settings(self) -> dict:
         views = [[view.name, view.camera.width, view.camera.height] for view in self.scene.train]
         chosen = {"exposure": self.exposures is not None, "model": self.model.config.to_dict()}
-        return {**self.config.to_dict(), "views": views, **chosen}
+        return {**self.config.to_dict(), "views": views, "strategy": type(self.strategy).__qualname__, **chosen}
 
     def save(self, path: Path) -> None:
         """Write the run's state to `path`."""
@@ -231,7 +240,7 @@ class Trainer:
         tensors |= {f"adam.{name}": value for name, value in self.optimizer.state_dict().items()}
         if self.exposures is not None:
             tensors |= {f"exposure.{name}": value for name, value in self.exposures.state_dict().items()}
-        tensors |= {"density.gradients": self.density.gradients, "density.views": self.density.views}
+        tensors |= {f"density.{name}": value for name, value in self.strategy.state_dict().items()}
         progress = {"step": self.step, "records": self.records, "seconds": dict(self.seconds), "elapsed": self.elapsed}
         tensors = {name: value.detach().cpu() for name, value in tensors.items()}
         save_checkpoint(path, settings=self._settings(), tensors=tensors, progress=progress)
@@ -257,8 +266,8 @@ class Trainer:
             self.exposures.load_state_dict(
                 {n.removeprefix("exposure."): value for n, value in tensors.items() if n.startswith("exposure.")}
             )
-        self.density.gradients, self.density.views = (
-            tensors[f"density.{name}"].to(self.device) for name in ("gradients", "views")
+        self.strategy.load_state_dict(
+            {name.removeprefix("density."): value for name, value in tensors.items() if name.startswith("density.")}
         )
         self.step, self.records = progress["step"], progress["records"]
         self.saved = self.step

@@ -11,7 +11,7 @@ import pytest
 import torch
 from scenes import ball_scene
 
-from hyrfpack.train import DensityConfig, LearningRates, TrainConfig, Trainer
+from hyrfpack.train import DensityConfig, DensityControl, LearningRates, TrainConfig, Trainer
 from hyrfpack.train.config import LARGEST_SEED
 
 NO_INT = (2.5, math.nan, math.inf, True, "3", (3,), np.int64(3))
@@ -38,8 +38,9 @@ WRONG = {
     "density": (None, {}, DensityConfig),
 }
 WRONG_DENSITY = {
-    **dict.fromkeys(("start", "stop", "prune_opacity"), (-0.1, 1.1, *NO_FLOAT)),
+    **dict.fromkeys(("start", "stop", "peak", "prune_opacity"), (-0.1, 1.1, *NO_FLOAT)),
     **dict.fromkeys(("gradient", "split_scale", "prune_scale"), (-1e-9, *NO_FLOAT)),
+    "excess": (0.99, -2.0, *NO_FLOAT),
     "rounds": (0, -1, None, *NO_INT),
     "resets": (-1, None, *NO_INT),
     "reset_opacity": (0, 1, *NO_FLOAT),
@@ -80,3 +81,11 @@ def test_training_with_any_seed_of_64_bits_splits_gaussians_and_ends(seed):
 
     assert trainer.run() and len(trainer.model) > before
     assert all(torch.isfinite(values).all() for values in trainer.model.parameters())
+
+
+@pytest.mark.parametrize("config", [DensityConfig(), DensityConfig(start=0.1, stop=0.9, peak=0.9, excess=1.0)])
+def test_the_mean_count_is_that_of_the_rounds_targets(config):
+    control = DensityControl(dataclasses.replace(config, rounds=10_000), 10_000, 500, 100, 0)
+    steps = range(1, 10_001)
+    counts = [100 if step < control.first else control.target(min(step, control.last)) for step in steps]
+    assert config.mean_count(100, 500) == pytest.approx(np.mean(counts), rel=2e-3)

@@ -13,7 +13,8 @@ from hyrfpack.train.config import DensityConfig, LearningRates
 from hyrfpack.train.density import DensityControl, rotate
 from hyrfpack.train.optimizer import Optimizer
 
-CONFIG = DensityConfig(start=0.1, stop=0.5, rounds=4, gradient=1e-3, split_scale=0.05)  # of 100 steps: 10, 20, ... 50
+# Of 100 steps: 10, 20, ... 50. The count only rises.
+CONFIG = DensityConfig(start=0.1, stop=0.5, peak=0.5, excess=1.0, rounds=4, gradient=1e-3, split_scale=0.05)
 STEPS = 100
 SMALL, LARGE = -4.6, -2.0  # scale logits that decode to 0.01 and 0.12
 
@@ -36,6 +37,12 @@ def copied(model) -> dict[str, torch.Tensor]:
     return {name: getattr(model.gaussians, name).detach().clone() for name in Gaussians.NAMES}
 
 
+def halved(logits: torch.Tensor | float) -> torch.Tensor:
+    """Opacity logits of two that together let through what one of these lets through; these are above 0.36."""
+    through = torch.sigmoid(-torch.as_tensor(logits, dtype=torch.float64)).sqrt()
+    return ((1 - through) / through).log().float()
+
+
 def high_for(rows, count: int = 20) -> torch.Tensor:
     gradients = torch.zeros(count)
     gradients[rows] = 1.0
@@ -52,9 +59,10 @@ def test_small_gaussians_with_large_gradients_are_cloned():
     density.act(50, model, optimizer)
 
     assert len(model) == 23
+    before["opacity_logits"][[2, 5, 11]] = halved(before["opacity_logits"][[2, 5, 11]])
     for name, values in before.items():
-        assert torch.equal(getattr(model.gaussians, name)[:20], values)
-        assert torch.equal(getattr(model.gaussians, name)[20:], values[[2, 5, 11]])
+        torch.testing.assert_close(getattr(model.gaussians, name)[:20], values)
+        torch.testing.assert_close(getattr(model.gaussians, name)[20:], values[[2, 5, 11]])
 
 
 def test_large_gaussians_with_large_gradients_are_replaced_by_two_children():
@@ -67,8 +75,8 @@ def test_large_gaussians_with_large_gradients_are_replaced_by_two_children():
     assert len(model) == 17 + 6
     assert torch.equal(model.gaussians.positions[:17], before["positions"][kept])
     parents = torch.tensor([2, 5, 11, 2, 5, 11])
-    for name in ("color_logits", "opacity_logits"):
-        assert torch.equal(getattr(model.gaussians, name)[17:], before[name][parents])
+    assert torch.equal(model.gaussians.color_logits[17:], before["color_logits"][parents])
+    torch.testing.assert_close(model.gaussians.opacity_logits[17:], halved(before["opacity_logits"][parents]))
 
 
 def test_clones_and_splits_each_follow_their_own_size():
@@ -177,7 +185,9 @@ def test_pruned_gaussians_are_not_cloned():
     opacities[3] = -8.0
     model, optimizer, density = set_up(gradients=high_for([3, 4]), opacity_logits=opacities)
     density.act(50, model, optimizer)
-    assert len(model) == 19 + 1 and (model.gaussians.opacity_logits == 2.0).all()
+    assert len(model) == 19 + 1
+    opacities[[3, 4]] = halved(2.0)  # the last one has the place of the one that went
+    torch.testing.assert_close(model.gaussians.opacity_logits.sort(0).values, opacities.sort(0).values)
 
 
 def test_far_gaussians_are_judged_by_their_share_of_what_may_be():
@@ -252,7 +262,85 @@ def test_a_full_budget_still_replaces_what_is_pruned():
     opacities[:5] = -8.0
     model, optimizer, density = set_up(budget=20, opacity_logits=opacities)
     density.act(30, model, optimizer)
-    assert len(model) == 20 and (model.gaussians.opacity_logits == 2.0).all()
+    assert len(model) == 20 and (model.gaussians.opacity_logits >= halved(2.0) - 1e-5).all()
+
+
+# -- above the budget and back ---------------------------------------------------------------------------------------
+
+EXCESS = dataclasses.replace(CONFIG, peak=0.3, excess=3.0)  # of 100 steps: most after 30, the budget after 50
+
+
+def test_the_count_rises_above_the_budget_and_falls_to_it_along_two_lines():
+    model, optimizer, density = set_up(20, budget=40, config=EXCESS)
+    counts = {}
+    for step in range(1, STEPS + 1):
+        density.gradients, density.views = torch.ones(len(model)), torch.ones(len(model))
+        density.act(step, model, optimizer)
+        counts[step] = len(model)
+    assert [counts[step] for step in (9, 10, 20, 30, 40, 49, 50, 100)] == [20, 20, 40, 80, 80, 80, 40, 40]
+    assert [density.target(step) for step in (10, 20, 30, 40, 50)] == [20, 70, 120, 80, 40]
+
+
+@pytest.mark.parametrize(("start", "stop", "rounds"), [(0.1, 0.5, 3), (0.02, 0.72, 30), (0.0, 1.0, 7)])
+def test_the_budget_is_what_is_left_whether_rounds_divide_the_run_or_not(start, stop, rounds):
+    config = dataclasses.replace(EXCESS, start=start, stop=stop, rounds=rounds)
+    model, optimizer, density = set_up(20, budget=21, config=config)
+    for step in range(1, STEPS + 1):
+        density.gradients, density.views = torch.ones(len(model)), torch.ones(len(model))
+        density.act(step, model, optimizer)
+    assert len(model) == 21
+
+
+def test_those_go_whose_opacity_moves_the_loss_least():
+    """By o dL/do = dL/dx / (1 - o): of two with the same slope by their logits, the more opaque one matters more."""
+    opacities = torch.where(torch.arange(20) < 10, 0.0, 2.0)[:, None]  # 0.5 and 0.88
+    model, optimizer, density = set_up(config=EXCESS, budget=12, opacity_logits=opacities)
+    density.squares = torch.linspace(1, 2, 20)[torch.randperm(20, generator=torch.Generator().manual_seed(0))]
+    slopes = density.squares.clone()
+    before = copied(model)
+    density.act(50, model, optimizer)
+
+    worth = slopes / (1 - opacities[:, 0].sigmoid()) ** 2
+    kept = worth.argsort(descending=True)[:12].sort().values
+    assert set(range(10, 20)) < set(kept.tolist())
+    assert torch.equal(model.gaussians.positions, before["positions"][kept])
+    torch.testing.assert_close(density.squares, 0.8 * slopes[kept])
+
+
+def test_squares_are_summed_over_views_and_shared_with_clones_and_children():
+    sizes = torch.where(torch.arange(20) % 2 == 0, SMALL, LARGE)[:, None]
+    model, optimizer, density = set_up(gradients=high_for([2, 5]), scale_logits=sizes)
+    view = SimpleNamespace(width=8, height=8)
+    for slope in (1.0, 2.0):
+        model.gaussians.opacity_logits.grad = torch.full((20, 1), slope)
+        density.observe(seen_by([3], [True], [[0.0, 0.0]]), view, model)
+    assert (density.squares == 5).all()
+    density.act(50, model, optimizer)
+
+    expected = torch.full((22,), 4.0)
+    expected[[2, 19, 20, 21]] = 2.0  # the one cloned; its clone, and the two children of the one that went
+    torch.testing.assert_close(density.squares, expected)
+
+
+@pytest.mark.parametrize("scale_logits", [SMALL, LARGE])
+def test_two_let_through_what_one_did(scale_logits):
+    opacities = torch.linspace(-0.5, 12, 20)[:, None]
+    model, optimizer, density = set_up(opacity_logits=opacities, scale_logits=scale_logits, fields=0.0)
+    with torch.no_grad():
+        before = 1 - model.decode_geometry().opacities.double()
+        density.act(50, model, optimizer)
+        after = 1 - model.decode_geometry().opacities.double()
+    assert len(after) == 40
+    pairs = after[:20] * after[20:]
+    torch.testing.assert_close(pairs, before, rtol=1e-2, atol=1e-6)
+
+
+def test_faint_ones_stay_as_they_are():
+    """Halved at every round, they would be gone before any step made them brighter."""
+    opacities = torch.linspace(-4, -1.4, 20)[:, None]  # up to 0.198
+    model, optimizer, density = set_up(opacity_logits=opacities)
+    density.act(50, model, optimizer)
+    torch.testing.assert_close(model.gaussians.opacity_logits, opacities.repeat(2, 1))
 
 
 # -- opacity reset ---------------------------------------------------------------------------------------------------
@@ -322,10 +410,11 @@ def seen_by(indices, visible, absgrad) -> SimpleNamespace:
 
 
 def test_views_add_gradients_in_ndc_for_what_was_visible():
-    _, _, density = set_up()
+    model, _, density = set_up()
     density.clear(20)
-    density.observe(seen_by([3, 7, 9], [True, False, True], [[0.3, 0.0], [9.0, 9.0], [0.03, 0.04]]), 200, 100)
-    density.observe(seen_by([3], [True], [[0.0, 0.2]]), 200, 100)
+    wide = SimpleNamespace(width=200, height=100)
+    density.observe(seen_by([3, 7, 9], [True, False, True], [[0.3, 0.0], [9.0, 9.0], [0.03, 0.04]]), wide, model)
+    density.observe(seen_by([3], [True], [[0.0, 0.2]]), wide, model)
 
     assert density.views.tolist() == [0, 0, 0, 2, 0, 0, 0, 0, 0, 1, *[0] * 10]
     expected = torch.zeros(20)
@@ -335,8 +424,9 @@ def test_views_add_gradients_in_ndc_for_what_was_visible():
 
 
 def test_views_without_gradients_leave_no_trace():
-    _, _, density = set_up(gradients=0.25)
-    density.observe(SimpleNamespace(indices=torch.tensor([3]), visible=torch.tensor([True]), absgrad=None), 10, 10)
+    model, _, density = set_up(gradients=0.25)
+    nothing = SimpleNamespace(indices=torch.tensor([3]), visible=torch.tensor([True]), absgrad=None)
+    density.observe(nothing, SimpleNamespace(width=10, height=10), model)
     assert (density.gradients == 0.25).all() and (density.views == 1).all()
 
 
@@ -353,7 +443,7 @@ def test_every_round_is_watched(steps):
     density = DensityControl(DensityConfig(prune_opacity=0.0), steps, 20, len(model), 0)
     acted = steps_of_rounds(density, model, optimizer, steps)
     assert acted and all(density.watching(step) for step in range(1, acted[-1] + 1))
-    assert not density.watching(round(0.6 * steps) + 1)
+    assert not density.watching(round(0.65 * steps) + 1)
 
 
 def test_the_same_seed_gives_the_same_children():

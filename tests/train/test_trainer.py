@@ -17,7 +17,7 @@ from hyrfpack.scene import Picture, Scene
 from hyrfpack.train import DensityConfig, LearningRates, TrainConfig, Trainer
 
 # Density control acts after steps 2, 7, 12, 17, 22 and 27, with a reset after 12 and 22: it all happens early.
-DENSITY = DensityConfig(start=0.05, stop=0.68, rounds=5, gradient=1e-5, resets=2)
+DENSITY = DensityConfig(start=0.05, stop=0.68, peak=0.68, excess=1.0, rounds=5, gradient=1e-5, resets=2)
 SHORT = TrainConfig(steps=40, seed=3, max_gaussians=160, density=DENSITY)
 
 
@@ -99,7 +99,7 @@ def test_gaussians_are_added_and_reset_in_the_run_that_the_others_compare_with(w
     """Else resume and determinism would say little."""
     counts = [record["gaussians"] for record in whole.records]
     assert counts[0] != counts[7] != counts[-1]
-    assert (whole.density.first, whole.density.interval, whole.density.last) == (2, 5, 27)
+    assert (whole.strategy.first, whole.strategy.interval, whole.strategy.last) == (2, 5, 27)
 
 
 def test_every_epoch_shows_every_view_once_in_an_order_of_its_own():
@@ -324,7 +324,7 @@ def test_saving_what_was_loaded_gives_the_same_state(tmp_path):
     loaded.load(tmp_path / "a.pt")
     assert parameters(loaded) == parameters(stopped)
     for name in ("gradients", "views"):
-        assert torch.equal(getattr(loaded.density, name), getattr(stopped.density, name))
+        assert torch.equal(getattr(loaded.strategy, name), getattr(stopped.strategy, name))
     states = stopped.optimizer.state_dict(), loaded.optimizer.state_dict()
     assert states[0].keys() == states[1].keys()
     assert all(torch.equal(states[0][key], states[1][key]) for key in states[0])

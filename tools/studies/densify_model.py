@@ -16,37 +16,18 @@ import argparse
 import time
 from pathlib import Path
 
-from torch import Tensor
-
 import hyrfpack
 from hyrfpack.atomic import check_writable, make_folder
 from hyrfpack.cameras.paths import Viewpoint
-from hyrfpack.model import Geometry, HybridModel
-from hyrfpack.model.gaussians import logit
+from hyrfpack.model import HybridModel
 from hyrfpack.scene import Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
-from hyrfpack.train.density import DensityControl
 from hyrfpack.train.progress import ProgressLine
 from hyrfpack.train.run import MODEL
 
 # A round can at most double the number, and splits no Gaussian that none of the views since the last round has seen.
 ROUNDS, STEPS_BETWEEN = 20, 6
 GROWING = ROUNDS * STEPS_BETWEEN
-
-
-class DimmingControl(DensityControl):
-    """Density control whose splits keep coverage: two children of opacity 1 - sqrt(1 - a) for a parent of a.
-
-    With the parent's opacity for each child, layers pile up over many rounds faster than the steps between can thin
-    them: growing fiftyfold then ends 1.5 dB lower.
-    """
-
-    def _split(self, step: int, model: HybridModel, geometry: Geometry, bounds: Tensor, split: Tensor) -> dict:
-        children = super()._split(step, model, geometry, bounds, split)
-        parents = geometry.opacities[split.repeat(2), None]
-        dimmed = 1 - (1 - parents).sqrt()
-        children["opacity_logits"] = children["opacity_logits"] + logit(dimmed) - logit(parents)
-        return children
 
 
 def densifying_config(gaussians: int, settle: int, seed: int) -> TrainConfig:
@@ -57,16 +38,15 @@ def densifying_config(gaussians: int, settle: int, seed: int) -> TrainConfig:
     """
     steps = GROWING + settle
     density = DensityConfig(
-        start=STEPS_BETWEEN / steps, stop=GROWING / steps, rounds=ROUNDS - 1, gradient=0.0, split_scale=0.0
+        start=STEPS_BETWEEN / steps,
+        stop=GROWING / steps,
+        peak=GROWING / steps,
+        excess=1.0,
+        rounds=ROUNDS - 1,
+        gradient=0.0,
+        split_scale=0.0,
     )
     return TrainConfig(steps=steps, seed=seed, max_gaussians=gaussians, density=density)
-
-
-def continued(scene: Scene, model: HybridModel, config: TrainConfig) -> Trainer:
-    """A trainer at the start of a run that goes on with `model`."""
-    trainer = Trainer(scene, config, model=model)
-    trainer.density = DimmingControl(config.density, config.steps, trainer.budget, len(model), config.seed)
-    return trainer
 
 
 def report(label: str, model: HybridModel, scene: Scene, start: float) -> None:
@@ -77,7 +57,7 @@ def report(label: str, model: HybridModel, scene: Scene, start: float) -> None:
 
 def densify(scene: Scene, model: HybridModel, config: TrainConfig, start: float) -> HybridModel:
     """Split and settle; returns the model, and prints a line after each of the two."""
-    trainer = continued(scene, model, config)
+    trainer = Trainer(scene, config, model=model)
     with ProgressLine(config.steps, 0) as line:
 
         def after_step(trainer: Trainer, loss: float, mse: float) -> None:
