@@ -7,13 +7,15 @@ import os
 import platform
 import sys
 import time
+from collections.abc import Iterable, Iterator
 from contextlib import redirect_stderr, suppress
-from typing import TextIO
+from typing import Any, TextIO, TypeVar, cast
 
 import click
 
 import hyrfpack
 
+T = TypeVar("T")
 _MANNER, _STARTED = "hyrfpack.manner", "hyrfpack.started"  # in click's context, where all commands see them
 _PACKAGES = ("torch", "numpy", "numba", "triton", "pycolmap")
 
@@ -65,6 +67,28 @@ def note(sentence: str) -> None:
         sentence = f"[{time.perf_counter() - click.get_current_context().meta[_STARTED]:7.2f} s] {sentence}"
     with suppress(OSError):  # a full disk or a terminal that is gone does not end the work
         click.echo(sentence, err=True)
+
+
+def counted(items: Iterable[T], length: int, label: str) -> Iterator[T]:
+    """The items, with a bar on standard error; where that cannot be drawn, the work goes on without."""
+    with click.progressbar(items, length, label, file=cast(TextIO, _LenientError())) as bar:
+        yield from bar
+
+
+class _LenientError:
+    """Standard error that drops what cannot be written."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(sys.stderr, name)
+
+    def write(self, text: str) -> int:
+        with suppress(OSError):
+            sys.stderr.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            sys.stderr.flush()
 
 
 def detail(sentence: str) -> None:

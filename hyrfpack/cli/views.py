@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +23,7 @@ from hyrfpack.cli.common import (
     split_views,
     table,
 )
+from hyrfpack.cli.manners import counted
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -103,8 +103,7 @@ def render(
     loaded = load(model, place, part)
     loaded.precision = precision
     pictures = render_files(loaded, named, output, depth=depth)
-    with click.progressbar(pictures, len(named), "rendering", file=sys.stderr) as frames:
-        written = list(frames)
+    written = list(counted(pictures, len(named), "rendering"))
     if film:
         write_video(written, film)
     elif video:

@@ -172,6 +172,12 @@ def test_notes_that_cannot_be_printed_do_not_end_the_work(data, tmp_path):
     assert program("2>/dev/full", "train", data, "-o", tmp_path, *TINY).returncode == 0
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")
+def test_a_bar_that_cannot_be_drawn_does_not_end_the_work(model, tmp_path):
+    done = program("2>/dev/full", "render", model, "-o", tmp_path / "out", "--orbit", "2")
+    assert done.returncode == 0 and len(list((tmp_path / "out").glob("*.png"))) == 2
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="file names are bytes on Linux")
 def test_names_that_the_encoding_lacks_are_printed_with_escapes(model, tmp_path):
     for name in (b"\xe9.hyrf", "模型.hyrf".encode()):
