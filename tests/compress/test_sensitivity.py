@@ -33,7 +33,8 @@ def looked_at_from(cameras: list[Camera]) -> list[Camera]:
 
 @torch.no_grad()
 def pictures(model: HybridModel, views: list[Camera]) -> np.ndarray:
-    return np.concatenate([render(model, view).rgb.double().numpy().ravel() for view in views])
+    decoded = model.decode()
+    return np.concatenate([render(model, view, decoded=decoded).rgb.double().numpy().ravel() for view in views])
 
 
 def slope(model: HybridModel, views: list[Camera], parameter: torch.Tensor, place: int, step: float) -> float:

@@ -203,7 +203,8 @@ def test_a_lost_device_comes_back_with_the_same_view(browser: Browser, tmp_path:
     settled(browser)
     before = browser.evaluate("JSON.stringify(hyrfpack.camera())")
     run(browser, "window.said = []; hyrfpack.player.addEventListener('said', ({detail}) => said.push(detail));")
-    for _ in range(20):
+    made = []
+    for _ in range(8):
         browser.evaluate(
             "new Promise((resolve) => { const { player } = hyrfpack, back = () => device.restoreContext();"
             "player.canvas.addEventListener('webglcontextlost', () => setTimeout(back, 0), {once: true});"
@@ -212,9 +213,11 @@ def test_a_lost_device_comes_back_with_the_same_view(browser: Browser, tmp_path:
         )
         settled(browser)
         assert browser.evaluate("JSON.stringify(hyrfpack.camera())") == before
+        sizes = "hyrfpack.player.renderer.graphics.made.size, hyrfpack.player.renderer.content.graphics.made.size"
+        made.append(browser.evaluate(f"[{sizes}]"))
     assert "taken away" in browser.evaluate("said[0]") and browser.evaluate("said.at(-1)") == ""
-    made = browser.evaluate("hyrfpack.player.renderer.graphics.made.size")
-    assert made < 20 and browser.evaluate("hyrfpack.player.renderer.content.graphics.made.size") < 40
+    # Nothing is left behind; how much is there when it is asked differs by what the last picture needed.
+    assert all(last - first < 5 for first, last in zip(made[0], made[-1], strict=True)), made
     camera = cameras()[0]
     assert psnr(shown(browser, camera), rendered(model, camera)) > 45
 
@@ -247,7 +250,7 @@ def test_many_files_opened_one_after_the_other_leave_nothing_behind(browser: Bro
     )
     open_once = "hyrfpack.player.open({name: 'x.hyrf', stream: (async function* () { yield file.slice(); })()})"
     counts = []
-    for _ in range(12):
+    for _ in range(5):
         browser.evaluate(f"{open_once}.then(() => true)")
         counts.append(browser.evaluate("window.count"))
     assert len(set(counts[1:])) == 1

@@ -45,6 +45,7 @@ def test_the_window_starts_at_the_first_camera_and_draws_only_when_something_cha
 
 
 def test_mouse_and_keys_move_the_eye(browser: Browser, tmp_path: Path):
+    browser.prefer(less_motion=True)  # it gets there at once, and to the same places: see below
     opened(browser, tmp_path, page_of(cloud()))
     home = eye(browser)
 
