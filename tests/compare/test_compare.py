@@ -289,7 +289,7 @@ def test_what_is_no_finished_run_is_refused_with_what_to_do(runs, tmp_path):
     assert "each once" in refused("compare", *runs, runs[0] / ".." / "a", "-o", page)
     assert "ends in .html" in refused("compare", *runs, "-o", tmp_path / "page.pdf")
     assert "the output is an input" in refused("compare", *runs, "-o", runs[0] / "metrics.json", "--overwrite")
-    (runs[0] / "views" / "000.png").write_bytes((runs[0] / "curve.png").read_bytes())
+    Image.new("RGB", (7, 5)).save(runs[0] / "views" / "000.png")
     assert "remove it, and the view is left out" in refused("compare", *runs, "-o", page)
     (runs[0] / "model.hyrf").write_bytes(b"nothing")
     assert f"{runs[0]}/model.hyrf" in refused("compare", *runs, "-o", page)

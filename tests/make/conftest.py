@@ -24,9 +24,9 @@ QUICK = {
 }
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def quick():
-    """A few steps and views are enough for tests."""
+    """A few steps and views are enough for tests of this folder, and must not reach those of others."""
     with pytest.MonkeyPatch.context() as patch:
         hurry(patch)
         yield
