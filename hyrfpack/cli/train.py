@@ -11,6 +11,7 @@ from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
     SEED,
+    SIZE,
     at_predicted_exposure,
     chosen_device,
     detail,
@@ -32,6 +33,13 @@ BACKGROUND_COLORS = ("black", "white", "random")
 @click.option("-o", "--output", "out", type=OUTPUT, required=True, metavar="RUN", help="Folder of the run.")
 @click.option("--steps", type=click.IntRange(min=1), default=3000, show_default=True, help="Optimiser steps.")
 @click.option("--max-gaussians", type=click.IntRange(min=1), metavar="N", help="Budget.  [default: from the photos]")
+@click.option(
+    "--target-size",
+    "target_bytes",
+    type=SIZE,
+    metavar="SIZE",
+    help="As many Gaussians as 'compress' packs into so much, such as 500kB, instead of --max-gaussians.",
+)
 @click.option("--preset", type=click.Choice(PRESETS), default="auto", show_default=True, help="The kind of scene.")
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Same seed, same bytes.")
 @scene_options
@@ -83,12 +91,15 @@ def train(
     Examples:
       hyrfpack train photos/bonsai -o runs/bonsai
       hyrfpack train photos/garden -o runs/garden --images images_4 --steps 30000
+      hyrfpack train photos/garden -o runs/garden --target-size 1MB
       hyrfpack train lego -o runs/lego --background-color white --max-gaussians 50000
       hyrfpack train photos/garden -o runs/garden --images images_4 --steps 30000 --resume
       hyrfpack train photos/desk -o runs/desk --poses
     """
     if resume and overwrite:
         raise click.UsageError("--resume goes on with a run and --overwrite replaces it; give one of them")
+    if None not in (settings["max_gaussians"], settings["target_bytes"]):
+        raise click.UsageError("--max-gaussians and --target-size each decide how large the model is; give one of them")
     from hyrfpack.data import PictureCache
     from hyrfpack.device import describe_device
     from hyrfpack.train import TrainConfig

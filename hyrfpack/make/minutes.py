@@ -46,6 +46,7 @@ class Cost:
         decoding: seconds that training waits for a photo to be decoded.
         cpu_pass: seconds to draw a view on the CPU and follow it back, at `gaussians`.
         gaussians: that the pilot ended with.
+        target_bytes: that the packed model may have; None for no limit.
     """
 
     step: float
@@ -53,6 +54,7 @@ class Cost:
     decoding: float
     cpu_pass: float
     gaussians: int
+    target_bytes: int | None = None
 
     def scaled(self, pixels: float) -> Cost:
         """That of photos with so many times the pixels, by estimate."""
@@ -61,14 +63,14 @@ class Cost:
 
     def training(self, scene: Scene, steps: int) -> float:
         """Seconds of a training, from the number of Gaussians that there are on average."""
-        budget, _ = budget_for(scene, TrainConfig(steps=steps))
+        budget = self._budget(scene, steps)
         mean = DensityConfig().mean_count(min(budget, len(scene.points) or budget // 2), budget)
         step = self.step + self.step_per_gaussian * mean
         return SETTLED * steps * step + self.decoding * min(steps, len(scene.train))
 
     def after(self, scene: Scene, steps: int) -> dict[str, float]:
         """Seconds of the stages that follow, training's own scores counted as scoring."""
-        budget, _ = budget_for(scene, TrainConfig(steps=steps))
+        budget = self._budget(scene, steps)
         at_end, at_pilot = (self.step + self.step_per_gaussian * n for n in (budget, self.gaussians))
         one = SETTLED * self.cpu_pass * at_end / at_pilot
         return {
@@ -76,6 +78,9 @@ class Cost:
             "scoring": one * (DRAWN_AFTER + 2 * SCORED * len(scene.test)) + OVERHEAD / 2,
             "export": OVERHEAD / 2,
         }
+
+    def _budget(self, scene: Scene, steps: int) -> int:
+        return budget_for(scene, TrainConfig(steps=steps, target_bytes=self.target_bytes))[0]
 
     def total(self, scene: Scene, steps: int) -> float:
         return self.training(scene, steps) + sum(self.after(scene, steps).values())
@@ -93,6 +98,7 @@ def measure(
     path: Path,
     reading: Reading,
     scene: Scene,
+    target_bytes: int | None,
     device: torch.device,
     end: float,
     seed: int,
@@ -105,12 +111,14 @@ def measure(
     Args:
         path, reading: of the photos.
         scene: them, as they are read.
+        target_bytes: that the packed model may have; None for no limit.
         cache: keeps photos that are decoded.
     """
     draft = QUALITIES["draft"]
     if (left := end - monotonic()) <= 0:
         say(f"the time is over before the training: a draft follows, of {draft.steps} steps")
-        return Plan(draft.steps, min(reading.max_size or draft.max_size, draft.max_size))
+        shrunk = min(reading.max_size or draft.max_size, draft.max_size)
+        return Plan(draft.steps, shrunk, target_bytes=target_bytes)
     sizes = _sizes(scene, reading.max_size)
     probed = next((size for size in reversed(sizes) if size >= SMALLEST), sizes[-1])
     scenes = {reading.max_size: scene}
@@ -119,14 +127,14 @@ def measure(
         return scenes[size] if size in scenes else scenes.setdefault(size, reading.scene(path, size))
 
     reporter.update(0.0, f"a few steps on photos of {_longest(at(probed))} pixels")
-    cost = first = pilot(at(probed), device, seed, cache, PILOT_SHARE * left)
+    cost = first = pilot(at(probed), target_bytes, device, seed, cache, PILOT_SHARE * left)
     for chosen in sizes:
         cost = first.scaled(megapixels(at(chosen)) / megapixels(at(probed)))
         if cost.steps_within(at(chosen), end - monotonic()) >= USEFUL_STEPS:
             break
     if chosen != probed:
         reporter.update(0.5, f"a few steps on photos of {_longest(at(chosen))} pixels")
-        cost = pilot(at(chosen), device, seed, cache, PILOT_SHARE * left)
+        cost = pilot(at(chosen), target_bytes, device, seed, cache, PILOT_SHARE * left)
     fitting, left = at(chosen), end - monotonic()
     steps = cost.steps_within(fitting, left)
     if steps < draft.steps:
@@ -136,16 +144,19 @@ def measure(
         enough = ", which are enough: it will be ready before" if steps == FULL_STEPS else ""
         say(f"{left / 60:.1f} minutes are left: {steps:,} steps on photos of {_longest(fitting)} pixels{enough}")
     reporter.estimates |= {"training": cost.training(fitting, steps), **cost.after(fitting, steps)}
-    return Plan(steps, chosen)
+    return Plan(steps, chosen, target_bytes=target_bytes)
 
 
-def pilot(scene: Scene, device: torch.device, seed: int, cache: PictureCache, seconds: float) -> Cost:
+def pilot(
+    scene: Scene, target_bytes: int | None, device: torch.device, seed: int, cache: PictureCache, seconds: float
+) -> Cost:
     """Measure what a scene costs by a small training run from its first Gaussians to a budget.
 
     Args:
+        target_bytes: that the packed model may have; None for no limit.
         seconds: after which it ends in any case, but for the steps that it takes to measure anything.
     """
-    budget, _ = budget_for(scene, TrainConfig())
+    budget, _ = budget_for(scene, TrainConfig(target_bytes=target_bytes))
     config = TrainConfig(steps=PILOT_STEPS, seed=seed, max_gaussians=budget, density=RISING)
     trainer = Trainer(scene, config, cache, device)
     counts: list[int] = []
@@ -162,7 +173,8 @@ def pilot(scene: Scene, device: torch.device, seed: int, cache: PictureCache, se
     trainer.run(report=report, stop=lambda: len(working) > 2 * COLD_STEPS and monotonic() > end)
     step, per_gaussian = _line_through(counts[COLD_STEPS:], working[COLD_STEPS:])
     views = [view.camera for view in evenly_spaced(scene.train, 4)]
-    return Cost(step, per_gaussian, statistics.fmean(waiting), _cpu_pass(trainer.model, views), counts[-1])
+    cpu_pass = _cpu_pass(trainer.model, views)
+    return Cost(step, per_gaussian, statistics.fmean(waiting), cpu_pass, counts[-1], target_bytes)
 
 
 def _line_through(counts: Sequence[int], seconds: Sequence[float]) -> tuple[float, float]:

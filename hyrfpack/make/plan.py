@@ -62,11 +62,17 @@ class Plan:
         steps: of training.
         max_size: of photos, as in `load_scene`.
         finetune_steps: of packing.
+        target_bytes: what the packed model may have; None for no limit.
     """
 
     steps: int
     max_size: int
     finetune_steps: int = 0
+    target_bytes: int | None = None
+
+    def config(self, seed: int) -> TrainConfig:
+        """Settings of its training."""
+        return TrainConfig(steps=self.steps, seed=seed, target_bytes=self.target_bytes)
 
 
 def passes(gaussians: int) -> int:
@@ -92,7 +98,7 @@ def forecast(pixels: float, steps: int, finetune_steps: int, gaussians: int, dev
 
 def forecast_scene(scene: Scene, plan: Plan, device: torch.device) -> dict[str, float]:
     """`forecast` for photos that are known."""
-    gaussians, _ = budget_for(scene, TrainConfig(steps=plan.steps))
+    gaussians, _ = budget_for(scene, plan.config(seed=0))
     return forecast(megapixels(scene), plan.steps, plan.finetune_steps, gaussians, device)
 
 

@@ -191,7 +191,7 @@ class _Making:
         if request.minutes is None:
             self.reporter.estimates |= forecast_scene(scene, plan, request.device)
         training = stages.fit(work, scene, self._digest(scene), plan, request.seed, request.device, cache)
-        stages.pack(work, scene, plan, request.target_bytes)
+        stages.pack(work, scene, plan)
         return self._result(work.folder / stages.PACKED, scene, poses=poses, training=training)
 
     def _poses(self) -> dict[str, Any]:
@@ -215,7 +215,7 @@ class _Making:
         """What the quality asks for."""
         quality = QUALITIES[self.request.quality]
         steps = quality.steps if self.request.device.type == "cpu" else quality.gpu_steps
-        return Plan(steps, self.request.reading.max_size, quality.finetune_steps)
+        return Plan(steps, self.request.reading.max_size, quality.finetune_steps, self.request.target_bytes)
 
     def _plan(self, path: Path, reading: Reading, scene: Scene, cache: PictureCache) -> tuple[Plan, Scene]:
         """What is asked for or fits the minutes, and the scene at the size that this takes."""
@@ -226,7 +226,10 @@ class _Making:
         self.reporter.estimates |= {"measurement": 0.0, "training": max(0.0, end - monotonic())}
 
         def act(going_on: bool) -> tuple[dict[str, Any], list[str]]:
-            plan = measure(path, reading, scene, request.device, end, request.seed, cache, self.reporter, self.say)
+            plan = measure(
+                path, reading, scene, request.target_bytes, request.device, end, request.seed, cache, self.reporter,
+                self.say,
+            )  # fmt: skip
             return asdict(plan), []
 
         inputs = {

@@ -28,7 +28,7 @@ from hyrfpack.make.progress import Reporter
 from hyrfpack.make.state import digest, digest_all
 from hyrfpack.make.work import PRODUCTS, Work
 from hyrfpack.scene import Scene
-from hyrfpack.train import TrainConfig, train
+from hyrfpack.train import train
 from hyrfpack.train.progress import SMOOTHING
 from hyrfpack.train.run import CHECKPOINT, METRICS, MODEL
 
@@ -72,7 +72,7 @@ def fit(
     work: Work, scene: Scene, data: str, plan: Plan, seed: int, device: torch.device, cache: PictureCache
 ) -> dict[str, Any]:
     """Train into `run/`; returns steps, Gaussians and the choices made."""
-    config = TrainConfig(steps=plan.steps, seed=seed)
+    config = plan.config(seed)
     run = work.folder / RUN
 
     def act(going_on: bool) -> tuple[dict, list[str]]:
@@ -127,7 +127,7 @@ def _training_report(reporter: Reporter, steps: int) -> Callable[[int, float, fl
 # -- packing -------------------------------------------------------------------------------------------------------
 
 
-def pack(work: Work, scene: Scene, plan: Plan, target_bytes: int | None) -> dict[str, Any]:
+def pack(work: Work, scene: Scene, plan: Plan) -> dict[str, Any]:
     """Compress into `model.hyrf`; returns bytes and Gaussians."""
 
     def act(going_on: bool) -> tuple[dict, list[str]]:
@@ -136,7 +136,7 @@ def pack(work: Work, scene: Scene, plan: Plan, target_bytes: int | None) -> dict
 
         source, target = work.folder / RUN / MODEL, work.folder / PACKED
         report = compress(
-            source, target, data=scene, finetune_steps=plan.finetune_steps, target_bytes=target_bytes, say=say
+            source, target, data=scene, finetune_steps=plan.finetune_steps, target_bytes=plan.target_bytes, say=say
         )
         return {"bytes": report.bytes_after, "gaussians": report.gaussians, "found": report.found}, [PACKED]
 
@@ -145,7 +145,7 @@ def pack(work: Work, scene: Scene, plan: Plan, target_bytes: int | None) -> dict
         "model": digest(work.folder / RUN / MODEL),
         cameras: work.state.inputs("training")["photos and poses"],
         "finetune": plan.finetune_steps,
-        "target size": target_bytes,
+        "target size": plan.target_bytes,
     }
     return work.stage("compression", inputs, act)
 

@@ -104,7 +104,8 @@ class TrainConfig:
         seed: of view order, initialisation and density control; 0 to LARGEST_SEED.
         preset: the paper's regime, one of PRESETS; "auto" looks at the scene.
         max_gaussians: budget, the most that a run ends with; on the way it is exceeded by `DensityConfig.excess`.
-            None chooses from the pictures' pixels and the steps.
+            None chooses from the pictures' pixels, the steps and `target_bytes`.
+        target_bytes: the size of the packed file to train for, instead of `max_gaussians`; None for no limit.
         log2_table_size: rows per level of the radiance grid as a power of two (the geometry grid has half);
             None follows the budget. 4 to 24.
         background: whether a background sphere is trained; None lets the preset decide.
@@ -124,6 +125,7 @@ class TrainConfig:
     seed: int = 0
     preset: str = "auto"
     max_gaussians: int | None = None
+    target_bytes: int | None = None
     log2_table_size: int | None = None
     background: bool | None = None
     exposure: bool | None = None
@@ -143,9 +145,11 @@ class TrainConfig:
     def __post_init__(self) -> None:
         check_int("steps", self.steps, 1)
         check_int("seed", self.seed, 0, LARGEST_SEED)
-        for name in ("max_gaussians", "checkpoint_every"):
+        for name in ("max_gaussians", "target_bytes", "checkpoint_every"):
             if getattr(self, name) is not None:
                 check_int(name, getattr(self, name), 1)
+        if self.max_gaussians is not None and self.target_bytes is not None:
+            raise ValueError("a number of Gaussians and a target size each decide how large the model is; give one")
         if self.log2_table_size is not None:
             check_int("log2_table_size", self.log2_table_size, 4, 24)
         check_choice("preset", self.preset, PRESETS)

@@ -26,6 +26,11 @@ SYNTHETIC_HALF_BOX = 1.3  # NeRF-synthetic objects lie in [-1.3, 1.3]^3
 # (Mip-NeRF 360 at 1 megapixel: 0.85 and 0.9 million; published models have up to 2.5).
 PER_PHOTO_PIXEL, PER_PIXEL = 0.85, 1 / 240
 LEAST_BUDGET = 5_000
+# What `compress` makes of a model: bytes of decoders and headers, and of each Gaussian with its table rows. Trained for
+# 500 to 3,000 steps, the twelve sets of tools/studies/quality.py have 3 to 9 bytes a Gaussian, most of them 5 to 6.
+PACKED, PACKED_GAUSSIAN = 12_000, 6.0
+LEAST_TARGETED = 250  # Gaussians, however small the file shall be
+LARGER = 2  # at most: how many times the usual budget a target size may bring
 GAUSSIANS_PER_ROW = 20  # for each row and level of the radiance table; the paper's models have 8 to 20
 INITIAL_OPACITY = 0.1
 INITIAL_SIZE = (1e-5, 0.5)  # local units over S(p)
@@ -85,14 +90,21 @@ def scene_frame(scene: Scene, preset: str) -> Frame:
 def budget_for(scene: Scene, config: TrainConfig) -> tuple[int, str]:
     """The most Gaussians a run may have, and why.
 
-    It follows the photos' pixels; a shorter run can fit fewer, in proportion to the square root of its length.
+    It follows the photos' pixels; a shorter run can fit fewer, in proportion to the square root of its length. Of a
+    target size it is about what fits in, and at most `LARGER` times as many as without.
     """
     if config.max_gaussians is not None:
         return config.max_gaussians, "asked for"
     pixels = sum(view.camera.width * view.camera.height for view in scene.train)
     full = max(PER_PHOTO_PIXEL * pixels / len(scene.train), PER_PIXEL * pixels)
     share = math.sqrt(min(1.0, config.steps / FULL_STEPS))
-    return max(LEAST_BUDGET, round(full * share)), f"{pixels:,} pixels in all, {config.steps:,} steps"
+    budget, why = max(LEAST_BUDGET, round(full * share)), f"{pixels:,} pixels in all, {config.steps:,} steps"
+    if config.target_bytes is not None:
+        fitting = max(LEAST_TARGETED, round((config.target_bytes - PACKED) / PACKED_GAUSSIAN))
+        if fitting <= LARGER * budget:
+            return fitting, f"to be packed into {config.target_bytes:,} bytes"
+        budget, why = LARGER * budget, f"{LARGER} times what suits {why}"
+    return budget, why
 
 
 def table_size_for(budget: int, config: TrainConfig) -> tuple[int, str]:

@@ -134,7 +134,7 @@ def file_limit(size: int) -> Iterator[None]:
     [
         ({}, 500, "make.json: "),
         ({"seed": 1}, 20_000, "training failed: .*run/model.hyrf: "),
-        ({"target_bytes": 2_000_000}, 20_000, "compression failed: .*model.hyrf: "),
+        ({"quality": "best"}, 5_000, "compression failed: .*model.hyrf: "),
         ({"output": "other.html"}, 20_000, "export failed: .*export/other.html: "),
         ({"output": "scene.html"}, 20_000, "scene.html: "),  # the copy of what is there
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from time import monotonic
 
 import pytest
@@ -10,6 +11,7 @@ import torch
 from hyrfpack.data import PictureCache, load_scene
 from hyrfpack.make import make, minutes
 from hyrfpack.make.minutes import Cost, measure
+from hyrfpack.make.plan import Plan
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.source import Reading
 from hyrfpack.train.config import FULL_STEPS
@@ -42,6 +44,12 @@ def test_more_pixels_take_as_much_longer(scene):
     )
 
 
+def test_a_smaller_model_takes_less_time(scene):
+    small = replace(COST, target_bytes=15_000)
+    assert small.training(scene, 1000) < COST.training(scene, 1000)
+    assert small.after(scene, 1000)["compression"] < COST.after(scene, 1000)["compression"]
+
+
 def test_a_line_goes_through_what_is_on_a_line_and_never_falls():
     counts = list(range(100, 1000, 20))
     assert minutes._line_through(counts, [0.5 + 1e-3 * n for n in counts]) == pytest.approx((0.5, 1e-3))
@@ -50,7 +58,7 @@ def test_a_line_goes_through_what_is_on_a_line_and_never_falls():
 
 
 def test_a_measurement_gives_a_cost_of_this_scene(scene):
-    cost = minutes.pilot(scene, CPU, 0, PictureCache(), 5.0)
+    cost = minutes.pilot(scene, None, CPU, 0, PictureCache(), 5.0)
     assert cost.step >= 0 and cost.step_per_gaussian >= 0 and cost.step + cost.step_per_gaussian > 0
     assert cost.cpu_pass > 0 and cost.decoding >= 0 and cost.gaussians > 0
 
@@ -62,21 +70,22 @@ def test_large_photos_are_made_smaller_where_the_time_is_short(posed, scene, mon
     monkeypatch.setattr(minutes, "pilot", cost)
     monkeypatch.setattr(minutes, "SIZES", (24, 16, 8))
     said: list[str] = []
-    plans = [
-        measure(
-            posed, Reading(), scene, CPU, monotonic() + s, 0, PictureCache(), Reporter(["training"], None), said.append
-        )
-        for s in (3000.0, 300.0, 100.0)
-    ]
-    assert [plan.max_size for plan in plans] == [1600, 16, 8]
+
+    def planned(seconds: float) -> Plan:
+        arguments = (posed, Reading(), scene, 90_000, CPU, monotonic() + seconds, 0, PictureCache())
+        return measure(*arguments, Reporter(["training"], None), said.append)
+
+    plans = [planned(seconds) for seconds in (3000.0, 300.0, 100.0)]
+    assert [plan.max_size for plan in plans] == [1600, 16, 8] and {plan.target_bytes for plan in plans} == {90_000}
     assert plans[0].steps > 1000 and "pixels" in said[0]
 
 
 def test_a_time_that_is_over_or_too_short_makes_a_draft_and_says_so(posed, scene):
     said: list[str] = []
     for seconds in (-1.0, 0.5):
-        arguments = (posed, Reading(), scene, CPU, monotonic() + seconds, 0, PictureCache())
-        assert measure(*arguments, Reporter(["training"], None), said.append).steps == 6
+        arguments = (posed, Reading(), scene, 20_000, CPU, monotonic() + seconds, 0, PictureCache())
+        plan = measure(*arguments, Reporter(["training"], None), said.append)
+        assert (plan.steps, plan.target_bytes) == (6, 20_000)
     assert "the time is over" in said[0] and "the time is short" in said[1]
 
 

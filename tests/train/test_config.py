@@ -20,6 +20,7 @@ WRONG = {
     "steps": (0, -1, None, *NO_INT),
     "seed": (-1, LARGEST_SEED + 1, None, *NO_INT),
     "max_gaussians": (0, -1, *NO_INT),
+    "target_bytes": (0, -1, *NO_INT),
     "checkpoint_every": (0, -1, *NO_INT),
     "log2_table_size": (3, 25, 40, -1, *NO_INT),
     "preset": ("indoor", None, 1),
@@ -89,3 +90,8 @@ def test_the_mean_count_is_that_of_the_rounds_targets(config):
     steps = range(1, 10_001)
     counts = [100 if step < control.first else control.target(min(step, control.last)) for step in steps]
     assert config.mean_count(100, 500) == pytest.approx(np.mean(counts), rel=2e-3)
+
+
+def test_two_sizes_of_a_model_are_one_too_many():
+    with pytest.raises(ValueError, match="give one"):
+        TrainConfig(max_gaussians=100, target_bytes=20_000)

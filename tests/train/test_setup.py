@@ -13,6 +13,10 @@ from hyrfpack.model import Frame
 from hyrfpack.scene import Picture, Scene, evenly_spaced
 from hyrfpack.train import TrainConfig
 from hyrfpack.train.setup import (
+    LARGER,
+    LEAST_TARGETED,
+    PACKED,
+    PACKED_GAUSSIAN,
     budget_for,
     build_model,
     detect_preset,
@@ -194,6 +198,19 @@ def test_the_budget_follows_the_mean_photo_where_they_differ():
 
 def test_an_asked_budget_is_taken():
     assert budget_for(around_an_object(), TrainConfig(max_gaussians=77)) == (77, "asked for")
+
+
+@pytest.mark.parametrize("target", [24_000, 36_000, 48_000])
+def test_a_budget_for_a_target_size_fills_what_decoders_leave(target):
+    budget, reason = budget_for(around_an_object(), TrainConfig(target_bytes=target))
+    assert (budget, reason) == ((target - PACKED) / PACKED_GAUSSIAN, f"to be packed into {target:,} bytes")
+
+
+def test_a_budget_for_a_target_size_is_neither_nothing_nor_more_than_photos_can_use():
+    scene = around_an_object()
+    assert budget_for(scene, TrainConfig(target_bytes=1))[0] == LEAST_TARGETED
+    usual, why = budget_for(scene, TrainConfig())
+    assert budget_for(scene, TrainConfig(target_bytes=10**9)) == (LARGER * usual, f"{LARGER} times what suits {why}")
 
 
 @pytest.mark.parametrize("budget", [1, 1000, 30_000, 500_000, 3_000_000, 10**9])
