@@ -46,6 +46,7 @@ from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 FINETUNED = 4.0  # times as much distortion, which fine-tuning takes back
 VERIFIED = 6  # cameras at which a file's pictures are compared with the model's
 TOLERATED, MENDED = 2.0, 4  # times the distortion asked for, and how often a finer file is made where it is more
+BLAMED = 0.7  # pruning, where pictures are off by less than this share without it
 TRIALS, FINETUNED_TRIALS = 9, 4  # of a search
 
 
@@ -193,18 +194,29 @@ class Packer:
         """
         views = evenly_spaced(cameras, VERIFIED)
         pictures = _pictures(self.model, views)
-        distortion = wanted
+
+        def off(trial: Trial) -> float:
+            return _difference(_pictures(decode_model(trial.data), views), pictures)
+
+        def say(error: float, mended: str) -> None:
+            self.say(f"pictures are off by {error:.2g} instead of {wanted:.2g}: {mended}")
+
+        distortion, error = wanted, off(trial)
+        if error > TOLERATED * wanted and self.prune:
+            self.prune = False
+            whole = self.attempt(wanted)
+            if (left := off(whole)) < BLAMED * error:
+                say(error, "nothing is pruned")
+                trial, error = whole, left
+            else:
+                self.prune = True
         for _ in range(MENDED):
-            error = _difference(_pictures(decode_model(trial.data), views), pictures)
             if error <= TOLERATED * wanted:
                 break
-            if self.prune:
-                self.prune = False
-                self.say(f"pictures are off by {error:.2g} instead of {wanted:.2g}: nothing is pruned")
-            else:
-                distortion *= max(wanted / error, 1 / 16)
-                self.say(f"pictures are off by {error:.2g} instead of {wanted:.2g}: finer, for {distortion:.2g}")
+            distortion *= max(wanted / error, 1 / 16)
+            say(error, f"finer, for {distortion:.2g}")
             trial = self.attempt(distortion)
+            error = off(trial)
         return trial
 
     def within_bytes(self, limit: int, start: float) -> tuple[Trial, str]:

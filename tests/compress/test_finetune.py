@@ -59,14 +59,14 @@ def test_fine_tuning_is_worth_more_than_the_same_bytes_of_finer_steps(trained, p
     steps = []
 
     tuned = finetune(
-        plan.apply(trained), plan, sensitivity, scene.train, 60, report=lambda step, loss: steps.append((step, loss))
+        plan.apply(trained), plan, sensitivity, scene.train, 150, report=lambda step, loss: steps.append((step, loss))
     )
 
     model, size = decoded(tuned, plan, sensitivity)
     after = evaluate(model, scene.train).psnr
     assert size < len(finer)
     assert after > without + 0.5
-    assert [step for step, _ in steps] == list(range(1, 61))
+    assert [step for step, _ in steps] == list(range(1, 151))
     assert np.mean([loss for _, loss in steps[-8:]]) < np.mean([loss for _, loss in steps[:8]])
 
 

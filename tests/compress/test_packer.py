@@ -63,11 +63,11 @@ def squared_error(first: Path, second: Path, cameras) -> float:
 # -- what it is for --------------------------------------------------------------------------------------------------
 
 
-def test_it_is_smaller_than_the_paper_profile_by_far_at_hardly_any_loss(trained, paper, compact, scene):
+def test_it_is_smaller_than_the_paper_profile_by_far_at_a_small_loss(trained, paper, compact, scene):
     path, _ = compact
 
-    assert path.stat().st_size < 0.55 * paper.stat().st_size
-    assert psnr(path, scene) > psnr(trained, scene) - 0.1
+    assert path.stat().st_size < 0.45 * paper.stat().st_size
+    assert psnr(path, scene) > psnr(trained, scene) - 0.2
 
 
 def test_with_a_limit_on_the_loss_it_loses_no_more_than_the_paper_profile_and_is_smaller(
@@ -135,12 +135,16 @@ def test_fine_tuning_keeps_to_limits(limit, trained, scene, tmp_path):
 
 
 def test_pruning_leaves_out_gaussians_and_bytes_and_not_pruning_keeps_all(trained, scene, tmp_path):
-    every = len(load(trained))
+    model = load(trained)
+    every = len(model)
+    with torch.no_grad():
+        model.gaussians.opacity_logits[: every // 3] -= 20  # hardly to be seen
+    save(model, tmp_path / "some.hyrf")
 
-    kept = compress(trained, tmp_path / "all.hyrf", data=scene, distortion=1e-4, prune=False)
-    pruned = compress(trained, tmp_path / "fewer.hyrf", data=scene, distortion=1e-4)
+    kept = compress(tmp_path / "some.hyrf", tmp_path / "all.hyrf", data=scene, distortion=1e-4, prune=False)
+    pruned = compress(tmp_path / "some.hyrf", tmp_path / "fewer.hyrf", data=scene, distortion=1e-4)
 
-    assert kept.gaussians == every > pruned.gaussians > every / 4
+    assert kept.gaussians == every > every - every // 3 >= pruned.gaussians > every / 4
     assert pruned.bytes_after < kept.bytes_after
 
 
@@ -191,10 +195,10 @@ def test_a_compressed_file_can_be_compressed_again_and_unpacked_exactly(paper, c
 
 @pytest.mark.parametrize(
     ("told", "expected"),
-    [(30.0, 6.93e-6), (20.0, 6.93e-5), (None, 6.93e-6), ("good", 6.93e-6), (0.0, 6.93e-6), (1e400, 6.93e-6)],
+    [(30.0, 2.33e-5), (20.0, 2.33e-4), (None, 2.33e-5), ("good", 2.33e-5), (0.0, 2.33e-5), (1e400, 2.33e-5)],
 )
-def test_by_itself_it_aims_at_three_hundredths_of_a_dB(told, expected):
-    """Errors add up: 10 lg((e + distortion) / e) = 0.03 at e = 10^(-psnr / 10)."""
+def test_by_itself_it_aims_at_a_tenth_of_a_dB(told, expected):
+    """Errors add up: 10 lg((e + distortion) / e) = 0.1 at e = 10^(-psnr / 10)."""
     assert default_distortion({} if told is None else {"psnr": told}) == pytest.approx(expected, rel=0.01)
 
 
