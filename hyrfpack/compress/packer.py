@@ -43,7 +43,7 @@ from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 
-FINETUNED = 4.0  # times as much distortion, which fine-tuning takes back
+FINETUNED = 1.2  # times as much distortion, which fine-tuning takes back
 VERIFIED = 6  # cameras at which a file's pictures are compared with the model's
 TOLERATED, MENDED = 2.0, 4  # times the distortion asked for, and how often a finer file is made where it is more
 BLAMED = 0.7  # pruning, where pictures are off by less than this share without it

@@ -7,8 +7,8 @@ Each set is trained with both versions at several budgets of Gaussians, as share
 of each, and packed by it; both are scored by this version, on held-out photos, from the files as decoded: PSNR at the
 exposure that training photos foretell (`psnr_predicted`), plain PSNR, SSIM. Then for each set the difference in bytes
 at equal PSNR (Bjontegaard's, over the PSNR that both reach, by monotone cubics through the points), and the difference
-in scores at the most bytes that both have. Runs are kept below --out, and one that is there is not made again. The
-other version runs with this environment's packages.
+in scores at the most bytes that both have. Runs are kept below --out, and one that is there is not trained again, nor
+scored again while its scores.json is there. The other version runs with this environment's packages.
 """
 
 from __future__ import annotations
@@ -54,8 +54,9 @@ def run(version: Path, scene: Scene, steps: int, gaussians: int, seed: int, out:
     kept = out / "scores.json"
     if kept.exists():
         return json.loads(kept.read_text())
-    settings = ["--steps", str(steps), "--max-gaussians", str(gaussians), "--seed", str(seed), "--overwrite"]
-    _command(version, "train", str(scene.path), "-o", str(out), *settings)
+    if not (out / "metrics.json").exists():
+        settings = ["--steps", str(steps), "--max-gaussians", str(gaussians), "--seed", str(seed), "--overwrite"]
+        _command(version, "train", str(scene.path), "-o", str(out), *settings)
     packed = out / "compact.hyrf"
     packed.unlink(missing_ok=True)
     _command(version, "compress", str(out / "model.hyrf"), "-o", str(packed))
