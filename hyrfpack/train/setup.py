@@ -26,9 +26,9 @@ SYNTHETIC_HALF_BOX = 1.3  # NeRF-synthetic objects lie in [-1.3, 1.3]^3
 # (Mip-NeRF 360 at 1 megapixel: 0.85 and 0.9 million; published models have up to 2.5).
 PER_PHOTO_PIXEL, PER_PIXEL = 0.85, 1 / 240
 LEAST_BUDGET = 5_000
-# What `compress` makes of a model: bytes of decoders and headers, and of each Gaussian with its table rows. Trained for
-# 500 to 3,000 steps, the twelve sets of tools/studies/quality.py have 3 to 9 bytes a Gaussian, most of them 5 to 6.
-PACKED, PACKED_GAUSSIAN = 12_000, 6.0
+# Bytes of decoders and headers in a packed file, and of each Gaussian with its table rows. By itself `compress` takes 2
+# to 6 bytes for a Gaussian, most often 4 to 5: of the same bytes, more and coarser ones are better.
+PACKED, PACKED_GAUSSIAN = 8_000, 3.5
 LEAST_TARGETED = 250  # Gaussians, however small the file shall be
 LARGER = 2  # at most: how many times the usual budget a target size may bring
 GAUSSIANS_PER_ROW = 20  # for each row and level of the radiance table; the paper's models have 8 to 20
