@@ -151,6 +151,31 @@ def test_pruning_leaves_out_gaussians_and_bytes_and_not_pruning_keeps_all(traine
 # -- how it goes about it --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    ("pruned", "whole", "pruning", "mended"),
+    [
+        (1.9, 1.0, True, []),  # as asked for, or nearly
+        (5.0, 1.0, False, ["nothing is pruned"]),
+        (5.0, 4.9, True, ["finer, for 0.0002"]),  # pruning is not to blame
+        (9.0, 4.0, False, ["nothing is pruned", "finer, for 0.00025"]),
+    ],
+)
+def test_pictures_that_are_off_by_more_than_was_asked_for_are_mended(pruned, whole, pruning, mended, monkeypatch):
+    """A packer whose pictures are off by so many times the distortion, with and without pruning."""
+    said: list[str] = []
+    packer = running.Packer(None, {}, None, None, 0, True, said.append)
+    factor = {True: pruned, False: whole}
+    monkeypatch.setattr(packer, "attempt", lambda distortion: running.Trial(factor[packer.prune] * distortion, {}))
+    monkeypatch.setattr(running, "decode_model", lambda error: error)
+    monkeypatch.setattr(running, "_pictures", lambda error, views: error)
+    monkeypatch.setattr(running, "_difference", lambda error, model: error)
+
+    trial = packer.verified(packer.attempt(1e-3), 1e-3, [])
+
+    assert trial.data <= 2e-3 and packer.prune == pruning
+    assert [sentence.partition(": ")[2] for sentence in said] == mended
+
+
 def test_without_photos_it_looks_from_the_cameras_that_the_file_keeps(trained, compact, scene, tmp_path):
     """They are those of the photos, to nine digits."""
     said = []
