@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from hyrfpack.evaluate.metrics import stated_error
 
-# dB that a file may cost, by estimate, unless told otherwise. A model of more Gaussians, coarser numbers, is better than
-# one of fewer, finer ones, of as many bytes: docs/design-choices.md.
+# dB that a file may cost, by estimate, unless told otherwise. Of as many bytes, a model of more Gaussians with coarser
+# numbers is better than one of fewer with finer ones: docs/design-choices.md.
 PSNR_DROP = 0.1
 LIMITS = (1e-8, 1e-2)  # least and largest that files are made for
 
