@@ -334,6 +334,17 @@ def test_options_of_compress_that_cannot_be_met_are_one_sentence(case, run, data
     assert (tmp_path / "old.hyrf").read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 1
 
 
+def test_a_number_of_gaussians_and_a_target_size_are_one_too_many(data, tmp_path):
+    options = ("--max-gaussians", 500, "--target-size", "20kB")
+    assert "give one of them" in refused("train", data, "-o", tmp_path / "run", *options)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_target_size_decides_how_many_gaussians_are_trained(data, tmp_path):
+    done = succeeded("train", data, "-o", tmp_path / "run", "--steps", 5, "--target-size", "11.5kB", "--json")
+    assert "to be packed into 11,500 bytes" in json.loads(done.stdout)["choices"]["max_gaussians"]
+
+
 def test_a_second_training_does_not_overwrite_the_first(run, data):
     before = (run / "model.hyrf").read_bytes()
     assert "--overwrite" in refused("train", data, "-o", run, "--steps", 5)
