@@ -31,7 +31,7 @@ PILOT_SHARE = 0.06  # of the time, for one measurement at most
 USEFUL_STEPS = 1_000  # fewer are only a trial: smaller photos are better
 SIZES = (1200, 800, 600, 400)  # of photos, where the time is short
 SMALLEST = 640  # pixels: photos that are no larger are not shrunk further for the first measurement
-SETTLED = 0.85  # of the pilot's pace per Gaussian: a trained scene hides more of what lies behind
+SETTLED = 0.92  # of the pilot's pace per Gaussian: a trained scene hides more of what lies behind
 # A pass (drawing a view on the CPU and following it back) is the unit of all that comes after the training.
 SCORED, DRAWN_AFTER, VERIFIED = 0.6, 16, 12  # passes for a view that is scored; views that training and packing draw
 PER_GAUSSIAN, OVERHEAD = 1.5e-4, 6.0  # seconds of coding and writing, for a Gaussian and for anything
