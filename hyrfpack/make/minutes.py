@@ -22,6 +22,7 @@ from hyrfpack.render import render
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.config import FULL_STEPS
+from hyrfpack.train.pilots import measure_share, measures_share
 from hyrfpack.train.setup import budget_for
 
 PILOT_STEPS = 45  # of a whole small run: from the first Gaussians to the budget
@@ -47,6 +48,7 @@ class Cost:
         cpu_pass: seconds to draw a view on the CPU and follow it back, at `gaussians`.
         gaussians: that the pilot ended with.
         target_bytes: that the packed model may have; None for no limit.
+        share: of the usual budget; None for all of it.
     """
 
     step: float
@@ -55,6 +57,7 @@ class Cost:
     cpu_pass: float
     gaussians: int
     target_bytes: int | None = None
+    share: float | None = None
 
     def scaled(self, pixels: float) -> Cost:
         """That of photos with so many times the pixels, by estimate."""
@@ -80,7 +83,7 @@ class Cost:
         }
 
     def _budget(self, scene: Scene, steps: int) -> int:
-        return budget_for(scene, TrainConfig(steps=steps, target_bytes=self.target_bytes))[0]
+        return budget_for(scene, TrainConfig(steps=steps, target_bytes=self.target_bytes, share=self.share))[0]
 
     def total(self, scene: Scene, steps: int) -> float:
         return self.training(scene, steps) + sum(self.after(scene, steps).values())
@@ -135,7 +138,15 @@ def measure(
     if chosen != probed:
         reporter.update(0.5, f"a few steps on photos of {_longest(at(chosen))} pixels")
         cost = pilot(at(chosen), target_bytes, device, seed, cache, PILOT_SHARE * left)
-    fitting, left = at(chosen), end - monotonic()
+    fitting = at(chosen)
+    config = TrainConfig(steps=cost.steps_within(fitting, end - monotonic()), seed=seed, target_bytes=target_bytes)
+    if measures_share(fitting, config):
+        reporter.update(0.6, "two short runs that tell how many Gaussians the scene is worth")
+        share, _ = measure_share(fitting, config, cache, device)
+        cost = dataclasses.replace(cost, share=share)
+    elif target_bytes is None:
+        cost = dataclasses.replace(cost, share=1.0)  # that it stays so where there are a few more steps
+    left = end - monotonic()
     steps = cost.steps_within(fitting, left)
     if steps < draft.steps:
         steps = draft.steps
@@ -144,7 +155,7 @@ def measure(
         enough = ", which are enough: it will be ready before" if steps == FULL_STEPS else ""
         say(f"{left / 60:.1f} minutes are left: {steps:,} steps on photos of {_longest(fitting)} pixels{enough}")
     reporter.estimates |= {"training": cost.training(fitting, steps), **cost.after(fitting, steps)}
-    return Plan(steps, chosen, target_bytes=target_bytes)
+    return Plan(steps, chosen, target_bytes=target_bytes, share=cost.share)
 
 
 def pilot(

@@ -37,6 +37,15 @@ def save_checkpoint(path: Path, *, settings: dict, tensors: dict[str, torch.Tens
     write_atomic(path, buffer.getbuffer())
 
 
+def saved_settings(path: Path) -> dict:
+    """The settings of the run that a checkpoint is of.
+
+    Raises:
+        HyrfTrainingError: it is missing, damaged or of another version.
+    """
+    return _read(path)[0]
+
+
 def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor], dict]:
     """Read a checkpoint; nothing in the file is executed.
 
@@ -46,6 +55,19 @@ def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor]
     Raises:
         HyrfTrainingError: it is missing, damaged, or of a run with other settings (which are named).
     """
+    saved, tensors, progress = _read(path)
+    if different := sorted(
+        key for key in saved.keys() | settings.keys() if saved.get(key) != _plain(settings.get(key))
+    ):
+        raise HyrfTrainingError(
+            f"{path}: the run was started with other settings ({', '.join(different)}); "
+            "resume with the same ones or train anew with --overwrite"
+        )
+    return tensors, progress
+
+
+def _read(path: Path) -> tuple[dict, dict[str, torch.Tensor], dict]:
+    """Settings, tensors and progress."""
     if not path.is_file():
         raise HyrfTrainingError(f"{path}: there is no checkpoint to resume from; train without --resume")
     try:
@@ -54,21 +76,16 @@ def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor]
             raise ValueError("the digest does not match")
         content = torch.load(io.BytesIO(data[:-DIGEST_BYTES]), weights_only=True, map_location="cpu")
         saved, progress = json.loads(content["settings"]), json.loads(content["progress"])
-        tensors = content["tensors"]
-        version = content["version"]
-        different = sorted(key for key in saved.keys() | settings.keys() if saved.get(key) != _plain(settings.get(key)))
+        tensors, version = content["tensors"], content["version"]
+        if not isinstance(saved, dict):
+            raise ValueError("the settings are no object")
     except Exception as error:  # torch's unpickler raises whatever it meets
         raise HyrfTrainingError(f"{path}: the checkpoint is damaged; delete it and train anew") from error
     if version != VERSION:
         raise HyrfTrainingError(
             f"{path}: the checkpoint is of another version of hyrfpack; train anew with --overwrite"
         )
-    if different:
-        raise HyrfTrainingError(
-            f"{path}: the run was started with other settings ({', '.join(different)}); "
-            "resume with the same ones or train anew with --overwrite"
-        )
-    return tensors, progress
+    return saved, tensors, progress
 
 
 def _plain(value: object) -> object:

@@ -27,13 +27,16 @@ from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
+from hyrfpack.train.checkpoint import saved_settings
 from hyrfpack.train.config import TrainConfig
+from hyrfpack.train.pilots import PILOTS_STEPS, measure_share, measures_share
 from hyrfpack.train.progress import ProgressLine
 from hyrfpack.train.trainer import Trainer
 
 MODEL, CHECKPOINT, METRICS, CURVE, VIEWS = "model.hyrf", "checkpoint.pt", "metrics.json", "curve.png", "views"
 # What ends a run early; Windows has no SIGHUP.
 STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+Report = Callable[[int, float, float, int], None]  # step, loss, mean squared error, Gaussians
 BACKGROUND_SEEN = 1e-3  # a background that gets less than this share of the light is not there
 
 
@@ -64,7 +67,7 @@ def train(
     cache: PictureCache | None = None,
     device: str | torch.device = "auto",
     quiet: bool = False,
-    report: Callable[[int, float, float, int], None] | None = None,
+    report: Report | None = None,
 ) -> TrainResult:
     """Train a model on a scene and leave everything about the run in a folder.
 
@@ -83,7 +86,8 @@ def train(
             sums of gradients vary in their last bits from run to run.
         quiet: print nothing.
         report: told after each step its number, the loss and mean squared error of its view (NaN where all of it is
-            masked) and how many Gaussians there are, in place of the line that is shown otherwise.
+            masked) and how many Gaussians there are, in place of the line that is shown otherwise; 0 for its number
+            while pilots run.
 
     Raises:
         HyrfError: the folder holds another run, training cannot start or go on, no photo has a pixel to train on or to
@@ -108,7 +112,13 @@ def train(
     _prepare(out, scene, resume, overwrite)
     cache = cache or PictureCache()
     _check_photos(scene, cache)
+    why = ""
+    if resume and config.share is None:
+        config = dataclasses.replace(config, share=saved_settings(checkpoint).get("share"))
+    elif measures_share(scene, config):
+        config, why = _measured(scene, config, cache, device, quiet, report)
     trainer = Trainer(scene, config, cache, device)
+    trainer.choices["max_gaussians"] += why
     if resume:
         trainer.load(checkpoint)
     with _naming_the_checkpoint(trainer, overwrite):
@@ -128,6 +138,17 @@ def train(
         metrics = _finish(trainer, out)
     checkpoint.unlink(missing_ok=True)
     return TrainResult(True, trainer.step, out / MODEL, metrics)
+
+
+def _measured(
+    scene: Scene, config: TrainConfig, cache: PictureCache, device: torch.device, quiet: bool, report: Report | None
+) -> tuple[TrainConfig, str]:
+    """The settings with the share of the usual budget that pilots tell, and their reason."""
+    with ProgressLine(PILOTS_STEPS, 0, quiet or report is not None) as line:
+        line.note("how many Gaussians is the scene worth? Two short runs tell:")
+        tell = line.update if report is None else lambda step, *facts: report(0, *facts)
+        share, why = measure_share(scene, config, cache, device, tell)
+    return dataclasses.replace(config, share=share), f": {why}"
 
 
 def _finish(trainer: Trainer, out: Path) -> dict:

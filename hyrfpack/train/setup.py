@@ -90,8 +90,8 @@ def scene_frame(scene: Scene, preset: str) -> Frame:
 def budget_for(scene: Scene, config: TrainConfig) -> tuple[int, str]:
     """The most Gaussians a run may have, and why.
 
-    It follows the photos' pixels; a shorter run can fit fewer, in proportion to the square root of its length. Of a
-    target size it is about what fits in, and at most `LARGER` times as many as without.
+    It is the configured share of what follows from the photos' pixels and, as a shorter run can fit fewer, from the
+    square root of its length. Of a target size it is about what fits in, and at most `LARGER` times as many as without.
     """
     if config.max_gaussians is not None:
         return config.max_gaussians, "asked for"
@@ -103,7 +103,9 @@ def budget_for(scene: Scene, config: TrainConfig) -> tuple[int, str]:
         fitting = max(LEAST_TARGETED, round((config.target_bytes - PACKED) / PACKED_GAUSSIAN))
         if fitting <= LARGER * budget:
             return fitting, f"to be packed into {config.target_bytes:,} bytes"
-        budget, why = LARGER * budget, f"{LARGER} times what suits {why}"
+        return LARGER * budget, f"{LARGER} times what suits {why}"
+    if config.share is not None:
+        return max(1, round(config.share * budget)), f"{config.share:g} times what suits {why}"
     return budget, why
 
 

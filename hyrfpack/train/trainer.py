@@ -241,7 +241,13 @@ class Trainer:
         if self.exposures is not None:
             tensors |= {f"exposure.{name}": value for name, value in self.exposures.state_dict().items()}
         tensors |= {f"density.{name}": value for name, value in self.strategy.state_dict().items()}
-        progress = {"step": self.step, "records": self.records, "seconds": dict(self.seconds), "elapsed": self.elapsed}
+        progress = {
+            "step": self.step,
+            "records": self.records,
+            "seconds": dict(self.seconds),
+            "elapsed": self.elapsed,
+            "choices": self.choices,
+        }
         tensors = {name: value.detach().cpu() for name, value in tensors.items()}
         save_checkpoint(path, settings=self._settings(), tensors=tensors, progress=progress)
         self.saved = self.step
@@ -272,6 +278,7 @@ class Trainer:
         self.step, self.records = progress["step"], progress["records"]
         self.saved = self.step
         self.seconds, self.elapsed = defaultdict(float, progress["seconds"]), progress["elapsed"]
+        self.choices |= progress.get("choices", {})
 
 
 def _mean_square(error: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:

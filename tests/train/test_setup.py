@@ -200,6 +200,13 @@ def test_an_asked_budget_is_taken():
     assert budget_for(around_an_object(), TrainConfig(max_gaussians=77)) == (77, "asked for")
 
 
+@pytest.mark.parametrize("share", [0.25, 1.0, 2.0])
+def test_a_share_is_of_what_pixels_and_steps_suggest(share):
+    usual, why = budget_for(around_an_object(), TrainConfig())
+    found = budget_for(around_an_object(), TrainConfig(share=share))
+    assert found == (round(share * usual), f"{share:g} times what suits {why}")
+
+
 @pytest.mark.parametrize("target", [22_000, 29_000, 36_000])
 def test_a_budget_for_a_target_size_fills_what_decoders_leave(target):
     budget, reason = budget_for(around_an_object(), TrainConfig(target_bytes=target))

@@ -7,8 +7,9 @@ Each set is trained with both versions at several budgets of Gaussians, as share
 of each, and packed by it; both are scored by this version, on held-out photos, from the files as decoded: PSNR at the
 exposure that training photos foretell (`psnr_predicted`), plain PSNR, SSIM. Then for each set the difference in bytes
 at equal PSNR (Bjontegaard's, over the PSNR that both reach, by monotone cubics through the points), and the difference
-in scores at the most bytes that both have. Runs are kept below --out, and one that is there is not trained again, nor
-scored again while its scores.json is there. The other version runs with this environment's packages.
+in scores at the most bytes that both have. A share of `measured` is the budget that a version takes by itself. Runs
+are kept below --out, and one that is there is not trained again, nor scored again while its scores.json is there. The
+other version runs with this environment's packages.
 """
 
 from __future__ import annotations
@@ -46,17 +47,19 @@ SETS = (
     "specular_gold_cape",
     "street_lund",
 )
+MEASURED = "measured"
 SCORES = ("bytes", "psnr_predicted", "psnr", "ssim", "seconds", "gaussians")
 
 
-def run(version: Path, scene: Scene, steps: int, gaussians: int, seed: int, out: Path) -> dict[str, float]:
-    """Train and pack with one version, score with this one."""
+def run(version: Path, scene: Scene, steps: int, gaussians: int | None, seed: int, out: Path) -> dict[str, float]:
+    """Train and pack with one version, score with this one. Without a number of Gaussians, it chooses."""
     kept = out / "scores.json"
     if kept.exists():
         return json.loads(kept.read_text())
     if not (out / "metrics.json").exists():
-        settings = ["--steps", str(steps), "--max-gaussians", str(gaussians), "--seed", str(seed), "--overwrite"]
-        _command(version, "train", str(scene.path), "-o", str(out), *settings)
+        settings = ["--steps", str(steps), "--seed", str(seed), "--overwrite"]
+        budget = [] if gaussians is None else ["--max-gaussians", str(gaussians)]
+        _command(version, "train", str(scene.path), "-o", str(out), *settings, *budget)
     packed = out / "compact.hyrf"
     packed.unlink(missing_ok=True)
     _command(version, "compress", str(out / "model.hyrf"), "-o", str(packed))
@@ -147,7 +150,7 @@ def mean_over_seeds(points: Sequence[dict[str, float]]) -> dict[str, float]:
 def main() -> None:
     parser = study_arguments(__doc__ or "", 2000, SETS, Path("runs/quality"))
     parser.add_argument("--against", type=Path, required=True, help="folder of the other version")
-    parser.add_argument("--shares", type=float, nargs="+", default=[0.25, 0.5, 1.0, 2.0], help="of the budget")
+    parser.add_argument("--shares", nargs="+", default=["0.25", "0.5", "1", "2"], help="of the budget, or 'measured'")
     args = parser.parse_args()
     versions = {"now": HERE, "before": args.against.resolve()}
     warnings.simplefilter("ignore")
@@ -160,9 +163,10 @@ def main() -> None:
             for version, folder in versions.items():
                 seeds = []
                 for seed in range(args.seeds):
-                    out = args.out.resolve() / f"{args.steps}" / name / f"{version}-{share:g}-{seed}"
+                    out = args.out.resolve() / f"{args.steps}" / name / f"{version}-{share}-{seed}"
                     out.mkdir(parents=True, exist_ok=True)
-                    seeds.append(run(folder, scene, args.steps, round(share * budget), seed, out))
+                    gaussians = None if share == MEASURED else round(float(share) * budget)
+                    seeds.append(run(folder, scene, args.steps, gaussians, seed, out))
                 points[version].append(mean_over_seeds(seeds))
         rows.append(row(name, points["now"], points["before"]))
         print(markdown(_HEADER, rows[-1:]).splitlines()[-1], flush=True)
