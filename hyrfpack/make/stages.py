@@ -116,6 +116,9 @@ def _training_report(reporter: Reporter, steps: int) -> Callable[[int, float, fl
 
     def report(step: int, loss: float, mse: float, gaussians: int) -> None:
         nonlocal seen
+        if step == 0:
+            reporter.update(0.0, "two short runs tell how many Gaussians the scene is worth")
+            return
         if not math.isnan(mse):
             seen = mse if math.isnan(seen) else SMOOTHING * mse + (1 - SMOOTHING) * seen
         quality = () if math.isnan(seen) else (f"PSNR {decibels(seen):.2f}",)

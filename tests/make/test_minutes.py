@@ -15,6 +15,7 @@ from hyrfpack.make.plan import Plan
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.source import Reading
 from hyrfpack.train.config import FULL_STEPS
+from hyrfpack.train.pilots import LEAST_STEPS
 
 COST = Cost(step=0.1, step_per_gaussian=1e-6, decoding=0.01, cpu_pass=0.05, gaussians=5_000)
 CPU = torch.device("cpu")
@@ -78,6 +79,21 @@ def test_large_photos_are_made_smaller_where_the_time_is_short(posed, scene, mon
     plans = [planned(seconds) for seconds in (3000.0, 300.0, 100.0)]
     assert [plan.max_size for plan in plans] == [1600, 16, 8] and {plan.target_bytes for plan in plans} == {90_000}
     assert plans[0].steps > 1000 and "pixels" in said[0]
+
+
+def test_a_long_run_has_the_share_that_the_scene_is_worth_and_a_short_one_all(posed, scene, monkeypatch):
+    monkeypatch.setattr(minutes, "pilot", lambda *_: Cost(0.0, 1e-5, 0.0, 0.0, 100))
+    monkeypatch.setattr(minutes, "measure_share", lambda *_: (0.5, "by a coin"))
+
+    def planned(seconds: float, target_bytes: int | None = None) -> Plan:
+        arguments = (posed, Reading(), scene, target_bytes, CPU, monotonic() + seconds, 0, PictureCache())
+        return measure(*arguments, Reporter(["training"], None), lambda sentence: None)
+
+    short, long, targeted = planned(60.0), planned(600.0), planned(600.0, 90_000)
+    assert short.steps < LEAST_STEPS <= long.steps
+    assert (short.share, long.share, targeted.share) == (1.0, 0.5, None)
+    monkeypatch.setattr(minutes, "measures_share", lambda *_: False)
+    assert planned(600.0).steps < 0.8 * long.steps
 
 
 def test_a_time_that_is_over_or_too_short_makes_a_draft_and_says_so(posed, scene):
