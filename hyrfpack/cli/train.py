@@ -118,7 +118,9 @@ def train(
     cache = None if cache_mb is None else PictureCache(cache_mb * 2**20)
     result = run(scene, out, TrainConfig(**settings), resume=resume, overwrite=overwrite, cache=cache, device=place)
     detail("seconds: " + ", ".join(f"{part} {t:.1f}" for part, t in result.metrics.get("stage_seconds", {}).items()))
-    if not result.complete:
+    if not result.complete and result.step == 0:
+        note("stopped before the first step; the same command begins anew")
+    elif not result.complete:
         note(f"stopped after step {result.step:,}; {resuming(overwrite)} goes on from there")
     if as_json:
         print_json({"complete": result.complete, "step": result.step, **result.metrics})

@@ -23,17 +23,17 @@ from hyrfpack.scene import Camera, Scene, evenly_spaced
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.coarse import can_be_halved
 from hyrfpack.train.config import FULL_STEPS
-from hyrfpack.train.pilots import measure_share, measures_share
+from hyrfpack.train.pilots import PILOT_STEPS, measure_budget, measures_budget
 from hyrfpack.train.setup import budget_for
 
-PILOT_STEPS = 45  # of a whole small run: from the first Gaussians to the budget
+PROBE_STEPS = 45  # of a whole small run: from the first Gaussians to the budget
 RISING = DensityConfig(stop=0.6, peak=0.6, excess=1.0)  # from few Gaussians to many, for what one of them takes
 COLD_STEPS = 3  # which compile kernels
-PILOT_SHARE = 0.06  # of the time, for one measurement at most
+PROBE_TIME = 0.06  # of the time, for one measurement at most
 USEFUL_STEPS = 1_000  # fewer are only a trial: smaller photos are better
 SIZES = (1200, 800, 600, 400)  # of photos, where the time is short
 SMALLEST = 640  # pixels: photos that are no larger are not shrunk further for the first measurement
-SETTLED = 0.92  # of the pilot's pace per Gaussian: a trained scene hides more of what lies behind
+SETTLED = 0.92  # of the probe's pace per Gaussian: a trained scene hides more of what lies behind
 HALVED = 0.45  # of the time of a step, with a photo of half the size
 # A pass (drawing a view on the CPU and following it back) is the unit of all that comes after the training.
 SCORED, DRAWN_AFTER, VERIFIED = 0.6, 16, 12  # passes for a view that is scored; views that training and packing draw
@@ -48,9 +48,9 @@ class Cost:
         step, step_per_gaussian: seconds of a training step: of pixels, and for each Gaussian.
         decoding: seconds that training waits for a photo to be decoded.
         cpu_pass: seconds to draw a view on the CPU and follow it back, at `gaussians`.
-        gaussians: that the pilot ended with.
+        gaussians: that the probe ended with.
         target_bytes: that the packed model may have; None for no limit.
-        share: of the usual budget; None for all of it.
+        budget_factor: as in `TrainConfig`.
     """
 
     step: float
@@ -59,7 +59,7 @@ class Cost:
     cpu_pass: float
     gaussians: int
     target_bytes: int | None = None
-    share: float | None = None
+    budget_factor: float | None = None
 
     def scaled(self, pixels: float) -> Cost:
         """That of photos with so many times the pixels, by estimate."""
@@ -78,8 +78,8 @@ class Cost:
     def after(self, scene: Scene, steps: int) -> dict[str, float]:
         """Seconds of the stages that follow, training's own scores counted as scoring."""
         budget = self._budget(scene, steps)
-        at_end, at_pilot = (self.step + self.step_per_gaussian * n for n in (budget, self.gaussians))
-        one = SETTLED * self.cpu_pass * at_end / at_pilot
+        at_end, at_probe = (self.step + self.step_per_gaussian * n for n in (budget, self.gaussians))
+        one = SETTLED * self.cpu_pass * at_end / at_probe
         return {
             "compression": one * (passes(budget) + VERIFIED) + PER_GAUSSIAN * budget,
             "scoring": one * (DRAWN_AFTER + 2 * SCORED * len(scene.test)) + OVERHEAD / 2,
@@ -87,7 +87,8 @@ class Cost:
         }
 
     def _budget(self, scene: Scene, steps: int) -> int:
-        return budget_for(scene, TrainConfig(steps=steps, target_bytes=self.target_bytes, share=self.share))[0]
+        config = TrainConfig(steps=steps, target_bytes=self.target_bytes, budget_factor=self.budget_factor)
+        return budget_for(scene, config)[0]
 
     def total(self, scene: Scene, steps: int) -> float:
         return self.training(scene, steps) + sum(self.after(scene, steps).values())
@@ -134,22 +135,27 @@ def measure(
         return scenes[size] if size in scenes else scenes.setdefault(size, reading.scene(path, size))
 
     reporter.update(0.0, f"a few steps on photos of {_longest(at(probed))} pixels")
-    cost = first = pilot(at(probed), target_bytes, device, seed, cache, PILOT_SHARE * left)
+    cost = first = probe(at(probed), target_bytes, device, seed, cache, PROBE_TIME * left)
     for chosen in sizes:
         cost = first.scaled(megapixels(at(chosen)) / megapixels(at(probed)))
         if cost.steps_within(at(chosen), end - monotonic()) >= USEFUL_STEPS:
             break
     if chosen != probed:
         reporter.update(0.5, f"a few steps on photos of {_longest(at(chosen))} pixels")
-        cost = pilot(at(chosen), target_bytes, device, seed, cache, PILOT_SHARE * left)
+        cost = probe(at(chosen), target_bytes, device, seed, cache, PROBE_TIME * left)
     fitting = at(chosen)
     config = TrainConfig(steps=cost.steps_within(fitting, end - monotonic()), seed=seed, target_bytes=target_bytes)
-    if measures_share(fitting, config):
-        reporter.update(0.6, "two short runs that tell how many Gaussians the scene is worth")
-        share, _ = measure_share(fitting, config, cache, device)
-        cost = dataclasses.replace(cost, share=share)
-    elif target_bytes is None:
-        cost = dataclasses.replace(cost, share=1.0)  # that it stays so where there are a few more steps
+    factor = None if target_bytes else 1.0  # which stays so where there are a few more steps
+    if measures_budget(fitting, config):
+
+        def tell(step: int, loss: float, mse: float, gaussians: int) -> None:
+            share = 0.6 + 0.4 * step / (2 * PILOT_STEPS)
+            reporter.update(share, "two short runs tell how many Gaussians the scene is worth")
+
+        if measured := measure_budget(fitting, config, cache, device, tell):
+            factor, why = measured
+            say(f"{factor:g} times the usual number of Gaussians: {why}")
+    cost = dataclasses.replace(cost, budget_factor=factor)
     left = end - monotonic()
     steps = cost.steps_within(fitting, left)
     if steps < draft.steps:
@@ -159,10 +165,10 @@ def measure(
         enough = ", which are enough: it will be ready before" if steps == FULL_STEPS else ""
         say(f"{left / 60:.1f} minutes are left: {steps:,} steps on photos of {_longest(fitting)} pixels{enough}")
     reporter.estimates |= {"training": cost.training(fitting, steps), **cost.after(fitting, steps)}
-    return Plan(steps, chosen, target_bytes=target_bytes, share=cost.share)
+    return Plan(steps, chosen, target_bytes=target_bytes, budget_factor=factor)
 
 
-def pilot(
+def probe(
     scene: Scene, target_bytes: int | None, device: torch.device, seed: int, cache: PictureCache, seconds: float
 ) -> Cost:
     """Measure what a scene costs by a small training run from its first Gaussians to a budget.
@@ -172,7 +178,7 @@ def pilot(
         seconds: after which it ends in any case, but for the steps that it takes to measure anything.
     """
     budget, _ = budget_for(scene, TrainConfig(target_bytes=target_bytes))
-    config = TrainConfig(steps=PILOT_STEPS, seed=seed, max_gaussians=budget, density=RISING, coarse=0.0)
+    config = TrainConfig(steps=PROBE_STEPS, seed=seed, max_gaussians=budget, density=RISING, coarse=0.0)
     trainer = Trainer(scene, config, cache, device)
     counts: list[int] = []
     working: list[float] = []

@@ -63,18 +63,20 @@ class Plan:
         max_size: of photos, as in `load_scene`.
         finetune_steps: of packing.
         target_bytes: what the packed model may have; None for no limit.
-        share: of the usual number of Gaussians; None lets the training measure it.
+        budget_factor: as in `TrainConfig`.
     """
 
     steps: int
     max_size: int
     finetune_steps: int = 0
     target_bytes: int | None = None
-    share: float | None = None
+    budget_factor: float | None = None
 
     def config(self, seed: int) -> TrainConfig:
         """Settings of its training."""
-        return TrainConfig(steps=self.steps, seed=seed, target_bytes=self.target_bytes, share=self.share)
+        return TrainConfig(
+            steps=self.steps, seed=seed, target_bytes=self.target_bytes, budget_factor=self.budget_factor
+        )
 
 
 def passes(gaussians: int) -> int:

@@ -112,13 +112,17 @@ def _split(scene: Scene) -> dict[str, Any]:
 
 
 def _training_report(reporter: Reporter, steps: int) -> Callable[[int, float, float, int], None]:
-    seen = math.nan
+    seen, measuring = math.nan, False
 
     def report(step: int, loss: float, mse: float, gaussians: int) -> None:
-        nonlocal seen
+        nonlocal seen, measuring
         if step == 0:
+            measuring = True
             reporter.update(0.0, "two short runs tell how many Gaussians the scene is worth")
             return
+        if measuring:  # the pace of what follows is another
+            measuring = False
+            reporter.begin("training")
         if not math.isnan(mse):
             seen = mse if math.isnan(seen) else SMOOTHING * mse + (1 - SMOOTHING) * seen
         quality = () if math.isnan(seen) else (f"PSNR {decibels(seen):.2f}",)

@@ -14,7 +14,7 @@ BACKGROUND_COLORS = ("black", "white", "random")
 LARGEST_SEED = 2**64 - 1  # torch's generators take 64 bits
 FULL_STEPS = 30_000  # the length of a run that the paper's schedule is written for
 SHORT_STEPS = 1_000  # rates grow no further in runs shorter than this
-LEAST_SHARE, LARGEST_SHARE = 1e-3, 1e3
+BUDGET_FACTORS = 1e-3, 1e3  # least and largest
 SMALLEST_RATE = 1e-30  # next to nothing; their ratio is taken, so 0 is none
 
 
@@ -105,9 +105,10 @@ class TrainConfig:
         seed: of view order, initialisation and density control; 0 to LARGEST_SEED.
         preset: the paper's regime, one of PRESETS; "auto" looks at the scene.
         max_gaussians: budget, the most that a run ends with; on the way it is exceeded by `DensityConfig.excess`.
-            None chooses from the pictures' pixels, the steps, `target_bytes` and `share`.
-        share: the budget as a multiple of what pixels and steps suggest, instead of `max_gaussians`. None lets `train`
-            measure it before a run of at least 2,000 steps, see `hyrfpack.train.pilots`; 1 in shorter ones.
+            None chooses from the pictures' pixels, the steps, `target_bytes` and `budget_factor`.
+        budget_factor: the budget as a multiple of what pixels and steps suggest, instead of `max_gaussians`. None is 1,
+            but `hyrfpack.train` measures it before a run of at least 2,000 steps on at least eight photos, see
+            `hyrfpack.train.pilots`.
         target_bytes: the size of the packed file to train for, instead of `max_gaussians`; None for no limit.
         log2_table_size: rows per level of the radiance grid as a power of two (the geometry grid has half);
             None follows the budget. 4 to 24.
@@ -130,7 +131,7 @@ class TrainConfig:
     seed: int = 0
     preset: str = "auto"
     max_gaussians: int | None = None
-    share: float | None = None
+    budget_factor: float | None = None
     target_bytes: int | None = None
     log2_table_size: int | None = None
     background: bool | None = None
@@ -155,11 +156,15 @@ class TrainConfig:
         for name in ("max_gaussians", "target_bytes", "checkpoint_every"):
             if getattr(self, name) is not None:
                 check_int(name, getattr(self, name), 1)
-        sizes = {"a number of Gaussians": self.max_gaussians, "a target size": self.target_bytes, "a share": self.share}
+        sizes = {
+            "a number of Gaussians": self.max_gaussians,
+            "a target size": self.target_bytes,
+            "a factor": self.budget_factor,
+        }
         if len(given := [name for name, value in sizes.items() if value is not None]) > 1:
             raise ValueError(f"{' and '.join(given)} each decide how large the model is; give one")
-        if self.share is not None:
-            check_float("share", self.share, LEAST_SHARE, LARGEST_SHARE)
+        if self.budget_factor is not None:
+            check_float("budget_factor", self.budget_factor, *BUDGET_FACTORS)
         if self.log2_table_size is not None:
             check_int("log2_table_size", self.log2_table_size, 4, 24)
         check_choice("preset", self.preset, PRESETS)

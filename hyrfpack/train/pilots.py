@@ -1,50 +1,60 @@
 """How many Gaussians a scene is worth, told by two short runs before the long one.
 
 Where n Gaussians score a + g log2(n) dB on photos that were not trained on, and each costs the same, the best number of
-them is in proportion to g: an object before a plain wall is worth a fraction of what a cluttered room is, however
-many pixels its photos have. Two pilots, of a quarter of a small budget and of all of it, measure g.
+them is in proportion to g: a plain scene is worth a fraction of what one full of detail is, however many pixels its
+photos have. Two pilots, of a quarter of a small budget and of all of it, measure g.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 
 import torch
 
 from hyrfpack.data import PictureCache
-from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
-from hyrfpack.scene import Scene, View, evenly_spaced
+from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.setup import budget_for
 from hyrfpack.train.trainer import Trainer
 
 LEAST_STEPS = 2_000  # of a run that pilots take little of
-PILOT_STEPS = 120
-PILOTS_STEPS = 2 * PILOT_STEPS
+PILOT_STEPS = 120  # of each of the two
 BUDGET_STEPS = 500  # the whole budget of a pilot is that of a run of so many steps
-SMALL = 0.25  # share of it that the small pilot has
+SMALL = 0.25  # of it has the small pilot
 EXPECTED = 0.6  # dB between them where pixels and steps decide rightly
-LEAST, MOST = 0.25, 1.5  # times that many
+# Times that many. Steps as wide as this, for another seed moves the gain by up to 0.3 dB, a GPU's sums by less.
+FACTORS = (0.25, 0.35, 0.5, 0.7, 1.0, 1.5)
 FEWEST_PHOTOS = 8  # to train on; of fewer none can be spared
 JUDGES = 8  # photos at most that pilots are scored on
 
 
-def measures_share(scene: Scene, config: TrainConfig) -> bool:
-    """Whether the share is to be measured: nobody has said how many Gaussians, and it takes little of the run."""
-    asked = any(value is not None for value in (config.share, config.max_gaussians, config.target_bytes))
-    return not asked and config.steps >= LEAST_STEPS and len(scene.train) >= FEWEST_PHOTOS
+def is_usable(picture: Picture) -> bool:
+    """Whether its mask leaves anything of it."""
+    return picture.mask is None or bool(picture.mask.any())
 
 
-def measure_share(
+def is_undecided(config: TrainConfig) -> bool:
+    """Whether nobody has said how many Gaussians there shall be."""
+    return config.budget_factor is None and config.max_gaussians is None and config.target_bytes is None
+
+
+def measures_budget(scene: Scene, config: TrainConfig) -> bool:
+    """Whether pilots are to tell the budget: nobody has said it, they take little of the run, and photos are enough."""
+    return is_undecided(config) and config.steps >= LEAST_STEPS and len(scene.train) >= FEWEST_PHOTOS
+
+
+def measure_budget(
     scene: Scene,
     config: TrainConfig,
     cache: PictureCache,
     device: torch.device,
     report: Callable[[int, float, float, int], None] = lambda step, loss, mse, gaussians: None,
-) -> tuple[float, str]:
-    """Times the usual budget that a scene is worth, `LEAST` to `MOST`, and why.
+    stop: Callable[[], bool] = lambda: False,
+) -> tuple[float, str] | None:
+    """Times the usual budget that a scene is worth, one of `FACTORS`, and why; None where it was stopped.
 
     Some of the training photos are held out, the pilots are trained on the others, and scored on them after an affine
     correction of colours.
@@ -52,31 +62,46 @@ def measure_share(
     Args:
         config: of the run to come.
         cache: keeps photos that are decoded.
-        report: told after each of `PILOTS_STEPS` steps its number, the loss and mean squared error of its view and how
+        report: told after each of 2 `PILOT_STEPS` steps its number, the loss and mean squared error of its view and how
             many Gaussians there are.
+        stop: asked after each step.
 
     Raises:
-        HyrfError: as `Trainer.run`.
+        HyrfError: as `Trainer.run`; a photo cannot be read.
     """
-    rest, judges = _split(scene.train)
+    near, judges = split(scene.train)
+    judges = [view for view in judges if is_usable(cache.get(view))]
+    if not judges:
+        return 1.0, "masks leave nothing of the photos to judge by"
+    scene = dataclasses.replace(scene, train=near, test=[])
     usual, _ = budget_for(scene, TrainConfig(steps=BUDGET_STEPS))
+    few = round(SMALL * usual)
     scores: list[float] = []
-    for share in (SMALL, 1.0):
-        settings = dataclasses.replace(config, steps=PILOT_STEPS, max_gaussians=round(share * usual))
-        trainer = Trainer(dataclasses.replace(scene, train=rest, test=[]), settings, cache, device)
-        before = PILOT_STEPS * len(scores)
-        trainer.run(report=lambda t, loss, mse, before=before: report(before + t.step, loss, mse, len(t.model)))
-        try:
-            scores.append(evaluate(trainer.model, judges).psnr_corrected)
-        except HyrfError:  # masks leave nothing of them
-            return 1.0, "not measured: masks leave nothing of the photos to judge by"
+    for budget in (few, usual):
+        trainer = Trainer(scene, dataclasses.replace(config, steps=PILOT_STEPS, max_gaussians=budget), cache, device)
+        first = PILOT_STEPS * len(scores)
+
+        def tell(trainer: Trainer, loss: float, mse: float, first: int = first) -> None:
+            report(first + trainer.step, loss, mse, len(trainer.model))
+
+        trainer.run(report=tell, stop=stop)
+        if stop():
+            return None
+        scores.append(evaluate(trainer.model, judges).psnr_corrected)
     gain = scores[1] - scores[0]
-    share = min(max(round(gain / EXPECTED, 2), LEAST), MOST)
-    return share, f"in {PILOT_STEPS} steps {usual:,} Gaussians scored {gain:+.2f} dB over {round(SMALL * usual):,}"
+    worth = max(gain / EXPECTED, FACTORS[0])
+    factor = min(FACTORS, key=lambda factor: abs(math.log(factor / worth)))
+    return factor, f"in {PILOT_STEPS} steps {usual:,} Gaussians scored {gain:+.2f} dB over {few:,}"
 
 
-def _split(views: list[View]) -> tuple[list[View], list[View]]:
-    """Photos to train on, and one of every eight, or of every five where there are few, to judge by."""
-    every, place = (8, 4) if len(views) >= 16 else (5, 2)
-    rest = [view for number, view in enumerate(views) if number % every != place]
-    return evenly_spaced(rest, PILOT_STEPS), evenly_spaced(views[place::every], JUDGES)
+def split(views: Sequence[View]) -> tuple[list[View], list[View]]:
+    """Photos to train pilots on and to judge them by.
+
+    One of every eight judges, or of every five where there are few, `JUDGES` at most. The rest is trained on; of many
+    photos those that are nearest to a judge, as many as a pilot has steps, for spread over a large set they would show
+    too little of each place.
+    """
+    every, first = (8, 4) if len(views) >= 16 else (5, 2)
+    judges = evenly_spaced(range(first, len(views), every), JUDGES)
+    others = sorted(set(range(len(views))) - set(judges), key=lambda n: min(abs(n - judge) for judge in judges))
+    return [views[n] for n in sorted(others[:PILOT_STEPS])], [views[n] for n in judges]

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -26,10 +27,10 @@ from hyrfpack.evaluate.figures import training_curve
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
-from hyrfpack.scene import Picture, Scene, View, evenly_spaced
+from hyrfpack.scene import Scene, View, evenly_spaced
 from hyrfpack.train.checkpoint import saved_settings
 from hyrfpack.train.config import TrainConfig
-from hyrfpack.train.pilots import PILOTS_STEPS, measure_share, measures_share
+from hyrfpack.train.pilots import PILOT_STEPS, is_undecided, is_usable, measure_budget, measures_budget
 from hyrfpack.train.progress import ProgressLine
 from hyrfpack.train.trainer import Trainer
 
@@ -73,7 +74,8 @@ def train(
 
     The folder gets `model.hyrf` (profile raw), `metrics.json`, `curve.png`, `views/` (held-out photos beside their
     renders and error maps) and, while running, `checkpoint.pt`. The first Ctrl-C (or SIGTERM, or SIGHUP as when the
-    terminal is closed) saves the checkpoint and returns, unless whoever started the program has it ignored.
+    terminal is closed) saves the checkpoint and returns, unless whoever started the program has it ignored; before the
+    first step, while short runs measure the budget, there is nothing to save.
 
     Args:
         scene: from `hyrfpack.load_scene`.
@@ -83,7 +85,7 @@ def train(
         overwrite: replace what an earlier run left in the folder.
         cache: holds decoded photos; by default a quarter of the memory.
         device: where to train, see `hyrfpack.device.choose_device`. A run may be resumed on another one. On a GPU
-            sums of gradients vary in their last bits from run to run.
+            sums of gradients vary in their last bits from run to run, which may tip the measured budget.
         quiet: print nothing.
         report: told after each step its number, the loss and mean squared error of its view (NaN where all of it is
             masked) and how many Gaussians there are, in place of the line that is shown otherwise; 0 for its number
@@ -112,24 +114,33 @@ def train(
     _prepare(out, scene, resume, overwrite)
     cache = cache or PictureCache()
     _check_photos(scene, cache)
+    silent = quiet or report is not None
     why = ""
-    if resume and config.share is None:
-        config = dataclasses.replace(config, share=saved_settings(checkpoint).get("share"))
-    elif measures_share(scene, config):
-        config, why = _measured(scene, config, cache, device, quiet, report)
+    if resume and is_undecided(config):
+        config = dataclasses.replace(config, budget_factor=saved_settings(checkpoint).get("budget_factor"))
+    elif not resume and measures_budget(scene, config):
+        with ProgressLine(2 * PILOT_STEPS, 0, silent) as line, _stop_requests() as stop:
+            line.note("how many Gaussians is the scene worth? Two short runs tell")
+            tell: Report = line.update if report is None else partial(_as_step_nought, report)
+            measured = measure_budget(scene, config, cache, device, tell, stop)
+            if measured is None:
+                return TrainResult(False, 0, None, {})
+            config, why = dataclasses.replace(config, budget_factor=measured[0]), f": {measured[1]}"
     trainer = Trainer(scene, config, cache, device)
     trainer.choices["max_gaussians"] += why
     if resume:
         trainer.load(checkpoint)
     with _naming_the_checkpoint(trainer, overwrite):
         with (
-            ProgressLine(config.steps, trainer.step, quiet or report is not None, _shorter(device)) as line,
+            ProgressLine(config.steps, trainer.step, silent, _shorter(device)) as line,
             _stop_requests() as stop,
         ):
-            tell = report or line.update
+            if why:
+                line.note(f"Gaussians at most: {trainer.choices['max_gaussians']}")
+            told = report or line.update
             complete = trainer.run(
                 checkpoint=checkpoint,
-                report=lambda t, loss, mse: tell(t.step, loss, mse, len(t.model)),
+                report=lambda t, loss, mse: told(t.step, loss, mse, len(t.model)),
                 stop=stop,
                 warn=line.note,
             )
@@ -140,15 +151,8 @@ def train(
     return TrainResult(True, trainer.step, out / MODEL, metrics)
 
 
-def _measured(
-    scene: Scene, config: TrainConfig, cache: PictureCache, device: torch.device, quiet: bool, report: Report | None
-) -> tuple[TrainConfig, str]:
-    """The settings with the share of the usual budget that pilots tell, and their reason."""
-    with ProgressLine(PILOTS_STEPS, 0, quiet or report is not None) as line:
-        line.note("how many Gaussians is the scene worth? Two short runs tell:")
-        tell = line.update if report is None else lambda step, *facts: report(0, *facts)
-        share, why = measure_share(scene, config, cache, device, tell)
-    return dataclasses.replace(config, share=share), f": {why}"
+def _as_step_nought(report: Report, step: int, loss: float, mse: float, gaussians: int) -> None:
+    report(0, loss, mse, gaussians)
 
 
 def _finish(trainer: Trainer, out: Path) -> dict:
@@ -241,15 +245,11 @@ def _prepare(out: Path, scene: Scene, resume: bool, overwrite: bool) -> None:
 def _check_photos(scene: Scene, cache: PictureCache) -> None:
     """Refuse now what would else end the run after its last step: held-out photos that cannot be read, and masks that
     leave nothing. Photos to train on are read in the first steps anyway, so that one that can be used is enough."""
-    held_out = [_is_usable(view.load()) for view in scene.test]
+    held_out = [is_usable(view.load()) for view in scene.test]
     if held_out and not any(held_out):
         raise _nothing_left(scene, scene.test, "to score")
-    if scene.train and not any(_is_usable(cache.get(view)) for view in scene.train):
+    if scene.train and not any(is_usable(cache.get(view)) for view in scene.train):
         raise _nothing_left(scene, scene.train, "to train on")
-
-
-def _is_usable(picture: Picture) -> bool:
-    return picture.mask is None or bool(picture.mask.any())
 
 
 def _nothing_left(scene: Scene, views: list[View], purpose: str) -> HyrfTrainingError:

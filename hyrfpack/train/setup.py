@@ -90,22 +90,22 @@ def scene_frame(scene: Scene, preset: str) -> Frame:
 def budget_for(scene: Scene, config: TrainConfig) -> tuple[int, str]:
     """The most Gaussians a run may have, and why.
 
-    It is the configured share of what follows from the photos' pixels and, as a shorter run can fit fewer, from the
+    It is the configured factor times what follows from the photos' pixels and, as a shorter run can fit fewer, from the
     square root of its length. Of a target size it is about what fits in, and at most `LARGER` times as many as without.
     """
     if config.max_gaussians is not None:
         return config.max_gaussians, "asked for"
     pixels = sum(view.camera.width * view.camera.height for view in scene.train)
     full = max(PER_PHOTO_PIXEL * pixels / len(scene.train), PER_PIXEL * pixels)
-    share = math.sqrt(min(1.0, config.steps / FULL_STEPS))
-    budget, why = max(LEAST_BUDGET, round(full * share)), f"{pixels:,} pixels in all, {config.steps:,} steps"
+    length = math.sqrt(min(1.0, config.steps / FULL_STEPS))
+    budget, why = max(LEAST_BUDGET, round(full * length)), f"{pixels:,} pixels in all, {config.steps:,} steps"
     if config.target_bytes is not None:
         fitting = max(LEAST_TARGETED, round((config.target_bytes - PACKED) / PACKED_GAUSSIAN))
         if fitting <= LARGER * budget:
             return fitting, f"to be packed into {config.target_bytes:,} bytes"
         return LARGER * budget, f"{LARGER} times what suits {why}"
-    if config.share is not None:
-        return max(1, round(config.share * budget)), f"{config.share:g} times what suits {why}"
+    if config.budget_factor not in (None, 1):
+        return max(1, round(config.budget_factor * budget)), f"{config.budget_factor:g} times what suits {why}"
     return budget, why
 
 

@@ -59,7 +59,7 @@ def test_a_line_goes_through_what_is_on_a_line_and_never_falls():
 
 
 def test_a_measurement_gives_a_cost_of_this_scene(scene):
-    cost = minutes.pilot(scene, None, CPU, 0, PictureCache(), 5.0)
+    cost = minutes.probe(scene, None, CPU, 0, PictureCache(), 5.0)
     assert cost.step >= 0 and cost.step_per_gaussian >= 0 and cost.step + cost.step_per_gaussian > 0
     assert cost.cpu_pass > 0 and cost.decoding >= 0 and cost.gaussians > 0
 
@@ -68,7 +68,7 @@ def test_large_photos_are_made_smaller_where_the_time_is_short(posed, scene, mon
     def cost(scene, *_):
         return Cost(1e-3 * scene.train[0].camera.width ** 2, 0.0, 0.0, 0.0, 100)
 
-    monkeypatch.setattr(minutes, "pilot", cost)
+    monkeypatch.setattr(minutes, "probe", cost)
     monkeypatch.setattr(minutes, "SIZES", (24, 16, 8))
     said: list[str] = []
 
@@ -81,9 +81,9 @@ def test_large_photos_are_made_smaller_where_the_time_is_short(posed, scene, mon
     assert plans[0].steps > 1000 and "pixels" in said[0]
 
 
-def test_a_long_run_has_the_share_that_the_scene_is_worth_and_a_short_one_all(posed, scene, monkeypatch):
-    monkeypatch.setattr(minutes, "pilot", lambda *_: Cost(0.0, 1e-5, 0.0, 0.0, 100))
-    monkeypatch.setattr(minutes, "measure_share", lambda *_: (0.5, "by a coin"))
+def test_a_long_run_has_the_budget_that_the_scene_is_worth_and_a_short_one_all(posed, scene, monkeypatch):
+    monkeypatch.setattr(minutes, "probe", lambda *_: Cost(0.0, 1e-5, 0.0, 0.0, 100))
+    monkeypatch.setattr(minutes, "measure_budget", lambda *_: (0.5, "by a coin"))
 
     def planned(seconds: float, target_bytes: int | None = None) -> Plan:
         arguments = (posed, Reading(), scene, target_bytes, CPU, monotonic() + seconds, 0, PictureCache())
@@ -91,8 +91,8 @@ def test_a_long_run_has_the_share_that_the_scene_is_worth_and_a_short_one_all(po
 
     short, long, targeted = planned(60.0), planned(600.0), planned(600.0, 90_000)
     assert short.steps < LEAST_STEPS <= long.steps
-    assert (short.share, long.share, targeted.share) == (1.0, 0.5, None)
-    monkeypatch.setattr(minutes, "measures_share", lambda *_: False)
+    assert (short.budget_factor, long.budget_factor, targeted.budget_factor) == (1.0, 0.5, None)
+    monkeypatch.setattr(minutes, "measures_budget", lambda *_: False)
     assert planned(600.0).steps < 0.8 * long.steps
 
 
@@ -108,5 +108,5 @@ def test_a_time_that_is_over_or_too_short_makes_a_draft_and_says_so(posed, scene
 def test_what_was_decided_is_kept(posed, tmp_path, monkeypatch):
     first = make(posed, tmp_path / "scene.hyrf", minutes=0.01)
     assert list(first.seconds)[0] == "measurement"
-    monkeypatch.setattr(minutes, "pilot", None)
+    monkeypatch.setattr(minutes, "probe", None)
     assert "measurement" in make(posed, tmp_path / "scene.ply", minutes=0.01).kept

@@ -20,7 +20,7 @@ WRONG = {
     "steps": (0, -1, None, *NO_INT),
     "seed": (-1, LARGEST_SEED + 1, None, *NO_INT),
     "max_gaussians": (0, -1, *NO_INT),
-    "share": (0.0, -1.0, 1e4, *(value for value in NO_FLOAT if value is not None)),
+    "budget_factor": (0.0, -1.0, 1e4, *(value for value in NO_FLOAT if value is not None)),
     "target_bytes": (0, -1, *NO_INT),
     "checkpoint_every": (0, -1, *NO_INT),
     "log2_table_size": (3, 25, 40, -1, *NO_INT),
@@ -98,8 +98,8 @@ def test_the_mean_count_is_that_of_the_rounds_targets(config):
     ("sizes", "named"),
     [
         ({"max_gaussians": 100, "target_bytes": 20_000}, "a number of Gaussians and a target size"),
-        ({"max_gaussians": 100, "share": 0.5}, "a number of Gaussians and a share"),
-        ({"target_bytes": 20_000, "share": 0.5}, "a target size and a share"),
+        ({"max_gaussians": 100, "budget_factor": 0.5}, "a number of Gaussians and a factor"),
+        ({"target_bytes": 20_000, "budget_factor": 0.5}, "a target size and a factor"),
     ],
 )
 def test_two_sizes_of_a_model_are_one_too_many(sizes, named):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import signal
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,9 +13,10 @@ import torch
 from scenes import ball_scene
 
 from hyrfpack.data import PictureCache
-from hyrfpack.scene import Scene
+from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.scene import Scene, View
 from hyrfpack.train import TrainConfig, pilots, train
-from hyrfpack.train.pilots import measure_share, measures_share
+from hyrfpack.train.pilots import FACTORS, measure_budget, measures_budget
 
 CPU = torch.device("cpu")
 LONG = TrainConfig(steps=pilots.LEAST_STEPS)
@@ -24,8 +26,8 @@ def a_scene(views: int = 10) -> Scene:
     return ball_scene(views=views, points=60, side=24)
 
 
-def measured(scene: Scene, config: TrainConfig = LONG, **options) -> tuple[float, str]:
-    return measure_share(scene, config, PictureCache(), CPU, **options)
+def measured(scene: Scene, config: TrainConfig = LONG, **options) -> tuple[float, str] | None:
+    return measure_budget(scene, config, PictureCache(), CPU, **options)
 
 
 @pytest.fixture
@@ -44,7 +46,7 @@ def scores(monkeypatch) -> dict[int, float]:
         def __init__(self, scene, config, cache, device):
             self.model = config.max_gaussians
 
-        def run(self, report):
+        def run(self, report, stop):
             pass
 
     monkeypatch.setattr(pilots, "Trainer", Untrained)
@@ -53,13 +55,14 @@ def scores(monkeypatch) -> dict[int, float]:
 
 
 @pytest.mark.parametrize(
-    ("gain", "share"), [(-1.0, pilots.LEAST), (0.0, pilots.LEAST), (0.8, 0.8), (1.5, 1.5), (9.0, pilots.MOST)]
+    ("gain", "factor"),
+    [(-1.0, 0.25), (0.0, 0.25), (0.29, 0.25), (0.31, 0.35), (0.5, 0.5), (0.8, 0.7), (1.2, 1.0), (1.3, 1.5), (9.0, 1.5)],
 )
-def test_a_scene_gets_gaussians_in_proportion_to_what_two_doublings_bring(scores, gain, share):
-    scores |= {1250: 20.0, 5000: 20.0 + gain * pilots.EXPECTED}
-    found, why = measured(a_scene())
-    assert found == pytest.approx(share)
-    assert why == f"in {pilots.PILOT_STEPS} steps 5,000 Gaussians scored {gain * pilots.EXPECTED:+.2f} dB over 1,250"
+def test_a_scene_gets_gaussians_in_proportion_to_what_two_doublings_bring(scores, gain, factor):
+    gain *= pilots.EXPECTED
+    scores |= {1250: 20.0, 5000: 20.0 + gain}
+    why = f"in {pilots.PILOT_STEPS} steps 5,000 Gaussians scored {gain:+.2f} dB over 1,250"
+    assert measured(a_scene()) == (factor, why)
 
 
 @pytest.mark.parametrize(
@@ -70,18 +73,20 @@ def test_a_scene_gets_gaussians_in_proportion_to_what_two_doublings_bring(scores
         ({"steps": pilots.LEAST_STEPS - 1}, 8, False),
         ({"max_gaussians": 500}, 8, False),
         ({"target_bytes": 50_000}, 8, False),
-        ({"share": 1.0}, 8, False),
+        ({"budget_factor": 1.0}, 8, False),
     ],
 )
 def test_it_is_measured_where_nobody_has_said_and_there_is_time_and_photos_enough(change, views, expected):
-    assert measures_share(a_scene(views), dataclasses.replace(LONG, **change)) is expected
+    assert measures_budget(a_scene(views), dataclasses.replace(LONG, **change)) is expected
 
 
-@pytest.mark.parametrize("views", [8, 15, 16, 100, 1000])
-def test_photos_to_judge_by_are_not_trained_on(views):
-    rest, judges = pilots._split(range(views))
-    assert not set(rest) & set(judges) and set(rest) | set(judges) <= set(range(views))
-    assert 1 <= len(judges) <= pilots.JUDGES and min(pilots.PILOT_STEPS, 0.7 * views) <= len(rest) <= pilots.PILOT_STEPS
+@pytest.mark.parametrize("views", [8, 13, 15, 16, 100, 1000])
+def test_photos_to_judge_by_are_not_trained_on_and_lie_among_those_that_are(views):
+    near, judges = pilots.split(range(views))
+    assert not set(near) & set(judges) and set(near) | set(judges) <= set(range(views))
+    assert near == sorted(near) and len(near) == min(pilots.PILOT_STEPS, views - len(judges))
+    assert 1 <= len(judges) <= pilots.JUDGES
+    assert all(min(abs(judge - n) for n in near) == 1 for judge in judges)
 
 
 @pytest.mark.usefixtures("short")
@@ -89,56 +94,89 @@ def test_pilots_say_the_same_twice_and_report_each_step():
     told: list[tuple] = []
     first = measured(a_scene(), report=lambda *facts: told.append(facts))
     assert first == measured(a_scene())
-    assert pilots.LEAST <= first[0] <= pilots.MOST
+    assert first is not None and first[0] in FACTORS
     assert [step for step, *_ in told] == list(range(1, 13))
     assert all(np.isfinite(loss) and mse > 0 and gaussians > 0 for _, loss, mse, gaussians in told)
 
 
 @pytest.mark.usefixtures("short")
-def test_nothing_is_measured_by_photos_that_masks_leave_nothing_of():
-    scene = a_scene()
-    judges = {view.name for view in pilots._split(scene.train)[1]}
-    blank = [_masked(view) if view.name in judges else view for view in scene.train]
-    assert measured(dataclasses.replace(scene, train=blank)) == (
-        1.0,
-        "not measured: masks leave nothing of the photos to judge by",
+def test_pilots_end_where_they_are_asked_to():
+    told: list[int] = []
+    assert measured(a_scene(), report=lambda step, *_: told.append(step), stop=lambda: len(told) >= 8) is None
+    assert told[-1] == 8
+
+
+@pytest.mark.usefixtures("short")
+@pytest.mark.parametrize("left", [0, 1])
+def test_photos_that_masks_leave_nothing_of_do_not_judge(left, monkeypatch):
+    judged: list[list[str]] = []
+    monkeypatch.setattr(
+        pilots,
+        "evaluate",
+        lambda _, views: judged.append([view.name for view in views]) or SimpleNamespace(psnr_corrected=20.0),
     )
+    scene = a_scene()
+    judges = [view.name for view in pilots.split(scene.train)[1]]
+    views = [masked(view) if view.name in judges[left:] else view for view in scene.train]
+    factor, why = measured(dataclasses.replace(scene, train=views))
+    if left:
+        assert judged == [judges[:1]] * 2
+    else:
+        assert (factor, why) == (1.0, "masks leave nothing of the photos to judge by") and not judged
 
 
-def _masked(view):
+def masked(view: View) -> View:
     picture = view.load()
     nothing = dataclasses.replace(picture, mask=np.zeros(picture.rgb.shape[:2], bool))
     return dataclasses.replace(view, load=lambda: nothing)
 
 
 @pytest.mark.usefixtures("short")
-def test_a_run_has_the_share_that_pilots_tell_and_says_why(tmp_path, monkeypatch):
-    monkeypatch.setattr("hyrfpack.train.run.measure_share", lambda *_: (0.5, "by a coin"))
-    train(a_scene(), tmp_path, TrainConfig(steps=10), quiet=True)
+def test_a_run_has_the_budget_that_pilots_tell_and_says_why(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("hyrfpack.train.run.measure_budget", lambda *_: (0.5, "by a coin"))
+    train(a_scene(), tmp_path, TrainConfig(steps=10))
     metrics = json.loads((tmp_path / "metrics.json").read_bytes())
-    assert metrics["settings"]["share"] == 0.5
-    assert metrics["choices"]["max_gaussians"].startswith("2,500: 0.5 times what suits ")
-    assert metrics["choices"]["max_gaussians"].endswith(" steps: by a coin")
+    assert metrics["settings"]["budget_factor"] == 0.5
+    reason = metrics["choices"]["max_gaussians"]
+    assert reason.startswith("2,500: 0.5 times what suits ") and reason.endswith(" steps: by a coin")
+    assert f"Gaussians at most: {reason}" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("short")
-def test_a_run_that_goes_on_keeps_its_share_and_the_reason(tmp_path, monkeypatch):
-    config = TrainConfig(steps=10, checkpoint_every=4)
+def interrupted_at(step: int):
+    """A report that interrupts as a person does, once."""
+    left = [step]
+
+    def report(step: int, loss: float, mse: float, gaussians: int) -> None:
+        if left and step == left[0]:
+            left.clear()
+            signal.raise_signal(signal.SIGTERM)
+
+    return report
+
+
+@pytest.mark.usefixtures("short", "signals")
+def test_a_run_that_goes_on_keeps_its_budget_and_the_reason(tmp_path, monkeypatch):
+    config = TrainConfig(steps=10)
     train(a_scene(), tmp_path / "whole", config, quiet=True)
+    assert train(a_scene(), tmp_path / "again", config, report=interrupted_at(6)).step == 6
 
-    def interrupt(step, loss, mse, gaussians):
-        if step == 6:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(a_scene(), tmp_path / "again", config, report=interrupt)
-    monkeypatch.setattr("hyrfpack.train.run.measure_share", lambda *_: pytest.fail("measured again"))
+    monkeypatch.setattr("hyrfpack.train.run.measure_budget", lambda *_: pytest.fail("measured again"))
+    for asked in ({"max_gaussians": 5_000}, {"target_bytes": 20_000}, {"budget_factor": 0.9}):
+        with pytest.raises(HyrfTrainingError, match="started with other settings"):
+            train(a_scene(), tmp_path / "again", dataclasses.replace(config, **asked), resume=True, quiet=True)
     train(a_scene(), tmp_path / "again", config, resume=True, quiet=True)
 
     whole, again = (json.loads((tmp_path / name / "metrics.json").read_bytes()) for name in ("whole", "again"))
     assert whole["settings"] == again["settings"] and whole["choices"] == again["choices"]
     assert "scored" in whole["choices"]["max_gaussians"]
     assert (tmp_path / "whole/model.hyrf").read_bytes() == (tmp_path / "again/model.hyrf").read_bytes()
+
+
+@pytest.mark.usefixtures("short", "signals")
+def test_an_interrupt_before_the_first_step_leaves_nothing(tmp_path):
+    result = train(a_scene(), tmp_path, TrainConfig(steps=10), report=interrupted_at(0))
+    assert (result.complete, result.step, result.model, result.metrics) == (False, 0, None, {})
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.usefixtures("short")

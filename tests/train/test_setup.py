@@ -200,11 +200,11 @@ def test_an_asked_budget_is_taken():
     assert budget_for(around_an_object(), TrainConfig(max_gaussians=77)) == (77, "asked for")
 
 
-@pytest.mark.parametrize("share", [0.25, 1.0, 2.0])
-def test_a_share_is_of_what_pixels_and_steps_suggest(share):
+@pytest.mark.parametrize("factor", [0.25, 0.7, 1.0, 2.0])
+def test_a_factor_multiplies_what_pixels_and_steps_suggest(factor):
     usual, why = budget_for(around_an_object(), TrainConfig())
-    found = budget_for(around_an_object(), TrainConfig(share=share))
-    assert found == (round(share * usual), f"{share:g} times what suits {why}")
+    found = budget_for(around_an_object(), TrainConfig(budget_factor=factor))
+    assert found == (round(factor * usual), why if factor == 1 else f"{factor:g} times what suits {why}")
 
 
 @pytest.mark.parametrize("target", [22_000, 29_000, 36_000])

@@ -41,7 +41,7 @@ def main() -> None:
                 measure(
                     args.data / name,
                     args.out / str(args.steps) / f"{number}-{name}-{seed}",
-                    replace(TrainConfig(steps=args.steps, seed=seed, share=1.0), **changes),
+                    replace(TrainConfig(steps=args.steps, seed=seed, budget_factor=1.0), **changes),
                     reuse=True,
                 )
                 for seed in range(args.seeds)

@@ -42,7 +42,9 @@ def common(given: Scene, own: Scene) -> tuple[Scene, Scene, int]:
 
 def score(scene: Scene, out: Path, steps: int, seed: int) -> float:
     """Mean PSNR on held-out photos of a model trained for so many steps."""
-    result = hyrfpack.train(scene, out, hyrfpack.TrainConfig(steps=steps, seed=seed), overwrite=True, quiet=True)
+    result = hyrfpack.train(
+        scene, out, hyrfpack.TrainConfig(steps=steps, seed=seed, budget_factor=1.0), overwrite=True, quiet=True
+    )
     return result.metrics["evaluation"]["psnr"]
 
 
