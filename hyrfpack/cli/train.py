@@ -32,7 +32,7 @@ BACKGROUND_COLORS = ("black", "white", "random")
 @click.argument("data", type=PATH)
 @click.option("-o", "--output", "out", type=OUTPUT, required=True, metavar="RUN", help="Folder of the run.")
 @click.option("--steps", type=click.IntRange(min=1), default=3000, show_default=True, help="Optimiser steps.")
-@click.option("--max-gaussians", type=click.IntRange(min=1), metavar="N", help="Budget.  [default: from the photos]")
+@click.option("--max-gaussians", type=click.IntRange(min=1), metavar="N", help="Budget.  [default: measured]")
 @click.option(
     "--target-size",
     "target_bytes",
