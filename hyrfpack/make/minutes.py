@@ -34,7 +34,7 @@ USEFUL_STEPS = 1_000  # fewer are only a trial: smaller photos are better
 SIZES = (1200, 800, 600, 400)  # of photos, where the time is short
 SMALLEST = 640  # pixels: photos that are no larger are not shrunk further for the first measurement
 SETTLED = 0.92  # of the probe's pace per Gaussian: a trained scene hides more of what lies behind
-HALVED = 0.45  # of the time of a step, with a photo of half the size
+HALVED = 0.5  # of the time of a step, with a photo of half the size
 # A pass (drawing a view on the CPU and following it back) is the unit of all that comes after the training.
 SCORED, DRAWN_AFTER, VERIFIED = 0.6, 16, 12  # passes for a view that is scored; views that training and packing draw
 PER_GAUSSIAN, OVERHEAD = 1.5e-4, 6.0  # seconds of coding and writing, for a Gaussian and for anything

@@ -13,7 +13,9 @@ from pathlib import Path
 import torch
 
 from hyrfpack.atomic import write_atomic
+from hyrfpack.checks import check_float
 from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.train.config import BUDGET_FACTORS
 
 VERSION = 2
 DIGEST_BYTES = 32  # SHA-256 of all that goes before, at the end of the file
@@ -37,13 +39,19 @@ def save_checkpoint(path: Path, *, settings: dict, tensors: dict[str, torch.Tens
     write_atomic(path, buffer.getbuffer())
 
 
-def saved_settings(path: Path) -> dict:
-    """The settings of the run that a checkpoint is of.
+def saved_budget_factor(path: Path) -> float | None:
+    """`TrainConfig.budget_factor` of the run that a checkpoint is of, which may have been measured.
 
     Raises:
         HyrfTrainingError: it is missing, damaged or of another version.
     """
-    return _read(path)[0]
+    factor = _read(path)[0].get("budget_factor")
+    if factor is not None:
+        try:
+            check_float("budget_factor", factor, *BUDGET_FACTORS)
+        except ValueError as error:
+            raise _damaged(path) from error
+    return factor
 
 
 def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor], dict]:
@@ -80,12 +88,16 @@ def _read(path: Path) -> tuple[dict, dict[str, torch.Tensor], dict]:
         if not isinstance(saved, dict):
             raise ValueError("the settings are no object")
     except Exception as error:  # torch's unpickler raises whatever it meets
-        raise HyrfTrainingError(f"{path}: the checkpoint is damaged; delete it and train anew") from error
+        raise _damaged(path) from error
     if version != VERSION:
         raise HyrfTrainingError(
             f"{path}: the checkpoint is of another version of hyrfpack; train anew with --overwrite"
         )
     return saved, tensors, progress
+
+
+def _damaged(path: Path) -> HyrfTrainingError:
+    return HyrfTrainingError(f"{path}: the checkpoint is damaged; delete it and train anew")
 
 
 def _plain(value: object) -> object:

@@ -28,7 +28,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
 from hyrfpack.scene import Scene, View, evenly_spaced
-from hyrfpack.train.checkpoint import saved_settings
+from hyrfpack.train.checkpoint import saved_budget_factor
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.pilots import PILOT_STEPS, is_undecided, is_usable, measure_budget, measures_budget
 from hyrfpack.train.progress import ProgressLine
@@ -117,7 +117,7 @@ def train(
     silent = quiet or report is not None
     why = ""
     if resume and is_undecided(config):
-        config = dataclasses.replace(config, budget_factor=saved_settings(checkpoint).get("budget_factor"))
+        config = dataclasses.replace(config, budget_factor=saved_budget_factor(checkpoint))
     elif not resume and measures_budget(scene, config):
         with ProgressLine(2 * PILOT_STEPS, 0, silent) as line, _stop_requests() as stop:
             line.note("how many Gaussians is the scene worth? Two short runs tell")

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from hyrfpack.errors import HyrfTrainingError
-from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
+from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint, saved_budget_factor
 
 SETTINGS = {"steps": 40, "rates": (1e-3, 1e-5), "views": [["a.png", 4, 3]], "budget": None}
 PROGRESS = {"step": 12, "records": [{"step": 1, "loss": 0.25}], "seconds": {"data": 0.5}}
@@ -40,6 +40,23 @@ def test_what_was_saved_comes_back(path):
     assert progress == PROGRESS
     assert tensors.keys() == some_tensors().keys()
     assert all(torch.equal(tensors[name], value) for name, value in some_tensors().items())
+
+
+@pytest.mark.parametrize("factor", [None, 0.25, 1])
+def test_the_budget_factor_can_be_asked_for(path, factor):
+    save_checkpoint(path, settings={**SETTINGS, "budget_factor": factor}, tensors={}, progress=PROGRESS)
+    assert saved_budget_factor(path) == factor
+
+
+def test_a_run_of_before_there_was_one_has_no_budget_factor(path):
+    assert saved_budget_factor(path) is None
+
+
+@pytest.mark.parametrize("factor", ["1", -1.0, float("nan"), float("inf"), [1.0], True])
+def test_a_budget_factor_that_is_none_is_damage(path, factor):
+    save_checkpoint(path, settings={**SETTINGS, "budget_factor": factor}, tensors={}, progress=PROGRESS)
+    with pytest.raises(HyrfTrainingError, match="damaged"):
+        saved_budget_factor(path)
 
 
 def test_only_the_checkpoint_is_left_in_the_folder(path):
