@@ -18,6 +18,7 @@ from hyrfpack import evaluate, load, load_scene, save
 from hyrfpack.errors import HyrfError
 from hyrfpack.lock import held
 from hyrfpack.make import make, stages
+from hyrfpack.make.progress import Progress, Reporter
 from hyrfpack.splats.formats import ply
 from hyrfpack.train.setup import LEAST_BUDGET
 
@@ -35,6 +36,20 @@ def made(posed, tmp_path_factory) -> Path:
 
 def copy_of(made: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(made, tmp_path / "work"))
+
+
+def test_short_runs_before_a_training_do_not_count_in_its_forecast(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr("hyrfpack.make.progress.monotonic", lambda: clock[0])
+    told: list[Progress] = []
+    reporter = Reporter(["training"], told.append)
+    reporter.begin("training")
+    report = stages._training_report(reporter, 1000)
+    for step in [0] * 40 + list(range(1, 101)):
+        clock[0] += 0.1
+        report(step, 0.1, 0.01, 500)
+    assert told[1].words == ("two short runs tell how many Gaussians the scene is worth",) and told[1].share == 0
+    assert told[-1].share == 0.1 and told[-1].left == pytest.approx(90.0, rel=0.02)
 
 
 # -- what is given, and what is asked for ----------------------------------------------------------------------------
