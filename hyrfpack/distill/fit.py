@@ -255,8 +255,7 @@ def _lit(light: np.ndarray) -> np.ndarray:
 
 def _fit_to_pictures(model: HybridModel, scene: Scene, config: DistillConfig, cache: PictureCache, quiet: bool) -> None:
     # No density control: every Gaussian has its place, and packing leaves out those that pictures do not miss.
-    fixed = DensityConfig(stop=0.0)
-    settings = TrainConfig(steps=config.steps, seed=config.seed, learning_rates=RATES, density=fixed, coarse=0.0)
+    settings = TrainConfig(steps=config.steps, seed=config.seed, learning_rates=RATES, density=DensityConfig(stop=0.0))
     trainer = Trainer(scene, settings, cache, model=model)
     with ProgressLine(config.steps, 0, quiet) as line:
         trainer.run(report=lambda t, loss, mse: line.update(t.step, loss, mse, len(t.model)))

@@ -21,7 +21,6 @@ from hyrfpack.model import HybridModel
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
-from hyrfpack.train.coarse import can_be_halved
 from hyrfpack.train.config import FULL_STEPS
 from hyrfpack.train.pilots import PILOT_STEPS, measure_budget, measures_budget
 from hyrfpack.train.setup import budget_for
@@ -34,7 +33,6 @@ USEFUL_STEPS = 1_000  # fewer are only a trial: smaller photos are better
 SIZES = (1200, 800, 600, 400)  # of photos, where the time is short
 SMALLEST = 640  # pixels: photos that are no larger are not shrunk further for the first measurement
 SETTLED = 0.92  # of the probe's pace per Gaussian: a trained scene hides more of what lies behind
-HALVED = 0.5  # of the time of a step, with a photo of half the size
 # A pass (drawing a view on the CPU and following it back) is the unit of all that comes after the training.
 SCORED, DRAWN_AFTER, VERIFIED = 0.6, 16, 12  # passes for a view that is scored; views that training and packing draw
 PER_GAUSSIAN, OVERHEAD = 1.5e-4, 6.0  # seconds of coding and writing, for a Gaussian and for anything
@@ -71,8 +69,6 @@ class Cost:
         budget = self._budget(scene, steps)
         mean = DensityConfig().mean_count(min(budget, len(scene.points) or budget // 2), budget)
         step = self.step + self.step_per_gaussian * mean
-        if can_be_halved(scene.train[0].camera):
-            step *= 1 - TrainConfig.coarse * (1 - HALVED)
         return SETTLED * steps * step + self.decoding * min(steps, len(scene.train))
 
     def after(self, scene: Scene, steps: int) -> dict[str, float]:
@@ -178,7 +174,7 @@ def probe(
         seconds: after which it ends in any case, but for the steps that it takes to measure anything.
     """
     budget, _ = budget_for(scene, TrainConfig(target_bytes=target_bytes))
-    config = TrainConfig(steps=PROBE_STEPS, seed=seed, max_gaussians=budget, density=RISING, coarse=0.0)
+    config = TrainConfig(steps=PROBE_STEPS, seed=seed, max_gaussians=budget, density=RISING)
     trainer = Trainer(scene, config, cache, device)
     counts: list[int] = []
     working: list[float] = []

@@ -117,8 +117,6 @@ class TrainConfig:
             exposure; None looks at how much the photos differ, see `hyrfpack.train.exposure`.
         background_color: what transparent pictures are laid over: "black", "white" or "random" (a new colour
             every step; the model then has black behind it).
-        coarse: the part of the run, from its start, in which photos are trained on at half their size, if they are
-            large enough for it; 0 for none.
         ssim_weight: w in (1 - w) L1 + w (1 - SSIM).
         checkpoint_every: steps between checkpoints; None for a twentieth of the run.
         precision: "mixed" or "float32", as `HybridModel.precision`: what GPU kernels multiply in.
@@ -138,7 +136,6 @@ class TrainConfig:
     exposure: bool | None = None
     background_color: str = "black"
     antialiased: bool = False
-    coarse: float = 0.35
     ssim_weight: float = 0.2
     checkpoint_every: int | None = None
     precision: str = "mixed"
@@ -177,7 +174,6 @@ class TrainConfig:
                 check_bool(name, getattr(self, name))
         for name in ("antialiased", "scale_grows", "position_gradients"):
             check_bool(name, getattr(self, name))
-        check_float("coarse", self.coarse, 0, 1)
         check_float("ssim_weight", self.ssim_weight, 0, 1)
         check_pair("grid_resolutions", self.grid_resolutions)
         coarsest, finest = self.grid_resolutions

@@ -24,7 +24,6 @@ from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.render import render
 from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
-from hyrfpack.train.coarse import can_be_halved, halved
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.exposure import exposures_for
@@ -157,13 +156,10 @@ class Trainer:
         with self._timed("data"):
             solid = self._solid()
             target, mask = upload(picture, solid, self.device)
-            camera = view.camera
-            if self.step <= config.coarse * config.steps and can_be_halved(camera):
-                camera, target, mask = halved(camera, target, mask)
         try:
             rendering = render(
                 self.model,
-                camera,
+                view.camera,
                 absgrad=self.strategy.watching(self.step),
                 solid=None if solid is None else upload_array(solid, self.device),
             )
@@ -177,7 +173,7 @@ class Trainer:
         with self._timed("backward"):
             loss.backward()
         with self._timed("density"):
-            self.strategy.observe(rendering, camera, self.model)
+            self.strategy.observe(rendering, view.camera, self.model)
         with self._timed("optimizer"):
             broken = self.optimizer.step(self.step - 1, config.steps)
             if self.exposures is not None:

@@ -30,7 +30,6 @@ WRONG = {
     "exposure": (1, "no", math.nan),
     "background_color": ("grey", None),
     "antialiased": (None, 1, "yes"),
-    "coarse": (-0.1, 1.1, *NO_FLOAT),
     "ssim_weight": (1.1, -0.1, *NO_FLOAT),
     "scale_rule": ("max", None),
     "scale_grows": (None, 0),

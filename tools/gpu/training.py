@@ -58,8 +58,7 @@ class Training:
 def timed_training(scene: Scene, model: HybridModel, setup: Setup) -> Training:
     """Train `model` on the scene for a while: warm-up, timed steps, then a few under the profiler."""
     device, count = setup.torch_device, len(model)
-    config = TrainConfig(steps=FULL_STEPS, max_gaussians=count, coarse=0.0)
-    trainer = Trainer(scene, config, device=device, model=model)
+    trainer = Trainer(scene, TrainConfig(steps=FULL_STEPS, max_gaussians=count), device=device, model=model)
     errors: list[float] = []
     advance(trainer, setup.warm_steps, setup.step_seconds / 3, errors)
     reset_peak(device)

@@ -46,7 +46,7 @@ def densifying_config(gaussians: int, settle: int, seed: int) -> TrainConfig:
         gradient=0.0,
         split_scale=0.0,
     )
-    return TrainConfig(steps=steps, seed=seed, max_gaussians=gaussians, density=density, coarse=0.0)
+    return TrainConfig(steps=steps, seed=seed, max_gaussians=gaussians, density=density)
 
 
 def report(label: str, model: HybridModel, scene: Scene, start: float) -> None:
