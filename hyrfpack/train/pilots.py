@@ -25,7 +25,7 @@ PILOT_STEPS = 120  # of each of the two
 BUDGET_STEPS = 500  # the whole budget of a pilot is that of a run of so many steps
 SMALL = 0.25  # of it has the small pilot
 EXPECTED = 0.6  # dB between them where pixels and steps decide rightly
-# Times that many. Steps as wide as this, for another seed moves the gain by up to 0.3 dB, a GPU's sums by less.
+# Times that many, in steps so wide because another seed moves the gain by up to 0.3 dB.
 FACTORS = (0.25, 0.35, 0.5, 0.7, 1.0, 1.5)
 FEWEST_PHOTOS = 8  # to train on; of fewer none can be spared
 JUDGES = 8  # photos at most that pilots are scored on
