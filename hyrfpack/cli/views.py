@@ -173,7 +173,7 @@ def evaluate(
         print_json({"bytes": size, "max_size": scene.max_size, "picture_size": [width, height], **scores.to_dict()})
         return
     rows = [*(_row(view.name, view) for view in scores.views), _row("mean", scores)]
-    click.echo(table(["view", "PSNR (dB)", "predicted", "corrected", "SSIM", "LPIPS"], rows))
+    click.echo(table(["view", "PSNR (dB)", "predicted", "corrected", "SSIM", "predicted", "LPIPS"], rows))
     limit = f"--max-size {scene.max_size}" if scene.max_size else "as they are stored"
     click.echo(f"{len(scores.views)} photos of up to {width} x {height} pixels ({limit})")
     click.echo(f"{model}: {size:,} bytes, {scores.gaussians:,} Gaussians, {scores.seconds_per_frame:.4f} s a frame")
@@ -183,7 +183,8 @@ def evaluate(
 
 def _row(name: str, scores: ViewScore | Evaluation) -> list[str]:
     decibels = (scores.psnr, scores.psnr_predicted, scores.psnr_corrected)
-    return [name, *(_optional(value, 2) for value in decibels), f"{scores.ssim:.4f}", _optional(scores.lpips)]
+    similar = (scores.ssim, scores.ssim_predicted, scores.lpips)
+    return [name, *(_optional(value, 2) for value in decibels), *(_optional(value) for value in similar)]
 
 
 def _optional(value: float | None, digits: int = 4) -> str:

@@ -41,12 +41,13 @@ class ViewScore:
     psnr_predicted: float | None
     psnr_corrected: float
     ssim: float
+    ssim_predicted: float | None
     lpips: float | None
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Scores on held-out views; the first five are means over `views`.
+    """Scores on held-out views; the first six are means over `views`.
 
     Attributes:
         psnr: dB, pooled over each picture's pixels and channels, then averaged over views; of renders as they are, at
@@ -55,7 +56,8 @@ class Evaluation:
             `hyrfpack.evaluate.exposure.predicted_gains`: the held-out photo is not looked at. None without such photos.
         psnr_corrected: of renders brought to the colours of the very photo that they are scored against, see
             `hyrfpack.evaluate.exposure.corrected`.
-        ssim: 11x11 Gaussian window, sigma 1.5.
+        ssim: 11x11 Gaussian window, sigma 1.5; of renders as they are.
+        ssim_predicted: of renders exposed as for `psnr_predicted`.
         lpips: perceptual distance, or None.
         lpips_reason: why lpips is None, or which network made it.
         gaussians: how many the model has.
@@ -69,6 +71,7 @@ class Evaluation:
     psnr_predicted: float | None
     psnr_corrected: float
     ssim: float
+    ssim_predicted: float | None
     lpips: float | None
     lpips_reason: str
     gaussians: int
@@ -148,10 +151,10 @@ def evaluate(
         rendering = render(model, view.camera, settings, decoded=decoded)
         seconds.append(_now(device) - started)
         image = to_8bit(rendering.rgb)
-        predicted = None
+        foretold = None
         if trained.keys() - {view.name}:
             gains = torch.from_numpy(predicted_gains(view.name, list(trained), gains_of)).to(rendering.rgb)
-            predicted = psnr(to_8bit(expose(rendering.rgb, gains)), reference, mask)
+            foretold = to_8bit(expose(rendering.rgb, gains))
         distance = None
         if perceptual is not None:
             seen = image if mask is None else torch.where(mask[..., None], image, reference)
@@ -159,9 +162,10 @@ def evaluate(
         score = ViewScore(
             name=view.name,
             psnr=psnr(image, reference, mask),
-            psnr_predicted=predicted,
+            psnr_predicted=None if foretold is None else psnr(foretold, reference, mask),
             psnr_corrected=psnr(corrected(image, reference, mask), reference, mask),
             ssim=ssim(image, reference, mask),
+            ssim_predicted=None if foretold is None else ssim(foretold, reference, mask),
             lpips=distance,
         )
         scores.append(score)
@@ -175,6 +179,7 @@ def evaluate(
         psnr_predicted=_mean(score.psnr_predicted for score in scores),
         psnr_corrected=statistics.fmean(score.psnr_corrected for score in scores),
         ssim=statistics.fmean(score.ssim for score in scores),
+        ssim_predicted=_mean(score.ssim_predicted for score in scores),
         lpips=_mean(score.lpips for score in scores),
         lpips_reason=NO_LPIPS if perceptual is None else f"network {perceptual.name}",
         gaussians=len(model),

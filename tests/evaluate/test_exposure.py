@@ -11,7 +11,7 @@ from scenes import ball_points, ball_scene, small_model
 
 from hyrfpack.evaluate import evaluate
 from hyrfpack.evaluate.exposure import corrected, expose, fitted_gains, predicted_gains
-from hyrfpack.evaluate.metrics import IDENTICAL_PSNR, psnr, to_8bit
+from hyrfpack.evaluate.metrics import IDENTICAL_PSNR, psnr, ssim, to_8bit
 from hyrfpack.render import render
 from hyrfpack.scene import Picture, View
 
@@ -111,9 +111,12 @@ def test_three_scores_leave_out_what_they_say():
         predicted = torch.as_tensor(np.sqrt(gains[beside[0]] * gains[beside[1]]) * np.ones(3)).float()
         photo = torch.from_numpy(view.load().rgb) / 255
         assert score.psnr_predicted == pytest.approx(psnr(to_8bit(expose(image, predicted)), photo), abs=0.3)
+        assert score.ssim_predicted == pytest.approx(ssim(to_8bit(expose(image, predicted)), photo), abs=0.01)
+        assert score.ssim < score.ssim_predicted <= 1
         assert score.psnr < score.psnr_predicted < 42 < score.psnr_corrected <= IDENTICAL_PSNR
         assert score.psnr == pytest.approx(psnr(to_8bit(image), photo)) and np.all(own != 1)
     assert scores.psnr_predicted == pytest.approx(np.mean([score.psnr_predicted for score in scores.views]))
+    assert scores.ssim_predicted == pytest.approx(np.mean([score.ssim_predicted for score in scores.views]))
     assert scores.psnr_corrected == pytest.approx(np.mean([score.psnr_corrected for score in scores.views]))
 
 
@@ -123,6 +126,7 @@ def test_without_training_photos_nothing_is_predicted_and_nothing_else_changes()
 
     alone, beside = evaluate(model, views[:1]), evaluate(model, views[:1], training=views)
 
-    assert alone.psnr_predicted is None and alone.views[0].psnr_predicted is None
+    for score in (alone, alone.views[0]):
+        assert score.psnr_predicted is None and score.ssim_predicted is None
     assert (alone.psnr, alone.psnr_corrected, alone.ssim) == (beside.psnr, beside.psnr_corrected, beside.ssim)
     assert evaluate(model, views[:1], training=views[:1]).psnr_predicted is None
