@@ -22,7 +22,7 @@ from hyrfpack.render import render
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.config import FULL_STEPS
-from hyrfpack.train.pilots import PILOT_STEPS, measure_budget, measures_budget
+from hyrfpack.train.pilots import MOST_STEPS, measure_budget, measures_budget
 from hyrfpack.train.setup import budget_for
 
 PROBE_STEPS = 45  # of a whole small run: from the first Gaussians to the budget
@@ -145,8 +145,8 @@ def measure(
     if measures_budget(fitting, config):
 
         def tell(step: int, loss: float, mse: float, gaussians: int) -> None:
-            share = 0.6 + 0.4 * step / (2 * PILOT_STEPS)
-            reporter.update(share, "two short runs tell how many Gaussians the scene is worth")
+            share = 0.6 + 0.4 * step / MOST_STEPS
+            reporter.update(share, "short runs tell how many Gaussians the scene is worth")
 
         if measured := measure_budget(fitting, config, cache, device, tell):
             factor, why = measured

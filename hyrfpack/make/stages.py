@@ -118,7 +118,7 @@ def _training_report(reporter: Reporter, steps: int) -> Callable[[int, float, fl
         nonlocal seen, measuring
         if step == 0:
             measuring = True
-            reporter.update(0.0, "two short runs tell how many Gaussians the scene is worth")
+            reporter.update(0.0, "short runs tell how many Gaussians the scene is worth")
             return
         if measuring:  # the pace of what follows is another
             measuring = False

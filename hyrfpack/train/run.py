@@ -30,7 +30,7 @@ from hyrfpack.render import render
 from hyrfpack.scene import Scene, View, evenly_spaced
 from hyrfpack.train.checkpoint import saved_budget_factor
 from hyrfpack.train.config import TrainConfig
-from hyrfpack.train.pilots import PILOT_STEPS, is_undecided, is_usable, measure_budget, measures_budget
+from hyrfpack.train.pilots import MOST_STEPS, is_undecided, is_usable, measure_budget, measures_budget
 from hyrfpack.train.progress import ProgressLine
 from hyrfpack.train.trainer import Trainer
 
@@ -119,8 +119,8 @@ def train(
     if resume and is_undecided(config):
         config = dataclasses.replace(config, budget_factor=saved_budget_factor(checkpoint))
     elif not resume and measures_budget(scene, config):
-        with ProgressLine(2 * PILOT_STEPS, 0, silent) as line, _stop_requests() as stop:
-            line.note("how many Gaussians is the scene worth? Two short runs tell")
+        with ProgressLine(MOST_STEPS, 0, silent) as line, _stop_requests() as stop:
+            line.note("how many Gaussians is the scene worth? Short runs tell")
             tell: Report = line.update if report is None else partial(_as_step_nought, report)
             measured = measure_budget(scene, config, cache, device, tell, stop)
             if measured is None:

@@ -48,7 +48,7 @@ def test_short_runs_before_a_training_do_not_count_in_its_forecast(monkeypatch):
     for step in [0] * 40 + list(range(1, 101)):
         clock[0] += 0.1
         report(step, 0.1, 0.01, 500)
-    assert told[1].words == ("two short runs tell how many Gaussians the scene is worth",) and told[1].share == 0
+    assert told[1].words == ("short runs tell how many Gaussians the scene is worth",) and told[1].share == 0
     assert told[-1].share == 0.1 and told[-1].left == pytest.approx(90.0, rel=0.02)
 
 
