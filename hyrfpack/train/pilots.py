@@ -65,8 +65,8 @@ def measure_budget(
     Args:
         config: of the run to come.
         cache: keeps photos that are decoded.
-        report: told after each of at most `MOST_STEPS` steps its number, the loss and mean squared error of its view and
-            how many Gaussians there are.
+        report: told after each of `MOST_STEPS` steps at most its number, the loss and mean squared error of its view,
+            and how many Gaussians there are.
         stop: asked after each step.
 
     Raises:
