@@ -137,10 +137,10 @@ def train(
         ):
             if why:
                 line.note(f"Gaussians at most: {trainer.choices['max_gaussians']}")
-            told = report or line.update
+            tell = report or line.update
             complete = trainer.run(
                 checkpoint=checkpoint,
-                report=lambda t, loss, mse: told(t.step, loss, mse, len(t.model)),
+                report=lambda t, loss, mse: tell(t.step, loss, mse, len(t.model)),
                 stop=stop,
                 warn=line.note,
             )
