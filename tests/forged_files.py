@@ -12,7 +12,8 @@ from hyrfpack.format.arrays import RULES, group_shapes, parse_config
 from hyrfpack.quant.integers import encode_integers
 from tools.safety.fuzz_mutate import Part, assemble
 
-FREE = 1 << 28  # bytes that a file of any length may decode to
+FREE = 3 << 24  # bytes that a file of any length may decode to
+GAUSSIANS = 1 << 18  # that it may have
 GRID = {"log2_table_size": 4, "levels": 1, "base": 2, "finest": 2}
 CONFIG = {
     "frame": {"center": [0.0, 0.0, 0.0], "scale": 1.0, "half_extent": [1.0, 0.75, 0.5]},
@@ -92,12 +93,12 @@ def channel(differences: np.ndarray, classes: np.ndarray, codes: bytes, mean: fl
 
 def most_gaussians() -> bytes:
     """As many Gaussians as a file of a kilobyte may have, all alike; valid."""
-    return file_of(metadata(FREE // 32 - 100), COMPACT)
+    return file_of(metadata(GAUSSIANS - 100), COMPACT)
 
 
 def largest_tables() -> bytes:
     """Tables as large as a file of a kilobyte may have, all numbers alike; valid."""
-    grid = {"log2_table_size": 24, "levels": 1, "base": 255, "finest": 255}
+    grid = {"log2_table_size": 24, "levels": 1, "base": 146, "finest": 146}
     return file_of(metadata(1, geometry=grid, radiance=grid), COMPACT)
 
 
@@ -116,14 +117,14 @@ def deepest_metadata() -> bytes:
 
 def nothing_there(codec: int) -> bytes:
     """Millions of Gaussians in a codec, and no byte of them."""
-    meta = metadata(FREE // 32 - 100)
+    meta = metadata(GAUSSIANS - 100)
     empty = dict.fromkeys(("POSI", "COLO", "SCAL", "OPAC"), (codec, b""))
     return file_of(meta, plain(metadata(0)) | empty)
 
 
 def ends_in_damage() -> bytes:
     """Millions of points, all alike, and one bit too many after them."""
-    return file_of(metadata(FREE // 32 - 100), COMPACT | {"POSI": (6, POINTS + b"\1")})
+    return file_of(metadata(GAUSSIANS - 100), COMPACT | {"POSI": (6, POINTS + b"\1")})
 
 
 SMALL = {

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from hyrfpack.cameras.files import camera_from_numbers, camera_to_numbers
 from hyrfpack.cameras.paths import Viewpoint, orbit
@@ -12,6 +16,8 @@ from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 
 KEPT = 128  # cameras that a trained model keeps
 ORBIT = 48  # cameras around a model that kept none
+COARSE = 14  # cameras that a small file keeps
+FINE = 500  # of the parts of the scene's box that they are right to, about
 
 
 def kept_cameras(cameras: Sequence[Camera]) -> list[list[float]]:
@@ -33,6 +39,30 @@ def provenance_of(scene: Scene, mean_exposure: bool = False) -> dict:
     if not needless:
         kept["max_size"] = scene.max_size
     return {**kept, "mean_exposure": True} if mean_exposure else kept
+
+
+def coarse(provenance: dict, scale: float) -> dict:
+    """A provenance as small files carry it: "coarse_cameras" instead of "cameras", and no more digits than it takes.
+
+    They are COARSE of the cameras, evenly spread, and stand where those stood to about 1 / FINE of the scene: enough to
+    look from there, not to train on. What cannot be read is left out.
+
+    Args:
+        scale: of the scene's box, world units.
+    """
+    kept = {name: value for name, value in provenance.items() if name != "cameras"}
+    with suppress(TypeError, ValueError, ArithmeticError, KeyError):
+        kept["viewpoint"] = Viewpoint.from_json(provenance["viewpoint"]).to_json(rounded=True)
+    with suppress(TypeError, ValueError, ArithmeticError, KeyError):
+        cameras = evenly_spaced([camera_from_numbers(numbers) for numbers in provenance["cameras"]], COARSE)
+        farthest = max((float(np.linalg.norm(camera.position)) for camera in cameras), default=0.0)
+        # A rotation that is rounded moves the camera by as much of its distance from the origin.
+        places = (
+            int(np.clip(np.ceil(np.log10(max(2 * farthest / scale, 1e-9) * FINE)), 4, 9)),
+            int(np.clip(np.ceil(np.log10(FINE / scale)), 0, 9)),
+        )
+        kept["coarse_cameras"] = [camera_to_numbers(camera, places) for camera in cameras]
+    return kept
 
 
 def has_mean_exposure(provenance: dict) -> bool:
@@ -57,7 +87,8 @@ class Capture:
 
     @property
     def cameras(self) -> list[Camera]:
-        """Those of the photos to train on, or else those that the file keeps, or else an orbit about what it shows.
+        """Those of the photos to train on, or else those that the file keeps, coarse ones if it has no others, or else
+        an orbit about what it shows.
 
         Raises:
             HyrfDataError: what the file says makes no sense.
@@ -67,7 +98,7 @@ class Capture:
         if self.made_up:
             return orbit(self.viewpoint, ORBIT)
         try:
-            return [camera_from_numbers(numbers) for numbers in self.facts["provenance"]["cameras"]]
+            return [camera_from_numbers(numbers) for numbers in self._kept or self._coarse]
         except (TypeError, ValueError, ArithmeticError) as error:
             raise HyrfDataError(
                 f"the cameras that the file keeps are not valid ({error!s:.160}); name the photos with --data"
@@ -76,7 +107,12 @@ class Capture:
     @property
     def made_up(self) -> bool:
         """Whether `cameras` is an orbit, because no camera is known."""
-        return not (self._photographed or self.facts["provenance"].get("cameras"))
+        return not (self._photographed or self._kept or self._coarse)
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether `cameras` are only about where photos were taken from, see `coarse`."""
+        return bool(not (self._photographed or self._kept) and self._coarse)
 
     @property
     def viewpoint(self) -> Viewpoint:
@@ -104,6 +140,14 @@ class Capture:
         stored = self.facts["provenance"].get("max_size")
         usable = isinstance(stored, int) and not isinstance(stored, bool) and stored >= 0
         return stored if usable else DEFAULT_MAX_SIZE
+
+    @property
+    def _kept(self) -> Any:
+        return self.facts["provenance"].get("cameras")
+
+    @property
+    def _coarse(self) -> Any:
+        return self.facts["provenance"].get("coarse_cameras")
 
     @property
     def _photographed(self) -> list[Camera]:

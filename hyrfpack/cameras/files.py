@@ -39,10 +39,24 @@ def camera_from_json(item: Mapping[str, Any]) -> Camera:
     return Camera(width, height, fx, fy, cx, cy, item["camera_from_world"])
 
 
-def camera_to_numbers(camera: Camera) -> list[float]:
-    """A camera as a short list: width, height, fx, fy, cx, cy and the 3 x 4 camera_from_world, rounded."""
-    pose = camera.camera_from_world[:3].ravel()
-    return [camera.width, camera.height, *map(_rounded, (*camera.intrinsics, *pose))]
+def camera_to_numbers(camera: Camera, places: tuple[int, int] | None = None) -> list[float]:
+    """A camera as a short list: width, height, fx, fy, cx, cy and the 3 x 4 camera_from_world, rounded.
+
+    Args:
+        places: behind the point of rotation (4 or more: it must stay one) and translation; intrinsics get one. By
+            default all get nine digits, or six places.
+    """
+    pose = camera.camera_from_world[:3].tolist()
+    if places is None:
+        return [
+            camera.width,
+            camera.height,
+            *map(rounded_number, (*camera.intrinsics, *(x for row in pose for x in row))),
+        ]
+    rotation, translation = places
+    rows = ([*(round(x, rotation) for x in row[:3]), round(row[3], translation)] for row in pose)
+    lens = (round(number, 1) for number in camera.intrinsics)
+    return [camera.width, camera.height, *lens, *(x + 0.0 for row in rows for x in row)]  # no -0.0
 
 
 def camera_from_numbers(numbers: Sequence[Any]) -> Camera:
@@ -135,6 +149,6 @@ def _focal_length(value: Any) -> float:
     return value
 
 
-def _rounded(number: float) -> float:
-    """To nine digits, or where these are not six behind the point, as with map coordinates, to six."""
+def rounded_number(number: float) -> float:
+    """A number to nine digits, or where these are not six behind the point, as with map coordinates, to six."""
     return float(f"{number:.9g}") if abs(number) < 1000 else round(float(number), 6)

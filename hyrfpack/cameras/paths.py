@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hyrfpack.cameras.files import LENS, camera_from_json
+from hyrfpack.cameras.files import LENS, camera_from_json, rounded_number
 from hyrfpack.scene import Camera
 
 WHOLE_CIRCLE = 270.0  # degrees of azimuth; cameras that cover more are taken to stand all around
@@ -87,9 +87,9 @@ class Viewpoint:
         camera = Camera(800, 600, focal, focal, 400.0, 300.0, look_at(position, middle, up))
         return cls(middle, up, camera, (0.0, 360.0)).checked()
 
-    def to_json(self) -> dict[str, Any]:
-        """A dictionary ready for JSON: the "viewpoint" of a file's provenance."""
-        return {
+    def to_json(self, rounded: bool = False) -> dict[str, Any]:
+        """A dictionary ready for JSON: the "viewpoint" of a file's provenance; `rounded`, by `rounded_number`."""
+        numbers = {
             "center": self.center.tolist(),
             "up": self.up.tolist(),
             "camera_from_world": self.camera.camera_from_world.tolist(),
@@ -98,6 +98,7 @@ class Viewpoint:
             "height": self.camera.height,
             "arc": list(self.arc),
         }
+        return _rounded(numbers) if rounded else numbers
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Viewpoint:
@@ -221,3 +222,12 @@ def _rotate(vector: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
     """Rodrigues' rotation about a unit axis, angle in radians."""
     cosine, sine = math.cos(angle), math.sin(angle)
     return vector * cosine + np.cross(axis, vector) * sine + axis * (axis @ vector) * (1 - cosine)
+
+
+def _rounded(value: Any) -> Any:
+    """Every number of nested dictionaries and lists by `rounded_number`."""
+    if isinstance(value, dict):
+        return {name: _rounded(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_rounded(item) for item in value]
+    return rounded_number(value) if isinstance(value, float) else value

@@ -268,7 +268,7 @@ def _print_report(path: Path, report: CompressionReport, scores: dict[str, float
     if report.found:
         click.echo(report.found)
     if report.error is not None:
-        click.echo(f"estimated loss: {report.error:.2g} mean squared error, {-10 * math.log10(report.error):.1f} dB")
+        click.echo(f"loss in pictures: {report.error:.2g} mean squared error, {-10 * math.log10(report.error):.1f} dB")
     if scores:
         click.echo(
             f"held-out photos: PSNR {scores['psnr_before']:.3f} to {scores['psnr']:.3f} dB, "
@@ -308,6 +308,9 @@ def _section_table(sections: list[dict], total: int, gaussians: int, shares: dic
         )
         if shares:
             rows[-1].append(f"{shares[tag]:.1%}" if tag in shares else "")
+    if shares:
+        left_out = sum(share for part, share in shares.items() if part not in together)
+        rows.append(["Gaussians left out", "", "", "", "", "", f"{left_out:.1%}"])
     return table([*header, *(["of the loss"] if shares else [])], rows)
 
 

@@ -10,21 +10,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 import torch
 
-from hyrfpack.cameras.capture import Capture, has_mean_exposure
+from hyrfpack.cameras.capture import Capture, coarse, has_mean_exposure
 from hyrfpack.checks import check_type
+from hyrfpack.compress.calibrate import Originals, calibrate, foretold
 from hyrfpack.compress.distortion import LIMITS, default_distortion
 from hyrfpack.compress.finetune import finetune, gains_of_photos
 from hyrfpack.compress.plan import make_plan
-from hyrfpack.compress.quantize import opacity_error, quantize
-from hyrfpack.compress.search import coarsest, finest
+from hyrfpack.compress.quantize import quantize
+from hyrfpack.compress.search import coarsest, fullest
 from hyrfpack.compress.sensitivity import Sensitivity, measure_sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
-from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import (
     DEFAULT_PROFILE,
     CompressionReport,
@@ -32,30 +31,33 @@ from hyrfpack.format.codec import (
     encode_model,
     load_with_provenance,
     repack,
-    without_cameras,
     write_model,
 )
-from hyrfpack.format.compact.quantized import Quantized
 from hyrfpack.format.info import describe
-from hyrfpack.format.sections import COLORS, OPACITIES, POSITIONS, SCALES
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
-from hyrfpack.render import render
-from hyrfpack.scene import Camera, Scene, View, evenly_spaced
+from hyrfpack.scene import Scene, View
 
 FINETUNED = 1.2  # times as much distortion, which fine-tuning takes back
-VERIFIED = 6  # cameras at which a file's pictures are compared with the model's
-TOLERATED, MENDED = 2.0, 4  # times the distortion asked for, and how often a finer file is made where it is more
-BLAMED = 0.7  # pruning, where pictures are off by less than this share without it
+TOLERATED, MENDED = 1.2, 3  # factor from the distortion asked for, and how often another file is made beyond it
+COARSER, FINER = 2.0, 16.0  # factors at most that another file differs by
 TRIALS, FINETUNED_TRIALS = 9, 4  # of a search
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A file that was made: its bytes, the error it adds by section, and dB of PSNR lost where that was measured."""
+    """A file that was made.
+
+    Attributes:
+        data: its bytes.
+        errors: what it adds to the pictures' mean squared error by section and by what is pruned, foretold.
+        error: what it adds to it, where pictures were compared.
+        lost: dB of PSNR, where that was measured.
+    """
 
     data: bytes
     errors: dict[str, float]
+    error: float = 0.0
     lost: float = 0.0
 
 
@@ -130,20 +132,22 @@ def compress(
     cameras = Capture(describe(source), data).cameras
     say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
     sensitivity = measure_sensitivity(model, cameras)
-    packer = Packer(model, without_cameras(provenance), sensitivity, data, finetune_steps, prune, say)
     start = distortion or default_distortion(provenance) * (FINETUNED if finetune_steps else 1)
+    originals = Originals.of(model, cameras)
+    sensitivity = calibrate(model, sensitivity, originals, start, prune)
+    packer = Packer(model, coarse(provenance, model.config.frame.scale), sensitivity, data, finetune_steps, prune, say)
     if target_bytes is not None:
         trial, found = packer.within_bytes(target_bytes, start)
     elif max_psnr_drop is not None:
         trial, found = packer.within_drop(max_psnr_drop, start)
     else:
-        trial, found = packer.attempt(start), ""
-        if not finetune_steps:
-            trial = packer.verified(trial, start, cameras)
+        trial, found = packer.attempt(start) if finetune_steps else packer.settled(start, originals), ""
     report = write_model(trial.data, target)
-    total = sum(trial.errors.values()) or 1.0
-    shares = {group: error / total for group, error in trial.errors.items()}
-    return dataclasses.replace(report, shares=shares, error=sum(trial.errors.values()), found=found)
+    total = sum(trial.errors.values())
+    shares = {part: error / (total or 1.0) for part, error in trial.errors.items()}
+    return dataclasses.replace(
+        report, shares=shares, error=trial.error or total, found=found, finetuned=finetune_steps > 0
+    )
 
 
 @dataclass
@@ -153,7 +157,7 @@ class Packer:
     Attributes:
         model: the model.
         provenance: that the files tell.
-        sensitivity: of the model, see `measure_sensitivity`.
+        sensitivity: of the model, see `calibrate`.
         scene: photos to fine-tune on; None where there are none.
         finetune_steps: of each file.
         prune: leave out Gaussians that cost more in bytes than they give to pictures.
@@ -184,39 +188,31 @@ class Packer:
             )
         quantized = quantize(planned, plan, self.sensitivity, reach=0 if self.finetune_steps else 1)
         data = encode_model(model, "compact", self.provenance, quantized=quantized)
-        return Trial(data, added_errors(planned, quantized, self.sensitivity))
+        return Trial(data, foretold(self.model, planned, quantized, self.sensitivity))
 
-    def verified(self, trial: Trial, wanted: float, cameras: Sequence[Camera]) -> Trial:
-        """The trial, or a finer one where its pictures turn out to be further off than `wanted` says.
+    def settled(self, wanted: float, originals: Originals) -> Trial:
+        """A file whose pictures are off by about as much as is `wanted`.
 
-        The estimate adds up errors that have nothing to do with each other. Where hundreds of faint Gaussians make up
-        a pixel, what pruning takes away and what rounding adds have the same sign.
+        Its parts were calibrated one by one; together they may do a little more or less.
         """
-        views = evenly_spaced(cameras, VERIFIED)
-        pictures = _pictures(self.model, views)
 
-        def off(trial: Trial) -> float:
-            return _difference(_pictures(decode_model(trial.data), views), pictures)
-
-        def say(error: float, mended: str) -> None:
-            self.say(f"pictures are off by {error:.2g} instead of {wanted:.2g}: {mended}")
-
-        distortion, error = wanted, off(trial)
-        if error > TOLERATED * wanted and self.prune:
-            self.prune = False
-            whole = self.attempt(wanted)
-            if (left := off(whole)) < BLAMED * error:
-                say(error, "nothing is pruned")
-                trial, error = whole, left
-            else:
-                self.prune = True
-        for _ in range(MENDED):
-            if error <= TOLERATED * wanted:
-                break
-            distortion *= max(wanted / error, 1 / 16)
-            say(error, f"finer, for {distortion:.2g}")
+        def attempt(distortion: float) -> Trial:
             trial = self.attempt(distortion)
-            error = off(trial)
+            return dataclasses.replace(trial, error=originals.error(decode_model(trial.data)))
+
+        trial, distortion = attempt(wanted), wanted
+        for _ in range(MENDED):
+            off = trial.error / wanted
+            if off == 0 or 1 / TOLERATED < off < TOLERATED:
+                break
+            distortion /= min(max(off, 1 / COARSER), FINER)
+            kind = "finer" if off > 1 else "coarser"
+            self.say(f"pictures are off by {trial.error:.2g} instead of {wanted:.2g}: {kind}, for {distortion:.2g}")
+            other = attempt(distortion)
+            if off > 1:
+                trial = other
+                continue
+            return other if other.error < TOLERATED * wanted else trial  # once: what no view sees has a limit, too
         return trial
 
     def within_bytes(self, limit: int, start: float) -> tuple[Trial, str]:
@@ -225,7 +221,7 @@ class Packer:
             self.say(f"distortion {distortion:.2g}: {len(trial.data):,} bytes")
             return trial
 
-        answer = finest(attempt, lambda trial: len(trial.data) <= limit, start, self._trials(), LIMITS)
+        answer = fullest(attempt, lambda trial: len(trial.data), limit, start, self._trials(), LIMITS)
         if answer is None:
             smallest = len(self.attempt(LIMITS[1]).data)
             raise HyrfError(
@@ -272,29 +268,3 @@ class Packer:
 
     def _trials(self) -> int:
         return FINETUNED_TRIALS if self.finetune_steps else TRIALS
-
-
-@torch.no_grad()
-def _pictures(model: HybridModel, cameras: Sequence[Camera]) -> list[torch.Tensor]:
-    decoded = model.decode()
-    return [render(model, camera, decoded=decoded).rgb for camera in cameras]
-
-
-def _difference(pictures: list[torch.Tensor], others: list[torch.Tensor]) -> float:
-    """Mean squared difference of the median view: in a single one some Gaussian may come too close to the camera."""
-    return float(np.median([float((a - b).square().mean()) for a, b in zip(pictures, others, strict=True)]))
-
-
-def added_errors(planned: HybridModel, quantized: Quantized, sensitivity: Sensitivity) -> dict[str, float]:
-    """What storing a planned model adds to the pictures' mean squared error, by section and by estimate."""
-    wanted, stored, s = to_arrays(planned), quantized.arrays(), sensitivity.of(quantized.plan.kept)
-    weights = {COLORS: np.repeat(s.colors, 3), SCALES: s.scales, **s.fields}
-    # A point is anywhere in its cell.
-    bits = np.concatenate([layer.points.bits[layer.points.classes] for layer in quantized.plan.layers])
-    _, opacity = opacity_error(planned, wanted[OPACITIES][:, 0].astype(np.float64), s.opacities)
-    errors = {OPACITIES: float(opacity(slice(None), stored[OPACITIES][:, 0]).sum())}
-    errors[POSITIONS] = float((s.positions * 3 / 12 * 4.0**-bits).sum())
-    for group, weight in weights.items():
-        difference = stored[group].ravel().astype(np.float64) - wanted[group].ravel()
-        errors[group] = float((weight * difference**2).sum())
-    return errors

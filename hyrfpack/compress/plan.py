@@ -37,9 +37,7 @@ def make_plan(model: HybridModel, sensitivity: Sensitivity, distortion: float, p
     each = distortion / sum(parameter.numel() for parameter in model.parameters())
     kept = np.arange(len(cube))
     if prune:
-        with torch.no_grad():
-            opacities = model.decode_geometry().opacities.double().cpu().numpy()
-        kept = np.flatnonzero(~negligible(sensitivity.opacities, opacities, each))
+        kept = np.flatnonzero(removal_error(model, sensitivity) >= ERROR_PER_BIT * each * BITS_OF_A_GAUSSIAN)
     of_kept = sensitivity.of(kept)
     classes = importance_classes(of_kept)
     bits = position_bits(of_kept.positions, classes, each)
@@ -102,15 +100,15 @@ def position_bits(sensitivity: np.ndarray, classes: np.ndarray, distortion: floa
     return bits
 
 
-def negligible(sensitivity: np.ndarray, opacities: np.ndarray, distortion: float) -> np.ndarray:
-    """(N,) bool: Gaussians whose removal adds less error than their bits are worth.
+@torch.no_grad()
+def removal_error(model: HybridModel, sensitivity: Sensitivity) -> np.ndarray:
+    """(N,) what leaving out each Gaussian adds to the pictures' mean squared error.
 
-    Args:
-        sensitivity: (N,) by the opacity logits; by the opacity o itself it is s / (o (1 - o))^2.
-        opacities: (N,) in [0, 1].
+    By the opacity o itself the sensitivity is s / (o (1 - o))^2, s being that by its logit.
     """
-    by_opacity = sensitivity / np.maximum(opacities * (1 - opacities), 1e-4) ** 2
-    return by_opacity * opacities**2 < ERROR_PER_BIT * distortion * BITS_OF_A_GAUSSIAN
+    opacities = model.decode_geometry().opacities.double().cpu().numpy()
+    by_opacity = sensitivity.opacities / np.maximum(opacities * (1 - opacities), 1e-4) ** 2
+    return sensitivity.removals * by_opacity * opacities**2
 
 
 def color_basis(colors: np.ndarray) -> np.ndarray:

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 
 from hyrfpack.atomic import write_atomic
-from hyrfpack.cameras.capture import Capture
+from hyrfpack.cameras.capture import Capture, coarse
+from hyrfpack.compress.calibrate import Originals, calibrate
 from hyrfpack.compress.distortion import LIMITS, default_distortion
 from hyrfpack.compress.quantize import decide
 from hyrfpack.compress.report_page import FILES, PAGE, PLOT, SHOWN, Findings, Point, ShownView, page, picture_names
@@ -28,7 +29,6 @@ from hyrfpack.format.codec import (
     decode_model,
     encode_model,
     load_with_provenance,
-    without_cameras,
 )
 from hyrfpack.format.info import describe
 from hyrfpack.measure.machine import machine, machine_line
@@ -45,7 +45,7 @@ PHOTOS, VIEWPOINTS = 24, 12  # scored at most
 VISIBLE = 0.4  # rms difference that the worst shown view is amplified to, at most
 MOST_AMPLIFIED = 64
 TURNS = 3  # of timing each file
-CHOSEN = "this file"
+CHOSEN, SAME = "this file", "compact, the same distortion"
 
 
 def write_report(
@@ -92,7 +92,8 @@ def write_report(
     if len(model):
         cameras = Capture(describe(source), scene).cameras
         curve = _finer_and_coarser(model, provenance, cameras, _distortion(facts, model, provenance))
-    same = [name for name, other in curve.items() if other == data]  # the file itself, where it is on the curve
+    # The file itself stands for the one of its distortion, unless it was fine-tuned, and so is off the curve.
+    same = [SAME] if SAME in curve and report.profile == "compact" and not report.finetuned else []
     files = {CHOSEN: data, **profiles, **{name: other for name, other in curve.items() if name not in same}}
     points, decoded = _measured(files, scored)
 
@@ -145,7 +146,7 @@ def _distortion(facts: dict, model: HybridModel, provenance: dict) -> float:
 def _profiles(model: HybridModel, provenance: dict, done: str) -> dict[str, bytes]:
     """The model in the profiles without settings to choose, but for the one that is done."""
     files = {}
-    for profile, kept in (("raw", provenance), ("paper", without_cameras(provenance))):
+    for profile, kept in (("raw", provenance), ("paper", coarse(provenance, model.config.frame.scale))):
         with suppress(HyrfError):  # half precision does not hold every model
             if profile != done:
                 files[profile] = encode_model(model, profile, kept)
@@ -156,13 +157,15 @@ def _finer_and_coarser(
     model: HybridModel, provenance: dict, cameras: Sequence[Camera], distortion: float
 ) -> dict[str, bytes]:
     """The model in profile "compact", finest first."""
-    sensitivity = measure_sensitivity(model, cameras)
+    sensitivity = calibrate(
+        model, measure_sensitivity(model, cameras), Originals.of(model, cameras), distortion, prune=True
+    )
     files = {}
     for factor in FACTORS if len(model) < LARGE else FACTORS[1:-1]:
         share = f"{Fraction(factor)} of the distortion" if factor < 1 else f"{factor} times the distortion"
         quantized = decide(model, sensitivity, float(np.clip(factor * distortion, *LIMITS)))
-        name = "compact, the same distortion" if factor == 1 else f"compact, {share}"
-        files[name] = encode_model(model, "compact", without_cameras(provenance), quantized=quantized)
+        name = SAME if factor == 1 else f"compact, {share}"
+        files[name] = encode_model(model, "compact", coarse(provenance, model.config.frame.scale), quantized=quantized)
     return files
 
 

@@ -223,6 +223,9 @@ def _parts(report: CompressionReport) -> list[Element]:
         bits = f"{8 * after / numbers:.2f}" if numbers else ""
         loss = f"{report.shares[tag]:.1%}" if tag in report.shares else ""
         rows.append([names.get(tag, tag), f"{before:,}", f"{after:,}", f"{after / total:.1%}", bits, loss])
+    if report.shares:
+        left_out = sum(share for part, share in report.shares.items() if part not in sizes)
+        rows.append(["Gaussians left out", "", "0", "0.0%", "", f"{left_out:.1%}"])
     rest = total - sum(after for _, after in sizes.values())
     rows.append(["header, table of contents, padding", "", f"{rest:,}", f"{rest / total:.1%}", "", ""])
     rows.append(["the whole file", f"{report.bytes_before:,}", f"{total:,}", "100.0%", "", ""])

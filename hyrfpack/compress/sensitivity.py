@@ -9,19 +9,21 @@ import numpy as np
 import torch
 
 from hyrfpack.cameras.between import views_between
-from hyrfpack.format.arrays import GROUPS
-from hyrfpack.format.sections import MLPS, TABLES
+from hyrfpack.format.arrays import GROUPS, to_arrays
+from hyrfpack.format.sections import COLORS, MLPS, OPACITIES, POSITIONS, SCALES, TABLES
 from hyrfpack.model import HybridModel, expand
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, evenly_spaced
 
-DRAWN = 6_000_000  # Gaussians drawn in all views together, about: more views of smaller models
-FEWEST, MOST = 6, 192  # views
-FIELD_VIEWS = 1 / 6  # share of the views that the fields are measured on; each counts for many Gaussians there
+DRAWN = 3_000_000  # Gaussians drawn in all views together, about: more views of smaller models
+FEWEST, MOST = 6, 96  # views
+FIELD_VIEWS = 1 / 2  # share of the views that the fields are measured on; each counts for many Gaussians there
 TRUSTED = 8.0  # views that the guess from size, opacity and place counts for
 CELLS = 32  # of the cube, along each axis, in which guess and measurement are brought together
 NEAREST = 0.05  # local units
 LEAST = 1e-2  # of a decoder's number, against the mean of its decoder
+WITHOUT = 1e-6  # error that zeros for a whole decoder add at least: where all is saturated, no slope tells
+PRUNED = "pruned"  # what is not stored, beside the sections
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,7 @@ class Sensitivity:
         colors: (N,) by a colour logit, mean of the three.
         scales, opacities: (N,) by the explicit logits.
         fields: by the numbers of each hash table and decoder, laid out as in the file, by section.
+        removals: factor of what leaving out a Gaussian adds, to what its `opacities` say.
     """
 
     positions: np.ndarray
@@ -43,11 +46,28 @@ class Sensitivity:
     scales: np.ndarray
     opacities: np.ndarray
     fields: dict[str, np.ndarray]
+    removals: float = 1.0
 
     def of(self, index: np.ndarray | slice) -> Sensitivity:
         """That of the Gaussians at `index` (n,) int64, and of all fields."""
         explicit = self.positions[index], self.colors[index], self.scales[index], self.opacities[index]
-        return Sensitivity(*explicit, self.fields)
+        return Sensitivity(*explicit, self.fields, self.removals)
+
+    def times(self, factors: dict[str, float]) -> Sensitivity:
+        """Each section's, and what is PRUNED, multiplied by its factor; 1 where there is none."""
+        positions, colors, scales, opacities = (
+            values * factors.get(group, 1.0)
+            for group, values in (
+                (POSITIONS, self.positions),
+                (COLORS, self.colors),
+                (SCALES, self.scales),
+                (OPACITIES, self.opacities),
+            )
+        )
+        fields = {group: values * factors.get(group, 1.0) for group, values in self.fields.items()}
+        # What an opacity weighs is no measure of a removal's own factor.
+        removals = self.removals * factors.get(PRUNED, 1.0) / factors.get(OPACITIES, 1.0)
+        return Sensitivity(positions, colors, scales, opacities, fields, removals)
 
 
 def measure_sensitivity(model: HybridModel, cameras: Sequence[Camera], seed: int = 0) -> Sensitivity:
@@ -119,7 +139,12 @@ def _gathered(
     }
     # Both numbers of a row are read together.
     fields |= {group: fields[group].reshape(-1, 2).mean(axis=1).repeat(2) for group in TABLES}
-    fields |= {group: np.maximum(fields[group], LEAST * fields[group].mean()) for group in MLPS}
+    arrays = to_arrays(model)
+    for group in MLPS:
+        least = max(
+            LEAST * fields[group].mean(), WITHOUT / max(float(np.square(arrays[group], dtype=float).sum()), 1e-30)
+        )
+        fields[group] = np.maximum(fields[group], least)
     positions, colors, scales, opacities = explicit
     return Sensitivity(positions, colors, scales, opacities, fields)
 

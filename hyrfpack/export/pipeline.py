@@ -109,8 +109,9 @@ def export(
     read = Source.read(source, data)
     if kind is PAGE and not baked:
         return write_native_page(read, source, target, say)
-    if kind in (TRANSFORMS, COLMAP) and not read.cameras:
-        raise HyrfError(f"{source}: it keeps no cameras; export them from the file that training wrote, or name --data")
+    if kind in (TRANSFORMS, COLMAP) and (read.coarse or not read.cameras):
+        kept = "only coarse cameras" if read.coarse else "no cameras"
+        raise HyrfError(f"{source}: it keeps {kept}; export them from the file that training wrote, or name --data")
     if kind is TRANSFORMS:
         return _export_cameras(read, target)
     points = kind in (COLMAP, *POINTS)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hyrfpack.cameras.between import views_between
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.paths import Viewpoint, common_direction, look_at, orbit
 from hyrfpack.errors import HyrfDataError, HyrfError
@@ -20,6 +21,7 @@ FITTED = 256  # cameras at most that colours are fitted at: each takes memory an
 MEASURED = 12  # views at most that a loss is measured at
 HELD_OUT = 8  # every so many of the cameras that a file keeps are not fitted, but measured at
 FEW = 16  # cameras, of which none can be spared
+BETWEEN = 4  # places beside each coarse camera that are fitted, too
 RING, LIFTS = 24, (-0.2, 0.0, 0.2)  # cameras around what kept none: in rings, raised by so much of their distance
 TURNED = 0.5  # length of the mean downward direction up to which pictures count as turned against each other
 
@@ -31,6 +33,7 @@ class Source:
     Attributes:
         model: the model.
         cameras: those it was trained on, by name; empty where the file keeps none and there are no photos.
+        coarse: whether they are only about where these were, as small files keep them: not to train on.
         fitted: those that colours shall be fitted at; where none are known, some around what the model shows.
         measured: cameras to measure at, with their photos where there are any. None of them is fitted, but where
             there are fewer than FEW in all.
@@ -45,6 +48,7 @@ class Source:
     up: np.ndarray
     center: np.ndarray
     error: float
+    coarse: bool = False
 
     @classmethod
     def read(cls, path: str | os.PathLike[str], data: Scene | None = None) -> Source:
@@ -79,7 +83,11 @@ class Source:
         spare = cameras[::HELD_OUT] if len(cameras) >= FEW else cameras
         fitted = [c for number, c in enumerate(cameras) if number % HELD_OUT] if len(cameras) >= FEW else cameras
         measured = [(camera, None) for camera in evenly_spaced(spare, MEASURED)]
-        return cls(model, named, fitted, measured, _up_of(cameras, up), center, stated)
+        if capture.is_coarse:
+            # Too few to fit harmonics to by themselves: what lies between them counts more than where they stand.
+            between = [camera for seed in range(BETWEEN) for camera in views_between(cameras, seed)]
+            fitted = [*cameras, *between, *_around(viewpoint, center, up)]
+        return cls(model, named, fitted, measured, _up_of(cameras, up), center, stated, capture.is_coarse)
 
 
 def _up_of(cameras: list[Camera], up: np.ndarray) -> np.ndarray:

@@ -12,12 +12,13 @@ import numpy as np
 import torch
 
 from hyrfpack.atomic import write_atomic
+from hyrfpack.cameras.capture import coarse
 from hyrfpack.checks import check_type
 from hyrfpack.device import choose_device
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import compact, paper, raw
 from hyrfpack.format.arrays import RULES, check_rules, group_shapes, parse_config, to_model
-from hyrfpack.format.container import Container, Section, read_container, write_container
+from hyrfpack.format.container import Container, Section, raw_limit, read_container, write_container
 from hyrfpack.format.info import SectionSize, section_sizes
 from hyrfpack.format.metadata import Metadata, read_metadata
 from hyrfpack.format.sections import LAYERED, METADATA, POSITIONS, SECTIONS, group_and_layer, layer_section
@@ -32,6 +33,8 @@ PROFILES: dict[str, Callable[..., tuple[list[Section], dict]]] = {
     "compact": compact.encode,
 }
 DEFAULT_PROFILE = "compact"  # of `compress`
+# Gaussians that a file may have: so many for each of its bytes, and some that are free, as equal ones take no bytes.
+GAUSSIANS_A_BYTE, FREE_GAUSSIANS = 32, 1 << 18
 DECODERS = {**raw.DECODERS, **paper.DECODERS}  # of codecs that need no other section
 
 
@@ -45,9 +48,11 @@ class CompressionReport:
         bytes_before: of all parameters as float32.
         bytes_after: of the file.
         sections: bytes of each section before and after; header, table of contents and padding are the rest.
-        shares: of "compact", by section: what part of the error in pictures comes from it, by estimate.
-        error: of "compact": the mean squared error that pictures get, by estimate, colours in [0, 1].
+        shares: of "compact": what part of the error in pictures comes from each section, and from what is "pruned".
+        error: of "compact": the mean squared error that pictures got, colours in [0, 1]; by estimate where the file was
+            not drawn.
         found: in words, what a search came to.
+        finetuned: of "compact": whether its numbers were fitted to photos.
     """
 
     profile: str
@@ -58,6 +63,7 @@ class CompressionReport:
     shares: dict[str, float] = field(default_factory=dict)
     error: float | None = None
     found: str = ""
+    finetuned: bool = False
 
 
 def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | None = None, **settings: Any) -> bytes:
@@ -82,7 +88,19 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
     layers = counts if len(counts) > 1 else []
     metadata = Metadata(profile, sum(counts), model.config.to_dict(), RULES, used, provenance or {}, layers=layers)
     is_new = profile == "compact"  # all else is read by readers of version 1.0 too
-    return write_container([metadata.to_section(deflate=is_new), *sections], minor=int(is_new))
+    sections = [metadata.to_section(deflate=is_new), *sections]
+    stored, raw_length = (sum(sizes) for sizes in zip(*((len(s.data), s.raw_length) for s in sections), strict=True))
+    if raw_length > raw_limit(stored) or sum(counts) > most_gaussians(stored):
+        raise HyrfError(
+            f"{raw_length:,} bytes of numbers, nearly all alike, would take only {stored:,}, and readers do not "
+            "unpack so much from so few; keep this model as profile raw"
+        )
+    return write_container(sections, minor=int(is_new))
+
+
+def most_gaussians(file_length: int) -> int:
+    """Most Gaussians that a file of `file_length` bytes may hold."""
+    return GAUSSIANS_A_BYTE * file_length + FREE_GAUSSIANS
 
 
 def decode_model(
@@ -167,24 +185,20 @@ def repack(
     fraction: float | None = None,
     **settings: Any,
 ) -> CompressionReport:
-    """Rewrite a `.hyrf` file with profile "raw" or "paper"; its provenance goes along.
+    """Rewrite a `.hyrf` file with profile "raw" or "paper"; its provenance goes along, see `coarse`.
 
     Arguments and errors as `encode_model`, `load` and `save`.
     """
     Outputs(source, overwrite=True).file(target)
     model, provenance = load_with_provenance(source, fraction)
-    return save(model, target, profile, provenance if profile == "raw" else without_cameras(provenance), **settings)
+    kept = provenance if profile == "raw" else coarse(provenance, model.config.frame.scale)
+    return save(model, target, profile, kept, **settings)
 
 
 def load_with_provenance(path: str | os.PathLike[str], fraction: float | None = None) -> tuple[HybridModel, dict]:
     """A model and where it comes from. Arguments and errors as `load`."""
     with Container.open(path, SECTIONS, fraction) as container:
         return _decode(container), read_metadata(container).provenance
-
-
-def without_cameras(provenance: dict) -> dict:
-    """Provenance as small files carry it: the cameras are what compression is measured with, and it is done."""
-    return {name: value for name, value in provenance.items() if name != "cameras"}
 
 
 def _decode(container: Container) -> HybridModel:
@@ -222,6 +236,11 @@ def _decode(container: Container) -> HybridModel:
         raise HyrfFormatError(
             f"{name}: the first {needed:,} of {container.length:,} bytes make a model, and only "
             f"{container.available:,} are there or allowed; take more of the file"
+        )
+    if sum(layers[:there]) > (most := most_gaussians(container.available)):
+        raise HyrfFormatError(
+            f"{name}: it says {sum(layers[:there]):,} Gaussians, and so few bytes may hold {most:,}; the file is "
+            "damaged, copy or write it again"
         )
     sections = {tag: container[tag] for tag in wanted}
     arrays: dict[str, np.ndarray] = {}

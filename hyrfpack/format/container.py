@@ -29,9 +29,9 @@ MAX_SECTIONS = 1024
 MAX_FILE_BYTES = 1 << 34
 MAX_RAW_BYTES = 1 << 34
 # Decoded bytes a file may promise: deflate, the densest common coder, tops out at 1032:1; the constant lets a
-# small file hold large constant arrays.
+# small file hold large tables of which little is read.
 MAX_EXPANSION = 1024
-FREE_RAW_BYTES = 1 << 28
+FREE_RAW_BYTES = 3 << 24
 
 _HEADER = struct.Struct("<8sHHIQQIII")
 _CHECKSUM = struct.Struct("<I")

@@ -2,16 +2,27 @@ from __future__ import annotations
 
 import json
 import math
+import zlib
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scenes import ball_scene, ring
 
-from hyrfpack.cameras.capture import KEPT, ORBIT, Capture, has_mean_exposure, kept_cameras, provenance_of
+from hyrfpack.cameras.capture import (
+    COARSE,
+    FINE,
+    KEPT,
+    ORBIT,
+    Capture,
+    coarse,
+    has_mean_exposure,
+    kept_cameras,
+    provenance_of,
+)
 from hyrfpack.cameras.paths import Viewpoint, orbit
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.scene import Camera
+from hyrfpack.scene import Camera, evenly_spaced
 
 
 def facts(**provenance) -> dict:
@@ -54,6 +65,47 @@ def test_photos_come_before_the_cameras_that_are_kept_and_these_before_an_orbit(
         assert len(capture.cameras) == 3 and not capture.made_up
     assert Capture(facts()).made_up and len(Capture(facts()).cameras) == ORBIT
     assert not Capture(facts(), scene).made_up
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 250.0])
+@pytest.mark.parametrize("away", [0.0, 3e4])
+def test_coarse_cameras_stand_about_where_the_cameras_stood(scale, away):
+    cameras = []
+    for camera in ring(40):
+        pose = camera.camera_from_world.copy()
+        pose[:3, 3] = -pose[:3, :3] @ (scale * (camera.position + away))
+        cameras.append(replace(camera, camera_from_world=pose))
+    provenance = {"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json(), "seed": 3}
+
+    kept = json.loads(json.dumps(coarse(provenance, scale)))
+
+    capture = Capture(facts(**kept))
+    assert {*kept} == {"coarse_cameras", "viewpoint", "seed"} and capture.is_coarse and not capture.made_up
+    assert len(capture.cameras) == COARSE and coarse(kept, scale) == kept
+    for rough, exact in zip(capture.cameras, evenly_spaced(cameras, COARSE), strict=True):
+        assert np.linalg.norm(rough.position - exact.position) < 3 * scale / FINE
+        np.testing.assert_allclose(rough.rotation, exact.rotation, atol=1e-4)
+        np.testing.assert_allclose(rough.intrinsics, exact.intrinsics, atol=0.051)
+    center = capture.viewpoint.center - Viewpoint.of(cameras).center
+    assert np.abs(center).max() < 1e-6 * scale * max(away, 1)
+
+
+def test_coarse_cameras_take_about_30_bytes_each():
+    cameras = [replace(camera, fx=71.23456789, fy=71.3) for camera in ring(40)]
+    kept = coarse({"cameras": kept_cameras(cameras)}, 1.0)
+    assert len(zlib.compress(json.dumps(kept["coarse_cameras"]).encode(), 9)) < 45 * COARSE
+
+
+def test_cameras_and_viewpoints_that_make_no_sense_are_left_out():
+    assert coarse({"cameras": [[1, 2]], "viewpoint": 7, "steps": 5}, 1.0) == {"viewpoint": 7, "steps": 5}
+    assert coarse({"cameras": "none", "seed": 1}, 1.0) == {"seed": 1}
+    assert coarse({}, 1.0) == {}
+
+
+def test_exact_cameras_come_before_coarse_ones():
+    rough = coarse({"cameras": kept_cameras(ring(3))}, 1.0)
+    capture = Capture(facts(cameras=kept_cameras(ring(5)), **rough))
+    assert len(capture.cameras) == 5 and not capture.is_coarse
 
 
 def test_a_viewpoint_that_is_not_asked_for_is_not_looked_at():

@@ -88,7 +88,7 @@ def test_compact_is_the_default_and_smaller_than_the_paper_profile(run, packed, 
 def test_compress_prints_every_section_and_what_it_costs(run, tmp_path):
     printed = succeeded("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf").stdout
     words = ("positions", "geometry hash table", "radiance decoder", "padding", "bits/Gaussian", "bits/number")
-    for word in (*words, "of the loss", "estimated loss"):
+    for word in (*words, "of the loss", "loss in pictures"):
         assert word in printed
 
 

@@ -6,6 +6,7 @@ import json
 import re
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from hyrfpack.export.kinds import COLMAP, ENDINGS, PLAYER, chosen, kind_of
 from hyrfpack.export.measure import likeness
 from hyrfpack.export.source import Source
 from hyrfpack.format import load, save
+from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.model import Frame
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, Picture, Scene
@@ -248,6 +250,13 @@ def photographed(model, cameras) -> Scene:
     return Scene("made up", "colmap", views[::2], views[1::2], np.zeros((0, 3)), np.zeros((0, 3), np.float32))
 
 
+def without_cameras(source: Path, target: Path) -> Path:
+    """A copy of a model's file that does not say where its photos were taken."""
+    model, provenance = load_with_provenance(source)
+    save(model, target, provenance={name: value for name, value in provenance.items() if name != "cameras"})
+    return target
+
+
 def told_of(unit: float, judged: str, folder) -> tuple[str, ExportReport]:
     """What an export to .spz says last of forty Gaussians in a unit of length, and its report."""
     frame = Frame((0, 0, 0), unit, (1.0, 1.0, 1.0))
@@ -255,8 +264,7 @@ def told_of(unit: float, judged: str, folder) -> tuple[str, ExportReport]:
     cameras = [moved(camera, unit, (0, 0, 0)) for camera in ring(8)]
     source, said = write(folder / "model.hyrf", model, cameras), []
     if judged == "made-up viewpoints":
-        hyrfpack.compress(source, folder / "compact.hyrf", distortion=1e-7)
-        source = folder / "compact.hyrf"
+        source = without_cameras(source, folder / "bare.hyrf")
     data = photographed(model, cameras) if judged == "photos" else None
     report = export(source, folder / "a.spz", degree=0, data=data, say=said.append)
     return said[-1], report
@@ -329,18 +337,25 @@ def compact(plain, tmp_path_factory):
 
 @pytest.mark.parametrize("name", ["cameras.json", "colmap"])
 def test_cameras_that_a_file_does_not_keep_are_one_sentence_or_come_from_photos(name, compact, tmp_path, no_bake):
-    with pytest.raises(HyrfError, match=r"compact\.hyrf: it keeps no cameras; [^\n]*--data$"):
+    with pytest.raises(HyrfError, match=r"compact\.hyrf: it keeps only coarse cameras; [^\n]*--data$"):
         export(compact, tmp_path / name)
     assert list(tmp_path.iterdir()) == []
     if name.endswith(".json"):
         assert export(compact, tmp_path / name, data=ball_scene(5)).cameras == 5
 
 
-def test_a_compact_file_is_baked_and_measured_around_the_scene(compact, tmp_path):
+def test_a_compact_file_is_baked_and_measured_from_where_its_photos_were_taken(compact, tmp_path):
     said = []
     report = export(compact, tmp_path / "a.spz", degree=1, say=said.append)
+    assert re.fullmatch(r"fitting colours of degree 1 at \d+ cameras", said[0])
+    assert report.views > 0 and report.psnr > 25
+    assert export(compact, tmp_path / "a.points.ply").cameras == len(FOUR)
+
+
+def test_a_file_without_cameras_is_baked_and_measured_around_the_scene(plain, tmp_path):
+    said = []
+    report = export(without_cameras(plain, tmp_path / "bare.hyrf"), tmp_path / "a.spz", degree=1, say=said.append)
     assert "keeps no cameras" in said[0] and report.views > 0 and report.psnr > 25
-    assert export(compact, tmp_path / "a.points.ply").cameras == 0
 
 
 # -- refusals come before the work, and nothing is half done -----------------------------------------------------------

@@ -66,6 +66,7 @@ def read(data: bytes, part: bool = False) -> tuple[dict[str, Any], dict[str, np.
     used = 1
     while used < len(layers) and all(sections[section_type(group, used)].whole for group in LAYERED):
         used += 1
+    need(sum(layers[:used]) <= 32 * len(data) + 2**18, "META: too many Gaussians for so few bytes")
 
     matrices: dict[str, list[np.ndarray]] = {group: [] for group in MATRIX_CODECS}
     points: dict[int, Points] = {}
@@ -200,7 +201,7 @@ def read_container(data: bytes, part: bool = False) -> dict[str, Section]:
         sections[name] = Section(name, codec, raw_length, stored_length, crc, data[offset:padded], padded <= len(data))
         expected, raw_total = padded, raw_total + raw_length * sections[name].whole
     need(expected == length, "bytes after the last section")
-    need(raw_total <= min(1024 * len(data) + 2**28, 2**34), "sections too large")
+    need(raw_total <= min(1024 * len(data) + 3 * 2**24, 2**34), "sections too large")
     return sections
 
 

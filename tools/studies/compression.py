@@ -1,10 +1,12 @@
 """What profile `compact` takes beside `paper`, on trained models: by itself, at no more loss, and fine-tuned.
 
     python -m tools.studies.train_sets --steps 3000 --sets gerrard_hall        models in runs/sets/3000
-    python -m tools.studies.compression --models runs/sets/3000 --finetune 1000
+    python -m tools.studies.compression --models runs/sets/3000 --finetune 1000 --matched
 
-For each set below --models: the profiles by their defaults; the smallest `compact` file that loses no more PSNR and no
-more SSIM than `paper` does on held-out photos; and the same after fine-tuning. Losses are against the model as trained.
+For each set below --models: the profiles by their defaults, and how far the error that was foretold is from the one at
+held-out cameras; with --matched the smallest `compact` file that loses no more PSNR and no more SSIM than `paper` does
+on held-out photos; with --finetune a fine-tuned one. Losses are against the model as trained, at the exposure that
+photos beside the held-out ones predict where photos' exposures were learnt.
 """
 
 from __future__ import annotations
@@ -16,27 +18,39 @@ import time
 from pathlib import Path
 
 import hyrfpack
+from hyrfpack.cameras.capture import coarse, has_mean_exposure
+from hyrfpack.compress.calibrate import Originals, calibrate
 from hyrfpack.compress.distortion import default_distortion
-from hyrfpack.compress.packer import FINETUNED, Packer
+from hyrfpack.compress.packer import FINETUNED, Packer, Trial
 from hyrfpack.compress.search import coarsest
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.format import decode_model, encode_model
-from hyrfpack.format.codec import load_with_provenance, without_cameras
+from hyrfpack.format.codec import load_with_provenance
+from hyrfpack.model import HybridModel
+from hyrfpack.scene import evenly_spaced
 from tools.studies.train_sets import DATA
 from tools.tables import markdown
 
 ENDS = (1e-7, 1e-2)
+HELD_OUT = 12  # cameras at most that the error foretold is compared at
 
 
 @dataclasses.dataclass(frozen=True)
 class Made:
-    """A file that was made and what it loses: dB of PSNR and SSIM, mean over held-out photos."""
+    """A file that was made and what it loses: dB of PSNR and SSIM, mean over held-out photos.
+
+    `foretold` and `found` are mean squared errors against the model's own pictures: by estimate, and at held-out
+    cameras.
+    """
 
     distortion: float
     bytes: int
+    gaussians: int
     drop: float
     ssim_drop: float
     seconds: float
+    foretold: float = 0.0
+    found: float = 0.0
 
 
 class Set:
@@ -46,41 +60,57 @@ class Set:
         self.name = folder.name
         self.scene = hyrfpack.load_scene(data)
         self.model, provenance = load_with_provenance(folder / "model.hyrf")
-        self.provenance = without_cameras(provenance)
-        self.raw = hyrfpack.evaluate(self.model, self.scene.test)
+        self.provenance = coarse(provenance, self.model.config.frame.scale)
+        self.exposed = self.scene.train if has_mean_exposure(provenance) else ()
+        self.raw = self.scores(self.model)
+        self.held_out = Originals.seen([view.camera for view in evenly_spaced(self.scene.test, HELD_OUT)], self.model)
         start = time.perf_counter()
-        self.sensitivity = measure_sensitivity(self.model, [view.camera for view in self.scene.train])
+        cameras = [view.camera for view in self.scene.train]
+        self.sensitivity, self.originals = measure_sensitivity(self.model, cameras), Originals.of(self.model, cameras)
         self.measuring = time.perf_counter() - start
 
-    def made(self, data: bytes, distortion: float, start: float) -> Made:
+    def scores(self, model: HybridModel) -> tuple[float, float]:
+        """PSNR and SSIM on the held-out photos."""
+        scores = hyrfpack.evaluate(model, self.scene.test, training=self.exposed)
+        if scores.psnr_predicted is None or scores.ssim_predicted is None:
+            return scores.psnr, scores.ssim
+        return scores.psnr_predicted, scores.ssim_predicted
+
+    def made(self, data: bytes, distortion: float, start: float, trial: Trial | None = None) -> Made:
         seconds = time.perf_counter() - start
-        scores = hyrfpack.evaluate(decode_model(data), self.scene.test)
-        return Made(distortion, len(data), self.raw.psnr - scores.psnr, self.raw.ssim - scores.ssim, seconds)
+        model = decode_model(data)
+        psnr, ssim = self.scores(model)
+        foretold = sum(trial.errors.values()) if trial else 0.0
+        losses = self.raw[0] - psnr, self.raw[1] - ssim
+        return Made(distortion, len(data), len(model), *losses, seconds, foretold, self.held_out.error(model))
 
     def paper(self) -> Made:
         start = time.perf_counter()
         return self.made(encode_model(self.model, "paper", self.provenance), 0, start)
 
     def compact(self, distortion: float, steps: int = 0) -> Made:
+        """As `hyrfpack compress` does it."""
         start = time.perf_counter()
-        packer = Packer(self.model, self.provenance, self.sensitivity, self.scene, steps, True, lambda sentence: None)
-        return self.made(packer.attempt(distortion).data, distortion, start)
+        sensitivity = calibrate(self.model, self.sensitivity, self.originals, distortion)
+        packer = Packer(self.model, self.provenance, sensitivity, self.scene, steps, True, lambda sentence: None)
+        trial = packer.attempt(distortion) if steps else packer.settled(distortion, self.originals)
+        return self.made(trial.data, distortion, start, trial)
 
-    def measure(self, steps: int) -> dict:
+    def measure(self, steps: int, matched: bool) -> dict:
         """The row of this set."""
         distortion = default_distortion(self.provenance)
         paper, default = self.paper(), self.compact(distortion)
-        row = {"set": self.name, "gaussians": len(self.model), "psnr": self.raw.psnr, "ssim": self.raw.ssim}
+        row = {"set": self.name, "gaussians": len(self.model), "psnr": self.raw[0], "ssim": self.raw[1]}
         row |= {"measuring": self.measuring, "paper": paper, "default": default}
 
         def fits(made: Made) -> bool:
             return made.drop <= paper.drop and made.ssim_drop <= paper.ssim_drop
 
-        found = coarsest(self.compact, fits, distortion, 9, ENDS)
-        row["matched"] = found and found[1]
+        if matched:
+            found = coarsest(self.compact, fits, distortion, 9, ENDS)
+            row["matched"] = found and found[1]
         if steps:
-            found = coarsest(lambda value: self.compact(value, steps), fits, FINETUNED * distortion, 3, ENDS)
-            row["finetuned"] = found and found[1]
+            row["finetuned"] = self.compact(FINETUNED * distortion, steps)
         return {key: dataclasses.asdict(value) if isinstance(value, Made) else value for key, value in row.items()}
 
 
@@ -98,8 +128,11 @@ def table(rows: list[dict]) -> str:
                 continue
             share = "" if kind == "paper" else f" ({made['bytes'] / row['paper']['bytes']:.3f})"
             cells.append(f"{made['bytes']:,}{share}, {made['drop']:+.3f}, {made['ssim_drop']:+.4f}")
+        default = row["default"]
+        cells.append(f"{default['found'] / default['foretold']:.2f}")
+        cells.append(f"{row['measuring']:.1f} + {default['seconds']:.1f}")
         lines.append(cells)
-    return markdown(columns, lines)
+    return markdown([*columns, "found / foretold", "seconds"], lines)
 
 
 def main() -> None:
@@ -110,13 +143,14 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=DATA, help="where the photos are, by the same names")
     parser.add_argument("--sets", nargs="*", help="(all)")
     parser.add_argument("--finetune", type=int, default=0, metavar="N", help="also fine-tune for N steps (0)")
+    parser.add_argument("--matched", action="store_true", help="also search for the file that loses as little as paper")
     parser.add_argument("--json", type=Path, help="write the rows there")
     options = parser.parse_args()
     rows = []
     for folder in sorted(path.parent for path in options.models.glob("*/model.hyrf")):
         if options.sets and folder.name not in options.sets:
             continue
-        rows.append(Set(folder, options.data / folder.name).measure(options.finetune))
+        rows.append(Set(folder, options.data / folder.name).measure(options.finetune, options.matched))
         print(table(rows[-1:]), flush=True)
         if options.json:
             options.json.write_text(json.dumps(rows, indent=1))

@@ -18,7 +18,7 @@ export const MOST_SECTIONS = 1024;
 const MOST_BYTES = 2 ** 34; // of a file, and of what it decodes to
 // Decoded bytes that a file may promise: so many for each of its own, and some that are free.
 const EXPANSION = 1024;
-const FREE_BYTES = 2 ** 28;
+const FREE_BYTES = 3 * 2 ** 24;
 
 const MOST_LAYERS = 8;
 export const LAYERED_TYPES = ["POSI", "COLO", "SCAL", "OPAC"];

@@ -11,6 +11,9 @@ import { decodeFloat16, decodeFloat32, decodeMinMax, decodeVectors } from "./pla
 
 export { HyrfFormatError };
 
+// Gaussians that a file may have: so many for each of its bytes, and some that are free.
+const GAUSSIANS_A_BYTE = 32, FREE_GAUSSIANS = 2 ** 18;
+
 /**
  * @typedef {import("./container.js").Entry} Entry
  * @typedef {import("./grids.js").FieldName} FieldName
@@ -103,20 +106,24 @@ const readModel = (container) => {
     incompleteFile(container, Math.max(...wanted.map(({ type }) => entryOf(container, type).end)));
   }
 
+  const layers = counts.slice(0, there), count = layers.reduce((sum, each) => sum + each, 0);
+  if (count > GAUSSIANS_A_BYTE * container.bytes.length + FREE_GAUSSIANS) {
+    damagedFile(`it says ${count} Gaussians, too many for its bytes`);
+  }
+
   /** @type {Map<string, Float32Array>} */
   const arrays = new Map();
   /** @type {LatticePoints[]} */
   const points = []; // of each layer that has its positions on a lattice
   for (const section of wanted) arrays.set(section.type, decodeSection(container, section, config, points));
 
-  const layers = counts.slice(0, there);
   /** @param {string} type */
   const joined = (type) => joinedArrays(layers.map((_, layer) => arrayOf(arrays, layerType(type, layer))));
   const [positions, colorLogits, scaleLogits, opacityLogits] = LAYERED_TYPES.map(joined);
   return {
     metadata,
     config,
-    count: layers.reduce((sum, count) => sum + count, 0),
+    count,
     layers,
     whole: there === counts.length,
     positions,

@@ -32,13 +32,15 @@ export function viewpointOf(metadata) {
   const viewpoint = storedViewpoint(provenance.viewpoint) ?? checkedViewpoint(frameViewpoint(center, scale)) ??
     frameViewpoint([0, 0, 0], 1);
   const up = unit3(viewpoint.up), { target } = viewpoint;
-  const kept = storedCameras(provenance.cameras);
+  const [exact, coarse] = [provenance.cameras, provenance.coarse_cameras].map(storedCameras);
+  const kept = exact.length ? exact : coarse;
   if (!kept.length) {
     const others = orbitCameras(viewpoint, ORBIT_CAMERAS).filter((_, number) => number % 2 === 1);
     const cameras = evenlySpaced(others, SHOWN_CAMERAS);
     return { cameras, fitted: ringCameras(viewpoint, up), up, target, madeUp: true };
   }
-  const fitted = evenlySpaced(kept, FITTED_CAMERAS);
+  // A few coarse cameras are too few to fit colours to: rings about the scene say what lies between them.
+  const fitted = [...evenlySpaced(kept, FITTED_CAMERAS), ...(exact.length ? [] : ringCameras(viewpoint, up))];
   return { cameras: evenlySpaced(kept, SHOWN_CAMERAS), fitted, up: upOfCameras(kept, up), target, madeUp: false };
 }
 

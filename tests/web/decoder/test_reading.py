@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 import torch
 from forged_files import (
+    COMPACT,
     FREE,
+    GAUSSIANS,
     SMALL,
     channel,
     file_of,
@@ -478,23 +480,33 @@ def test_every_file_of_the_corpus_gets_the_same_verdict():
     assert len(refused) > 50
 
 
-def test_what_sections_may_decode_to_is_bounded():
+@pytest.mark.parametrize(
+    ("count", "a_byte", "words"),
+    [(50_000, 1024, "say they decode to"), (0, 32, "Gaussians")],
+    ids=["bytes", "Gaussians"],
+)
+def test_what_sections_may_decode_to_is_bounded(count, a_byte, words):
     """At the bound POSI is found empty; a Gaussian more is refused before it is looked at."""
-    empty = dict.fromkeys(("POSI", "COLO", "SCAL", "OPAC"), (1, b""))
-    payloads = plain(metadata(0)) | empty
+    grid = {"log2_table_size": 24, "levels": 1, "base": 144 if count else 2, "finest": 144 if count else 2}
+    empty = dict.fromkeys(("POSI", "COLO", "SCAL", "OPAC"), (1, b"")) | {
+        "GTAB": COMPACT["GTAB"],
+        "RTAB": COMPACT["RTAB"],
+    }
+    decoders = {group: part for group, part in plain(metadata(0)).items() if group.endswith("MLP")}
 
     def file_and_slack(count: int) -> tuple[bytes, int]:
-        data = file_of(metadata(count), payloads)
+        data = file_of(metadata(count, geometry=grid, radiance=grid), decoders | empty)
         raw = sum(entry.raw_length for entry in read_container(data, SECTIONS, fraction=0).entries.values())
-        return data, FREE + 1024 * len(data) - raw
+        return data, (FREE + 1024 * len(data) - raw) // 32 if a_byte == 1024 else GAUSSIANS + 32 * len(data) - count
 
-    count = 8_000_000
-    count += file_and_slack(count)[1] // 32
+    for _ in range(3):  # a longer number makes a longer file
+        count += file_and_slack(count)[1]
     files = [file_and_slack(count + step)[0] for step in (0, 1)]
     at, beyond = in_javascript([(data, False) for data in files])
 
     assert at.refused.startswith("Section 'POSI'") and "'POSI'" in in_python(files[0]).refused
-    assert "say they decode to" in beyond.refused and "say they decode to" in in_python(files[1]).refused
+    assert words in beyond.refused and words in in_python(files[1]).refused
+    assert "'POSI'" not in beyond.refused
 
 
 def test_what_is_not_there_may_promise_anything():

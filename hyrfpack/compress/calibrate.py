@@ -1,0 +1,196 @@
+"""What storing a model does to pictures, measured on pictures, part by part: what sensitivities alone do not see.
+
+A sensitivity is a derivative: it foretells the error of small errors that have nothing to do with each other. Of what
+packing does, three things are neither. Gaussians that move swap their order before a camera, which adds an error in
+proportion to the step and not to its square. What pruning takes away always has the same sign. And where opacity or
+transmittance saturates, errors end early. So each part of a plan is tried by itself, drawn, compared with the model,
+and its sensitivities are multiplied by what was found over what was foretold, until they foretell it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyrfpack.cameras.between import views_between
+from hyrfpack.compress.plan import make_plan, removal_error
+from hyrfpack.compress.quantize import opacity_error, quantize
+from hyrfpack.compress.sensitivity import PRUNED, Sensitivity
+from hyrfpack.format.arrays import by_parameter, to_arrays
+from hyrfpack.format.compact.quantized import Quantized
+from hyrfpack.format.sections import COLORS, MLPS, OPACITIES, POSITIONS, SCALES, TABLES
+from hyrfpack.model import HybridModel
+from hyrfpack.render import render
+from hyrfpack.scene import Camera, evenly_spaced
+
+DRAWN = 120_000  # Gaussians drawn in the views of one comparison, about
+FEWEST, MOST = 4, 6  # views of it
+ROUNDS = 5  # of correcting
+CLOSE = 1.2  # factor within which the largest parts shall be foretold
+MINOR = 0.03  # share of the distortion below which a part is left as it is
+FARTHEST = 64.0  # factor of one correction
+# What is tried by itself. A decoder has too few numbers for an error that is more than luck: it goes with its table.
+Part = tuple[str, ...]
+PARTS: tuple[Part, ...] = ((POSITIONS,), (COLORS,), (SCALES, OPACITIES), *zip(TABLES, MLPS, strict=True))
+# Powers of found over foretold by which sensitivities are corrected. Errors of small independent numbers fall with the
+# square of their steps: 1. Those of swapped orders fall with the step: up to 2. What is pruned adds up: from 1/2.
+LAWS: dict[Part, float] = {(POSITIONS,): 1.5, (PRUNED,): 0.7}
+
+
+@dataclass
+class Factor:
+    """What a part's sensitivities are multiplied by, searched for.
+
+    Attributes:
+        law: the power of found over foretold to go on by.
+        value: the factor to be tried.
+        low, high: the greatest that was seen to be too small, and the least that was seen not to be.
+        done: whether errors are foretold well enough.
+    """
+
+    law: float
+    value: float = 1.0
+    low: float = 0.0
+    high: float = np.inf
+    done: bool = False
+
+    def correct(self, ratio: float) -> None:
+        """Go on, by the error found over the error foretold with `value`."""
+        if ratio > 1:
+            self.low = max(self.low, self.value)
+        else:
+            self.high = min(self.high, self.value)
+        if 1 / CLOSE < ratio < CLOSE:
+            self.done = True
+        elif self.high < CLOSE * self.low:
+            self.value, self.done = self.high, True
+        else:
+            further = self.value * min(max(ratio, 1 / FARTHEST), FARTHEST) ** self.law
+            self.value = further if self.low < further < self.high else (self.low * self.high) ** 0.5
+
+    @property
+    def final(self) -> float:
+        """The factor to take: one that was tried and is enough, where there is such a one."""
+        return self.value if self.done or self.high == np.inf else self.high
+
+
+@dataclass(frozen=True)
+class Originals:
+    """A model's pictures, that those of what is stored of it are compared with.
+
+    Attributes:
+        views: where from.
+        pictures: of each, (H, W, 3) in [0, 1].
+    """
+
+    views: list[Camera]
+    pictures: list[Tensor]
+
+    @classmethod
+    def of(cls, model: HybridModel, cameras: Sequence[Camera], seed: int = 1) -> Originals:
+        """Of a model: half at some of its cameras, half between them."""
+        count = int(np.clip(DRAWN // max(len(model), 1), FEWEST, MOST)) // 2
+        near = evenly_spaced(cameras, count)
+        return cls.seen([*near, *views_between(near, seed)], model)
+
+    @classmethod
+    def seen(cls, views: list[Camera], model: HybridModel) -> Originals:
+        """A model's pictures from these views."""
+        return cls(views, _pictures(model, views))
+
+    def error(self, model: HybridModel) -> float:
+        """Mean squared difference of colours in the median view: in a single one a Gaussian may come too close."""
+        pairs = zip(_pictures(model, self.views), self.pictures, strict=True)
+        return float(np.median([float((mine - theirs).square().mean()) for mine, theirs in pairs]))
+
+
+def calibrate(
+    model: HybridModel, sensitivity: Sensitivity, originals: Originals, distortion: float, prune: bool = True
+) -> Sensitivity:
+    """Sensitivities by which a plan for about so large a distortion foretells what its pictures show.
+
+    Args:
+        sensitivity: first-order, from `measure_sensitivity`.
+        originals: pictures of the model.
+        distortion, prune: as `make_plan` takes them.
+
+    Raises:
+        HyrfError: a parameter is NaN or infinite.
+    """
+    # Pruning first: what the others do depends on what is left.
+    for parts in (((PRUNED,),), PARTS) if prune else (PARTS,):
+        factors = {part: Factor(LAWS.get(part, 1.0)) for part in parts}
+        for _ in range(ROUNDS):
+            scaled = sensitivity.times({name: factor.value for part, factor in factors.items() for name in part})
+            plan = make_plan(model, scaled, distortion, prune)
+            planned = plan.apply(model)
+            quantized = quantize(planned, plan, scaled)
+            told = foretold(model, planned, quantized, scaled)
+            found = _found(model, planned, quantized, originals, [part for part in parts if not factors[part].done])
+            for part, error in found.items():
+                expected = sum(told[name] for name in part)
+                if expected > 0 and max(error, expected) > MINOR * distortion:
+                    factors[part].correct(error / expected)
+                else:
+                    factors[part].done = True
+            if all(factor.done for factor in factors.values()):
+                break
+        sensitivity = sensitivity.times({name: factor.final for part, factor in factors.items() for name in part})
+    return sensitivity
+
+
+def foretold(
+    model: HybridModel, planned: HybridModel, quantized: Quantized, sensitivity: Sensitivity
+) -> dict[str, float]:
+    """What storing a model adds to the pictures' mean squared error, by section and by what is pruned; by estimate."""
+    plan = quantized.plan
+    wanted, stored, s = to_arrays(planned), quantized.arrays(), sensitivity.of(plan.kept)
+    weights = {COLORS: np.repeat(s.colors, 3), SCALES: s.scales, **s.fields}
+    # A point is anywhere in its cell.
+    bits = np.concatenate([layer.points.bits[layer.points.classes] for layer in plan.layers])
+    _, opacity = opacity_error(planned, wanted[OPACITIES][:, 0].astype(np.float64), s.opacities)
+    errors = {PRUNED: float(np.delete(removal_error(model, sensitivity), plan.kept).sum())}
+    errors[OPACITIES] = float(opacity(slice(None), stored[OPACITIES][:, 0]).sum())
+    errors[POSITIONS] = float((s.positions * 3 / 12 * 4.0**-bits).sum())
+    for group, weight in weights.items():
+        difference = stored[group].ravel().astype(np.float64) - wanted[group].ravel()
+        errors[group] = float((weight * difference**2).sum())
+    return errors
+
+
+def _found(
+    model: HybridModel, planned: HybridModel, quantized: Quantized, originals: Originals, parts: Sequence[Part]
+) -> dict[Part, float]:
+    """As `foretold`, drawn and compared: each of some parts changed by itself."""
+    left = _with_positions(planned, model.gaussians.positions.detach()[torch.as_tensor(quantized.plan.kept)])
+    if parts == [(PRUNED,)]:
+        return {parts[0]: originals.error(left)}
+    whole = Originals.seen(originals.views, left)
+    stored = quantized.arrays()
+    errors: dict[Part, float] = {}
+    for part in parts:
+        if part == (POSITIONS,):
+            errors[part] = whole.error(planned)
+        else:
+            changed = deepcopy(left)
+            changed.load_state_dict(dict(by_parameter({name: stored[name] for name in part}, changed)), strict=False)
+            errors[part] = whole.error(changed)
+    return errors
+
+
+def _with_positions(model: HybridModel, positions: Tensor) -> HybridModel:
+    moved = deepcopy(model)
+    with torch.no_grad():
+        moved.gaussians.positions.copy_(positions)
+    return moved
+
+
+@torch.no_grad()
+def _pictures(model: HybridModel, cameras: Sequence[Camera]) -> list[Tensor]:
+    decoded = model.decode()
+    return [render(model, camera, decoded=decoded).rgb for camera in cameras]

@@ -1,0 +1,141 @@
+"""Errors that sensitivities foretell, held to pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scenes import ball_points, ring, small_model
+
+from hyrfpack.compress.calibrate import Originals, calibrate, foretold
+from hyrfpack.compress.plan import make_plan, removal_error
+from hyrfpack.compress.quantize import decide
+from hyrfpack.compress.sensitivity import PRUNED, Sensitivity, measure_sensitivity
+from hyrfpack.format import decode_model, encode_model
+from hyrfpack.format.sections import COLORS, OPACITIES, POSITIONS
+from hyrfpack.model import HybridModel
+
+CAMERAS = ring(8, width=48, height=48)
+ELSEWHERE = ring(7, width=40, height=40)
+
+
+def layers(count: int = 1500) -> HybridModel:
+    """Half-transparent Gaussians of all colours that lie in each other: what is seen is who is first."""
+    rng = np.random.default_rng(5)
+    return small_model(
+        ball_points(count)[0],
+        fields=0.2,
+        color_logits=rng.normal(0, 3, size=(count, 3)),
+        scale_logits=-2.0,
+        opacity_logits=rng.normal(0, 1, size=(count, 1)),
+    )
+
+
+def forecast(model: HybridModel, sensitivity: Sensitivity, distortion: float) -> tuple[float, float]:
+    """What a file adds to pictures by estimate, and at viewpoints that no estimate has seen."""
+    quantized = decide(model, sensitivity, distortion)
+    decoded = decode_model(encode_model(model, "compact", quantized=quantized))
+    told = foretold(model, quantized.plan.apply(model), quantized, sensitivity)
+    return sum(told.values()), Originals.of(model, ELSEWHERE).error(decoded)
+
+
+@pytest.fixture(scope="module")
+def model() -> HybridModel:
+    return layers()
+
+
+@pytest.fixture(scope="module")
+def first_order(model) -> Sensitivity:
+    return measure_sensitivity(model, CAMERAS)
+
+
+@pytest.mark.parametrize("distortion", [1e-3, 1e-5])
+def test_where_gaussians_swap_their_order_the_loss_is_foretold_to_a_third(distortion, model, first_order):
+    sensitivity = calibrate(model, first_order, Originals.of(model, CAMERAS), distortion)
+
+    told, found = forecast(model, sensitivity, distortion)
+
+    assert 2 / 3 < told / found < 3 / 2 and 2 / 3 < found / distortion < 3 / 2
+
+
+def test_without_it_the_loss_is_not_foretold(model, first_order):
+    told, found = forecast(model, first_order, 1e-5)
+
+    assert found > 2 * told
+
+
+def test_what_is_right_already_stays(model, first_order):
+    originals = Originals.of(model, CAMERAS)
+    once = calibrate(model, first_order, originals, 1e-4)
+
+    again = calibrate(model, once, originals, 1e-4)
+
+    for part in ("colors", "scales", "opacities"):
+        np.testing.assert_allclose(getattr(again, part), getattr(once, part), rtol=0.3)
+
+
+def test_factors_go_to_their_parts():
+    sensitivity = Sensitivity(*np.ones((4, 3)), {"RTAB": np.ones(4)})
+
+    scaled = sensitivity.times({POSITIONS: 2.0, OPACITIES: 4.0, "RTAB": 3.0, PRUNED: 5.0})
+
+    assert [values.tolist() for values in (scaled.positions, scaled.colors, scaled.opacities)] == [
+        [2.0] * 3,
+        [1.0] * 3,
+        [4.0] * 3,
+    ]
+    assert scaled.fields["RTAB"].tolist() == [3.0] * 4 and sensitivity.times({}).removals == 1
+
+
+def test_what_a_removal_costs_has_a_factor_of_its_own(model, first_order):
+    before = removal_error(model, first_order)
+
+    np.testing.assert_allclose(removal_error(model, first_order.times({OPACITIES: 7.0})), before, rtol=1e-12)
+    np.testing.assert_allclose(removal_error(model, first_order.times({PRUNED: 3.0})), 3 * before, rtol=1e-12)
+
+
+def test_where_pruning_darkens_pictures_more_than_the_sum_of_squares_less_is_pruned():
+    """Many faint Gaussians in one place: each alone is nothing, and all of them are what is seen."""
+    rng = np.random.default_rng(2)
+    model = small_model(
+        rng.normal(0, 0.2, size=(3000, 3)),
+        color_logits=3.0,
+        scale_logits=-2.0,
+        opacity_logits=rng.normal(-5, 1, (3000, 1)),
+    )
+    sensitivity = measure_sensitivity(model, CAMERAS)
+    distortion = 1e-4
+
+    calibrated = calibrate(model, sensitivity, Originals.of(model, CAMERAS), distortion)
+
+    assert len(make_plan(model, calibrated, distortion).kept) > 2 * len(make_plan(model, sensitivity, distortion).kept)
+    told, found = forecast(model, calibrated, distortion)
+    assert found < 2 * distortion and told < 2 * distortion
+
+
+def test_a_single_view_that_is_far_off_does_not_decide(model):
+    originals = Originals.of(model, CAMERAS)
+    broken = [torch.ones_like(picture) if n == 0 else picture for n, picture in enumerate(originals.pictures)]
+
+    assert Originals(originals.views, broken).error(model) == 0.0
+
+
+def test_parts_that_do_nothing_are_left_alone():
+    """Nobody sees it: nothing is found, and nothing divided by."""
+    model = small_model(ball_points(40)[0] * 0.1 + np.array([0.0, 0.0, 500.0]))
+    sensitivity = measure_sensitivity(model, CAMERAS)
+
+    calibrated = calibrate(model, sensitivity, Originals.of(model, CAMERAS), 1e-4)
+
+    for name in ("positions", "colors", "scales", "opacities"):
+        np.testing.assert_array_equal(getattr(calibrated, name), getattr(sensitivity, name))
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_one_and_two_cameras_will_do(count, model, first_order):
+    originals = Originals.of(model, CAMERAS[:count])
+
+    calibrated = calibrate(model, first_order, originals, 1e-4)
+
+    assert all(np.isfinite(values).all() for values in (calibrated.positions, calibrated.colors))
+    assert COLORS not in calibrated.fields
