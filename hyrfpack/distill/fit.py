@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-import math
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -16,11 +14,11 @@ import torch
 
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
-from hyrfpack.cameras.between import small_camera
+from hyrfpack.cameras.between import small_camera, views_between
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.checks import check_float, check_int, check_type
-from hyrfpack.compress.packer import Packer, Trial
-from hyrfpack.compress.search import coarsest
+from hyrfpack.compress.calibrate import Originals, calibrate
+from hyrfpack.compress.packer import Packer
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.distill.start import initial_model
@@ -38,16 +36,14 @@ from hyrfpack.train.config import LARGEST_SEED, DensityConfig, LearningRates, Tr
 from hyrfpack.train.progress import ProgressLine
 from hyrfpack.train.trainer import Trainer
 
+DECIDING = 3  # viewpoints to decide by, for each that is held out: means of few of them differ by a dB
 TEST_EVERY = 8  # of given cameras, one in so many is held out
 LIT_FROM = 64  # views at which it is measured what each Gaussian gives to pictures
 UNSEEN = 0.01  # of all light, what the faintest Gaussians together may send: they are left out
-FINETUNE = 0.5  # steps of fitting what is packed, for each step before
 REGRESSED, LEAST_REGRESSED = 250, 0.2  # steps from which on the first regression is whole, and its least share
-ESTIMATED = 0.5  # of what packing may add, to ask for: Gaussians that are left out together are missed more
-LEAST_DISTORTION = 0.5  # of the error before packing, or of the one allowed, that packing may add in any case
-# Times as much as it may add, fine-tuned and plain: at views to learn from, which are better than others.
-TOLERATED, TOLERATED_PLAIN = 1.1, 0.7
-PLAIN, PLAIN_ENDS = 1 / 16, (1 / 1024, 1.0)  # of it, to ask for without fine-tuning: first, at the least and most
+PACKED = 0.8  # of what packing may add, to ask for
+LEAST_ADDED = 0.25  # of the error before packing, that packing may add in any case
+HOPELESS = 0.5  # of the error allowed, that it may add where that is passed already
 TRIALS = 5  # files that are made so
 # Warm: small steps from a model that is nearly right.
 RATES = LearningRates(
@@ -64,7 +60,7 @@ class DistillConfig:
     """What decides the outcome of a distillation, besides the splats.
 
     Attributes:
-        steps: optimiser steps of fitting to the original's pictures, one each; half as many follow while packing.
+        steps: optimiser steps of fitting to the original's pictures, one each.
         psnr: dB of held-out pictures against the original's that the file is made for: higher takes more bytes.
         size: pixels of the longer side of pictures.
         train_views, test_views: how many viewpoints are made up, to teach (at most) and to score.
@@ -167,7 +163,7 @@ def distill_splats(
 
     Without cameras viewpoints are made up (`viewpoints`). The faintest Gaussians, as seen from there, are left out;
     the fields are fitted to the others' shapes and colours (`initial_model`), the whole is fitted to pictures of the
-    original, and what is packed is fitted again. Same splats and settings, same bytes.
+    original. Same splats and settings, same bytes.
 
     Args:
         splats: in any units, anywhere.
@@ -186,7 +182,7 @@ def distill_splats(
     Outputs(overwrite=True).file(target)
     weighted = Weighted.of(splats, name)
     original = Drawable.of(splats, weighted.frame)
-    train, test = _cameras(weighted, original, config, cameras)
+    train, deciding, test = _cameras(weighted, original, config, cameras)
     say(
         f"{len(splats):,} Gaussians, harmonics of degree {splats.degree}; {len(train)} viewpoints "
         f"{'made up' if cameras is None else 'given'} to teach with, {len(test)} held out"
@@ -208,7 +204,7 @@ def distill_splats(
     imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
     provenance = {"steps": config.steps, "seed": config.seed, "psnr": unpacked, "choices": {"imported": imported}}
     provenance["viewpoint"] = Viewpoint.of(train).to_json()
-    _pack(model, target, scene, original, provenance, config, cache, say)
+    _pack(model, target, train, deciding, original, provenance, config, say)
     decoded = hyrf_format.load(target)
     scores = likeness(decoded, original, test)
     if _below(_mean(scores), config.psnr):
@@ -231,19 +227,22 @@ def distill_splats(
 
 def _cameras(
     weighted: Weighted, drawable: Drawable, config: DistillConfig, cameras: Sequence[Camera] | None
-) -> tuple[list[Camera], list[Camera]]:
-    """To teach with, and held out; of fewer than two given ones, the same."""
+) -> tuple[list[Camera], list[Camera], list[Camera]]:
+    """To teach with, to decide by, and held out; of fewer than two given ones, the same. None decides and scores."""
     if cameras is None:
-        taught = math.ceil((1 + FINETUNE) * config.steps)  # pictures, and more than that are not looked at
-        counts = min(config.train_views, max(LIT_FROM, taught)), config.test_views
-        train, test = (
-            viewpoints(weighted, drawable, count, config.size, 2 * config.seed + held_out)
-            for held_out, count in enumerate(counts)
+        # More pictures than steps are not looked at.
+        taught = min(config.train_views, max(LIT_FROM, config.steps))
+        # Seeds that no other config.seed leads to.
+        seeds = 2 * config.seed, 2 * (LARGEST_SEED + 1) + config.seed, 2 * config.seed + 1
+        train, deciding, test = (
+            viewpoints(weighted, drawable, count, config.size, seed)
+            for count, seed in zip((taught, DECIDING * config.test_views, config.test_views), seeds, strict=True)
         )
-        return train, test
+        return train, deciding, test
     fitting = [small_camera(camera, config.size) for camera in cameras]
     test = fitting[::TEST_EVERY]
-    return [camera for number, camera in enumerate(fitting) if number % TEST_EVERY] or test, test
+    train = [camera for number, camera in enumerate(fitting) if number % TEST_EVERY] or test
+    return train, views_between(evenly_spaced(train, config.test_views), config.seed), test
 
 
 def _lit(light: np.ndarray) -> np.ndarray:
@@ -264,36 +263,28 @@ def _fit_to_pictures(model: HybridModel, scene: Scene, config: DistillConfig, ca
 def _pack(
     model: HybridModel,
     target: str | os.PathLike[str],
-    scene: Scene,
+    cameras: Sequence[Camera],
+    views: Sequence[Camera],
     original: Drawable,
     provenance: dict,
     config: DistillConfig,
-    cache: PictureCache,
     say: Callable[[str], None],
 ) -> None:
-    """Write a model as small as the quality asked for allows, as training views tell."""
-    cameras = [view.camera for view in scene.train]
-    views = evenly_spaced(cameras, config.test_views)
+    """Write a model as small as the quality asked for allows, as `views` tell that it has not learnt from."""
     allowed, error = _mse(config.psnr), _mse(_mean(likeness(model, original, views)))
-    room = max(allowed - error, LEAST_DISTORTION * min(allowed, error))
+    room = max(allowed - error, min(LEAST_ADDED * error, HOPELESS * allowed))
     say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
-    sensitivity = measure_sensitivity(model, cameras)
-    packer = Packer(model, provenance, sensitivity, scene, max(1, round(FINETUNE * config.steps)), True, say, cache)
-
-    @functools.cache
-    def attempt(distortion: float) -> Trial:
-        return packer.attempt(distortion)
-
-    def fits(trial: Trial, tolerated: float = TOLERATED_PLAIN) -> bool:
-        return _mse(_mean(likeness(decode_model(trial.data), original, views))) - error <= tolerated * room
-
-    trial = packer.attempt(ESTIMATED * room)
-    if not fits(trial, TOLERATED):  # fine-tuning saves bytes, but takes too large steps for models that are very near
-        packer.finetune_steps = 0
-        say("packing cost more than it may: once more, finer and without fine-tuning")
-        ends = PLAIN_ENDS[0] * room, PLAIN_ENDS[1] * room
-        found = coarsest(attempt, fits, PLAIN * room, TRIALS, ends)
-        trial = attempt(ends[0]) if found is None else found[1]
+    originals, wanted = Originals.of(model, cameras), PACKED * room
+    sensitivity = calibrate(model, measure_sensitivity(model, cameras), originals, wanted)
+    packer = Packer(model, provenance, sensitivity, scene=None, finetune_steps=0, prune=True, say=say)
+    trial = packer.settled(wanted, originals)
+    for _ in range(TRIALS):
+        off = _mse(_mean(likeness(decode_model(trial.data), original, views))) - error
+        if off <= room:
+            break
+        wanted *= max(PACKED * room / off, 1 / 16)
+        say(f"packing adds {off:.2g} to the error instead of {room:.2g}: finer, for {wanted:.2g}")
+        trial = packer.attempt(wanted)
     write_atomic(target, trial.data)  # only now: an interrupt leaves what was there before
 
 
