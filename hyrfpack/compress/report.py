@@ -91,9 +91,10 @@ def write_report(
     curve = {}
     if len(model):
         cameras = Capture(describe(source), scene).cameras
-        curve = _finer_and_coarser(model, provenance, cameras, _distortion(facts, model, provenance))
-    # The file itself stands for the one of its distortion, unless it was fine-tuned, and so is off the curve.
-    same = [SAME] if SAME in curve and report.profile == "compact" and not report.finetuned else []
+        # The file itself stands for the one of its distortion, unless it was fine-tuned, and so is off the curve.
+        itself = data if report.profile == "compact" and not report.finetuned else None
+        curve = _finer_and_coarser(model, provenance, cameras, _distortion(facts, model, provenance), itself)
+    same = [name for name, other in curve.items() if other is data]
     files = {CHOSEN: data, **profiles, **{name: other for name, other in curve.items() if name not in same}}
     points, decoded = _measured(files, scored)
 
@@ -154,14 +155,17 @@ def _profiles(model: HybridModel, provenance: dict, done: str) -> dict[str, byte
 
 
 def _finer_and_coarser(
-    model: HybridModel, provenance: dict, cameras: Sequence[Camera], distortion: float
+    model: HybridModel, provenance: dict, cameras: Sequence[Camera], distortion: float, same: bytes | None
 ) -> dict[str, bytes]:
-    """The model in profile "compact", finest first."""
+    """The model in profile "compact", finest first; `same` is the file of this distortion, where there is one."""
     sensitivity = calibrate(
         model, measure_sensitivity(model, cameras), Originals.of(model, cameras), distortion, prune=True
     )
     files = {}
     for factor in FACTORS if len(model) < LARGE else FACTORS[1:-1]:
+        if factor == 1 and same is not None:
+            files[SAME] = same
+            continue
         share = f"{Fraction(factor)} of the distortion" if factor < 1 else f"{factor} times the distortion"
         quantized = decide(model, sensitivity, float(np.clip(factor * distortion, *LIMITS)))
         name = SAME if factor == 1 else f"compact, {share}"

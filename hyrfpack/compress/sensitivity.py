@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from hyrfpack.cameras.between import views_between
-from hyrfpack.format.arrays import GROUPS, to_arrays
+from hyrfpack.format.arrays import GROUPS
 from hyrfpack.format.sections import COLORS, MLPS, OPACITIES, POSITIONS, SCALES, TABLES
 from hyrfpack.model import HybridModel, expand
 from hyrfpack.render import render
@@ -139,12 +139,10 @@ def _gathered(
     }
     # Both numbers of a row are read together.
     fields |= {group: fields[group].reshape(-1, 2).mean(axis=1).repeat(2) for group in TABLES}
-    arrays = to_arrays(model)
+    parameters = dict(model.named_parameters())
     for group in MLPS:
-        least = max(
-            LEAST * fields[group].mean(), WITHOUT / max(float(np.square(arrays[group], dtype=float).sum()), 1e-30)
-        )
-        fields[group] = np.maximum(fields[group], least)
+        size = sum(float(parameters[name].detach().double().square().sum()) for name in GROUPS[group])
+        fields[group] = np.maximum(fields[group], max(LEAST * fields[group].mean(), WITHOUT / max(size, 1e-30)))
     positions, colors, scales, opacities = explicit
     return Sensitivity(positions, colors, scales, opacities, fields)
 
