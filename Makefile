@@ -9,7 +9,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 PEERS := tests/node/node_modules/.ready
 
-.PHONY: help demo test test-newest test-oldest docs player bench gpu speed sets choices ablations precision kill fuzz fuzz-browser lint format clean
+.PHONY: help demo test test-browsers test-newest test-oldest docs player bench gpu speed sets choices ablations precision kill fuzz fuzz-browser lint format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -37,6 +37,9 @@ demo: $(READY) ## train, compress and render a small made-up scene; results in d
 
 test: lint $(PEERS) ## check style and types, then run all tests
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
+
+test-browsers: $(READY) ## run the tests of the page, each in every browser that is here (five minutes)
+	HYRFPACK_BROWSERS=all $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal tests/web
 
 test-newest: ## run the tests with the newest versions, on each Python that is here (6 GB and ten minutes each)
 	$(PYTHON) -m tools.safety.versions newest

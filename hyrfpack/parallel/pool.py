@@ -28,11 +28,9 @@ def thread_count() -> int:
 
 
 @cache
-def _executor() -> ThreadPoolExecutor:
+def _executor(threads: int) -> ThreadPoolExecutor:
     # Each worker is one core's worth of work: a torch call inside it must not fan out again.
-    return ThreadPoolExecutor(
-        thread_count(), thread_name_prefix="hyrfpack", initializer=torch.set_num_threads, initargs=(1,)
-    )
+    return ThreadPoolExecutor(threads, thread_name_prefix="hyrfpack", initializer=torch.set_num_threads, initargs=(1,))
 
 
 def _after_fork() -> None:
@@ -80,7 +78,8 @@ def run_tasks(task: Callable[[int], None], count: int) -> None:
     Tasks are pulled one by one, so uneven ones balance. Results must not depend on which thread ran what: each
     task writes to its own place.
     """
-    if count == 1 or thread_count() == 1:
+    threads = thread_count()
+    if count == 1 or threads == 1:
         for index in range(count):
             task(index)
         return
@@ -97,7 +96,7 @@ def run_tasks(task: Callable[[int], None], count: int) -> None:
                 for _ in pending:  # nothing new is begun
                     pass
 
-    for future in [_executor().submit(worker) for _ in range(min(thread_count(), count))]:
+    for future in [_executor(threads).submit(worker) for _ in range(min(threads, count))]:
         future.result()
     if errors:
         raise errors[min(errors)]

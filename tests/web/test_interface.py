@@ -34,6 +34,7 @@ from web.scripts import run_script
 
 from hyrfpack.web.html import decode_page
 
+pytestmark = pytest.mark.in_turn
 PHONE = {"dense": 2.0, "phone": True}
 
 

@@ -166,6 +166,7 @@ def test_decoders_lie_in_a_block_of_uniforms_where_a_device_reads_them(browser: 
         assert psnr(shown(browser, camera), rendered(model, camera)) > 45
 
 
+@pytest.mark.in_turn
 def test_a_model_without_gaussians_shows_its_background(browser: Browser, tmp_path: Path):
     model = made_up(0)
     loaded(browser, tmp_path, page_of(model))
@@ -173,6 +174,7 @@ def test_a_model_without_gaussians_shows_its_background(browser: Browser, tmp_pa
     assert psnr(shown(browser, camera), rendered(model, camera)) > 40
 
 
+@pytest.mark.in_turn
 def test_the_window_shows_what_scripts_are_given_and_then_rests(browser: Browser, tmp_path: Path):
     loaded(browser, tmp_path, page_of(made_up()))
     frames = browser.evaluate("hyrfpack.frames()")
@@ -182,6 +184,7 @@ def test_the_window_shows_what_scripts_are_given_and_then_rests(browser: Browser
     assert browser.evaluate("hyrfpack.frames()") == frames and browser.evaluate("window.asked") == 0
 
 
+@pytest.mark.in_turn
 def test_colours_follow_the_view_while_it_moves_and_are_complete_when_it_stands(browser: Browser, tmp_path: Path):
     model = made_up()
     loaded(browser, tmp_path, page_of(model))
@@ -234,6 +237,7 @@ def taken_away(browser: Browser) -> None:
     settled(browser)
 
 
+@pytest.mark.in_turn
 def test_many_files_opened_one_after_the_other_leave_nothing_behind(browser: Browser, tmp_path: Path):
     model = made_up(200)
     loaded(browser, tmp_path, page_of(model))
@@ -297,6 +301,7 @@ def test_a_weak_device_draws_fitted_harmonics(browser: Browser, tmp_path: Path, 
     assert min(scores) > 28 and browser.complaints() == [], scores
 
 
+@pytest.mark.in_turn
 def test_the_first_layer_is_seen_while_the_rest_comes(browser: Browser, tmp_path: Path):
     model, data = made_up(200), encode(made_up(14000), "compact")
     loaded(browser, tmp_path, page_of(model))
@@ -338,6 +343,7 @@ def test_a_device_lost_while_a_file_comes_in_is_made_up_for(browser: Browser, tm
         assert psnr(shown(browser, camera), rendered(model, camera)) > 45
 
 
+@pytest.mark.in_turn
 def test_scripts_may_dispose_of_a_player(browser: Browser, tmp_path: Path):
     loaded(browser, tmp_path, page_of(made_up(50)))
     browser.evaluate("hyrfpack.player.dispose()")
@@ -345,6 +351,7 @@ def test_scripts_may_dispose_of_a_player(browser: Browser, tmp_path: Path):
     assert browser.complaints() == []
 
 
+@pytest.mark.in_turn
 def test_a_damaged_file_is_refused_in_a_sentence(browser: Browser, tmp_path: Path):
     data = bytearray(encode_model(made_up(50)))
     data[-20] ^= 1

@@ -30,6 +30,8 @@ from web.pages import (
 from hyrfpack.cameras.paths import look_at
 from hyrfpack.scene import Camera
 
+pytestmark = pytest.mark.in_turn
+
 
 def test_the_address_can_name_the_camera(browser: Browser, tmp_path: Path):
     opened(browser, tmp_path, page_of(cloud()), "#camera=" + json_of(camera(1.0)))

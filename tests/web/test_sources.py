@@ -20,6 +20,7 @@ from hyrfpack.splats.formats import spz
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.web.player import element_script, encode_player
 
+pytestmark = pytest.mark.in_turn
 GOLDEN = (Path(__file__).parents[1] / "golden" / "v1.1_compact.hyrf").read_bytes()
 SHOWN = "hyrfpack.player.loaded && hyrfpack.player.scene.count"
 

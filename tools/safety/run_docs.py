@@ -29,12 +29,16 @@ DATA = Path(os.environ.get("HYRFPACK_DATA") or ROOT.parent / "shared" / "data") 
 BLOCK = re.compile(r"^```python\n(?P<fenced>.*?)^```$|(?P<indented>(?:^    [^\n]*\n|^\n)+)", re.MULTILINE | re.DOTALL)
 FEWER = """
 import runpy, sys
+from hyrfpack.distill import DistillConfig
 from hyrfpack.train import TrainConfig
-whole = TrainConfig.__post_init__
-def fewer(config):
-    object.__setattr__(config, "steps", min(config.steps, {steps}))
-    whole(config)
-TrainConfig.__post_init__ = fewer
+def cut(settings):
+    whole = settings.__post_init__
+    def fewer(config):
+        object.__setattr__(config, "steps", min(config.steps, {steps}))
+        whole(config)
+    settings.__post_init__ = fewer
+cut(TrainConfig)
+cut(DistillConfig)
 runpy.run_path(sys.argv[1], run_name="__main__")
 """
 
