@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -184,6 +184,8 @@ class Scene:
             a scene that was not read from files.
         tracks: by a view's name, (M,) int64 rows of `points` that the reconstruction found in that photo, ascending;
             empty where the input does not say. A point may lie outside the picture, which undistortion crops.
+        reading: the arguments of `hyrfpack.load_scene` that read it, defaults and all, the path an absolute one; empty
+            for a scene that was not read from files.
 
     Raises:
         ValueError: a point or its colour is not finite, or a track is of no point.
@@ -200,6 +202,7 @@ class Scene:
     files: tuple[str, ...] = ()
     max_size: int | None = None
     tracks: Mapping[str, np.ndarray] = field(default_factory=dict)
+    reading: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.points).all() and np.isfinite(self.point_colors).all()):

@@ -28,6 +28,7 @@ def public_functions() -> Iterator[tuple[str, object]]:
             yield f"hyrfpack.{name}", getattr(hyrfpack, name)
     for name in ("gallery", "player"):
         yield f"hyrfpack.export.{name}", getattr(hyrfpack.export, name)
+    yield "hyrfpack.train.photos_of", hyrfpack.train.photos_of
     modules = [importlib.import_module(f"hyrfpack.ops.{name}") for name in OPERATIONS]
     operations = {f"{m.__name__}.{name}": value for m in modules for name, value in vars(m).items()}
     coders = {f"{quant.__name__}.{name}": getattr(quant, name) for name in quant.__all__}

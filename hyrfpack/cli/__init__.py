@@ -84,7 +84,7 @@ def main() -> None:
     The same step by step:
       hyrfpack poses photos/ -o scenes/bonsai
       hyrfpack train scenes/bonsai -o runs/bonsai
-      hyrfpack compress runs/bonsai/model.hyrf -o bonsai.hyrf
+      hyrfpack compress runs/bonsai -o bonsai.hyrf
       hyrfpack evaluate bonsai.hyrf --data scenes/bonsai
     """
 

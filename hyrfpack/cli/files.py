@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 # Those of hyrfpack.format.codec, without loading torch.
 PROFILES, DEFAULT_PROFILE = ("raw", "paper", "compact"), "compact"
+MODEL = "model.hyrf"  # that of a run, as in hyrfpack.train.run
 
 
 @click.command(short_help="Pack a model into a small file.")
@@ -44,7 +45,12 @@ PROFILES, DEFAULT_PROFILE = ("raw", "paper", "compact"), "compact"
     show_default=True,
     help="How: what pictures need and no more (compact), the HyRF paper's recipe (paper), or exact float32 (raw).",
 )
-@click.option("--data", type=PATH, help="Photos of the scene: to measure on, and for the options below.")
+@click.option(
+    "--data",
+    type=PATH,
+    help="Photos of the scene: to measure on, and for the options below.  [default: those that MODEL was trained on]",
+)
+@click.option("--no-data", is_flag=True, help="Leave the photos alone that MODEL was trained on.")
 @click.option(
     "--finetune",
     "finetune_steps",
@@ -72,6 +78,7 @@ def compress(
     output: Path,
     profile: str,
     data: Path | None,
+    no_data: bool,
     finetune_steps: int | None,
     prune: bool,
     target_size: int | None,
@@ -81,23 +88,32 @@ def compress(
     reading: dict[str, Any],
     as_json: bool,
 ) -> None:
-    """Pack MODEL, a .hyrf file, into a smaller one and show what each part takes.
+    """Pack MODEL, a .hyrf file or the folder of a run, into a smaller file and show what each part takes.
 
     The default profile renders the model to see what each number does to pictures, and spends bits where they show.
-    With the photos it also says what was lost.
+    With the photos it also says what was lost. The folder of a run knows where its photos are, so that they need not
+    be named.
 
     \b
     Examples:
-      hyrfpack compress runs/bonsai/model.hyrf -o bonsai.hyrf
-      hyrfpack compress runs/bonsai/model.hyrf -o bonsai.hyrf --data photos/bonsai --finetune 500
-      hyrfpack compress runs/bonsai/model.hyrf -o bonsai.hyrf --target-size 150kB
-      hyrfpack compress runs/bonsai/model.hyrf -o bonsai.hyrf --data photos/bonsai --max-psnr-drop 0.05 --report page
+      hyrfpack compress runs/bonsai -o bonsai.hyrf
+      hyrfpack compress runs/bonsai -o bonsai.hyrf --finetune 500
+      hyrfpack compress runs/bonsai -o bonsai.hyrf --target-size 150kB --no-data
+      hyrfpack compress runs/bonsai -o bonsai.hyrf --max-psnr-drop 0.05 --report page
+      hyrfpack compress bonsai.hyrf -o small.hyrf --data photos/bonsai
     """
+    if data is not None and no_data:
+        raise click.UsageError("--data names photos and --no-data wants none; give one of them")
     from hyrfpack.compress import compress as pack
     from hyrfpack.compress.report_page import FILES
     from hyrfpack.format import describe
 
-    scene = None if data is None else read_scene(data, reading, describe(model))
+    if model.is_dir():
+        model /= MODEL
+    if data is not None:
+        scene: Scene | None = read_scene(data, reading, describe(model))
+    else:
+        scene = None if no_data or profile != DEFAULT_PROFILE else _photos_of(model)
     outputs = Outputs(model, scene=scene, overwrite=overwrite)
     outputs.file(output, ".hyrf")
     if report is not None:
@@ -237,6 +253,21 @@ def _typed(context: click.Context) -> str:
         else:
             words += [parameter.opts[-1], str(value)]
     return shlex.join(words)
+
+
+def _photos_of(model: Path) -> Scene | None:
+    """Those that a run's model was trained on, unless they cannot be had, which is said."""
+    from hyrfpack.errors import HyrfDataError
+    from hyrfpack.train import photos_of
+
+    try:
+        scene = photos_of(model)
+    except HyrfDataError as error:
+        note(f"{error}; going on without the photos that it was trained on")
+        return None
+    if scene is not None:
+        note(f"with the photos that it was trained on, {scene.path} (--no-data goes without)")
+    return scene
 
 
 def _scores(before: Path, after: Path, scene: Scene | None) -> dict[str, float]:

@@ -84,7 +84,9 @@ def load_scene(
     if len(found) > 1:
         notes.append(f"poses are there as {' and '.join(found)}; {chosen} was taken")
     scene.notes[:0] = notes
-    return replace(scene, files=(*scene.files, str(given))) if is_archive(given) else scene
+    files = (*scene.files, str(given)) if is_archive(given) else scene.files
+    reading = {"test_every": test_every, "images": images, "layout": chosen, "model": model, "max_size": max_size}
+    return replace(scene, files=files, reading={"path": os.path.abspath(given), **reading})
 
 
 def _folder_of(given: Path, notes: list[str]) -> Path:

@@ -183,6 +183,7 @@ def _finish(trainer: Trainer, out: Path) -> dict:
             "train": len(scene.train),
             "test": len(scene.test),
             "max_size": scene.max_size,
+            "reading": dict(scene.reading),
         },
         "choices": trainer.choices,
         "notes": scene.notes,

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -103,6 +104,25 @@ def test_compress_with_photos_says_what_was_lost_on_those_held_out(run, data, tm
     assert (report["psnr_before"], report["psnr"]) == pytest.approx([score["psnr"] for score in scores])
     assert (report["ssim_before"], report["ssim"]) == pytest.approx([score["ssim"] for score in scores])
     assert "held-out photos: PSNR" in succeeded(*arguments).stdout
+
+
+def test_compress_of_a_runs_folder_uses_its_photos_unless_told_not_to(run, data, tmp_path):
+    arguments = ("compress", run, "-o", tmp_path / "p.hyrf", "--overwrite", "--json")
+    result, named = succeeded(*arguments), succeeded(*arguments, "--data", data)
+    assert f"with the photos that it was trained on, {data}" in result.stderr
+    assert json.loads(result.stdout) == json.loads(named.stdout) and "psnr" in json.loads(result.stdout)
+    without = succeeded(*arguments, "--no-data")
+    assert "trained on" not in without.stderr and "psnr" not in json.loads(without.stdout)
+
+
+def test_compress_goes_on_without_photos_that_are_gone(run, tmp_path):
+    shutil.copytree(run, tmp_path / "run")
+    metrics = json.loads((run / "metrics.json").read_text())
+    metrics["scene"]["reading"]["path"] = str(tmp_path / "moved")
+    (tmp_path / "run" / "metrics.json").write_text(json.dumps(metrics))
+    arguments = ("compress", tmp_path / "run", "-o", tmp_path / "p.hyrf")
+    assert "going on without the photos" in succeeded(*arguments).stderr
+    assert "name their folder with --data" in refused(*arguments, "--overwrite", "--finetune", 1)
 
 
 def test_compress_keeps_to_a_target_size(run, tmp_path):
@@ -308,8 +328,9 @@ def test_wrong_usage_exits_with_2(arguments):
 
 # What `compress` is asked on the command line, and what it answers.
 REFUSED_OPTIONS = {
-    "fine-tuning without photos": (("--finetune", 5), "need photos; name their folder with --data"),
-    "a loss without photos": (("--max-psnr-drop", 0.1), "need photos; name their folder with --data"),
+    "fine-tuning without photos": (("--no-data", "--finetune", 5), "need photos; name their folder with --data"),
+    "a loss without photos": (("--no-data", "--max-psnr-drop", 0.1), "need photos; name their folder with --data"),
+    "photos and none": (("--no-data", "--data", "DATA"), "give one of them"),
     "two aims": (("--data", "DATA", "--target-size", "20kB", "--max-psnr-drop", 0.1), "give one of them"),
     "photos for the paper profile": (("--data", "DATA", "--profile", "paper"), "profile 'paper' has no settings"),
     "a size for the raw profile": (("--target-size", "1MB", "--profile", "raw"), "profile 'raw' has no settings"),

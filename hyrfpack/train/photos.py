@@ -1,0 +1,64 @@
+"""The photos that a run was trained on, found again by what its folder keeps."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from hyrfpack.data import LAYOUTS, load_scene
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.scene import Scene
+from hyrfpack.train.run import METRICS, MODEL
+
+
+def photos_of(model: str | os.PathLike[str]) -> Scene | None:
+    """The photos that the model of a run's folder was trained on, read and split as they were for it.
+
+    Args:
+        model: `model.hyrf` in the folder that `hyrfpack.train` left it in.
+
+    Returns:
+        The photos, or None for a file that is no run's, or a run's that does not say what it was trained on.
+
+    Raises:
+        HyrfDataError: the photos are gone, or others than they were.
+
+    Example:
+        >>> import hyrfpack
+        >>> photos = hyrfpack.train.photos_of("runs/bonsai/model.hyrf")
+        >>> len(photos.train), len(photos.test)
+        (8, 2)
+    """
+    model = Path(model)
+    if model.name != MODEL:
+        return None
+    try:
+        said = json.loads((model.parent / METRICS).read_text("utf-8"))["scene"]
+        reading, sizes = dict(said["reading"]), (said["train"], said["test"])
+        path = reading.pop("path")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    if not _is_reading(path, reading):
+        return None
+    scene = load_scene(path, **reading)
+    if sizes != (len(scene.train), len(scene.test)):
+        raise HyrfDataError(
+            f"{path}: {len(scene.train)} photos to train on and {len(scene.test)} held out, where {model} was trained "
+            f"on {sizes[0]} of {sum(sizes)}; name the photos with --data"
+        )
+    return scene
+
+
+def _is_reading(path: object, options: dict) -> bool:
+    """Whether these can be arguments of `load_scene`: a run's folder may come from anywhere."""
+    text = (str, type(None))
+    kinds: dict[str, Any] = {"test_every": int, "images": text, "layout": str, "model": text, "max_size": int}
+    if not isinstance(path, str) or "\0" in path or options.keys() != kinds.keys():
+        return False
+    return (
+        all(isinstance(value, kinds[name]) and not isinstance(value, bool) for name, value in options.items())
+        and options["layout"] in LAYOUTS
+        and min(options["test_every"], options["max_size"]) >= 0
+    )
