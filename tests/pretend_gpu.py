@@ -48,6 +48,10 @@ class OnGpu(torch.Tensor):
 
     __array__ = numpy
 
+    def __deepcopy__(self, memo: dict) -> torch.Tensor:
+        copied = OnGpu(self.here.clone()).requires_grad_(self.requires_grad)
+        return torch.nn.Parameter(copied, self.requires_grad) if isinstance(self, torch.nn.Parameter) else copied
+
     def data_ptr(self) -> int:
         return self.here.data_ptr()
 

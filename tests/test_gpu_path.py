@@ -145,3 +145,17 @@ def test_the_command_line_trains_and_renders_on_a_gpu(gpu, tmp_path):
     assert metrics["device"].startswith("cuda:0 (") and metrics["evaluation"]["psnr"] > 5
     succeeded("render", run / "model.hyrf", "-o", tmp_path / "out", "--orbit", 1, "--precision", "float32", *options)
     assert (tmp_path / "out" / "0000.png").is_file()
+
+
+def test_a_model_is_measured_packed_and_fine_tuned_on_a_gpu(gpu, tmp_path, monkeypatch):
+    monkeypatch.setattr("hyrfpack.compress.calibrate.ROUNDS", 1)
+    monkeypatch.setattr("hyrfpack.compress.calibrate.FEWEST", 2)
+    monkeypatch.setattr("hyrfpack.compress.calibrate.MOST", 2)
+    scene = ball_scene(views=2, points=12, side=8)
+    config = TrainConfig(steps=1, max_gaussians=12, log2_table_size=4, background=False)
+    model = hyrfpack.train(scene, tmp_path / "run", config, quiet=True, device="cpu").model
+    sizes = {}
+    for device in ("cpu", "cuda"):
+        target = tmp_path / f"{device}.hyrf"
+        sizes[device] = hyrfpack.compress(model, target, data=scene, finetune_steps=1, device=device).bytes_after
+    assert sizes["cuda"] == pytest.approx(sizes["cpu"], rel=0.02)

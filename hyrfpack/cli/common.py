@@ -125,26 +125,25 @@ def scene_options(command: Command) -> Command:
     return with_options
 
 
+device_option = click.option(
+    "--device",
+    metavar="NAME",
+    default="auto",
+    show_default=True,
+    help="cpu, cuda (NVIDIA and AMD), cuda:N or mps; auto takes cuda where it and Triton are.",
+)
+
+
 def device_options(command: Command) -> Command:
     """Options that say where the work is done, and how exactly there: --device, --precision."""
-    for option in (
-        click.option(
-            "--precision",
-            type=click.Choice(PRECISIONS),
-            default="mixed",
-            show_default=True,
-            help="What a GPU multiplies in: bfloat16 with float32 sums, or float32. The CPU knows float32 only.",
-        ),
-        click.option(
-            "--device",
-            metavar="NAME",
-            default="auto",
-            show_default=True,
-            help="cpu, cuda (NVIDIA and AMD), cuda:N or mps; auto takes cuda where it and Triton are.",
-        ),
-    ):
-        command = option(command)
-    return command
+    precision = click.option(
+        "--precision",
+        type=click.Choice(PRECISIONS),
+        default="mixed",
+        show_default=True,
+        help="What a GPU multiplies in: bfloat16 with float32 sums, or float32. The CPU knows float32 only.",
+    )
+    return device_option(precision(command))
 
 
 def chosen_device(name: str) -> torch.device:

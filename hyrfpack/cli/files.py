@@ -14,6 +14,8 @@ from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
     SIZE,
+    chosen_device,
+    device_option,
     json_option,
     note,
     number,
@@ -72,6 +74,7 @@ MODEL = "model.hyrf"  # that of a run, as in hyrfpack.train.run
 )
 @overwrite_option
 @scene_options
+@device_option
 @json_option
 def compress(
     model: Path,
@@ -86,6 +89,7 @@ def compress(
     report: Path | None,
     overwrite: bool,
     reading: dict[str, Any],
+    device: str,
     as_json: bool,
 ) -> None:
     """Pack MODEL, a .hyrf file or the folder of a run, into a smaller file and show what each part takes.
@@ -108,6 +112,7 @@ def compress(
     from hyrfpack.compress.report_page import FILES
     from hyrfpack.format import describe
 
+    place = chosen_device(device)
     if model.is_dir():
         model /= MODEL
     if data is not None:
@@ -127,6 +132,7 @@ def compress(
         prune=prune,
         target_bytes=target_size,
         max_psnr_drop=max_psnr_drop,
+        device=place,
         say=note,
     )
     scores = _scores(model, output, scene)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from copy import deepcopy
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from hyrfpack.compress.plan import at_cells, follow
 from hyrfpack.compress.quantize import quantize
 from hyrfpack.compress.rate_distortion import ERROR_PER_BIT
 from hyrfpack.compress.sensitivity import Sensitivity
@@ -19,9 +19,9 @@ from hyrfpack.device import upload
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.evaluate.exposure import expose, fitted_gains
 from hyrfpack.format.arrays import by_parameter
-from hyrfpack.format.compact.plan import Plan
+from hyrfpack.format.compact.plan import Plan, from_lattice
 from hyrfpack.format.compact.quantized import Quantized
-from hyrfpack.format.sections import COLORS
+from hyrfpack.format.sections import COLORS, POSITIONS
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
@@ -33,7 +33,7 @@ from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.trainer import shuffled
 
 RATES = LearningRates(
-    positions=(1e-9, 1e-9),  # they stay where they are
+    positions=(1e-4, 1e-6),  # cells that are left late cost the other numbers what they have settled to
     fields=(2e-3, 2e-4),
     color_logits=(6e-3, 6e-4),
     scale_logits=(8e-3, 8e-4),
@@ -54,19 +54,19 @@ def finetune(
     gains: Mapping[str, Tensor] | None = None,
     cache: PictureCache | None = None,
     report: Callable[[int, float], None] = lambda step, loss: None,
-) -> HybridModel:
-    """Fit a planned model's numbers to the photos as they will be decoded.
+) -> tuple[HybridModel, Plan]:
+    """Fit a model's numbers to the photos as they will be decoded.
 
     Each step renders the model as it is after quantising (rounding passes gradients straight through) and adds
 
         LOSS_PER_ERROR * 2 ln 2 D * bits
 
     to the photometric loss, the exchange rate of `quantize`; a number q steps from its prediction is taken to cost
-    |q| / (b ln 2) bits, b being the mean of |q| in its group (the ideal code of a Laplace distribution). Positions,
-    order and steps stay.
+    |q| / (b ln 2) bits, b being the mean of |q| in its group (the ideal code of a Laplace distribution). Positions move
+    on the lattice; classes and their steps stay.
 
     Args:
-        model: `plan.apply` of a trained model; not changed.
+        model: a trained model; not changed.
         plan: its plan.
         sensitivity: that the plan was made by.
         views: photos to fit.
@@ -77,13 +77,15 @@ def finetune(
         report: called after each step with its number, from 1, and the photometric loss.
 
     Returns:
-        The fitted model, to be quantised with `reach` 0: its numbers sit where they shall be rounded to.
+        The fitted part of the model that is stored, to be quantised with `reach` 0, for its numbers sit where they
+        shall be rounded to; and its plan.
 
     Raises:
         HyrfTrainingError: the loss or a gradient is not finite.
     """
-    tuned = deepcopy(model).requires_grad_(True)
-    tuned.gaussians.positions.requires_grad_(False)
+    tuned = plan.apply(model)
+    tuned.load_state_dict({"gaussians.positions": model.gaussians.positions.detach()[plan.kept]}, strict=False)
+    tuned.requires_grad_(True)
     share = min(1.0, steps / FULL_RATES)
     rates = {name: (share * first, share * last) for name, (first, last) in dataclasses.asdict(RATES).items()}
     optimizer = Optimizer(tuned, LearningRates(**rates))
@@ -93,8 +95,9 @@ def finetune(
     with closing((cache or PictureCache()).stream(order)) as pictures, torch_on_one_thread():
         for step, (view, picture) in enumerate(pictures):
             quantized = quantize(tuned, plan, sensitivity, reach=0, like=quantized)
-            exact = deepcopy(tuned.state_dict())
-            tuned.load_state_dict(dict(by_parameter(quantized.arrays(), tuned)), strict=False)
+            exact = {name: value.clone() for name, value in tuned.state_dict().items()}
+            decoded = {**quantized.arrays(), POSITIONS: _on_lattice(tuned, plan)}
+            tuned.load_state_dict(dict(by_parameter(decoded, tuned)), strict=False)
             solid = None if tuned.config.background else np.array(tuned.config.solid, np.float32)
             target, mask = upload(picture, solid, tuned.gaussians.positions.device)
             image = render(tuned, view.camera).rgb
@@ -111,8 +114,8 @@ def finetune(
                     "finite; compress without --finetune"
                 )
             report(step + 1, float(loss.detach()))
-    tuned.gaussians.positions.requires_grad_(True)
-    return tuned
+    plan, placed = follow(plan, tuned)
+    return placed, plan
 
 
 @torch.no_grad()
@@ -130,6 +133,17 @@ def gains_of_photos(model: HybridModel, views: Sequence[View], cache: PictureCac
             logs.append(np.log(fitted_gains(render(model, view.camera, decoded=decoded).rgb, photo, mask)))
     centred = torch.from_numpy(np.exp(logs - np.mean(logs, 0))).float().to(device)
     return {view.name: gains for view, gains in zip(views, centred, strict=True)}
+
+
+@torch.no_grad()
+def _on_lattice(model: HybridModel, plan: Plan) -> np.ndarray:
+    """The positions (M, 3) that a planned model's Gaussians would be stored at."""
+    cube = model.cube_coords(model.gaussians.positions.double()).cpu().numpy()
+    places, start = [], 0
+    for points in (layer.points for layer in plan.layers):
+        part = slice(start, start := start + len(points.classes))
+        places.append(from_lattice(at_cells(cube[part], points.classes, points.bits), model.config.frame))
+    return np.concatenate(places)
 
 
 @torch.no_grad()
@@ -151,7 +165,7 @@ def _add_rate(model: HybridModel, quantized: Quantized, price: float) -> None:
     for name, slope in by_parameter(slopes, model):
         gradient = parameters[name].grad
         if gradient is not None:
-            gradient += slope
+            gradient += slope.to(gradient)
 
 
 def _slope(symbols: np.ndarray, index: np.ndarray, count: int, codes: np.ndarray) -> np.ndarray:

@@ -22,6 +22,7 @@ from hyrfpack.compress.quantize import quantize
 from hyrfpack.compress.search import coarsest, fullest
 from hyrfpack.compress.sensitivity import Sensitivity, measure_sensitivity
 from hyrfpack.data import PictureCache
+from hyrfpack.device import choose_device
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
 from hyrfpack.format.codec import (
@@ -38,7 +39,6 @@ from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.scene import Scene, View
 
-FINETUNED = 1.2  # times as much distortion, which fine-tuning takes back
 TOLERATED, MENDED = 1.2, 3  # factor from the distortion asked for, and how often another file is made beyond it
 COARSER, FINER = 2.0, 16.0  # factors at most that another file differs by
 TRIALS, FINETUNED_TRIALS = 9, 4  # of a search
@@ -72,6 +72,7 @@ def compress(
     target_bytes: int | None = None,
     max_psnr_drop: float | None = None,
     distortion: float | None = None,
+    device: str | torch.device = "auto",
     say: Callable[[str], None] = lambda sentence: None,
     **settings: Any,
 ) -> CompressionReport:
@@ -92,6 +93,8 @@ def compress(
         max_psnr_drop: make the file as small as can be for so many dB of mean PSNR on the held-out photos of `data`;
             of `psnr_predicted` (`hyrfpack.Evaluation`) where photos' exposures were learnt beside the model.
         distortion: mean squared error that pictures may get, by estimate; instead of a search.
+        device: where pictures are drawn, see `hyrfpack.device.choose_device`. On the CPU the same input gives the same
+            bytes; on a GPU sums of gradients vary in their last bits, and bytes with them.
         say: told what is going on.
         settings: of "paper", see `hyrfpack.format.paper`; `noise` is the old word for `distortion`.
 
@@ -127,12 +130,14 @@ def compress(
             f"{data.path}: all photos are held out, so there is none to measure at; use a larger --test-every"
         )
     model, provenance = load_with_provenance(source)
+    model = model.to(choose_device(device, say))
+    model.precision = "float32"  # what is looked for is smaller than what a GPU rounds away otherwise
     if len(model) == 0:
         raise HyrfError(f"{source}: there is no Gaussian in it, so there is nothing to measure; use profile 'paper'")
     cameras = Capture(describe(source), data).cameras
     say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
     sensitivity = measure_sensitivity(model, cameras)
-    start = distortion or default_distortion(provenance) * (FINETUNED if finetune_steps else 1)
+    start = distortion or default_distortion(provenance, finetune_steps)
     originals = Originals.of(model, cameras)
     sensitivity = calibrate(model, sensitivity, originals, start, prune)
     packer = Packer(model, coarse(provenance, model.config.frame.scale), sensitivity, data, finetune_steps, prune, say)
@@ -176,18 +181,18 @@ class Packer:
 
     def attempt(self, distortion: float) -> Trial:
         """A file that adds about so large a mean squared error to pictures."""
-        model = self.model
+        model, steps = self.model, self.finetune_steps
         plan = make_plan(model, self.sensitivity, distortion, self.prune)
-        planned = plan.apply(model)
-        if self.finetune_steps:
+        if steps:
             assert self.scene is not None
-            self.say(f"fine-tuning for {self.finetune_steps:,} steps")
-            steps, gains = self.finetune_steps, self._gains
-            model = planned = finetune(
-                planned, plan, self.sensitivity, self.scene.train, steps, gains=gains, cache=self.cache
+            self.say(f"fine-tuning for {steps:,} steps")
+            planned, plan = finetune(
+                model, plan, self.sensitivity, self.scene.train, steps, gains=self._gains, cache=self.cache
             )
-        quantized = quantize(planned, plan, self.sensitivity, reach=0 if self.finetune_steps else 1)
-        data = encode_model(model, "compact", self.provenance, quantized=quantized)
+        else:
+            planned = plan.apply(model)
+        quantized = quantize(planned, plan, self.sensitivity, reach=0 if steps else 1)
+        data = encode_model(planned, "compact", self.provenance, quantized=quantized)
         return Trial(data, foretold(self.model, planned, quantized, self.sensitivity))
 
     def settled(self, wanted: float, originals: Originals) -> Trial:
@@ -198,7 +203,7 @@ class Packer:
 
         def attempt(distortion: float) -> Trial:
             trial = self.attempt(distortion)
-            return dataclasses.replace(trial, error=originals.error(decode_model(trial.data)))
+            return dataclasses.replace(trial, error=originals.error(self._decoded(trial)))
 
         trial, distortion = attempt(wanted), wanted
         for _ in range(MENDED):
@@ -238,7 +243,7 @@ class Packer:
 
         def attempt(distortion: float) -> Trial:
             trial = self.attempt(distortion)
-            lost = before - self._psnr(decode_model(trial.data), views)
+            lost = before - self._psnr(self._decoded(trial), views)
             trial = dataclasses.replace(trial, lost=lost)
             self.say(f"distortion {distortion:.2g}: {len(trial.data):,} bytes, {lost:+.3f} dB lost")
             return trial
@@ -258,6 +263,11 @@ class Packer:
         if not has_mean_exposure(self.provenance):
             return None
         return gains_of_photos(self.model, self.scene.train, self.cache)
+
+    def _decoded(self, trial: Trial) -> HybridModel:
+        model = decode_model(trial.data).to(self.model.gaussians.positions.device)
+        model.precision = self.model.precision
+        return model
 
     def _psnr(self, model: HybridModel, views: Sequence[View]) -> float:
         """At the exposure that photos beside each predict, where the model has their mean: what the photos' own

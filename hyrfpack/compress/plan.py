@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -53,16 +55,43 @@ def make_plan(model: HybridModel, sensitivity: Sensitivity, distortion: float, p
     return Plan(kept, tuple(layers), basis, groups, each)
 
 
+def follow(plan: Plan, model: HybridModel) -> tuple[Plan, HybridModel]:
+    """The plan of Gaussians that have moved, and they in its order, on the lattice.
+
+    Each stays in its layer and class; places and order are new, and with them which rows of the tables are read.
+
+    Args:
+        plan: `plan.apply` made the model, in whose order it is.
+        model: the part of a model that is stored, moved.
+    """
+    with torch.no_grad():
+        cube = model.cube_coords(model.gaussians.positions.double()).cpu().numpy()
+    layers, order, start = [], [], 0
+    for points in (layer.points for layer in plan.layers):
+        members = np.arange(start, start := start + len(points.classes))
+        layer, index = _layer(cube[members], points.classes, points.bits)
+        layers.append(layer)
+        order.append(members[index])
+    places = np.concatenate(order)
+    groups = {group: groups_of(group, model.config, layers[0].points) for group in plan.groups}
+    there = replace(plan, kept=places, layers=tuple(layers), groups=groups)
+    return replace(there, kept=plan.kept[places]), there.apply(model)
+
+
 def _layer(cube: np.ndarray, classes: np.ndarray, bits: np.ndarray) -> tuple[Layer, np.ndarray]:
     """A layer of the points (n, 3) of the cube, and which of them comes at each place."""
     while True:
-        side = (1 << bits)[classes][:, None]
-        cells = np.clip(np.floor(cube * side), 0, side - 1).astype(np.int64)
-        data, order, points = encode_points(Points(cells, classes, bits))
+        data, order, points = encode_points(at_cells(cube, classes, bits))
         # A class coarser than all share was made finer: its points are placed anew, in the middle of their cells.
         if (points.bits == bits).all():
             return Layer(points, data), order
         bits = points.bits
+
+
+def at_cells(cube: np.ndarray, classes: np.ndarray, bits: np.ndarray) -> Points:
+    """The lattice points of the cells that points (n, 3) of the cube are in."""
+    side = (1 << bits)[classes][:, None]
+    return Points(np.clip(np.floor(cube * side), 0, side - 1).astype(np.int64), classes, bits)
 
 
 def _layer_classes(members: np.ndarray) -> list[list[int]]:

@@ -107,7 +107,7 @@ def make(
         matching: as of `hyrfpack.estimate_poses`.
         target_bytes: pack the model into so many bytes.
         seed: of all that is random, 0 to 2^64 - 1.
-        device: where to train, see `hyrfpack.device.choose_device`.
+        device: where to train and to pack, see `hyrfpack.device.choose_device`.
         overwrite: replace an output that is there.
         report: told how far the work is.
         say: told what is going on, in sentences.
@@ -191,7 +191,7 @@ class _Making:
         if request.minutes is None:
             self.reporter.estimates |= forecast_scene(scene, plan, request.device)
         training = stages.fit(work, scene, self._digest(scene), plan, request.seed, request.device, cache)
-        stages.pack(work, scene, plan)
+        stages.pack(work, scene, plan, request.device)
         return self._result(work.folder / stages.PACKED, scene, poses=poses, training=training)
 
     def _poses(self) -> dict[str, Any]:

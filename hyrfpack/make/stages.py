@@ -134,7 +134,7 @@ def _training_report(reporter: Reporter, steps: int) -> Callable[[int, float, fl
 # -- packing -------------------------------------------------------------------------------------------------------
 
 
-def pack(work: Work, scene: Scene, plan: Plan) -> dict[str, Any]:
+def pack(work: Work, scene: Scene, plan: Plan, device: torch.device) -> dict[str, Any]:
     """Compress into `model.hyrf`; returns bytes and Gaussians."""
 
     def act(going_on: bool) -> tuple[dict, list[str]]:
@@ -143,8 +143,9 @@ def pack(work: Work, scene: Scene, plan: Plan) -> dict[str, Any]:
 
         source, target = work.folder / RUN / MODEL, work.folder / PACKED
         report = compress(
-            source, target, data=scene, finetune_steps=plan.finetune_steps, target_bytes=plan.target_bytes, say=say
-        )
+            source, target, data=scene, finetune_steps=plan.finetune_steps, target_bytes=plan.target_bytes,
+            device=device, say=say,
+        )  # fmt: skip
         return {"bytes": report.bytes_after, "gaussians": report.gaussians, "found": report.found}, [PACKED]
 
     cameras = "photos" if plan.finetune_steps else "cameras"  # fine-tuning looks at all, the rest at where they are

@@ -21,7 +21,7 @@ import hyrfpack
 from hyrfpack.cameras.capture import coarse, has_mean_exposure
 from hyrfpack.compress.calibrate import Originals, calibrate
 from hyrfpack.compress.distortion import default_distortion
-from hyrfpack.compress.packer import FINETUNED, Packer, Trial
+from hyrfpack.compress.packer import Packer, Trial
 from hyrfpack.compress.search import coarsest
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.format import decode_model, encode_model
@@ -110,7 +110,7 @@ class Set:
             found = coarsest(self.compact, fits, distortion, 9, ENDS)
             row["matched"] = found and found[1]
         if steps:
-            row["finetuned"] = self.compact(FINETUNED * distortion, steps)
+            row["finetuned"] = self.compact(default_distortion(self.provenance, steps), steps)
         return {key: dataclasses.asdict(value) if isinstance(value, Made) else value for key, value in row.items()}
 
 

@@ -56,13 +56,15 @@ class Plan:
     distortion_per_number: float
 
     def apply(self, model: HybridModel) -> HybridModel:
-        """The part of a model that is stored: the Gaussians kept, in order, moved to the lattice."""
+        """The part of a model that is stored, on its device: the Gaussians kept, in order, moved to the lattice."""
         arrays = to_arrays(model)
         for group in LOGITS:
             arrays[group] = arrays[group][self.kept]
         places = [from_lattice(layer.points, model.config.frame) for layer in self.layers]
         arrays[POSITIONS] = np.concatenate(places)
-        return to_model(model.config, arrays)
+        stored = to_model(model.config, arrays).to(model.gaussians.positions.device)
+        stored.precision = model.precision
+        return stored
 
 
 def from_lattice(points: Points, frame: Frame) -> np.ndarray:
