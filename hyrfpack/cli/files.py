@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 # Those of hyrfpack.format.codec, without loading torch.
 PROFILES, DEFAULT_PROFILE = ("raw", "paper", "compact"), "compact"
-MODEL = "model.hyrf"  # that of a run, as in hyrfpack.train.run
 
 
 @click.command(short_help="Pack a model into a small file.")
@@ -111,6 +110,7 @@ def compress(
     from hyrfpack.compress import compress as pack
     from hyrfpack.compress.report_page import FILES
     from hyrfpack.format import describe
+    from hyrfpack.train.run import MODEL
 
     place = chosen_device(device)
     if model.is_dir():

@@ -20,7 +20,7 @@ from torch import Tensor
 from hyrfpack.cameras.between import views_between
 from hyrfpack.compress.plan import make_plan, removal_error
 from hyrfpack.compress.quantize import opacity_error, quantize
-from hyrfpack.compress.sensitivity import PRUNED, Sensitivity
+from hyrfpack.compress.sensitivity import PRUNED, Sensitivity, measure_sensitivity
 from hyrfpack.format.arrays import by_parameter, to_arrays
 from hyrfpack.format.compact.quantized import Quantized
 from hyrfpack.format.sections import COLORS, MLPS, OPACITIES, POSITIONS, SCALES, TABLES
@@ -107,6 +107,22 @@ class Originals:
         """Mean squared difference of colours in the median view: in a single one a Gaussian may come too close."""
         pairs = zip(_pictures(model, self.views), self.pictures, strict=True)
         return float(np.median([float((mine - theirs).square().mean()) for mine, theirs in pairs]))
+
+
+def calibrated(
+    model: HybridModel, cameras: Sequence[Camera], distortion: float, prune: bool = True
+) -> tuple[Sensitivity, Originals]:
+    """A model's sensitivities for about so large a distortion, calibrated, and the pictures that they are by.
+
+    Args:
+        cameras: where pictures will be looked at from, about; world units.
+        distortion, prune: as `make_plan` takes them.
+
+    Raises:
+        HyrfError: a number of the model is NaN or infinite.
+    """
+    sensitivity, originals = measure_sensitivity(model, cameras), Originals.of(model, cameras)
+    return calibrate(model, sensitivity, originals, distortion, prune), originals
 
 
 def calibrate(

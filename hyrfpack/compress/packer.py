@@ -14,13 +14,13 @@ import torch
 
 from hyrfpack.cameras.capture import Capture, coarse, has_mean_exposure
 from hyrfpack.checks import check_type
-from hyrfpack.compress.calibrate import Originals, calibrate, foretold
+from hyrfpack.compress.calibrate import Originals, calibrated, foretold
 from hyrfpack.compress.distortion import LIMITS, default_distortion
 from hyrfpack.compress.finetune import finetune, gains_of_photos
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.quantize import quantize
 from hyrfpack.compress.search import coarsest, fullest
-from hyrfpack.compress.sensitivity import Sensitivity, measure_sensitivity
+from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.device import choose_device
 from hyrfpack.errors import HyrfError
@@ -136,10 +136,8 @@ def compress(
         raise HyrfError(f"{source}: there is no Gaussian in it, so there is nothing to measure; use profile 'paper'")
     cameras = Capture(describe(source), data).cameras
     say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
-    sensitivity = measure_sensitivity(model, cameras)
     start = distortion or default_distortion(provenance, finetune_steps)
-    originals = Originals.of(model, cameras)
-    sensitivity = calibrate(model, sensitivity, originals, start, prune)
+    sensitivity, originals = calibrated(model, cameras, start, prune)
     packer = Packer(model, coarse(provenance, model.config.frame.scale), sensitivity, data, finetune_steps, prune, say)
     if target_bytes is not None:
         trial, found = packer.within_bytes(target_bytes, start)
@@ -162,7 +160,7 @@ class Packer:
     Attributes:
         model: the model.
         provenance: that the files tell.
-        sensitivity: of the model, see `calibrate`.
+        sensitivity: of the model, see `calibrated`.
         scene: photos to fine-tune on; None where there are none.
         finetune_steps: of each file.
         prune: leave out Gaussians that cost more in bytes than they give to pictures.

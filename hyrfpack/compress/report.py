@@ -15,12 +15,11 @@ import torch
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.capture import Capture, coarse
-from hyrfpack.compress.calibrate import Originals, calibrate
+from hyrfpack.compress.calibrate import calibrated
 from hyrfpack.compress.distortion import LIMITS, default_distortion
 from hyrfpack.compress.quantize import decide
 from hyrfpack.compress.report_page import FILES, PAGE, PLOT, SHOWN, Findings, Point, ShownView, page, picture_names
 from hyrfpack.compress.report_plot import draw
-from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import Evaluation, evaluate
 from hyrfpack.evaluate.metrics import psnr, to_8bit
@@ -158,9 +157,7 @@ def _finer_and_coarser(
     model: HybridModel, provenance: dict, cameras: Sequence[Camera], distortion: float, same: bytes | None
 ) -> dict[str, bytes]:
     """The model in profile "compact", finest first; `same` is the file of this distortion, where there is one."""
-    sensitivity = calibrate(
-        model, measure_sensitivity(model, cameras), Originals.of(model, cameras), distortion, prune=True
-    )
+    sensitivity, _ = calibrated(model, cameras, distortion)
     files = {}
     for factor in FACTORS if len(model) < LARGE else FACTORS[1:-1]:
         if factor == 1 and same is not None:

@@ -17,9 +17,8 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.between import small_camera, views_between
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.checks import check_float, check_int, check_type
-from hyrfpack.compress.calibrate import Originals, calibrate
+from hyrfpack.compress.calibrate import calibrated
 from hyrfpack.compress.packer import Packer
-from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.distill.start import initial_model
 from hyrfpack.distill.teacher import light_of, likeness, teaching_scene
@@ -274,8 +273,8 @@ def _pack(
     allowed, error = _mse(config.psnr), _mse(_mean(likeness(model, original, views)))
     room = max(allowed - error, min(LEAST_ADDED * error, HOPELESS * allowed))
     say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
-    originals, wanted = Originals.of(model, cameras), PACKED * room
-    sensitivity = calibrate(model, measure_sensitivity(model, cameras), originals, wanted)
+    wanted = PACKED * room
+    sensitivity, originals = calibrated(model, cameras, wanted)
     packer = Packer(model, provenance, sensitivity, scene=None, finetune_steps=0, prune=True, say=say)
     trial = packer.settled(wanted, originals)
     for _ in range(TRIALS):

@@ -8,6 +8,7 @@ import pytest
 from explicit_balls import LITTLE, ball
 
 import hyrfpack
+from hyrfpack.compress import calibrate
 from hyrfpack.distill import DistillConfig, distill_splats, fit, teacher
 from hyrfpack.distill.teacher import likeness, teaching_scene
 from hyrfpack.distill.views import Weighted, viewpoints
@@ -147,7 +148,7 @@ def test_nothing_is_measured_or_drawn_twice_however_often_packing_is_tried(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fit, "_mse", lambda psnr: 2.0**-psnr)  # what packing adds seems to be very much
-    measured = counting(monkeypatch, fit, "measure_sensitivity")
+    measured = counting(monkeypatch, calibrate, "measure_sensitivity")
     tried = counting(monkeypatch, fit.Packer, "attempt")
     drawn = counting(monkeypatch, teacher, "photograph")
 
