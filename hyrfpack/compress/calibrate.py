@@ -9,7 +9,7 @@ and its sensitivities are multiplied by what was found over what was foretold, u
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 
@@ -18,13 +18,16 @@ import torch
 from torch import Tensor
 
 from hyrfpack.cameras.between import views_between
-from hyrfpack.compress.plan import make_plan, removal_error
+from hyrfpack.compress.plan import make_plan, of_each_number, removal_error, worth_keeping
 from hyrfpack.compress.quantize import opacity_error, quantize
 from hyrfpack.compress.sensitivity import PRUNED, Sensitivity, measure_sensitivity
 from hyrfpack.format.arrays import by_parameter, to_arrays
+from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.compact.quantized import Quantized
 from hyrfpack.format.sections import COLORS, MLPS, OPACITIES, POSITIONS, SCALES, TABLES
 from hyrfpack.model import HybridModel
+from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.parallel.pool import side_by_side
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, evenly_spaced
 
@@ -77,6 +80,14 @@ class Factor:
     def final(self) -> float:
         """The factor to take: one that was tried and is enough, where there is such a one."""
         return self.value if self.done or self.high == np.inf else self.high
+
+
+@dataclass(frozen=True)
+class Tried:
+    """What a part adds to the pictures' mean squared error: as pictures show it, and as sensitivities foretell it."""
+
+    found: float
+    told: float
 
 
 @dataclass(frozen=True)
@@ -138,75 +149,119 @@ def calibrate(
     Raises:
         HyrfError: a parameter is NaN or infinite.
     """
+    each = of_each_number(model, distortion)
+
     # Pruning first: what the others do depends on what is left.
-    for parts in (((PRUNED,),), PARTS) if prune else (PARTS,):
-        factors = {part: Factor(LAWS.get(part, 1.0)) for part in parts}
-        for _ in range(ROUNDS):
-            scaled = sensitivity.times({name: factor.value for part, factor in factors.items() for name in part})
+    def without_pruned(scaled: Sensitivity, _: list[Part]) -> dict[Part, Tried]:
+        removals = removal_error(model, scaled)
+        kept = worth_keeping(removals, each)
+        return {(PRUNED,): Tried(originals.error(_only(model, kept)), float(np.delete(removals, kept).sum()))}
+
+    if prune:
+        sensitivity = _corrected(sensitivity, ((PRUNED,),), distortion, without_pruned)
+    kept = worth_keeping(removal_error(model, sensitivity), each) if prune else np.arange(len(model))
+    left = _only(model, kept)
+    whole = Originals.seen(originals.views, left)
+
+    placed: tuple[np.ndarray, Plan, HybridModel] | None = None
+
+    def as_stored(scaled: Sensitivity, parts: list[Part]) -> dict[Part, Tried]:
+        nonlocal placed
+        if placed is None or not np.array_equal(placed[0], scaled.positions):
             plan = make_plan(model, scaled, distortion, prune)
-            planned = plan.apply(model)
-            quantized = quantize(planned, plan, scaled)
-            told = foretold(model, planned, quantized, scaled)
-            found = _found(model, planned, quantized, originals, [part for part in parts if not factors[part].done])
-            for part, error in found.items():
-                expected = sum(told[name] for name in part)
-                if expected > 0 and max(error, expected) > MINOR * distortion:
-                    factors[part].correct(error / expected)
-                else:
-                    factors[part].done = True
-            if all(factor.done for factor in factors.values()):
-                break
-        sensitivity = sensitivity.times({name: factor.final for part, factor in factors.items() for name in part})
-    return sensitivity
+            placed = scaled.positions, plan, plan.apply(model)
+        _, plan, planned = placed
+        quantized = quantize(planned, plan, scaled, sections=[name for part in parts for name in part])
+        told, stored = _added(planned, quantized, scaled), quantized.arrays()
+        there = to_arrays(model)[POSITIONS][plan.kept]
+
+        def found(part: Part) -> float:
+            if part == (POSITIONS,):
+                return whole.error(planned)
+            return whole.error(_changed(planned, {name: stored[name] for name in part} | {POSITIONS: there}))
+
+        return {part: Tried(found(part), sum(told[name] for name in part)) for part in parts}
+
+    return _corrected(sensitivity, PARTS, distortion, as_stored)
 
 
 def foretold(
     model: HybridModel, planned: HybridModel, quantized: Quantized, sensitivity: Sensitivity
 ) -> dict[str, float]:
     """What storing a model adds to the pictures' mean squared error, by section and by what is pruned; by estimate."""
+    removed = np.delete(removal_error(model, sensitivity), quantized.plan.kept)
+    return {PRUNED: float(removed.sum()), **_added(planned, quantized, sensitivity)}
+
+
+def _added(planned: HybridModel, quantized: Quantized, sensitivity: Sensitivity) -> dict[str, float]:
+    """As `foretold`, by the sections that are quantised and by positions."""
     plan = quantized.plan
     wanted, stored, s = to_arrays(planned), quantized.arrays(), sensitivity.of(plan.kept)
     weights = {COLORS: np.repeat(s.colors, 3), SCALES: s.scales, **s.fields}
     # A point is anywhere in its cell.
     bits = np.concatenate([layer.points.bits[layer.points.classes] for layer in plan.layers])
-    _, opacity = opacity_error(planned, wanted[OPACITIES][:, 0].astype(np.float64), s.opacities)
-    errors = {PRUNED: float(np.delete(removal_error(model, sensitivity), plan.kept).sum())}
-    errors[OPACITIES] = float(opacity(slice(None), stored[OPACITIES][:, 0]).sum())
-    errors[POSITIONS] = float((s.positions * 3 / 12 * 4.0**-bits).sum())
-    for group, weight in weights.items():
-        difference = stored[group].ravel().astype(np.float64) - wanted[group].ravel()
-        errors[group] = float((weight * difference**2).sum())
-    return errors
-
-
-def _found(
-    model: HybridModel, planned: HybridModel, quantized: Quantized, originals: Originals, parts: Sequence[Part]
-) -> dict[Part, float]:
-    """As `foretold`, drawn and compared: each of some parts changed by itself."""
-    left = _with_positions(planned, model.gaussians.positions.detach()[torch.as_tensor(quantized.plan.kept)])
-    if parts == [(PRUNED,)]:
-        return {parts[0]: originals.error(left)}
-    whole = Originals.seen(originals.views, left)
-    stored = quantized.arrays()
-    errors: dict[Part, float] = {}
-    for part in parts:
-        if part == (POSITIONS,):
-            errors[part] = whole.error(planned)
+    errors = {POSITIONS: float((s.positions * 3 / 12 * 4.0**-bits).sum())}
+    for group, values in stored.items():
+        if group == OPACITIES:
+            _, error = opacity_error(planned, wanted[group][:, 0].astype(np.float64), s.opacities)
+            errors[group] = float(error(slice(None), values[:, 0]).sum())
         else:
-            changed = deepcopy(left)
-            changed.load_state_dict(dict(by_parameter({name: stored[name] for name in part}, changed)), strict=False)
-            errors[part] = whole.error(changed)
+            difference = values.ravel().astype(np.float64) - wanted[group].ravel()
+            errors[group] = float((weights[group] * difference**2).sum())
     return errors
 
 
-def _with_positions(model: HybridModel, positions: Tensor) -> HybridModel:
-    moved = deepcopy(model)
-    with torch.no_grad():
-        moved.gaussians.positions.copy_(positions)
-    return moved
+def _corrected(
+    sensitivity: Sensitivity,
+    parts: Sequence[Part],
+    distortion: float,
+    attempt: Callable[[Sensitivity, list[Part]], dict[Part, Tried]],
+) -> Sensitivity:
+    """Sensitivities whose parts foretell what is found.
+
+    Args:
+        attempt: what is found and foretold of parts with these sensitivities.
+    """
+
+    def scaled(factors: dict[Part, float]) -> Sensitivity:
+        return sensitivity.times({name: factor for part, factor in factors.items() for name in part})
+
+    factors = {part: Factor(LAWS.get(part, 1.0)) for part in parts}
+    for _ in range(ROUNDS):
+        waiting = [part for part, factor in factors.items() if not factor.done]
+        if not waiting:
+            break
+        for part, tried in attempt(scaled({part: factor.value for part, factor in factors.items()}), waiting).items():
+            if tried.told > 0 and max(tried.found, tried.told) > MINOR * distortion:
+                factors[part].correct(tried.found / tried.told)
+            else:
+                factors[part].done = True
+    return scaled({part: factor.final for part, factor in factors.items()})
+
+
+def _only(model: HybridModel, kept: np.ndarray) -> HybridModel:
+    """A model of some of a model's Gaussians (n,)."""
+    only, index = deepcopy(model), torch.as_tensor(kept, device=model.gaussians.positions.device)
+    only.gaussians = Gaussians(*(getattr(model.gaussians, name).detach()[index] for name in Gaussians.NAMES))
+    return only
+
+
+def _changed(model: HybridModel, arrays: dict[str, np.ndarray]) -> HybridModel:
+    """A model with other numbers in some sections."""
+    changed = deepcopy(model)
+    changed.load_state_dict(dict(by_parameter(arrays, changed)), strict=False)
+    return changed
 
 
 @torch.no_grad()
 def _pictures(model: HybridModel, cameras: Sequence[Camera]) -> list[Tensor]:
     decoded = model.decode()
-    return [render(model, camera, decoded=decoded).rgb for camera in cameras]
+
+    @torch.no_grad()  # of this thread
+    def picture(camera: Camera) -> Tensor:
+        return render(model, camera, decoded=decoded).rgb
+
+    if model.gaussians.positions.is_cuda:
+        return [picture(camera) for camera in cameras]
+    # A view a core: much of one runs on one core only.
+    return side_by_side(picture, cameras)

@@ -34,14 +34,10 @@ def make_plan(model: HybridModel, sensitivity: Sensitivity, distortion: float, p
     Raises:
         HyrfError: a parameter is NaN or infinite.
     """
-    with torch.no_grad():
-        cube = model.cube_coords(model.gaussians.positions.double()).cpu().numpy()
-    each = distortion / sum(parameter.numel() for parameter in model.parameters())
-    kept = np.arange(len(cube))
-    if prune:
-        kept = np.flatnonzero(removal_error(model, sensitivity) >= ERROR_PER_BIT * each * BITS_OF_A_GAUSSIAN)
+    each = of_each_number(model, distortion)
+    kept = worth_keeping(removal_error(model, sensitivity), each) if prune else np.arange(len(model))
     of_kept = sensitivity.of(kept)
-    classes = importance_classes(of_kept)
+    cube, classes = _cube(model), importance_classes(of_kept)
     bits = position_bits(of_kept.positions, classes, each)
     layers, order = [], []
     for kinds in _layer_classes(np.bincount(classes, minlength=CLASSES)):
@@ -55,6 +51,27 @@ def make_plan(model: HybridModel, sensitivity: Sensitivity, distortion: float, p
     return Plan(kept, tuple(layers), basis, groups, each)
 
 
+def of_each_number(model: HybridModel, distortion: float) -> float:
+    """What each number of a model may add to the pictures' mean squared error."""
+    return distortion / sum(parameter.numel() for parameter in model.parameters())
+
+
+def worth_keeping(removals: np.ndarray, each: float) -> np.ndarray:
+    """Indices (n,), ascending, of the Gaussians that give more to pictures than they cost in bytes.
+
+    Args:
+        removals: (N,) what leaving out each adds, see `removal_error`.
+        each: what each number may add, see `of_each_number`.
+    """
+    return np.flatnonzero(removals >= ERROR_PER_BIT * each * BITS_OF_A_GAUSSIAN)
+
+
+@torch.no_grad()
+def _cube(model: HybridModel) -> np.ndarray:
+    """Where Gaussians are in the contracted cube, (N, 3) float64."""
+    return model.cube_coords(model.gaussians.positions.double()).cpu().numpy()
+
+
 def follow(plan: Plan, model: HybridModel) -> tuple[Plan, HybridModel]:
     """The plan of Gaussians that have moved, and they in its order, on the lattice.
 
@@ -64,8 +81,7 @@ def follow(plan: Plan, model: HybridModel) -> tuple[Plan, HybridModel]:
         plan: `plan.apply` made the model, in whose order it is.
         model: the part of a model that is stored, moved.
     """
-    with torch.no_grad():
-        cube = model.cube_coords(model.gaussians.positions.double()).cpu().numpy()
+    cube = _cube(model)
     layers, order, start = [], [], 0
     for points in (layer.points for layer in plan.layers):
         members = np.arange(start, start := start + len(points.classes))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,7 @@ from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.compact.channels import LIMIT
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.compact.quantized import COLUMNS, Quantized
-from hyrfpack.format.sections import COLORS, OPACITIES, SCALES
+from hyrfpack.format.sections import COLORS, LOGITS, MLPS, OPACITIES, SCALES, TABLES
 from hyrfpack.model import HybridModel
 from hyrfpack.parallel.pool import run_jobs
 
@@ -33,7 +33,13 @@ def decide(model: HybridModel, sensitivity: Sensitivity, distortion: float, prun
 
 
 def quantize(
-    model: HybridModel, plan: Plan, sensitivity: Sensitivity, *, reach: int = 1, like: Quantized | None = None
+    model: HybridModel,
+    plan: Plan,
+    sensitivity: Sensitivity,
+    *,
+    reach: int = 1,
+    like: Quantized | None = None,
+    sections: Collection[str] = (*LOGITS, *TABLES, *MLPS),
 ) -> Quantized:
     """Quantise a planned model (`plan.apply`) by rate and distortion.
 
@@ -41,44 +47,49 @@ def quantize(
         sensitivity: that the plan was made by.
         reach: how many steps from the nearest symbol are tried; 0 takes the nearest.
         like: an earlier result of the same plan, whose weights of predictions are taken over.
+        sections: what to quantise; a file takes all.
 
     Raises:
         HyrfError: a parameter is NaN or infinite.
     """
     arrays = {group: values.astype(np.float64) for group, values in to_arrays(model).items()}
     sensitivity, d = sensitivity.of(plan.kept), plan.distortion_per_number
-    opacity, error = opacity_error(model, arrays[OPACITIES][:, 0], sensitivity.opacities)
     jobs: dict[str, Callable[[], Any]] = {
         group: partial(quantize_groups, arrays[group].ravel(), groups, sensitivity.fields[group], d, reach)
         for group, groups in plan.groups.items()
+        if group in sections
     }
-    # Cut before it is turned: a colour far outside would come back as another.
-    colors = np.clip(arrays[COLORS], -LIMIT / 2, LIMIT / 2) @ plan.basis.astype(np.float64)
+    logits = [group for group in LOGITS if group in sections]
+    weights = {COLORS: sensitivity.colors, SCALES: sensitivity.scales, OPACITIES: sensitivity.opacities}
+    error: ErrorModel | None = None
+    if COLORS in logits:  # cut before it is turned: a colour far outside would come back as another
+        arrays[COLORS] = np.clip(arrays[COLORS], -LIMIT / 2, LIMIT / 2) @ plan.basis.astype(np.float64)
+    if OPACITIES in logits:
+        numbers, error = opacity_error(model, arrays[OPACITIES][:, 0], sensitivity.opacities)
+        arrays[OPACITIES] = numbers[:, None]
     stop = 0
     for layer, classes in enumerate(layer.points.classes for layer in plan.layers):
         part = slice(stop, stop := stop + len(classes))
-        s = sensitivity.of(part)
-
-        def opacity_cost(places: np.ndarray, candidates: np.ndarray, part: slice = part) -> np.ndarray:
-            return error(places + part.start, candidates)
-
-        parts: dict[str, tuple[np.ndarray, np.ndarray, ErrorModel | None, int]] = {
-            COLORS: (colors[part], s.colors, None, reach),
-            SCALES: (arrays[SCALES][part], s.scales, None, reach),
-            OPACITIES: (opacity[part, None], s.opacities, opacity_cost, reach and OPACITY_REACH),
-        }
-        for group, (values, weights, cost, far) in parts.items():
-            for column, numbers in enumerate(values.T):
+        for group in logits:
+            opaque = group == OPACITIES
+            cost = partial(_of_later, error, part.start) if opaque and error else None
+            far = reach and OPACITY_REACH if opaque else reach
+            for column, values in enumerate(arrays[group][part].T):
                 weight = None if like is None else like.channels[layer][group][column].weight
                 jobs[f"{group} {layer} {column}"] = partial(
-                    quantize_channel, numbers, classes, weights, d, cost, far, weight
+                    quantize_channel, values, classes, weights[group][part], d, cost, far, weight
                 )
     done = run_jobs(jobs)
     channels = [
-        {group: [done[f"{group} {layer} {column}"] for column in range(count)] for group, count in COLUMNS.items()}
+        {group: [done[f"{group} {layer} {column}"] for column in range(COLUMNS[group])] for group in logits}
         for layer in range(len(plan.layers))
     ]
-    return Quantized(plan, channels, {group: done[group] for group in plan.groups})
+    return Quantized(plan, channels, {group: done[group] for group in plan.groups if group in sections})
+
+
+def _of_later(error: ErrorModel, start: int, places: Any, candidates: np.ndarray) -> np.ndarray:
+    """The error of Gaussians that are counted from `start` on."""
+    return error(places + start, candidates)
 
 
 @torch.no_grad()

@@ -118,13 +118,18 @@ def measure_sensitivity(model: HybridModel, cameras: Sequence[Camera], seed: int
             parameter.grad = None
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(wanted[name])
-    return _gathered(model, squares, pixels, field_pixels, near)
+    return _gathered(model, squares, pixels, field_pixels, near, stretch)
 
 
 def _gathered(
-    model: HybridModel, squares: dict[str, torch.Tensor], pixels: int, field_pixels: int, cameras: Sequence[Camera]
+    model: HybridModel,
+    squares: dict[str, torch.Tensor],
+    pixels: int,
+    field_pixels: int,
+    cameras: Sequence[Camera],
+    stretch: torch.Tensor,
 ) -> Sensitivity:
-    expected = _expected(model, cameras)
+    expected = _expected(model, cameras, stretch)
     views = len(cameras) * 2
     explicit = []
     for name, guess in expected.items():
@@ -168,7 +173,7 @@ def _stretch(model: HybridModel) -> torch.Tensor:
 
 
 @torch.no_grad()
-def _expected(model: HybridModel, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
+def _expected(model: HybridModel, cameras: Sequence[Camera], stretch: torch.Tensor) -> dict[str, np.ndarray]:
     """(N,) each: what a Gaussian's numbers would do to pictures, up to a factor, if nothing stood before it.
 
     Each pixel under a Gaussian of opacity o and standard deviations a, b (the larger two) depends on its colour by o at
@@ -185,7 +190,7 @@ def _expected(model: HybridModel, cameras: Sequence[Camera]) -> dict[str, np.nda
         distance = torch.linalg.vector_norm(positions - place, dim=1).clamp_min(NEAREST)
         total += (area * (camera.fx * camera.fy / (camera.width * camera.height)) / distance**2).clamp_max(1)
     seen = total * opacities**2
-    stretched = _stretch(model).double().square().sum(dim=(1, 2))
+    stretched = stretch.double().square().sum(dim=(1, 2))
     guesses = {
         "positions": seen * stretched / area.clamp_min(1e-12),
         "color_logits": seen,

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
@@ -16,6 +17,7 @@ from typing import TypeVar
 
 import torch
 
+S = TypeVar("S")
 T = TypeVar("T")
 
 
@@ -27,10 +29,18 @@ def thread_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+_this_thread = threading.local()
+
+
+def _be_one_core() -> None:
+    """Each worker is one core's worth of work: neither torch nor this pool shall fan out again inside it."""
+    torch.set_num_threads(1)
+    _this_thread.works = True
+
+
 @cache
 def _executor(threads: int) -> ThreadPoolExecutor:
-    # Each worker is one core's worth of work: a torch call inside it must not fan out again.
-    return ThreadPoolExecutor(threads, thread_name_prefix="hyrfpack", initializer=torch.set_num_threads, initargs=(1,))
+    return ThreadPoolExecutor(threads, thread_name_prefix="hyrfpack", initializer=_be_one_core)
 
 
 def _after_fork() -> None:
@@ -76,10 +86,10 @@ def run_tasks(task: Callable[[int], None], count: int) -> None:
     """Call task(0) ... task(count - 1) on the pool's threads and wait for all; then the first error is raised here.
 
     Tasks are pulled one by one, so uneven ones balance. Results must not depend on which thread ran what: each
-    task writes to its own place.
+    task writes to its own place. Inside of a task, further ones run one after the other.
     """
     threads = thread_count()
-    if count == 1 or threads == 1:
+    if count == 1 or threads == 1 or getattr(_this_thread, "works", False):
         for index in range(count):
             task(index)
         return
@@ -111,12 +121,22 @@ def run_ranges(task: Callable[[int, int], None], length: int, minimum: int = 204
     run_tasks(lambda i: task(edges[i], edges[i + 1]), ranges)
 
 
-def run_jobs(jobs: dict[str, Callable[[], T]]) -> dict[str, T]:
-    """What independent jobs return; they run side by side."""
-    names, done = list(jobs), {}
+def side_by_side(function: Callable[[S], T], items: Sequence[S]) -> list[T]:
+    """What a function returns for each item, in their order; an item a core at a time.
+
+    Example:
+        >>> side_by_side(abs, [-2, 3])
+        [2, 3]
+    """
+    done: dict[int, T] = {}
 
     def run(index: int) -> None:
-        done[names[index]] = jobs[names[index]]()
+        done[index] = function(items[index])
 
-    run_tasks(run, len(names))
-    return {name: done[name] for name in names}
+    run_tasks(run, len(items))
+    return [done[index] for index in range(len(items))]
+
+
+def run_jobs(jobs: dict[str, Callable[[], T]]) -> dict[str, T]:
+    """What independent jobs return; they run side by side."""
+    return dict(zip(jobs, side_by_side(lambda job: job(), list(jobs.values())), strict=True))

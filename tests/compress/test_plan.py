@@ -265,6 +265,20 @@ def test_the_decoder_gets_what_the_encoder_said_it_would(count: int, distortion:
     assert len(to_model(model.config, arrays)) == len(plan.kept)
 
 
+@pytest.mark.parametrize("sections", [("COLO",), ("SCAL", "OPAC"), ("GTAB", "GMLP"), ()])
+def test_some_sections_are_quantised_as_among_all(sections: tuple[str, ...]) -> None:
+    model = a_model()
+    plan = a_plan(model)
+    planned = plan.apply(model)
+
+    some = quantize(planned, plan, a_sensitivity(model), sections=sections).arrays()
+
+    every = quantize(planned, plan, a_sensitivity(model)).arrays()
+    assert some.keys() == set(sections)
+    for group, values in some.items():
+        np.testing.assert_array_equal(values, every[group])
+
+
 def test_without_reach_every_number_is_half_a_step_away_at_most() -> None:
     model = a_model()
     plan = a_plan(model)

@@ -25,7 +25,7 @@ _BLOCK = 1 << 15  # numbers at once: few enough that temporaries stay in the cac
 
 @dataclass(frozen=True)
 class Quantized:
-    """A model's numbers as they will be stored.
+    """A model's numbers as they will be stored; of some sections, until it is encoded.
 
     Attributes:
         plan: which they are.
@@ -40,7 +40,7 @@ class Quantized:
     def arrays(self) -> dict[str, np.ndarray]:
         """The numbers as they will be decoded: flat tables and decoders, (M, columns) explicit logits; float32."""
         arrays = {group: chosen.values for group, chosen in self.groups.items()}
-        for group in LOGITS:
+        for group in self.channels[0]:
             layers = [[channel.values for channel in layer[group]] for layer in self.channels]
             arrays[group] = np.concatenate([_joined(values, self.plan.basis) for values in layers])
         return arrays

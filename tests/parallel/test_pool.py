@@ -1,0 +1,50 @@
+"""The pool of threads: order, errors, and tasks that have tasks of their own."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+import torch
+
+from hyrfpack.parallel.pool import run_jobs, run_tasks, side_by_side
+
+
+@pytest.fixture(autouse=True)
+def two_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HYRFPACK_THREADS", "2")
+
+
+def test_results_come_in_the_order_of_the_items_and_by_the_names_of_the_jobs() -> None:
+    assert side_by_side(lambda number: number**2, list(range(50))) == [number**2 for number in range(50)]
+    assert run_jobs({name: name.upper for name in "cab"}) == {"c": "C", "a": "A", "b": "B"}
+    assert side_by_side(abs, []) == []
+
+
+def test_two_items_are_worked_on_at_once() -> None:
+    both = threading.Barrier(2, timeout=30)
+    side_by_side(lambda _: both.wait(), [0, 1])
+
+
+def test_tasks_of_tasks_run_where_they_are_and_wait_for_no_one() -> None:
+    """With both threads waiting for a third there would be no end to it."""
+
+    def nested(number: int) -> set[str]:
+        names: list[str] = []
+        run_tasks(lambda _: names.append(threading.current_thread().name), 4)
+        return {threading.current_thread().name, *names}
+
+    assert all(len(names) == 1 for names in side_by_side(nested, list(range(8))))
+
+
+def test_the_first_error_is_raised() -> None:
+    def fail(number: int) -> None:
+        if number >= 3:
+            raise ValueError(f"{number}")
+
+    with pytest.raises(ValueError, match="3"):
+        side_by_side(fail, list(range(6)))
+
+
+def test_torch_does_not_fan_out_inside_of_a_task() -> None:
+    assert side_by_side(lambda _: torch.get_num_threads(), [0, 1]) == [1, 1]
