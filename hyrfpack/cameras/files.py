@@ -74,11 +74,13 @@ def cameras_to_json(cameras: Sequence[tuple[str, Camera]]) -> str:
 def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
     """Read named cameras.
 
-    Two forms are understood:
+    Three forms are understood:
 
     - ours, a list: `[{"name": "0001", "width": 800, "height": 600, "fx": 700, "fy": 700, "cx": 400, "cy": 300,
       "camera_from_world": [[4 x 4]]}, ...]`, OpenCV axes (x right, y down, z forward). `name` may be left out, `fy`
       then equals `fx`, and `cx`, `cy` the picture's middle;
+    - `cameras.json` of 3DGS training: a list, too, with "position" (the camera's place), "rotation" (world_from_camera,
+      3 x 3) and "img_name" in place of "camera_from_world" and "name";
     - `transforms.json` of nerfstudio and instant-ngp: an object with `frames`, each with a `transform_matrix`
       (world_from_camera, OpenGL axes) and, here or for all frames, `w`, `h` and `fl_x` or `camera_angle_x`. Lens
       distortion is left out: renders are pinhole pictures.
@@ -116,7 +118,12 @@ def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
 
 
 def _from_ours(item: dict[str, Any], name: str) -> tuple[str, Camera]:
-    return str(item.get("name", name)), camera_from_json(item)
+    if "camera_from_world" in item or "rotation" not in item:
+        return str(item.get("name", name)), camera_from_json(item)
+    rotation = np.asarray(item["rotation"], np.float64).reshape(3, 3)
+    pose = np.eye(4)
+    pose[:3] = np.column_stack((rotation.T, -rotation.T @ np.asarray(item["position"], np.float64).reshape(3)))
+    return str(item.get("img_name", name)), camera_from_json({**item, "camera_from_world": rigid_pose(pose)})
 
 
 def _from_transforms(item: dict[str, Any], name: str) -> tuple[str, Camera]:

@@ -12,12 +12,13 @@ from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
     from hyrfpack.distill import DistillReport
+    from hyrfpack.scene import Camera
 
 
 @click.command("import", short_help="Make a small model of 3D Gaussians from elsewhere.")
 @click.argument("source", type=PATH)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The .hyrf file to write.")
-@click.option("--steps", type=click.IntRange(min=1), default=500, show_default=True, help="Optimiser steps.")
+@click.option("--steps", type=click.IntRange(min=1), default=300, show_default=True, help="Optimiser steps.")
 @click.option(
     "--psnr",
     type=click.FloatRange(10, 60),
@@ -35,7 +36,12 @@ if TYPE_CHECKING:
     metavar="PIXELS",
     help="Longer side of the pictures that it learns from.",
 )
-@click.option("--cameras", type=PATH, metavar="FILE", help="Where it will be looked at from, as JSON; or nerfstudio's.")
+@click.option(
+    "--cameras",
+    type=PATH,
+    metavar="PATH",
+    help="Where it will be looked at from: JSON (nerfstudio's and 3DGS' too), or the folder of photos and poses.",
+)
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Same seed, same bytes.")
 @overwrite_option
 @json_option
@@ -53,21 +59,22 @@ def import_(
     """Turn SOURCE, 3D Gaussians as .ply (plain or compressed), .splat, .spz or .sog, into a small .hyrf file.
 
     No photos are needed: the model learns from pictures of SOURCE itself, from all around or, where its Gaussians
-    surround, from inside. With --cameras, which reads what `hyrfpack render --cameras` reads, it learns what is seen
-    from there. The dB told are of viewpoints that were held out.
+    surround, from inside. With --cameras, which reads what `hyrfpack render --cameras` and `--data` read, it learns
+    what is seen from there; a cameras.json that 3DGS training left beside SOURCE is found by itself. The dB told are
+    of viewpoints that were held out.
 
     \b
     Examples:
       hyrfpack import scene.ply -o scene.hyrf
       hyrfpack import scene.spz -o scene.hyrf --steps 1500 --psnr 40
-      hyrfpack import room.ply -o room.hyrf --cameras transforms.json --size 800
+      hyrfpack import room.ply -o room.hyrf --cameras photos/room --size 800
     """
     loose = source.parent if source.name == "meta.json" else source  # a SOG is a folder, or a file
     Outputs(source, cameras, folder=loose, overwrite=overwrite).file(output, ".hyrf")
-    from hyrfpack.cameras.files import cameras_from_json
     from hyrfpack.distill import DistillConfig, distill
 
-    given = None if cameras is None else [camera for _, camera in cameras_from_json(cameras)]
+    cameras = cameras or _left_beside(source)
+    given = None if cameras is None else _cameras(cameras)
     config = DistillConfig(steps=steps, psnr=psnr, size=size, seed=seed)
     report = distill(source, output, config, cameras=given, say=note, quiet=False)
     if as_json:
@@ -83,6 +90,26 @@ def import_(
         f"{report.views} held-out views: {report.psnr:.2f} dB against the original, the worst {report.psnr_worst:.2f}; "
         f"{report.seconds:.0f} s"
     )
+
+
+def _left_beside(source: Path) -> Path | None:
+    """The cameras of 3DGS training, whose output is cameras.json and point_cloud/iteration_30000/point_cloud.ply."""
+    left = source.absolute().parents[2:3]
+    if source.name != "point_cloud.ply" or not left or not (left[0] / "cameras.json").is_file():
+        return None
+    note(f"taking the cameras of the training: {left[0] / 'cameras.json'}")
+    return left[0] / "cameras.json"
+
+
+def _cameras(path: Path) -> list[Camera]:
+    """Of a file of cameras, or of photos and poses."""
+    from hyrfpack.cameras.files import cameras_from_json
+    from hyrfpack.data import load_scene
+    from hyrfpack.data.archive import is_archive
+
+    if path.is_dir() or is_archive(path):
+        return [view.camera for view in load_scene(path).views]
+    return [camera for _, camera in cameras_from_json(path)]
 
 
 def _times(report: DistillReport, size: int | None) -> str:

@@ -1,5 +1,6 @@
 """Explicit 3D Gaussians of other programs -> a hybrid model, without photos."""
 
-from hyrfpack.distill.fit import DistillConfig, DistillReport, distill, distill_splats
+from hyrfpack.distill.config import DistillConfig
+from hyrfpack.distill.fit import DistillReport, distill, distill_splats
 
 __all__ = ["DistillConfig", "DistillReport", "distill", "distill_splats"]

@@ -8,7 +8,7 @@ rendered, by regression over the Gaussians.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -31,8 +31,8 @@ PER_ROW, PER_ROW_HARMONICS = 8, 2
 FINEST = 1024  # vertices of the finest level along an axis
 SILENT = HashGridConfig(4, levels=1, base=2, finest=2)  # of a field that has nothing to say
 SMALLEST = 2e-4  # local units that scales are told apart down to: half a pixel, at 1000 across the box
-BATCH = 16_384  # Gaussians a step
-EPOCHS, LEAST_STEPS = 80, 600
+BATCH = 4096  # Gaussians a step: many small steps come nearer than few large ones that take as long
+EPOCHS, LEAST_STEPS, MOST_STEPS = 80, 2400, 6000
 RATES = LearningRates(fields=(4e-3, 1e-4), color_logits=(1e-2, 1e-3))
 SIZE_WEIGHT = 0.1  # of the squared error of a size that the field may guess, against those of shapes that it must know
 MOST_WEIGHT = 10.0  # of a Gaussian, in means
@@ -108,12 +108,20 @@ def initial_model(
     with torch.no_grad():
         for values in (model.radiance.weights[-1], model.radiance.biases[-1]):
             values.zero_()
+    if not degree:
+        model.radiance.requires_grad_(False)
     _fit(model, drawable, shapes, light, cameras if degree else (), seed, share)
     with torch.no_grad():  # what the field says of sizes and opacities comes off what Gaussians store
         raw = model.geometry(model.cube_coords(gaussians.positions))
         gaussians.scale_logits.copy_(shapes.sizes[:, None] - raw[:, 1:4].mean(1, keepdim=True))
         gaussians.opacity_logits.copy_(opacity_logits - raw[:, :1])
     return model
+
+
+def _batches(count: int, generator: torch.Generator) -> Iterator[Tensor]:
+    """Indices of BATCH of `count` rows, without end: none twice in one batch (see `take_rows`), all in each round."""
+    while True:
+        yield from torch.randperm(count, generator=generator).split(BATCH)
 
 
 def _fit(
@@ -134,11 +142,10 @@ def _fit(
     poses = [torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32) for camera in cameras]
     no_turn = torch.eye(1, 4)
     optimizer = Optimizer(model, RATES)
-    steps = math.ceil(share * max(LEAST_STEPS, EPOCHS * count // BATCH))
+    steps = math.ceil(share * min(max(LEAST_STEPS, EPOCHS * count // BATCH), MOST_STEPS))
     keep_freed_memory()
     with torch_on_one_thread():
-        for step in range(steps):
-            some = torch.randperm(count, generator=generator)[:BATCH]  # no row twice: see `take_rows`
+        for step, some in zip(range(steps), _batches(count, generator), strict=False):
             raw = model.geometry(coords[some])
             made = _Shapes.of(raw[:, 1:4], raw[:, 4:] + no_turn)
             errors = (made.matrices - shapes.matrices[some]).square().sum((1, 2))

@@ -12,11 +12,12 @@ from torch import Tensor
 from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.rasterize.cull import frustum_cull
-from hyrfpack.parallel.pool import torch_on_one_thread
+from hyrfpack.parallel.pool import side_by_side, torch_on_one_thread
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.splats.draw import Drawable, draw, sent_light
 
+LIT_AT_ONCE = 8  # views whose light is in memory together
 LEAST_ALPHA = 1e-6  # below it a pixel has no colour of its own
 
 
@@ -46,14 +47,18 @@ def light_of(drawable: Drawable, cameras: Sequence[Camera]) -> Tensor:
     """(N,) the light that each Gaussian sends to a picture, in pixels: the sum of T alpha, mean over cameras."""
     total = torch.zeros(len(drawable.positions))
     settings = RenderSettings()
-    for camera in cameras:
+
+    def light(camera: Camera) -> tuple[Tensor, Tensor]:
         pose = torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32)
         size = camera.intrinsics, camera.width, camera.height
         index = frustum_cull(drawable.positions, pose, *size, settings.near, settings.cull_tolerance)
         parts = (drawable.positions, drawable.quats, drawable.scales, drawable.opacities)
         means, quats, scales, opacities = (part[index] for part in parts)
-        light = sent_light(means, quats, scales, opacities, camera, pose, drawable.antialiased)
-        total.index_add_(0, index, light)
+        return index, sent_light(means, quats, scales, opacities, camera, pose, drawable.antialiased)
+
+    for first in range(0, len(cameras), LIT_AT_ONCE):
+        for index, sent in side_by_side(light, cameras[first : first + LIT_AT_ONCE]):
+            total.index_add_(0, index, sent)
     return total / max(1, len(cameras))
 
 
@@ -61,9 +66,10 @@ def light_of(drawable: Drawable, cameras: Sequence[Camera]) -> Tensor:
 def likeness(model: HybridModel, drawable: Drawable, cameras: Sequence[Camera]) -> list[float]:
     """PSNR in dB of a model's pictures against the original's, both over black and cut to [0, 1], by camera."""
     decoded = model.decode()
-    scores = []
-    for camera in cameras:
+
+    @torch.no_grad()  # of this thread
+    def score(camera: Camera) -> float:
         wanted = draw(drawable, camera).rgb.clamp(0, 1)
-        given = render(model, camera, decoded=decoded).rgb.clamp(0, 1)
-        scores.append(psnr(given, wanted))
-    return scores
+        return psnr(render(model, camera, decoded=decoded).rgb.clamp(0, 1), wanted)
+
+    return side_by_side(score, cameras)

@@ -11,6 +11,7 @@ from hyrfpack.cameras.between import small_camera
 from hyrfpack.cameras.paths import look_at
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.model import Frame
+from hyrfpack.parallel.pool import side_by_side
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.splats import Splats
@@ -26,6 +27,7 @@ ENCLOSED = 0.75  # of all directions from the clearest places: where so many end
 MIDDLE = 0.55  # of the box, along each axis, that views from inside stand in
 PLACES, CLEAREST = 256, 8  # that are looked at to tell
 TRIED = 6  # cameras for each that is wanted
+ENOUGH = 100_000  # splats that tell what a place is like; of more, every n-th
 THUMBNAIL = 24  # pixels a side, to see how much a picture shows
 
 
@@ -76,10 +78,12 @@ class Weighted:
 
     def clutter(self, place: np.ndarray, reach: float = CLEAR) -> float:
         """About how much of the sphere around a place (3,) splats within `reach` half diagonals cover."""
-        squares = ((self.splats.positions - place) ** 2).sum(axis=1)
+        every = _every(len(self.areas))
+        squares = ((self.splats.positions[::every] - place) ** 2).sum(axis=1)
         near = squares < (reach * self.radius) ** 2
+        areas, squares = self.areas[::every][near], squares[near]
         # A disc of standard deviations a and b lets 2 pi a b o of light from far behind it disappear.
-        return float((self.areas[near] / (2 * squares[near] + self.areas[near])).sum())
+        return every * float((areas / (2 * squares + areas)).sum())
 
 
 def _box(positions: np.ndarray, sizes: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -92,7 +96,9 @@ def _box(positions: np.ndarray, sizes: np.ndarray, weights: np.ndarray) -> tuple
     return low, high
 
 
-def viewpoints(weighted: Weighted, drawable: Drawable, count: int, size: int, seed: int) -> list[Camera]:
+def viewpoints(
+    weighted: Weighted, drawable: Drawable, count: int, size: int, seed: int, inside: bool | None = None
+) -> list[Camera]:
     """Cameras all around, near and far, or inside where splats surround.
 
     Views from outside look at splats, drawn as `Weighted.targets`, from all directions. Where the clearest places of
@@ -105,41 +111,53 @@ def viewpoints(weighted: Weighted, drawable: Drawable, count: int, size: int, se
         count: how many.
         size: pixels a side.
         seed: of what is drawn; other seeds give other cameras of the same kind.
+        inside: whether views stand inside; `surrounds` says, if it is not said here.
     """
     rng = np.random.default_rng(seed)
-    inside = _surrounds(weighted, drawable)
+    inside = surrounds(weighted, drawable) if inside is None else inside
     found: list[Camera] = []
     others: list[tuple[float, Camera]] = []
-    for _ in range(TRIED * count):
-        place, target = _inside(weighted, rng) if inside else _outside(weighted, rng)
-        camera = _camera(place, target, size, FIELD_OF_VIEW[inside])
-        covered = -1.0 if weighted.clutter(place) > CLUTTER else coverage(drawable, camera)
-        if covered >= COVERED:
-            found.append(camera)
-            if len(found) == count:
-                return found
-        else:
-            others.append((covered, camera))
+
+    def covered(camera: Camera) -> float:
+        return -1.0 if weighted.clutter(camera.position) > CLUTTER else coverage(drawable, camera)
+
+    for _ in range(TRIED):
+        ends = [_inside(weighted, rng) if inside else _outside(weighted, rng) for _ in range(count)]
+        cameras = [_camera(place, target, size, FIELD_OF_VIEW[inside]) for place, target in ends]
+        for share, camera in zip(side_by_side(covered, cameras), cameras, strict=True):
+            if share >= COVERED:
+                found.append(camera)
+            else:
+                others.append((share, camera))
+        if len(found) >= count:
+            return found[:count]
     others.sort(key=lambda pair: -pair[0])
     return found + [camera for _, camera in others[: count - len(found)]]
 
 
 def coverage(drawable: Drawable, camera: Camera) -> float:
     """How much of a camera's picture splats cover, 0 to 1, from a picture of THUMBNAIL pixels."""
-    return 1 - float(draw(drawable, small_camera(camera, THUMBNAIL)).transmittance.mean())
+    every = _every(len(drawable.positions))
+    # Of n times as many, each like these, the n-th power gets through.
+    seen = draw(drawable.thinned(every), small_camera(camera, THUMBNAIL), black=True).transmittance ** every
+    return 1 - float(seen.mean())
 
 
-def _surrounds(weighted: Weighted, drawable: Drawable) -> bool:
+def _every(count: int) -> int:
+    return max(1, -(-count // ENOUGH))
+
+
+def surrounds(weighted: Weighted, drawable: Drawable) -> bool:
     """Whether there are places in the box with room around them and splats all around."""
-    rng = np.random.default_rng(0)  # the same answer for training views and held-out ones
+    rng = np.random.default_rng(0)
     places = [_inside(weighted, rng)[0] for _ in range(PLACES)]
-    clutter = np.array([weighted.clutter(place, ROOMY) for place in places])
+    clutter = np.array(side_by_side(lambda place: weighted.clutter(place, ROOMY), places))
     seen = []
     for index in np.argsort(clutter, kind="stable")[:CLEAREST]:
         if clutter[index] <= CLUTTER:
             axes = np.concatenate((np.eye(3), -np.eye(3)))
             cameras = [_camera(places[index], places[index] + axis * weighted.radius, THUMBNAIL, 90.0) for axis in axes]
-            seen.append(np.mean([coverage(drawable, camera) for camera in cameras]))
+            seen.append(np.mean(side_by_side(lambda camera: coverage(drawable, camera), cameras)))
     return len(seen) > 0 and float(np.median(seen)) >= ENCLOSED
 
 

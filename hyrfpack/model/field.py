@@ -32,6 +32,14 @@ class Field(nn.Module):
             self.weights.append(nn.Parameter(uniform(fan_out, fan_in, bound=bound, generator=generator)))
             self.biases.append(nn.Parameter(torch.zeros(fan_out)))
 
+    @property
+    def silent(self) -> bool:
+        """Whether it says 0 wherever it is asked, and learns nothing: then nobody needs to ask. On a GPU, False."""
+        last = self.weights[-1], self.biases[-1]
+        if last[0].is_cuda or torch.is_grad_enabled() and any(values.requires_grad for values in self.parameters()):
+            return False
+        return not any(bool(values.any()) for values in last)
+
     def forward(self, coords: Tensor, extra: Tensor | None = None, *, mixed: bool = False) -> Tensor:
         """Raw outputs (N, outputs) at coords (N, 3) in the unit cube, with extra inputs (N, E); `mixed` as in `mlp`."""
         return mlp(self.features(coords, extra), list(self.weights), list(self.biases), mixed=mixed)

@@ -155,6 +155,8 @@ class HybridModel(nn.Module):
         positions, logits = explicit.positions, explicit.color_logits
         if index is not None:
             positions, logits = take_rows(positions, index), take_rows(logits, index)
+        if self.radiance.silent:
+            return torch.sigmoid(logits)
         positions = self._field_positions(positions)
         directions = torch.nn.functional.normalize(positions - viewpoint, dim=-1, eps=1e-12)
         return torch.sigmoid(self._radiance(positions, directions) + logits)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -50,6 +50,11 @@ class Drawable:
             splats.antialiased,
         )
 
+    def thinned(self, every: int) -> Drawable:
+        """Every n-th of the splats."""
+        names = "positions", "scales", "quats", "opacities", "harmonics"
+        return replace(self, **{name: getattr(self, name)[::every] for name in names})
+
     @property
     def degree(self) -> int:
         """Of the spherical harmonics."""
@@ -67,6 +72,8 @@ def draw(
     drawable: Drawable,
     camera: Camera,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    *,
+    black: bool = False,
 ) -> Rasterization:
     """Draw splats as a camera sees them, over black; `transmittance` of the result says what lies behind.
 
@@ -74,16 +81,18 @@ def draw(
         drawable: what to draw.
         camera: from where, in world units.
         settings: near plane (local units), culling and transmittance as in `hyrfpack.render`.
+        black: without colours, for what is covered alone.
     """
     pose = torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32)
     size = camera.intrinsics, camera.width, camera.height
     index = frustum_cull(drawable.positions, pose, *size, settings.near, settings.cull_tolerance)
+    positions = drawable.positions[index]
     return rasterize(
-        drawable.positions[index],
+        positions,
         drawable.quats[index],
         drawable.scales[index],
         drawable.opacities[index],
-        drawable.colors_from(camera_center(pose), index).clamp_min(0),
+        torch.zeros_like(positions) if black else drawable.colors_from(camera_center(pose), index).clamp_min(0),
         pose,
         *size,
         near=settings.near,

@@ -81,6 +81,26 @@ def test_transforms_json_takes_the_angle_and_intrinsics_of_one_frame(tmp_path):
     assert (second.width, second.intrinsics) == (60, (70, 71, 3, 4))
 
 
+def test_cameras_of_3dgs_training_are_turned_into_ours(tmp_path):
+    """It writes where a camera is and how it is turned; ours says where the world is, seen from there."""
+    made = ring(5)
+    items = []
+    for number, camera in enumerate(made):
+        inverse = np.linalg.inv(camera.camera_from_world)
+        lens = {"width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy}
+        place = {"position": inverse[:3, 3].tolist(), "rotation": inverse[:3, :3].tolist()}
+        items.append({"id": number, "img_name": f"IMG_{number}", **lens, **place})
+    (tmp_path / "cameras.json").write_text(json.dumps(items))
+
+    read = cameras_from_json(tmp_path / "cameras.json")
+
+    assert [name for name, _ in read] == [f"IMG_{number}" for number in range(5)]
+    for (_, camera), expected in zip(read, made, strict=True):
+        np.testing.assert_allclose(camera.camera_from_world, expected.camera_from_world, atol=1e-12)
+        assert camera.intrinsics == (expected.fx, expected.fy, expected.width / 2, expected.height / 2)
+
+
+TURNED = {"width": 40, "height": 30, "fx": 25, "rotation": np.eye(3).tolist(), "position": [0, 0, 0]}
 GOOD = {"width": 40, "height": 30, "fx": 25, "camera_from_world": np.eye(4).tolist()}
 
 
@@ -103,6 +123,11 @@ GOOD = {"width": 40, "height": 30, "fx": 25, "camera_from_world": np.eye(4).toli
         (json.dumps([{**GOOD, "camera_from_world": [1, 2]}]), "camera 0 is not valid"),
         (json.dumps([{**GOOD, "camera_from_world": np.diag([1, 1, -1, 1]).tolist()}]), "camera 0 is not valid"),
         (json.dumps([{"width": 3}]), "camera 0 has no"),
+        (json.dumps([TURNED, {**TURNED, "position": [0, 0]}]), "camera 1 is not valid"),
+        (json.dumps([{**TURNED, "position": [0, 0, math.nan]}]), "camera 0 is not valid"),
+        (json.dumps([{**TURNED, "rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}]), "camera 0 is not valid"),
+        (json.dumps([{**TURNED, "rotation": "turned"}]), "camera 0 is not valid"),
+        (json.dumps([{"rotation": np.eye(3).tolist()}]), "camera 0 has no 'position'"),
         (json.dumps({"frames": [{"transform_matrix": np.eye(4).tolist()}]}), "camera 0 has no 'w'"),
     ],
 )

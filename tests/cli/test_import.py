@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,8 @@ from commands import refused, succeeded
 from explicit_balls import ball
 
 from hyrfpack.cameras.files import cameras_to_json
+from hyrfpack.demo.scene import write_demo_scene
+from hyrfpack.distill import DistillConfig
 from hyrfpack.distill.views import Weighted, viewpoints
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.formats import ply
@@ -43,6 +46,32 @@ def test_import_learns_what_cameras_see_and_tells_numbers(source: Path, cameras:
     assert f"{numbers['psnr']:.2f} dB against the original" in words
 
 
+def test_cameras_may_be_those_of_photos(source: Path, tmp_path: Path) -> None:
+    photos = write_demo_scene(tmp_path / "photos", views=10, size=24)
+    result = succeeded("import", source, "-o", tmp_path / "x.hyrf", *QUICK, "--cameras", photos, "--json")
+    assert json.loads(result.stdout)["views"] == 2
+    assert "8 viewpoints given" in result.stderr
+
+
+def test_cameras_that_training_left_beside_are_taken(source: Path, cameras: Path, tmp_path: Path) -> None:
+    left = tmp_path / "output"
+    cloud = left / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    cloud.parent.mkdir(parents=True)
+    shutil.copy(source, cloud)
+    assert "made up" in succeeded("import", cloud, "-o", tmp_path / "without.hyrf", *QUICK).stderr
+    shutil.copy(cameras, left / "cameras.json")
+
+    result = succeeded("import", cloud, "-o", tmp_path / "x.hyrf", *QUICK)
+
+    assert str(left / "cameras.json") in result.stderr and "7 viewpoints given" in result.stderr
+
+
+def test_photos_without_poses_are_no_cameras(source: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    sentence = refused("import", source, "-o", tmp_path / "x.hyrf", "--cameras", tmp_path / "empty")
+    assert "empty" in sentence and not (tmp_path / "x.hyrf").exists()
+
+
 def test_import_makes_folders_that_are_missing(source: Path, tmp_path: Path) -> None:
     succeeded("import", source, "-o", tmp_path / "not" / "yet" / "ball.hyrf", *QUICK)
     assert (tmp_path / "not" / "yet" / "ball.hyrf").is_file()
@@ -63,4 +92,4 @@ def test_import_says_what_it_did_not_reach(source: Path, tmp_path: Path) -> None
     numbers = json.loads(result.stdout)
     assert numbers["psnr_asked"] == 60
     assert f"asked for 60 dB and reached {numbers['psnr']:.1f} at held-out viewpoints" in result.stderr
-    assert "--steps 500" in result.stderr
+    assert f"--steps {DistillConfig.steps}" in result.stderr

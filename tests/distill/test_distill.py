@@ -9,7 +9,7 @@ from explicit_balls import LITTLE, ball
 
 import hyrfpack
 from hyrfpack.compress import calibrate
-from hyrfpack.distill import DistillConfig, distill_splats, fit, teacher
+from hyrfpack.distill import DistillConfig, distill_splats, fit, pack, teach, teacher
 from hyrfpack.distill.teacher import likeness, teaching_scene
 from hyrfpack.distill.views import Weighted, viewpoints
 from hyrfpack.errors import HyrfDataError, HyrfError
@@ -107,7 +107,7 @@ def test_cameras_that_look_away_are_one_sentence(tmp_path: Path) -> None:
 
 def test_folder_that_cannot_be_made_is_told_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_bytes(b"")
-    monkeypatch.setattr(fit, "_cameras", lambda *arguments: pytest.fail("the work began"))
+    monkeypatch.setattr(teach, "_cameras", lambda *arguments: pytest.fail("the work began"))
     with pytest.raises(HyrfError, match="file is a file, not a folder"):
         distill_splats(ball(20), tmp_path / "file" / "x.hyrf", LITTLE)
 
@@ -117,8 +117,8 @@ def test_interrupt_while_packing_leaves_the_file_that_was_there(
 ) -> None:
     target = tmp_path / "x.hyrf"
     target.write_bytes(b"before")
-    monkeypatch.setattr(fit, "PACKED", 100.0)  # the first try will not do
-    monkeypatch.setattr(fit.Packer, "attempt", _interrupted_at_the_second(fit.Packer.attempt))
+    monkeypatch.setattr(pack, "PACKED", 100.0)  # the first try will not do
+    monkeypatch.setattr(pack.Packer, "attempt", _interrupted_at_the_second(pack.Packer.attempt))
     with pytest.raises(KeyboardInterrupt):
         distill_splats(ball(20), target, LITTLE)
     assert [path.name for path in tmp_path.iterdir()] == ["x.hyrf"]
@@ -147,9 +147,9 @@ def counting(monkeypatch: pytest.MonkeyPatch, place, name: str) -> list:
 def test_nothing_is_measured_or_drawn_twice_however_often_packing_is_tried(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fit, "_mse", lambda psnr: 2.0**-psnr)  # what packing adds seems to be very much
+    monkeypatch.setattr(pack, "_mse", lambda psnr: 2.0**-psnr)  # what packing adds seems to be very much
     measured = counting(monkeypatch, calibrate, "measure_sensitivity")
-    tried = counting(monkeypatch, fit.Packer, "attempt")
+    tried = counting(monkeypatch, pack.Packer, "attempt")
     drawn = counting(monkeypatch, teacher, "photograph")
 
     distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, steps=12))
@@ -162,11 +162,11 @@ def test_nothing_is_measured_or_drawn_twice_however_often_packing_is_tried(
 def test_a_short_import_looks_from_fewer_places_and_regresses_less(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looked = counting(monkeypatch, fit, "viewpoints")
-    started = counting(monkeypatch, fit, "initial_model")
-    monkeypatch.setattr(fit, "_fit_to_pictures", lambda *args: None)
-    monkeypatch.setattr(fit, "_pack", _interrupt)
-    for steps in (1, 500):
+    looked = counting(monkeypatch, teach, "viewpoints")
+    started = counting(monkeypatch, teach, "initial_model")
+    monkeypatch.setattr(teach, "_fit_to_pictures", lambda *args: None)
+    monkeypatch.setattr(fit, "pack", _interrupt)
+    for steps in (1, DistillConfig.steps):
         with pytest.raises(KeyboardInterrupt):
             distill_splats(ball(20), tmp_path / "x.hyrf", DistillConfig(steps=steps, size=16))
     (_, _, few, *_), _, _, (_, _, many, *_), _, _ = looked  # the others decide, or are held out
@@ -184,7 +184,7 @@ def test_a_file_less_like_the_original_than_asked_for_says_so(tmp_path: Path) ->
     report = distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, psnr=60), say=said.append)
     assert report.psnr_asked == 60
     assert said[-1].startswith(f"asked for 60 dB and reached {report.psnr:.1f} at held-out viewpoints")
-    assert "--steps 500" in said[-1] and "--cameras" in said[-1]
+    assert f"--steps {DistillConfig.steps}" in said[-1] and "--cameras" in said[-1]
 
     said.clear()
     distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, psnr=10), say=said.append)

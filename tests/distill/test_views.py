@@ -3,8 +3,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from explicit_balls import ball
 
+from hyrfpack.distill import views
 from hyrfpack.distill.views import CLUTTER, COVERED, DISTANCES, Weighted, coverage, viewpoints
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.splats import Splats, concatenate
@@ -64,3 +66,19 @@ def test_sky_does_not_stretch_the_frame() -> None:
     weighted, drawable, cameras = seen(concatenate((replace(ground, scales=ground.scales / 2), sky[::10])))
     assert weighted.frame.scale < 2
     assert np.abs([camera.position for camera in cameras]).max() < 10
+
+
+def test_of_many_splats_some_tell_what_a_place_is_like(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each fourth, as if there were four of it: where many lie behind each other, that is nearly what all say."""
+    ball = solid_ball()
+    faint = replace(ball, opacities=ball.opacities * 0.1)
+    weighted, drawable, cameras = seen(faint)
+    covered = [coverage(drawable, camera) for camera in cameras]
+    cluttered = [weighted.clutter(camera.position, 1.0) for camera in cameras]
+
+    monkeypatch.setattr(views, "ENOUGH", len(faint) // 4)
+
+    np.testing.assert_allclose([coverage(drawable, camera) for camera in cameras], covered, atol=0.1)
+    np.testing.assert_allclose(
+        [weighted.clutter(camera.position, 1.0) for camera in cameras], cluttered, rtol=0.3, atol=0.01
+    )

@@ -154,6 +154,36 @@ def test_silent_fields_leave_the_explicit_values():
     torch.testing.assert_close(model.decode_colors(torch.tensor(VIEWPOINT)), torch.full((40, 3), float(sigmoid(0.3))))
 
 
+@pytest.mark.parametrize("learns", [False, True])
+def test_a_colour_decoder_that_says_nothing_is_asked_only_while_it_learns(learns):
+    model, viewpoint = random_model().requires_grad_(False), torch.tensor(VIEWPOINT)
+    for values in (model.radiance.weights[-1], model.radiance.biases[-1]):
+        values.zero_()
+    model.radiance.requires_grad_(learns)
+    model.gaussians.color_logits.requires_grad_(True)
+    asked = []
+    model.radiance.grid.register_forward_hook(lambda *_: asked.append(1))
+
+    colors = model.decode_colors(viewpoint)
+    colors.sum().backward()
+
+    assert len(asked) == learns
+    assert torch.equal(colors, torch.sigmoid(model.gaussians.color_logits))
+    assert model.gaussians.color_logits.grad.abs().min() > 0
+    assert (model.radiance.biases[-1].grad is not None) == learns
+
+
+def test_one_number_in_the_last_layer_is_something_to_say():
+    model, viewpoint = random_model().requires_grad_(False), torch.tensor(VIEWPOINT)
+    weight, bias = model.radiance.weights[-1], model.radiance.biases[-1]
+    weight.zero_(), bias.zero_()
+    bias[1] = 1.0
+
+    colors = model.decode_colors(viewpoint)
+
+    torch.testing.assert_close(colors, torch.sigmoid(model.gaussians.color_logits + torch.tensor([0.0, 1.0, 0.0])))
+
+
 def test_decoding_some_equals_picking_from_all():
     model, index = random_model(), torch.tensor([3, 3, 17, 0, 39])
     viewpoint = torch.tensor(VIEWPOINT)

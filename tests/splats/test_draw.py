@@ -33,6 +33,12 @@ def test_colours_below_nothing_are_nothing():
     assert drawn.rgb.max() == 0 and drawn.transmittance.min() < 0.6
 
 
+def test_in_black_what_is_covered_is_the_same():
+    drawable, camera = Drawable.of(one_ball([[0.4, 0, 0]]), UNIT), camera_at((0, -3, 0))
+    black = draw(drawable, camera, black=True)
+    assert black.rgb.max() == 0 and torch.equal(black.transmittance, draw(drawable, camera).transmittance)
+
+
 def test_the_colour_is_the_one_of_the_direction_from_camera_to_centre():
     harmonics = np.zeros((4, 3))
     harmonics[2] = 0.2  # of z

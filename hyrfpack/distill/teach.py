@@ -1,0 +1,129 @@
+"""A hybrid model learns what splats look like: viewpoints, regression, pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from hyrfpack.cameras.between import small_camera, views_between
+from hyrfpack.data import PictureCache
+from hyrfpack.distill.config import DistillConfig
+from hyrfpack.distill.start import initial_model
+from hyrfpack.distill.teacher import light_of, teaching_scene
+from hyrfpack.distill.views import Weighted, surrounds, viewpoints
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.model import HybridModel
+from hyrfpack.scene import Camera, Scene, evenly_spaced
+from hyrfpack.splats.draw import Drawable
+from hyrfpack.splats.splats import Splats
+from hyrfpack.train.config import LARGEST_SEED, DensityConfig, LearningRates, TrainConfig
+from hyrfpack.train.progress import ProgressLine
+from hyrfpack.train.trainer import Trainer
+
+DECIDING = 3  # viewpoints to decide by, for each that is held out: means of few of them differ by a dB
+TEST_EVERY = 8  # of given cameras, one in so many is held out
+LIT_FROM = 64  # views at which it is measured what each Gaussian gives to pictures
+UNSEEN = 0.01  # of all light, what the faintest Gaussians together may send: they are left out
+REGRESSED, LEAST_REGRESSED = 250, 0.2  # steps from which on the first regression is whole, and its least share
+# Warm: small steps from a model that is nearly right.
+RATES = LearningRates(
+    positions=(2e-6, 2e-7),
+    fields=(3e-4, 3e-5),
+    color_logits=(3e-3, 3e-4),
+    scale_logits=(3e-3, 3e-4),
+    opacity_logits=(6e-3, 6e-4),
+)
+
+
+@dataclass(frozen=True)
+class Taught:
+    """A model that has learnt what splats look like, before it is packed.
+
+    Attributes:
+        model: the model.
+        original: the splats.
+        train, deciding, test: where they were looked at from to teach it, where files are looked at from to decide how
+            fine they need be, and where scores are of.
+    """
+
+    model: HybridModel
+    original: Drawable
+    train: list[Camera]
+    deciding: list[Camera]
+    test: list[Camera]
+
+
+def teach(
+    splats: Splats,
+    config: DistillConfig = DistillConfig(),  # noqa: B008 - frozen
+    *,
+    name: str = "the splats",
+    cameras: Sequence[Camera] | None = None,
+    say: Callable[[str], None] = lambda sentence: None,
+    quiet: bool = True,
+) -> Taught:
+    """Make a hybrid model that looks like splats. Arguments and errors as of `distill_splats`.
+
+    Example:
+        >>> from hyrfpack.splats.files import read_splats
+        >>> quick = DistillConfig(steps=1, size=16, train_views=2, test_views=2)
+        >>> len(teach(read_splats("bonsai.ply"), quick).model) > 0
+        True
+    """
+    weighted = Weighted.of(splats, name)
+    original = Drawable.of(splats, weighted.frame)
+    train, deciding, test = _cameras(weighted, original, config, cameras)
+    say(
+        f"{len(splats):,} Gaussians, harmonics of degree {splats.degree}; {len(train)} viewpoints "
+        f"{'made up' if cameras is None else 'given'} to teach with, {len(test)} held out"
+    )
+    light = light_of(original, evenly_spaced(train, LIT_FROM)).numpy()
+    kept = _lit(light)
+    if not len(kept):
+        raise HyrfDataError(f"{name}: no view shows anything of the Gaussians; give others with --cameras")
+    say(f"{len(splats) - len(kept):,} Gaussians are hardly seen and left out; fitting the fields to the others")
+    share = min(1.0, max(LEAST_REGRESSED, config.steps / REGRESSED))
+    lit = Drawable.of(splats[kept], weighted.frame), torch.from_numpy(light[kept])
+    model = initial_model(*lit, train, config.seed, share)
+    scene, cache = teaching_scene(name, original, train, test), PictureCache()
+    _fit_to_pictures(model, scene, config, cache, quiet)
+    return Taught(model, original, train, deciding, test)
+
+
+def _cameras(
+    weighted: Weighted, drawable: Drawable, config: DistillConfig, cameras: Sequence[Camera] | None
+) -> tuple[list[Camera], list[Camera], list[Camera]]:
+    """To teach with, to decide by, and held out; of fewer than two given ones, the same. None decides and scores."""
+    if cameras is None:
+        # More pictures than steps are not looked at.
+        taught = min(config.train_views, max(LIT_FROM, config.steps))
+        # Seeds that no other config.seed leads to.
+        seeds = 2 * config.seed, 2 * (LARGEST_SEED + 1) + config.seed, 2 * config.seed + 1
+        inside = surrounds(weighted, drawable)
+        train, deciding, test = (
+            viewpoints(weighted, drawable, count, config.size, seed, inside)
+            for count, seed in zip((taught, DECIDING * config.test_views, config.test_views), seeds, strict=True)
+        )
+        return train, deciding, test
+    fitting = [small_camera(camera, config.size) for camera in cameras]
+    test = fitting[::TEST_EVERY]
+    train = [camera for number, camera in enumerate(fitting) if number % TEST_EVERY] or test
+    return train, views_between(evenly_spaced(train, config.test_views), config.seed), test
+
+
+def _lit(light: np.ndarray) -> np.ndarray:
+    """Indices (n,), ascending, of the Gaussians without the faintest that together send UNSEEN of the light (N,)."""
+    order = np.argsort(light, kind="stable")
+    sums = np.cumsum(light[order].astype(np.float64))
+    return np.sort(order[(sums > UNSEEN * sums[-1]) & (light[order] > 0)]) if len(order) else order
+
+
+def _fit_to_pictures(model: HybridModel, scene: Scene, config: DistillConfig, cache: PictureCache, quiet: bool) -> None:
+    # No density control: every Gaussian has its place, and packing leaves out those that pictures do not miss.
+    settings = TrainConfig(steps=config.steps, seed=config.seed, learning_rates=RATES, density=DensityConfig(stop=0.0))
+    trainer = Trainer(scene, settings, cache, model=model)
+    with ProgressLine(config.steps, 0, quiet) as line:
+        trainer.run(report=lambda t, loss, mse: line.update(t.step, loss, mse, len(t.model)))
