@@ -59,6 +59,12 @@ BACKGROUND_COLORS = ("black", "white", "random")
 @click.option(
     "--cache-mb", type=click.IntRange(min=1), metavar="MB", help="Decoded photos to keep.  [default: RAM / 4]"
 )
+@click.option(
+    "--log",
+    type=OUTPUT,
+    metavar="FILE",
+    help="Write progress here as lines of JSON; with tensorboard, scalars beside it.",
+)
 @click.option("--poses", is_flag=True, help="Where DATA has no poses, estimate them first, into RUN/scene.")
 @click.option("--resume", is_flag=True, help="Go on from the run's checkpoint.")
 @click.option("--overwrite", is_flag=True, help="Replace what an earlier run left in the folder.")
@@ -69,6 +75,7 @@ def train(
     out: Path,
     reading: dict[str, Any],
     cache_mb: int | None,
+    log: Path | None,
     poses: bool,
     resume: bool,
     overwrite: bool,
@@ -116,7 +123,8 @@ def train(
     where = describe_device(place)
     note(f"{scene.layout} scene: {len(scene.train)} photos to train on, {len(scene.test)} held out; on {where}")
     cache = None if cache_mb is None else PictureCache(cache_mb * 2**20)
-    result = run(scene, out, TrainConfig(**settings), resume=resume, overwrite=overwrite, cache=cache, device=place)
+    config = TrainConfig(**settings)
+    result = run(scene, out, config, resume=resume, overwrite=overwrite, cache=cache, device=place, log=log)
     detail("seconds: " + ", ".join(f"{part} {t:.1f}" for part, t in result.metrics.get("stage_seconds", {}).items()))
     if not result.complete and result.step == 0:
         note("stopped before the first step; the same command begins anew")

@@ -23,6 +23,26 @@ BAR = 8, 24  # columns, at least and at most
 DROPPED = ("gaussians", "loss", "gone", "speed", "psnr", "left")  # where a terminal is narrow, the first ones first
 
 
+class Pace:
+    """How fast steps are taken, by what was measured since the kernels are compiled.
+
+    Attributes:
+        warm, warm_step: when that was, and after which step.
+    """
+
+    def __init__(self, steps: int, done: int) -> None:
+        self.steps, self.first, self.warm_step = steps, done, done
+        self.start = self.warm = monotonic()
+
+    def at(self, step: int, now: float) -> tuple[float, float]:
+        """Steps a second and seconds left after this step, taken `now`."""
+        since, taken = (self.warm, self.warm_step) if step > self.warm_step else (self.start, self.first)
+        speed = max(step - taken, 1) / max(now - since, 1e-9)
+        if step - self.first <= COLD_STEPS:
+            self.warm, self.warm_step = now, step
+        return speed, (self.steps - step) / speed
+
+
 class ProgressLine:
     """Shows step, steps/s, loss, PSNR, Gaussians and time left on standard error.
 
@@ -34,9 +54,8 @@ class ProgressLine:
         """Args: quiet: show nothing; advice: what would shorten the run ("fewer --steps or a GPU"), told once where
         more than an hour is left; without it, nothing is."""
         self.steps = steps
-        self.first = done
-        self.start = self.last_log = self.warm = monotonic()
-        self.warm_step = done
+        self.start = self.last_log = monotonic()
+        self.pace = Pace(steps, done)
         self.loss: float | None = None
         self.mse: float | None = None
         self.quiet = quiet or sys.stderr is None
@@ -74,7 +93,7 @@ class ProgressLine:
             self.loss = loss * weight + (self.loss or 0) * (1 - weight)
             self.mse = mse * weight + (self.mse or 0) * (1 - weight)
         now = monotonic()
-        speed, left = self._pace(step, now)
+        speed, left = self.pace.at(step, now)
         if self.quiet or self.loss is None or self.mse is None:
             return
         self._advise(step, now, left)
@@ -96,16 +115,8 @@ class ProgressLine:
             self.last_log = now
             _print("step " + "  ".join(parts.values()))
 
-    def _pace(self, step: int, now: float) -> tuple[float, float]:
-        """Steps a second and seconds left, by what was measured since the kernels are compiled."""
-        since, at = (self.warm, self.warm_step) if step > self.warm_step else (self.start, self.first)
-        speed = max(step - at, 1) / max(now - since, 1e-9)
-        if step - self.first <= COLD_STEPS:
-            self.warm, self.warm_step = now, step
-        return speed, (self.steps - step) / speed
-
     def _advise(self, step: int, now: float, left: float) -> None:
-        fair = step - self.warm_step >= FAIR_STEPS and now - self.warm >= FAIR_SECONDS
+        fair = step - self.pace.warm_step >= FAIR_STEPS and now - self.pace.warm >= FAIR_SECONDS
         if self.advice and fair and left > LONG:
             self.note(f"this takes {left / 3600:.1f} more hours; {self.advice} would shorten it")
             self.advice = ""

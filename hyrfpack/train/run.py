@@ -8,7 +8,7 @@ import signal
 import statistics
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,7 @@ from hyrfpack.render import render
 from hyrfpack.scene import Scene, View, evenly_spaced
 from hyrfpack.train.checkpoint import saved_budget_factor
 from hyrfpack.train.config import TrainConfig
+from hyrfpack.train.log import TrainingLog
 from hyrfpack.train.pilots import MOST_STEPS, is_undecided, is_usable, measure_budget, measures_budget
 from hyrfpack.train.progress import ProgressLine
 from hyrfpack.train.trainer import Trainer
@@ -69,6 +70,7 @@ def train(
     device: str | torch.device = "auto",
     quiet: bool = False,
     report: Report | None = None,
+    log: Path | str | None = None,
 ) -> TrainResult:
     """Train a model on a scene and leave everything about the run in a folder.
 
@@ -90,6 +92,8 @@ def train(
         report: told after each step its number, the loss and mean squared error of its view (NaN where all of it is
             masked) and how many Gaussians there are, in place of the line that is shown otherwise; 0 for its number
             while pilots run.
+        log: a file that gets a line of JSON every few steps, and TensorBoard's files beside it where that is
+            installed; see `hyrfpack.train.log.TrainingLog`. A resumed run adds to it.
 
     Raises:
         HyrfError: the folder holds another run, training cannot start or go on, no photo has a pixel to train on or to
@@ -112,6 +116,8 @@ def train(
     checkpoint = out / CHECKPOINT
     device = choose_device(device)
     _prepare(out, scene, resume, overwrite)
+    if log is not None:
+        Outputs(scene=scene, overwrite=resume or overwrite).file(log)
     cache = cache or PictureCache()
     _check_photos(scene, cache)
     silent = quiet or report is not None
@@ -130,23 +136,31 @@ def train(
     trainer.choices["max_gaussians"] += why
     if resume:
         trainer.load(checkpoint)
-    with _naming_the_checkpoint(trainer, overwrite):
+    with _naming_the_checkpoint(trainer, overwrite), ExitStack() as stack:
         with (
             ProgressLine(config.steps, trainer.step, silent, _shorter(device)) as line,
             _stop_requests() as stop,
         ):
             if why:
                 line.note(f"Gaussians at most: {trainer.choices['max_gaussians']}")
-            tell = report or line.update
-            complete = trainer.run(
-                checkpoint=checkpoint,
-                report=lambda t, loss, mse: tell(t.step, loss, mse, len(t.model)),
-                stop=stop,
-                warn=line.note,
-            )
-        if not complete:
-            return TrainResult(False, trainer.step, None, {})
-        metrics = _finish(trainer, out)
+            written = None
+            if log is not None:
+                written = stack.enter_context(TrainingLog(Path(log), config.steps, trainer.step, device, line.note))
+            told = [report or line.update, *([written.step] if written else [])]
+
+            def tell_all(trainer: Trainer, loss: float, mse: float) -> None:
+                for tell in told:
+                    tell(trainer.step, loss, mse, len(trainer.model))
+
+            complete = trainer.run(checkpoint=checkpoint, report=tell_all, stop=stop, warn=line.note)
+        metrics = _finish(trainer, out) if complete else {}
+        if written:
+            facts = {name: metrics[name] for name in ("gaussians", "bytes") if complete}
+            scores = metrics.get("evaluation", {})
+            facts |= {name: scores[name] for name in ("psnr", "ssim") if name in scores}
+            written.end(complete=complete, step=trainer.step, **facts)
+    if not complete:
+        return TrainResult(False, trainer.step, None, {})
     checkpoint.unlink(missing_ok=True)
     return TrainResult(True, trainer.step, out / MODEL, metrics)
 

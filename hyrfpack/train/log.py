@@ -1,0 +1,152 @@
+"""A training run told to programs: one line of JSON a record, and scalars for TensorBoard where it is installed."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from hyrfpack.errors import HyrfError
+from hyrfpack.evaluate.metrics import decibels
+from hyrfpack.train.progress import Pace
+
+RECORDS, LONGEST = 200, 10.0  # records of a run, at least; seconds between two of them, at most
+SCALARS = ("loss", "psnr", "gaussians", "steps_per_second", "memory_bytes", "gpu_memory_bytes")
+
+
+class TrainingLog:
+    """Writes records of a run to a file as they come, each at once: whoever reads it sees the run as it is.
+
+    Each line is an object with "event": "step" (every 1/RECORDS of the run and every LONGEST seconds), or "end" (where
+    "complete" says whether it is, "error" why not). That of a step has
+
+        step, steps         taken and to be taken
+        loss, psnr          means over the steps since the record before; dB; null where masks left nothing of them
+        gaussians           of the model
+        memory_bytes        the most that the process has had so far; null where the system does not tell
+        gpu_memory_bytes    the same of the GPU; null on a CPU
+        steps_per_second    lately
+        seconds, seconds_left   since training began or was gone on with, and to go, about
+
+    A file that can no longer be written, as on a full disk, ends the log and not the run.
+    """
+
+    def __init__(
+        self, path: Path, steps: int, done: int, device: torch.device, warn: Callable[[str], None] = warnings.warn
+    ) -> None:
+        """Begin a log, or go on with one where steps are done already; TensorBoard's files go to a folder of its name.
+
+        Raises:
+            HyrfError: the file cannot be written.
+        """
+        self.path, self.steps, self.device, self.warn = path, steps, device, warn
+        self.pace = Pace(steps, done)
+        self.start = self.last = time.monotonic()
+        self.losses: list[float] = []
+        self.errors: list[float] = []
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self.file = open(path, "a" if done else "w", encoding="utf-8")
+        except OSError as error:
+            raise HyrfError(f"{path}: the log cannot be written ({error.strerror}); name another file") from error
+        self.scalars = _summary_writer(path)
+
+    def step(self, step: int, loss: float, mse: float, gaussians: int) -> None:
+        """Take in one finished step."""
+        now = time.monotonic()
+        speed, left = self.pace.at(step, now)
+        if mse == mse:  # not all of the photo is masked
+            self.losses.append(loss)
+            self.errors.append(mse)
+        due = step % max(1, self.steps // RECORDS) == 0 or step == self.steps or now - self.last >= LONGEST
+        if not due:
+            return
+        count = len(self.errors)
+        record = {
+            "event": "step",
+            "step": step,
+            "steps": self.steps,
+            "loss": sum(self.losses) / count if count else None,
+            "psnr": decibels(sum(self.errors) / count) if count else None,
+            "gaussians": gaussians,
+            "memory_bytes": peak_memory(),
+            "gpu_memory_bytes": torch.cuda.max_memory_allocated(self.device) if self.device.type == "cuda" else None,
+            "steps_per_second": speed,
+            "seconds": now - self.start,
+            "seconds_left": left,
+        }
+        self.last = now
+        self.losses.clear()
+        self.errors.clear()
+        self._write(record)
+        if self.scalars is not None:
+            for name in SCALARS:
+                if record[name] is not None:
+                    self.scalars.add_scalar(f"train/{name}", record[name], step)
+
+    def end(self, *, complete: bool, step: int, **facts: Any) -> None:
+        """Write the last record: whether the run is complete, and what it came to."""
+        self._write({"event": "end", "complete": complete, "step": step, **facts})
+        if self.scalars is not None:
+            for name, value in facts.items():
+                if isinstance(value, float):
+                    self.scalars.add_scalar(f"held-out/{name}", value, step)
+
+    def __enter__(self) -> TrainingLog:
+        return self
+
+    def __exit__(self, _kind: object, error: object, _traceback: object) -> None:
+        if isinstance(error, HyrfError):
+            self._write({"event": "end", "complete": False, "error": str(error)})
+        with suppress(OSError):
+            self.file.close()
+        if self.scalars is not None:
+            self.scalars.close()
+
+    def _write(self, record: dict[str, Any]) -> None:
+        if self.file.closed:
+            return
+        numbers = {name: _short(value) for name, value in record.items()}
+        try:
+            self.file.write(json.dumps(numbers, allow_nan=False) + "\n")
+            self.file.flush()
+        except OSError as error:
+            self.warn(f"{self.path}: the log cannot be written ({error.strerror}); training goes on without it")
+            with suppress(OSError):  # it tries once more to write what is left
+                self.file.close()
+
+
+def peak_memory() -> int | None:
+    """The most memory in bytes that this process has had so far; None where the system does not tell.
+
+    Example:
+        >>> peak_memory() is None or peak_memory() > 1_000_000
+        True
+    """
+    if os.name != "posix":
+        return None
+    from resource import RUSAGE_SELF, getrusage
+
+    return getrusage(RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def _short(value: Any) -> Any:
+    """A number, of six digits."""
+    return float(f"{value:.6g}") if isinstance(value, float) else value
+
+
+def _summary_writer(path: Path) -> Any:
+    if find_spec("tensorboard") is None:
+        return None
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(path.with_suffix(".tensorboard")))

@@ -1,0 +1,163 @@
+"""What a run tells programs while it goes on."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from scenes import ball_scene
+
+from hyrfpack.errors import HyrfError
+from hyrfpack.scene import Scene
+from hyrfpack.train import TrainConfig, log, train
+from hyrfpack.train.log import RECORDS, TrainingLog, peak_memory
+
+CPU = torch.device("cpu")
+CONFIG = TrainConfig(steps=30, seed=1, max_gaussians=120, checkpoint_every=1)
+
+
+def a_scene() -> Scene:
+    scene = ball_scene(views=8, points=60, side=24)
+    return replace(scene, train=scene.train[2:], test=scene.train[:2])
+
+
+def read(path: Path) -> list[dict]:
+    """The records of a log; NaN and infinity are no JSON."""
+
+    def refuse(name: str) -> None:
+        raise AssertionError(f"{name} in the log")
+
+    return [json.loads(line, parse_constant=refuse) for line in path.read_text().splitlines()]
+
+
+def test_each_line_says_where_the_run_is_and_the_last_what_it_came_to(tmp_path: Path) -> None:
+    result = train(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "new" / "log.jsonl")
+
+    *steps, end = read(tmp_path / "new" / "log.jsonl")
+    assert [record["step"] for record in steps] == list(range(1, CONFIG.steps + 1))
+    for record in steps:
+        assert record["event"] == "step" and record["steps"] == CONFIG.steps
+        assert record["loss"] > 0 and record["psnr"] > 0 and record["gpu_memory_bytes"] is None
+    curve = {record["step"]: record for record in result.metrics["curve"]}
+    assert all(math.isclose(r["psnr"], curve[r["step"]]["psnr"], rel_tol=1e-5) for r in steps if r["step"] in curve)
+    assert steps[-1]["seconds_left"] == 0 and steps[-1]["gaussians"] == result.metrics["gaussians"]
+    scores = result.metrics["evaluation"]
+    assert end["event"] == "end" and end["complete"] and end["bytes"] == result.model.stat().st_size
+    assert (end["psnr"], end["ssim"]) == pytest.approx((scores["psnr"], scores["ssim"]), rel=1e-5)
+
+
+def test_records_of_a_long_run_are_means_and_few(tmp_path: Path) -> None:
+    steps = 5 * RECORDS
+    with TrainingLog(tmp_path / "log.jsonl", steps, 0, CPU) as written:
+        for step in range(1, steps + 1):
+            written.step(step, loss=step, mse=0.01 if step % 2 else math.nan, gaussians=7)
+
+    records = read(tmp_path / "log.jsonl")
+    assert len(records) == RECORDS
+    assert records[0]["loss"] == 3 and records[0]["psnr"] == pytest.approx(20)  # of steps 1, 3 and 5
+    assert records[1]["loss"] == 8  # of 7 and 9
+
+
+def test_a_slow_run_is_told_of_every_few_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(log.time, "monotonic", lambda: now[0])
+    with TrainingLog(tmp_path / "log.jsonl", 10**6, 0, CPU) as written:
+        for step in range(1, 13):
+            now[0] += 2.5
+            written.step(step, 1.0, 0.1, 7)
+
+    assert [record["step"] for record in read(tmp_path / "log.jsonl")] == [4, 8, 12]
+
+
+def test_what_masks_leave_nothing_of_is_null(tmp_path: Path) -> None:
+    with TrainingLog(tmp_path / "log.jsonl", 2, 0, CPU) as written:
+        written.step(1, math.nan, math.nan, 7)
+        written.step(2, 0.0, 0.0, 7)
+
+    first, second = read(tmp_path / "log.jsonl")
+    assert first["loss"] is first["psnr"] is None and second["loss"] == 0 and second["psnr"] == 100
+
+
+def test_a_resumed_run_adds_to_its_log_and_another_begins_anew(tmp_path: Path) -> None:
+    where, file = tmp_path / "run", tmp_path / "log.jsonl"
+    stop = iter([False] * 9 + [True])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hyrfpack.train.trainer.Trainer._record", lambda *_: next(stop) and _interrupt())
+        with pytest.raises(KeyboardInterrupt):
+            train(a_scene(), where, CONFIG, quiet=True, log=file)
+    train(a_scene(), where, CONFIG, quiet=True, log=file, resume=True)
+
+    steps = [record["step"] for record in read(file) if record["event"] == "step"]
+    assert steps == [*range(1, 10), *range(10, CONFIG.steps + 1)]
+    with pytest.raises(HyrfError, match="log"):
+        train(a_scene(), tmp_path / "other", CONFIG, quiet=True, log=file)
+    train(a_scene(), tmp_path / "other", TrainConfig(steps=2), quiet=True, log=file, overwrite=True)
+    assert [record["step"] for record in read(file)] == [1, 2, 2]
+
+
+def _interrupt() -> None:
+    raise KeyboardInterrupt
+
+
+def test_a_run_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise HyrfError("it is broken")
+
+    monkeypatch.setattr("hyrfpack.train.trainer.Trainer._train_step", fail)
+    with pytest.raises(HyrfError):
+        train(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "log.jsonl")
+
+    assert read(tmp_path / "log.jsonl") == [{"event": "end", "complete": False, "error": "it is broken"}]
+
+
+def test_a_log_that_cannot_be_begun_is_found_before_the_first_step(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(HyrfError, match="file"):
+        train(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "file" / "log.jsonl")
+    assert not (tmp_path / "run" / "model.hyrf").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_a_full_disk_ends_the_log_and_not_the_run() -> None:
+    said: list[str] = []
+    with TrainingLog(Path("/dev/full"), 3, 0, CPU, said.append) as written:
+        for step in (1, 2, 3):
+            written.step(step, 1.0, 0.1, 7)
+        written.end(complete=True, step=3)
+    assert len(said) == 1 and "training goes on without it" in said[0]
+
+
+def test_scalars_go_to_tensorboard_where_it_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scalars: dict[str, list[tuple[int, float]]] = {}
+
+    class Writer:
+        def __init__(self, folder: str) -> None:
+            assert folder == str(tmp_path / "log.tensorboard")
+
+        def add_scalar(self, name: str, value: float, step: int) -> None:
+            scalars.setdefault(name, []).append((step, value))
+
+        def close(self) -> None:
+            scalars["closed"] = []
+
+    monkeypatch.setattr(log, "find_spec", lambda name: name == "tensorboard")
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", SimpleNamespace(SummaryWriter=Writer))
+    with TrainingLog(tmp_path / "log.jsonl", 2, 0, CPU) as written:
+        written.step(1, 0.5, 0.1, 7)
+        written.step(2, 0.25, 0.01, 8)
+        written.end(complete=True, step=2, psnr=21.5, gaussians=8)
+
+    assert scalars["train/loss"] == [(1, 0.5), (2, 0.25)] and scalars["train/gaussians"] == [(1, 7), (2, 8)]
+    assert scalars["train/psnr"] == [(1, pytest.approx(10)), (2, pytest.approx(20))]
+    assert scalars["held-out/psnr"] == [(2, 21.5)] and "closed" in scalars
+
+
+def test_memory_is_in_bytes() -> None:
+    peak = peak_memory()
+    assert peak is None or 50e6 < peak < 1e12
