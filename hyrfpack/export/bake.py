@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -15,7 +16,7 @@ from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import ALPHA_MIN
 from hyrfpack.ops.shade import Shading, shade
-from hyrfpack.parallel.pool import run_tasks, torch_on_one_thread
+from hyrfpack.parallel.pool import run_tasks, side_by_side, torch_on_one_thread
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import sent_light
@@ -60,7 +61,7 @@ def bake(model: HybridModel, cameras: Sequence[Camera], degrees: Sequence[int] =
     scales = geometry.scales * model.config.frame.scale
     for name, values in {**vars(geometry), "positions": positions, "scales": scales}.items():
         refuse_nonfinite(name, values)
-    views = [_view(model, geometry, camera) for camera in cameras]
+    views = side_by_side(partial(_view, model, geometry), cameras)  # much of one runs on one core only
     light, stray = torch.zeros(2, len(model), dtype=torch.float64)
     for view in views:
         light[view.index] += view.light
@@ -99,6 +100,7 @@ class _View:
     stray: Tensor
 
 
+@torch.no_grad()  # of each thread
 def _view(model: HybridModel, geometry: Geometry, camera: Camera) -> _View:
     settings, positions = RenderSettings(), model.gaussians.positions.detach()
     camera = small_camera(camera)

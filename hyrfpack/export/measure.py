@@ -13,6 +13,7 @@ from torch import Tensor
 from hyrfpack.evaluate.metrics import psnr, to_8bit
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.background import pixel_directions
+from hyrfpack.parallel.pool import side_by_side
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, View
 from hyrfpack.splats.draw import Drawable, draw
@@ -54,8 +55,10 @@ def likeness(
     decoded, frame = model.decode(), model.config.frame
     solid = torch.tensor(model.config.solid)
     drawables = {name: (Drawable.of(splats, frame), behind) for name, (splats, behind) in contenders.items()}
-    scores: dict[str, list[tuple[float, float | None]]] = {}
-    for camera, view in views:
+
+    @torch.no_grad()  # of each thread
+    def scores_at(place: tuple[Camera, View | None]) -> dict[str, tuple[float, float | None]]:
+        camera, view = place
         own = to_8bit(render(model, camera, decoded=decoded, background=sphere).rgb)
         pictures = {"model": own}
         for name, (drawable, behind) in drawables.items():
@@ -64,11 +67,14 @@ def likeness(
             pictures[name] = to_8bit(raster.rgb + raster.transmittance[..., None] * backdrop)
         photo, mask = (None, None) if view is None else _photo(view, model)
         if mask is not None and not mask.any():
-            continue
-        for name, picture in pictures.items():
-            against = None if photo is None else psnr(picture, photo, mask)
-            scores.setdefault(name, []).append((psnr(picture, own, mask), against))
-    return {name: _mean(values) for name, values in scores.items()}
+            return {}
+        return {
+            name: (psnr(picture, own, mask), None if photo is None else psnr(picture, photo, mask))
+            for name, picture in pictures.items()
+        }
+
+    scores = [found for found in side_by_side(scores_at, views) if found]
+    return {name: _mean([found[name] for found in scores]) for name in ("model", *drawables)} if scores else {}
 
 
 def _equirect_colors(picture: Tensor, camera: Camera) -> Tensor:
