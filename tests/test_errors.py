@@ -8,7 +8,6 @@ import pytest
 from scenes import small_model
 
 from hyrfpack.data import load_scene
-from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.evaluate.figures import training_curve
 from hyrfpack.format import save
@@ -39,14 +38,6 @@ def test_profile_paper_without_dahuffman_writes_nothing(without, tmp_path):
         save(small_model([(0, 0, 0)]), tmp_path / "model.hyrf", "paper")
 
     assert not list(tmp_path.iterdir())
-
-
-def test_points_without_trimesh_are_refused_by_file(without, tmp_path):
-    write_demo_scene(tmp_path, views=2, size=8)
-    without("trimesh")
-
-    with pytest.raises(HyrfError, match="sparse_pc.ply: reading points needs trimesh"):
-        load_scene(tmp_path)
 
 
 def test_a_model_without_pycolmap_is_refused_by_folder(without, tmp_path):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
 
-from hyrfpack.errors import HyrfDataError, needs_package, reason_of
+from hyrfpack.errors import HyrfDataError, reason_of
+from hyrfpack.ply import columns, read_elements, read_header
+
+_POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
+_GREY = 0.5
 
 
 def read_ply(ply: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -16,21 +19,21 @@ def read_ply(ply: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         HyrfDataError: the file cannot be read, or holds fewer points than it says.
     """
-    with needs_package("trimesh", f"{ply}: reading points"):
-        import trimesh
+    name = str(ply)
     try:
-        with ply.open("rb") as stream:
-            stated = re.search(rb"element vertex (\d{1,18})\s", stream.read(4096))
-        # A texture that the file names is of no use here, and would be opened.
-        cloud = trimesh.load(str(ply), file_type="ply", process=False, skip_materials=True)
-        points = np.asarray(getattr(cloud, "vertices", np.zeros((0, 3))), dtype=np.float64)
-        mesh = isinstance(cloud, trimesh.Trimesh)
-        rgba = np.asarray(cloud.visual.vertex_colors if mesh else getattr(cloud, "colors", ()))
-        colors = rgba[:, :3] / 255 if rgba.shape == (len(points), 4) else np.full_like(points, 0.5)
-    except Exception as error:  # trimesh raises whatever its parsing meets.
-        raise HyrfDataError(f"{ply}: the points cannot be read ({reason_of(error)}); export them again") from error
-    if points.ndim != 2 or points.shape[1:] != (3,) or colors.shape != points.shape:
-        raise HyrfDataError(f"{ply}: the points have no usable positions and colours; export them again")
-    if stated and int(stated[1]) != len(points):
-        raise HyrfDataError(f"{ply}: says {int(stated[1])} points but holds {len(points)}; export them again")
-    return points, colors
+        data = ply.read_bytes()
+    except OSError as error:
+        raise HyrfDataError(f"{name}: the points cannot be read ({reason_of(error)}); export them again") from error
+    header = read_header(data, name)
+    vertex = header.elements.get("vertex")
+    kinds = vertex.properties if vertex else {}
+    if not all(kinds.get(label) for label in _POSITION):
+        raise HyrfDataError(f"{name}: it has no points, or no x, y and z of them; export them again")
+    rows = read_elements(data, header, {"vertex"}, name)["vertex"]
+    points = columns(rows, _POSITION).astype(np.float64)
+    if not all(kinds.get(label) for label in _COLOR):
+        return points, np.full_like(points, _GREY)
+    # The header tells what is full: rows in text come as float64, whatever they hold.
+    full = [1.0 if kinds[label][0] == "f" else np.iinfo(kinds[label]).max for label in _COLOR]
+    colors = columns(rows, _COLOR).astype(np.float64) / full
+    return points, np.clip(np.nan_to_num(colors), 0, 1)

@@ -331,7 +331,7 @@ def test_a_texture_named_in_a_file_of_points_is_not_opened(root, caplog):
     with caplog.at_level(logging.WARNING):
         assert len(load_scene(root, layout="nerfstudio", test_every=0).points) == 5
 
-    assert not caplog.records  # trimesh complains of a picture that it cannot open
+    assert not caplog.records
 
 
 # --- pictures ---

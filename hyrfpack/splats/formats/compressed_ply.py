@@ -19,8 +19,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError
+from hyrfpack.ply import PlyHeader, columns, read_elements, read_header
 from hyrfpack.splats.formats.checked import checked_splats
-from hyrfpack.splats.formats.ply_elements import PlyHeader, columns, read_elements, read_header
 from hyrfpack.splats.formats.smallest_three import with_largest
 from hyrfpack.splats.harmonics import BAND_0
 from hyrfpack.splats.splats import Splats

@@ -11,10 +11,10 @@ import numpy as np
 from scipy.special import expit
 
 from hyrfpack.errors import HyrfDataError
+from hyrfpack.ply import columns, read_elements, read_header
 from hyrfpack.splats.formats import compressed_ply
 from hyrfpack.splats.formats.checked import checked_splats
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
-from hyrfpack.splats.formats.ply_elements import columns, read_elements, read_header
 from hyrfpack.splats.harmonics import MAX_DEGREE, terms_of
 from hyrfpack.splats.splats import Splats
 

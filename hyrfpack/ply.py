@@ -103,8 +103,8 @@ def read_elements(data: bytes, header: PlyHeader, wanted: set[str], name: str) -
         kinds = element.properties
         if "" in kinds.values() and element.count and (text is None or label in wanted):
             raise HyrfDataError(
-                f"{name}: its element '{label}' has properties that are lists; no file of Gaussians needs them, export "
-                "it again as a plain one"
+                f"{name}: its element '{label}' has properties that are lists, which are not read; export it again as "
+                "a plain one"
             )
         if text is not None:
             lines = (line for line in text if not line.isspace())

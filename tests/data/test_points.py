@@ -1,0 +1,64 @@
+"""Points with colours out of PLY files: the expected numbers are those that were written by hand."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hyrfpack.data.points import read_ply
+from hyrfpack.errors import HyrfDataError
+
+POINTS = [[1.0, -2.5, 3.0], [0.0, 1e3, -4.0]]
+
+
+def ply_file(path: Path, kind: str, full: float, order: str = "<", faces: bool = False) -> Path:
+    """Two points, the first of all, half and nothing of red, green and blue; as programs write them."""
+    name = {"<": "binary_little_endian", ">": "binary_big_endian", "": "ascii"}[order]
+    header = ["ply", f"format {name} 1.0", "comment by hand", "element vertex 2"]
+    header += [f"property float {axis}" for axis in ("x", "y", "z", "nx")]
+    header += [f"property {kind} {color}" for color in ("red", "green", "blue")]
+    header += ["element face 1", "property list uchar int vertex_indices"] if faces else []
+    colors = [[full, full // 2 if full > 1 else 0.5, 0], [0, 0, 0]]
+    types = {"uchar": "u1", "ushort": "u2", "float": "f4"}
+    layout = np.dtype([("p", order + "f4", 4), ("c", (order or "=") + types[kind], 3)])
+    rows = np.array([((*p, 7), tuple(c)) for p, c in zip(POINTS, colors, strict=True)], layout)
+    if order:
+        data = rows.tobytes() + (b"\x03" + bytes(12) if faces else b"")
+    else:
+        lines = [" ".join(map(str, (*p, 7, *c))) for p, c in zip(POINTS, colors, strict=True)]
+        data = "\n".join([*lines, *(["3 0 1 1"] if faces else []), ""]).encode()
+    path.write_bytes("\n".join([*header, "end_header", ""]).encode() + data)
+    return path
+
+
+@pytest.mark.parametrize("faces", [False, True])
+@pytest.mark.parametrize("order", ["<", ">", ""])
+@pytest.mark.parametrize(
+    ("kind", "full", "half"), [("uchar", 255, 127 / 255), ("ushort", 65535, 32767 / 65535), ("float", 1.0, 0.5)]
+)
+def test_points_and_colours_are_those_written(tmp_path, kind, full, half, order, faces):
+    points, colors = read_ply(ply_file(tmp_path / "a.ply", kind, full, order, faces))
+
+    np.testing.assert_array_equal(points, POINTS)
+    np.testing.assert_allclose(colors, [[1, half, 0], [0, 0, 0]], rtol=0, atol=1e-7)
+    assert points.dtype == colors.dtype == np.float64
+
+
+def test_trimesh_is_not_needed(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    assert len(read_ply(ply_file(tmp_path / "a.ply", "uchar", 255))[0]) == 2
+
+
+@pytest.mark.parametrize("properties", ["", "property float x\nproperty float y\n"])
+def test_a_file_without_points_is_refused_by_name(tmp_path, properties):
+    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 0\n{properties}end_header\n")
+    with pytest.raises(HyrfDataError, match="a.ply: it has no points"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_what_cannot_be_opened_is_refused_by_name(tmp_path):
+    with pytest.raises(HyrfDataError, match="a.ply: the points cannot be read"):
+        read_ply(tmp_path / "a.ply")
