@@ -22,6 +22,7 @@ from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
 from hyrfpack.ops.rasterize.shaded import rasterize_shaded
 from hyrfpack.ops.transfer import tensor_like
+from hyrfpack.ops.upsample import upsample
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.scene import Camera
 
@@ -199,12 +200,7 @@ def _background(
     )
     if grid.device.type == "cpu":  # on a GPU, what is NaN is NaN in the picture
         _refuse_nonfinite(background=grid)
-    rows, columns, _ = grid.shape
-    grid = grid.permute(2, 0, 1)[None]
-    if stride > 1:
-        size = ((rows - 1) * stride + 1, (columns - 1) * stride + 1)
-        grid = torch.nn.functional.interpolate(grid, size, mode="bilinear", align_corners=True)
-    return grid[0, :, :height, :width].permute(1, 2, 0)
+    return upsample(grid.permute(2, 0, 1), stride)[:, :height, :width].permute(1, 2, 0)
 
 
 @contextmanager
