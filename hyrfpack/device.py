@@ -77,7 +77,8 @@ def describe_device(device: torch.device) -> str:
     """What it is called, as "cuda:0 (NVIDIA H200)"."""
     if device.type != "cuda":
         return device.type
-    return f"cuda:{device.index or 0} ({torch.cuda.get_device_properties(device).name})"
+    number = torch.cuda.current_device() if device.index is None else device.index
+    return f"cuda:{number} ({torch.cuda.get_device_properties(device).name})"
 
 
 def upload_array(array: np.ndarray, device: torch.device) -> Tensor:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 import torch
 from pretend_gpu import CUDA, OnGpu, pretended_gpu
 
 from hyrfpack import device as devices
-from hyrfpack.device import choose_device, upload
+from hyrfpack.device import choose_device, describe_device, upload
 from hyrfpack.errors import HyrfError
+from hyrfpack.ops.dispatch import has_triton
 from hyrfpack.ops.hash_encode import hash_encode
+from hyrfpack.parallel import has_numba
 from hyrfpack.scene import Picture
 
 needs_no_gpu = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
@@ -72,6 +76,29 @@ def test_kernels_refuse_tensors_of_another_gpu_than_the_current_one(monkeypatch)
         monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
         with pytest.raises(ValueError, match=r"set_device\(0\)"):
             hash_encode(torch.zeros(1, 3, device=gpu), torch.zeros(8, 2, device=gpu), (2,), 3)
+
+
+def test_cuda_is_called_by_the_number_of_the_current_one(monkeypatch):
+    with pretended_gpu():
+        monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
+        assert describe_device(torch.device("cuda")) == "cuda:1 (a GPU that is not there)"
+        assert describe_device(torch.device("cuda", 0)) == "cuda:0 (a GPU that is not there)"
+    assert describe_device(torch.device("cpu")) == "cpu"
+
+
+@pytest.mark.parametrize(("has", "package"), [(has_numba, "numba"), (has_triton, "triton")])
+def test_kernels_are_there_only_where_their_compiler_can_be_imported(has, package, monkeypatch):
+    """Numba is installed and raises ImportError where numpy is newer than it knows."""
+
+    class Refuses:
+        def find_spec(self, name, path=None, target=None):
+            if name == package:
+                raise ImportError(f"{package} needs an older numpy")
+
+    for name in [name for name in sys.modules if name.partition(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(sys, "meta_path", [Refuses(), *sys.meta_path])
+    assert not has.__wrapped__()
 
 
 def test_a_slow_choice_is_told(monkeypatch):

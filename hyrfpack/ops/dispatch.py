@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from functools import cache
 
@@ -15,7 +14,11 @@ from hyrfpack.parallel import has_numba
 @cache
 def has_triton() -> bool:
     """Whether GPU kernels can be built: Triton comes with torch wherever torch runs on CUDA or ROCm."""
-    return importlib.util.find_spec("triton") is not None
+    try:
+        import triton  # noqa: F401
+    except ImportError:
+        return False
+    return True
 
 
 def interpreting() -> bool:
