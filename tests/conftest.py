@@ -35,6 +35,15 @@ if os.environ["TRITON_INTERPRET"] == "1" and find_spec("triton"):
 
     patch_once()
 
+from ops.device import needs_triton  # not before: it asks for Triton, which reads the environment
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Marks what runs kernels of the GPU, so that a machine with one can choose that alone."""
+    if needs_triton.mark in item.iter_markers():
+        item.add_marker("gpu")
+
+
 # Until all tests are collected, nothing becomes garbage, and looking for it takes a third of the time.
 gc.disable()
 

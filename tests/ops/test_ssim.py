@@ -160,6 +160,7 @@ def test_gradient_is_that_of_what_is_made_of_the_loss(implementation: str) -> No
     assert_same(value_and_gradient(curved, implementation, *pictures), expected_of(curved, *pictures))
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(INTERPRETED, reason="no GPU to wait for")
 def test_host_never_waits_for_the_gpu() -> None:
     image, target = gpu(photo(40, 50).requires_grad_()), gpu(photo(40, 50, seed=1))

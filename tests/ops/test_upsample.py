@@ -66,6 +66,7 @@ def test_on_a_gpu_each_node_gathers_the_same_gradient_without_atomics(shape, str
     assert stride == 1 or "upsample_bilinear2d" in called.names  # or what ran was not seen
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(DEVICE == "cpu", reason="there is no GPU")
 def test_bytes_of_the_gpu_do_not_depend_on_the_run():
     grid, grad = made((3, 270, 480), 0).float().to(DEVICE), made((3, 539, 959), 1).float().to(DEVICE)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,21 +13,24 @@ from pathlib import Path
 import pytest
 import torch
 
+from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.model.calls import Call
 from hyrfpack.ops.dispatch import has_triton
 from hyrfpack.ops.rasterize.reference import project
 from tools.gpu import check as gpu_check
 from tools.gpu import frames as gpu_frames
 from tools.gpu import kernels as gpu_kernels
+from tools.gpu import quality as gpu_quality
 from tools.gpu import report as gpu_report
 from tools.gpu import roofline as gpu_roofline
+from tools.gpu import suite as gpu_suite
 from tools.gpu import tests as gpu_tests
 from tools.gpu import timing as gpu_timing
 from tools.gpu.compare import checked
 from tools.gpu.rows import goal
 from tools.gpu.scene import make_cameras, make_model, splats_of
 from tools.gpu.setup import Setup, find_set
-from tools.gpu.worker import run_items
+from tools.gpu.worker import failure, missing_package, run_items
 
 CUDA = torch.cuda.is_available()
 GPU = "gpu" if has_triton() else "cpu"
@@ -70,6 +74,9 @@ def run(item):
         print("last words", flush=True)
         os._exit(9)
     if item == "hangs":
+        time.sleep(60)
+    if item == "hangs in a test":
+        print("test_loop", flush=True)
         time.sleep(60)
 sys.exit(gpu_worker.work(run, sys.argv[1:], lambda: usable))
 """
@@ -199,13 +206,66 @@ def test_an_item_that_raises_dies_or_breaks_the_device_leaves_the_others() -> No
     assert told["raises"] == ["fine", "failed: ValueError: one line"]
     assert told["breaks"] == ["fine", "failed: RuntimeError: illegal access"]
     assert told["dies"] == ["fine", "failed: its process ended: last words"]
-    assert told["lacks"][1].startswith("left out: ModuleNotFoundError: No module named 'no_such_package'")
+    assert told["lacks"][1] == "left out: it needs no_such_package, which is not installed here"
 
 
 def test_an_item_that_hangs_is_killed_at_the_time_limit_and_the_rest_is_named() -> None:
     told = run_children("one", "hangs", "two", seconds=1.5)
     assert told["one"] == ["fine"]
     assert told["hangs"][-1] == told["two"][-1] == "failed: not done within the part's 2 s"
+
+
+def test_what_hung_is_told_by_what_it_printed_last() -> None:
+    told = run_children("hangs in a test", "two", seconds=1.5)
+    assert told["hangs in a test"][-1] == "failed: not done within the part's 2 s; last words: test_loop"
+    assert told["two"] == ["failed: not done within the part's 2 s"]
+
+
+def test_packages_of_others_are_told_from_our_modules_by_the_error_and_not_by_its_words() -> None:
+    lacks = ModuleNotFoundError("in /tmp/hyrfpack-gpu-1/", name="trimesh.path")
+    assert missing_package(lacks) == "trimesh"
+    assert missing_package(ModuleNotFoundError(name="PIL.Image")) == "pillow"
+    assert missing_package(ModuleNotFoundError("trimesh", name="hyrfpack.made_up")) is None
+    assert missing_package(ModuleNotFoundError("no name")) is missing_package(ImportError(name="scipy")) is None
+    with pytest.raises(HyrfError) as caught, needs_package("trimesh", "hyrfpack/a.ply: reading points"):
+        raise lacks
+    assert failure(caught.value) == {"status": "left out", "note": "it needs trimesh, which is not installed here"}
+
+
+@pytest.mark.parametrize(("module", "package"), [("PIL", "pillow"), ("rich", "rich"), ("scipy", "scipy")])
+def test_training_is_left_out_where_a_package_is_missing_and_the_sentence_says_which(module: str, package: str) -> None:
+    code = f"""
+import sys
+sys.modules[{module!r}] = None
+from tools.gpu import quality
+from tools.gpu.setup import Setup
+from tools.gpu.worker import work
+work(lambda item: quality.run(item, Setup.from_json({TINY.to_json()!r})), ["demo"], lambda: True)
+"""
+    (row,) = run_items(lambda left: [sys.executable, "-c", code], ["demo"], 60.0)
+    assert row == {"item": "demo", "status": "left out", "note": f"it needs {package}, which is not installed here"}
+
+
+def test_the_comparison_with_the_cpu_is_left_out_without_numba(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu_quality, "has_numba", lambda: False)
+    (row,) = gpu_quality.run("demo", TINY)
+    assert row["status"] == "left out" and "needs Numba" in row["note"]
+
+
+def test_frames_are_drawn_where_training_lacks_a_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "tools.gpu.training", None)
+    with pytest.raises(ModuleNotFoundError):  # a module of ours is no package that is missing
+        list(gpu_frames.run("200", TINY))
+    monkeypatch.setattr(gpu_frames, "failure", lambda error: {"status": "left out", "note": "it needs rich"})
+    rows = list(gpu_frames.run("200", TINY))
+    assert [row["table"] for row in rows if row.get("note") == "it needs rich"] == ["Training"]
+    assert "Frames, 16 x 16" in {row["table"] for row in rows}
+
+
+def test_a_part_that_lacks_a_package_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(gpu_check.PARTS, "poor", ("no_such_package.part", 5.0))
+    rows = gpu_check.check(["poor"], TINY)
+    assert rows[0]["status"] == "left out" and "no_such_package" in rows[0]["note"]
 
 
 def test_a_child_that_cannot_start_fails_each_item_once() -> None:
@@ -288,12 +348,55 @@ def test_matrix_case_runs_through() -> None:
     assert "status" not in row, row
 
 
-def test_tests_part_runs_some_of_a_file_and_tells_of_a_failure(tmp_path: Path) -> None:
-    file = tmp_path / "test_some.py"
-    file.write_text("def test_gpu_good(): pass\ndef test_gpu_bad(): assert 1 == 2\ndef test_cpu(): assert False\n")
-    row = gpu_tests.run_pytest(str(file))
-    assert row["result"].startswith("1 failed, 1 passed, 1 deselected")
-    assert row["status"] == "failed" and "1 == 2" in row["note"]
+def test_tests_marked_gpu_are_run_and_a_failure_is_told_with_its_reason(tmp_path: Path) -> None:
+    (tmp_path / "test_a.py").write_text("import pytest\npytestmark = pytest.mark.gpu\ndef test_good(): pass\n")
+    (tmp_path / "test_b.py").write_text(
+        "import pytest\n@pytest.mark.gpu\ndef test_good(): pass\n@pytest.mark.gpu\ndef test_bad(): assert 1 == 2\n"
+        "@pytest.mark.gpu\ndef test_worse(): assert 3 == 4\ndef test_cpu(): assert False\n"
+    )
+    (tmp_path / "test_c.py").write_text(
+        "import pytest\n@pytest.mark.gpu\n@pytest.mark.parametrize('x', ['a b - FAILED'])\ndef test_good(x): pass\n"
+    )
+    good, bad, last = gpu_suite.run_suite([str(tmp_path)])
+    assert [Path(row["case"]).name for row in (good, bad, last)] == ["test_a.py", "test_b.py", "test_c.py"]
+    assert good["result"] == last["result"] == "1 passed" and "status" not in good | last
+    assert bad["result"] == "1 passed, 2 failed" and bad["status"] == "failed"
+    assert "test_bad" in bad["note"] and "1 == 2" in bad["note"]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("def test_cpu(): pass", "no test is marked 'gpu'"),
+        ("import no_such_module", "exit code 2.*test_some.py"),
+        ("import os, pytest\n@pytest.mark.gpu\ndef test_dies(): os._exit(7)", "exit code 7.*test_dies"),
+    ],
+)
+def test_pytest_without_a_result_is_a_failure(content: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "test_some.py").write_text(content)
+    (row,) = gpu_suite.run_suite([str(tmp_path)])
+    assert row["status"] == "failed" and re.search(words, row["note"]), row
+
+
+def test_tests_are_left_out_where_there_is_no_pytest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pytest", None)
+    with pytest.raises(ModuleNotFoundError) as caught:
+        list(gpu_tests.run("pytest", TINY))
+    assert failure(caught.value)["status"] == "left out"
+
+
+def test_every_test_of_kernels_and_of_the_whole_path_is_chosen() -> None:
+    def collected(*options: str) -> list[str]:
+        command = [sys.executable, "-m", "pytest", "-q", "--collect-only", *gpu_suite.LENIENT, *options]
+        done = subprocess.run([*command, *gpu_suite.PLACES], cwd=gpu_check.ROOT, capture_output=True, text=True)
+        return [line for line in done.stdout.splitlines() if "::" in line]
+
+    chosen = set(collected("-m", gpu_suite.CHOSEN))
+    for name in ("tests/ops/test_shaded.py", "tests/test_gpu_path.py"):
+        whole = {line for line in collected() if line.startswith(name)}
+        assert whole and whole <= chosen
+    kernels = {path.parent.name for path in gpu_check.ROOT.glob("hyrfpack/ops/*/gpu.py")}
+    assert len(kernels) > 5 and all(any(f"test_{name}.py" in line for line in chosen) for name in kernels)
 
 
 def test_frames_part_runs_through() -> None:

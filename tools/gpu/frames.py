@@ -18,6 +18,7 @@ from tools.gpu.rows import Row, goal, kernel_rows
 from tools.gpu.scene import Splats, count_blended, disturb, make_cameras, make_model, make_scene, splats_of
 from tools.gpu.setup import GOAL_GAUSSIANS, Setup
 from tools.gpu.timing import kernel_times, median_ms, peak_mb, reset_peak, synchronize
+from tools.gpu.worker import failure
 
 GOAL_FRAMES, GOAL_SPEED = 300.0, 0.8
 GSPLAT_TRANSMITTANCE_MIN = 1e-4  # where gsplat finishes a pixel; ours goes on as far when the two are compared
@@ -41,7 +42,10 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
         training = timed_training(scene, disturb(truth), setup)
         model = training.model
     except ModuleNotFoundError as error:  # the trainer needs more packages than rendering
-        yield {"table": "Training", "Gaussians": f"{count:,}", "status": "left out", "note": f"{error}"}
+        reason = failure(error)
+        if reason["status"] == "failed":
+            raise
+        yield {"table": "Training", "Gaussians": f"{count:,}", **reason}
     splats = splats_of(model, cameras[1])
     yield _statistics(splats, model)
     if training:

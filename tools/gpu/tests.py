@@ -1,13 +1,8 @@
-"""Are the kernels right on this device: the tests of the operations where pytest is there, and a matrix of our own."""
+"""Are the kernels right on this device: a matrix of our own, and the tests of the repository where pytest is there."""
 
 from __future__ import annotations
 
-import importlib.util
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -17,41 +12,23 @@ from hyrfpack.ops.hash_encode import level_offsets, level_resolutions
 from tools.gpu.compare import checked
 from tools.gpu.rows import Row
 from tools.gpu.setup import Setup
+from tools.gpu.suite import run_suite
 
-ROOT = Path(__file__).parents[2]
 TABLE = "Right on this device"
-NOTHING_RAN = 5  # pytest's exit code where no test was chosen
+PYTEST = "pytest"
 
 
 def items(setup: Setup) -> list[str]:
-    """The cases of the matrix, then the files of tests; a file has none for pytest where that is not installed."""
-    files = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "tests" / "ops").glob("test_*.py"))
-    return [*CASES, *(files if importlib.util.find_spec("pytest") else [])]
+    """The cases of the matrix, then pytest, once for all: what it builds for one test, the next ones have."""
+    return [*CASES, PYTEST]
 
 
 def run(item: str, setup: Setup) -> Iterator[Row]:
-    """One case, or the gpu rows of one file of tests."""
-    if item in CASES:
-        call = CASES[item](setup.torch_device)
-        yield {"table": TABLE, "case": item, **checked(call, setup.implementation)}
+    """One case, or what came of each file of tests."""
+    if item == PYTEST:
+        yield from ({"table": TABLE, **row} for row in run_suite())
     else:
-        yield {"table": TABLE, "case": f"pytest {item} -k gpu", **run_pytest(item)}
-
-
-def run_pytest(file: str) -> Row:
-    """Run the gpu rows of one file; the cells tell how many passed, and why not."""
-    # Not strict: a GPU's machine may lack the plugins that pyproject.toml has settings of.
-    lenient = ["-o", "addopts=--import-mode=importlib", "-p", "no:cacheprovider"]
-    command = [sys.executable, "-m", "pytest", "-q", "--no-header", *lenient, "-k", "gpu", file]
-    wide = {**os.environ, "COLUMNS": "400"}  # as long as the sentence that tells why a test failed
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=wide)
-    lines = [line.strip() for line in (done.stdout + done.stderr).splitlines() if line.strip()]
-    row: Row = {"result": lines[-1].strip("= ") if lines else ""}
-    if done.returncode not in (0, NOTHING_RAN):
-        named = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
-        reasons = [line for line in lines if line.startswith("E ")]
-        row |= {"status": "failed", "note": " ".join([*named[:1], *reasons[:1]]) or row["result"]}
-    return row
+        yield {"table": TABLE, "case": item, **checked(CASES[item](setup.torch_device), setup.implementation)}
 
 
 def _normal(seed: int, *shape: int) -> Tensor:

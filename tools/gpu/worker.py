@@ -19,6 +19,8 @@ from contextlib import suppress
 
 from tools.gpu.rows import Row
 
+OURS = ("hyrfpack", "tools", "tests")
+PIP_NAMES = {"PIL": "pillow"}  # of modules that are called otherwise
 ROW, BEGUN, DONE = "@row ", "@begun ", "@done "  # what lines of a child begin with
 
 
@@ -46,11 +48,20 @@ def work(run: Callable[[str], Iterator[Row]], items: Sequence[str], is_usable: C
 
 def failure(error: Exception) -> Row:
     """The row of an item that raised."""
-    missing = isinstance(error, ModuleNotFoundError) or isinstance(error.__cause__, ModuleNotFoundError)
-    ours = missing and "hyrfpack" in str(error)
+    package = missing_package(error)
+    if package:
+        return {"status": "left out", "note": f"it needs {package}, which is not installed here"}
     words = " ".join(str(error).split()) or "no message"
-    status = "left out" if missing and not ours else "failed"
-    return {"status": status, "note": f"{type(error).__name__}: {words[:300]}"}
+    return {"status": "failed", "note": f"{type(error).__name__}: {words[:300]}"}
+
+
+def missing_package(error: BaseException | None) -> str | None:
+    """What pip calls the package of others for want of which this was raised; None where it was raised for another
+    reason, or for want of a module of ours."""
+    while error is not None and not isinstance(error, ModuleNotFoundError):
+        error = error.__cause__
+    top = (error.name or "").partition(".")[0] if error else ""
+    return None if top in ("", *OURS) else PIP_NAMES.get(top, top)
 
 
 def run_items(command: Callable[[list[str]], list[str]], items: Sequence[str], seconds: float) -> Iterator[Row]:
@@ -68,7 +79,7 @@ def run_items(command: Callable[[list[str]], list[str]], items: Sequence[str], s
             if kind + " " == ROW:
                 yield json.loads(rest)
             elif kind + " " == BEGUN:
-                at = rest
+                at, last = rest, ""
             elif kind + " " == DONE:
                 left.remove(rest)
                 at = None
@@ -76,7 +87,9 @@ def run_items(command: Callable[[list[str]], list[str]], items: Sequence[str], s
                 last = line.strip() or last
         if left and time.monotonic() >= end:
             for item in left:
-                yield {"item": item, "status": "failed", "note": f"not done within the part's {seconds:.0f} s"}
+                note = f"not done within the part's {seconds:.0f} s"
+                note += f"; last words: {last[:300]}" if item == at and last else ""
+                yield {"item": item, "status": "failed", "note": note}
             return
         if at or len(left) == before:  # it broke off within an item, or did not even begin
             broken = at or left[0]
