@@ -56,7 +56,7 @@ player: $(READY) $(PEERS) ## give the scripts of the web player short names agai
 bench: $(READY) ## time each hot operation at several sizes against its references
 	$(BIN)/python -m tools.bench
 
-gpu: $(READY) ## check and measure the GPU kernels on this machine's GPU; results in docs/gpu/ (twelve minutes at most)
+gpu: $(READY) ## check and measure the GPU kernels on this machine's GPU; results in docs/gpu/ (thirteen minutes at most)
 	$(BIN)/python -m tools.gpu.check
 
 speed: $(READY) ## time beside error of every setting, on a small model; plot in runs/speed.png (two to four minutes)

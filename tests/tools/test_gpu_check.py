@@ -16,6 +16,7 @@ import torch
 from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.model.calls import Call
 from hyrfpack.ops.dispatch import has_triton
+from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.rasterize.reference import project
 from tools.gpu import check as gpu_check
 from tools.gpu import frames as gpu_frames
@@ -28,7 +29,7 @@ from tools.gpu import tests as gpu_tests
 from tools.gpu import timing as gpu_timing
 from tools.gpu.compare import checked
 from tools.gpu.rows import goal
-from tools.gpu.scene import make_cameras, make_model, splats_of
+from tools.gpu.scene import TIDY, TRAINED, Look, make_cameras, make_model, splats_of
 from tools.gpu.setup import Setup, find_set
 from tools.gpu.worker import failure, missing_package, run_items
 
@@ -41,6 +42,7 @@ TINY = Setup(
     height=16,
     kernel_gaussians=24,
     frame_gaussians=(200,),
+    trained_gaussians=(200,),
     error_rows=32,
     crop=16,
     repeats=1,
@@ -386,21 +388,29 @@ def test_tests_are_left_out_where_there_is_no_pytest(monkeypatch: pytest.MonkeyP
 
 
 def test_every_test_of_kernels_and_of_the_whole_path_is_chosen() -> None:
-    def collected(*options: str) -> list[str]:
-        command = [sys.executable, "-m", "pytest", "-q", "--collect-only", *gpu_suite.LENIENT, *options]
-        done = subprocess.run([*command, *gpu_suite.PLACES], cwd=gpu_check.ROOT, capture_output=True, text=True)
-        return [line for line in done.stdout.splitlines() if "::" in line]
-
-    chosen = set(collected("-m", gpu_suite.CHOSEN))
-    for name in ("tests/ops/test_shaded.py", "tests/test_gpu_path.py"):
-        whole = {line for line in collected() if line.startswith(name)}
-        assert whole and whole <= chosen
+    command = [sys.executable, "-m", "pytest", "-q", "--collect-only", *gpu_suite.LENIENT, "-m", gpu_suite.CHOSEN]
+    done = subprocess.run([*command, *gpu_suite.PLACES], cwd=gpu_check.ROOT, capture_output=True, text=True)
+    chosen = {line.partition("[")[0] for line in done.stdout.splitlines() if "::" in line}
+    for file in ("tests/ops/test_shaded.py", "tests/test_gpu_path.py"):
+        names = re.findall(r"^def (test_\w+)", (gpu_check.ROOT / file).read_text(), re.MULTILINE)
+        assert names and {f"{file}::{name}" for name in names} <= chosen
     kernels = {path.parent.name for path in gpu_check.ROOT.glob("hyrfpack/ops/*/gpu.py")}
-    assert len(kernels) > 5 and all(any(f"test_{name}.py" in line for line in chosen) for name in kernels)
+    assert len(kernels) > 5 and kernels <= {re.search(r"test_(\w+)\.py", name)[1] for name in chosen}
 
 
-def test_frames_part_runs_through() -> None:
-    rows = list(gpu_frames.run("200", TINY))
+def test_a_room_as_trained_has_three_to_five_times_the_pairs() -> None:
+    @torch.no_grad()
+    def pairs(look: Look) -> int:
+        splats = splats_of(make_model(60_000, torch.device("cpu"), look), make_cameras(4, 480, 270)[1])
+        return int(rasterize(*splats.inputs.values(), *splats.view).pairs)
+
+    assert 3 <= pairs(TRAINED) / pairs(TIDY) <= 5
+
+
+@pytest.mark.parametrize("item", gpu_frames.items(TINY))
+def test_frames_part_runs_through(item: str) -> None:
+    rows = list(gpu_frames.run(item, TINY))
+    assert all(row["Gaussians"] == item for row in rows if row["table"] in ("The room", "Frames, 16 x 16", "Training"))
     tables = {row["table"] for row in rows}
     assert {"The room", "Frames, 16 x 16", "Rasterising against gsplat", "Training"} <= tables
     assert not [row for row in rows if row.get("status") == "failed"]

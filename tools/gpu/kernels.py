@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import torch
 from torch import Tensor
@@ -30,7 +30,7 @@ from tools.gpu import roofline
 from tools.gpu.compare import checked, relative_error, within
 from tools.gpu.roofline import Work
 from tools.gpu.rows import Row
-from tools.gpu.scene import Splats, count_blended, make_cameras, make_model, splats_of
+from tools.gpu.scene import TIDY, TRAINED, Look, Splats, count_blended, make_cameras, make_model, splats_of
 from tools.gpu.setup import Setup
 from tools.gpu.timing import group_kernels, kernel_times, measure_rates, median_ms
 
@@ -59,9 +59,9 @@ def rates_rows(setup: Setup) -> Iterator[Row]:
     yield {"table": "Measured rates", "rate": "fp32 matrix product", "value": f"{rates.fp32 / 1e12:.1f} TFLOP/s"}
 
 
-def rasterize_rows(setup: Setup) -> Iterator[Row]:
+def rasterize_rows(name: str, look: Look, setup: Setup) -> Iterator[Row]:
     """The whole rasteriser, forward and backward; the error is that of a part of the picture."""
-    splats = _splats(setup)
+    splats = _splats(setup, look)
     call, crop = (rasterize_call(some.inputs, *some.view) for some in (splats, cropped(splats, setup.crop)))
     drawn = rasterize(*splats.inputs.values(), *splats.view, implementation=setup.implementation)
     pairs, pixels, count = int(drawn.pairs), setup.width * setup.height, len(splats.inputs["means"])
@@ -79,7 +79,7 @@ def rasterize_rows(setup: Setup) -> Iterator[Row]:
         "blend": roofline.blend_backward(pairs, pixels, reached, blended),
     }
     totals = (sum(works.values(), Work(0, 0)), sum(back.values(), Work(0, 0)))
-    yield from _timed("rasterize", size, call, totals, setup, crop)
+    yield from _timed(name, size, call, totals, setup, crop)
     forward, backward = call.passes(setup.implementation)
     for way, task, parts in (("forward", forward, works), ("backward", backward, back)):
         measured = kernel_times(task, 5, setup.torch_device)
@@ -88,8 +88,14 @@ def rasterize_rows(setup: Setup) -> Iterator[Row]:
                 yield _row(f"- {stage}", way, size, ms, parts[stage], setup)
             elif ms:
                 yield {"table": TABLE, "kernel": f"- {stage}", "pass": way, "size": size, "ms": ms}
-        for name, ms in list(measured.items())[:12]:
-            yield {"table": "Rasteriser's kernels on the device", "pass": way, "name": name[:90], "ms": ms}
+        for kernel, ms in list(measured.items())[:12]:
+            yield {
+                "table": "Rasteriser's kernels on the device",
+                "call": name,
+                "pass": way,
+                "name": kernel[:90],
+                "ms": ms,
+            }
 
 
 def hash_encode_rows(setup: Setup) -> Iterator[Row]:
@@ -342,12 +348,12 @@ def cropped(splats: Splats, side: int) -> Splats:
 
 
 @cache
-def _model(setup: Setup) -> HybridModel:
-    return make_model(setup.kernel_gaussians, setup.torch_device)
+def _model(setup: Setup, look: Look = TIDY) -> HybridModel:
+    return make_model(setup.kernel_gaussians, setup.torch_device, look)
 
 
-def _splats(setup: Setup) -> Splats:
-    return splats_of(_model(setup), make_cameras(setup.views, setup.width, setup.height)[1])
+def _splats(setup: Setup, look: Look = TIDY) -> Splats:
+    return splats_of(_model(setup, look), make_cameras(setup.views, setup.width, setup.height)[1])
 
 
 def _sample(rows: Tensor, setup: Setup) -> Tensor:
@@ -356,7 +362,8 @@ def _sample(rows: Tensor, setup: Setup) -> Tensor:
 
 ITEMS: dict[str, Callable[[Setup], Iterator[Row]]] = {
     "rates": rates_rows,
-    "rasterize": rasterize_rows,
+    "rasterize": partial(rasterize_rows, "rasterize", TIDY),
+    "rasterize, as trained": partial(rasterize_rows, "rasterize, as trained", TRAINED),
     "hash encode": hash_encode_rows,
     "mlp mixed": lambda setup: mlp_rows(True, setup),
     "mlp float32": lambda setup: mlp_rows(False, setup),

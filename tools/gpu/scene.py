@@ -30,15 +30,33 @@ BOXES = (((0.5, 0.45, -0.4), (0.3, 0.2, 0.2)), ((-0.7, -0.6, -0.35), (0.2, 0.3, 
 SPHERES = (((0.5, 0.45, -0.08), 0.12), ((-0.2, 0.55, -0.42), 0.18), ((-0.65, -0.6, 0.03), 0.13))
 PLANTS = (((-1.1, 0.6, -0.1), 0.28), ((0.9, -0.6, -0.2), 0.24))
 LEAVES = 0.2  # share of the Gaussians that are in plants
-FAINT = 0.2  # share that is nearly transparent
 GAUSSIANS_PER_ROW = 20  # as training sizes the hash tables
 FOCAL = 0.75  # in picture widths
 
 
-def make_model(gaussians: int, device: torch.device, seed: int = 0) -> HybridModel:
+@dataclass(frozen=True)
+class Look:
+    """What the Gaussians of a room are like.
+
+    Attributes:
+        size: how large they are, as a multiple of the gaps between them.
+        faint: share that is nearly transparent.
+    """
+
+    size: float = 1.0
+    faint: float = 0.2
+
+
+TIDY = Look()
+# As training on photos leaves them: larger than the gaps, most of them faint, many over each other. Three to five times
+# as many Gaussian-tile pairs as in the tidy room.
+TRAINED = Look(size=3.0, faint=0.7)
+
+
+def make_model(gaussians: int, device: torch.device, look: Look = TIDY, seed: int = 0) -> HybridModel:
     """The room as a model of that many Gaussians, on a device."""
     generator = torch.Generator().manual_seed(seed)
-    points, colors, sizes, opacities = _scatter(gaussians, generator)
+    points, colors, sizes, opacities = _scatter(gaussians, look, generator)
     log2 = min(21, max(8, round(math.log2(max(1, gaussians / GAUSSIANS_PER_ROW)))))
     frame = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
     config = ModelConfig(frame=frame, geometry=HashGridConfig(log2 - 1), radiance=HashGridConfig(log2))
@@ -147,7 +165,7 @@ def count_blended(splats: Splats, tiles: int = 48, near: float = 0.01) -> tuple[
     return added / len(places), reached / max(1.0, pairs)
 
 
-def _scatter(count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _scatter(count: int, look: Look, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Positions (N, 3), colours (N, 3) in (0, 1), sizes (N, 1) in local units and opacities (N, 1)."""
     leaves = int(LEAVES * count)
     surface, area = _surfaces(count - leaves, generator)
@@ -161,8 +179,8 @@ def _scatter(count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Te
         gap = (4 / 3 * math.pi * radius**3 / max(1, some)) ** (1 / 3)
         sizes.append(torch.full((some, 1), 0.35 * gap))
     points = torch.cat(groups)
-    size = torch.cat(sizes) * torch.exp(0.5 * torch.randn(count, 1, generator=generator))
-    faint = torch.rand(count, 1, generator=generator) < FAINT
+    size = look.size * torch.cat(sizes) * torch.exp(0.5 * torch.randn(count, 1, generator=generator))
+    faint = torch.rand(count, 1, generator=generator) < look.faint
     draw = torch.rand(count, 1, generator=generator)
     opacities = torch.where(faint, 0.01 + 0.2 * draw, 0.6 + 0.38 * draw)
     # Stripes and checks of several sizes: something for the radiance to vary over.

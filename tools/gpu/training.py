@@ -13,7 +13,7 @@ from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, Trainer
 from hyrfpack.train.config import FULL_STEPS
 from tools.gpu.rows import Row, goal, kernel_rows
-from tools.gpu.setup import GOAL_GAUSSIANS, Setup
+from tools.gpu.setup import GOAL_ROOM, Setup
 from tools.gpu.timing import kernel_times, peak_mb, reset_peak, synchronize
 
 GOAL_MINUTES = 10.0
@@ -22,10 +22,10 @@ PROFILED_STEPS = 5
 
 @dataclass(frozen=True)
 class Training:
-    """What a timed run came to; `kernels` are milliseconds a step by kernel of the device."""
+    """What a timed run in a room of that name came to; `kernels` are milliseconds a step by kernel of the device."""
 
+    room: str
     model: HybridModel
-    gaussians: int
     steps: int
     seconds: float
     psnr: tuple[float, float]
@@ -38,11 +38,10 @@ class Training:
         rate = self.steps / self.seconds
         minutes = FULL_STEPS / rate / 60
         full = f"{minutes:.1f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
-        name = f"{self.gaussians:,}"
         total = sum(self.stages.values())
         yield {
             "table": "Training",
-            "Gaussians": name,
+            "Gaussians": self.room,
             "steps timed": self.steps,
             "steps/s": rate,
             "30,000 steps": full,
@@ -50,12 +49,12 @@ class Training:
             "peak MB": self.peak,
             "host's time": ", ".join(f"{stage} {seconds / total:.0%}" for stage, seconds in self.stages.items()),
         }
-        if self.gaussians == GOAL_GAUSSIANS:
-            yield goal(f"30,000 steps of {name} Gaussians", minutes, GOAL_MINUTES, "min", at_least=False)
-        yield from kernel_rows(self.kernels, f"A training step of {name} Gaussians: kernels on the device")
+        if self.room == GOAL_ROOM:
+            yield goal(f"30,000 steps of {self.room} Gaussians", minutes, GOAL_MINUTES, "min", at_least=False)
+        yield from kernel_rows(self.kernels, f"A training step of {self.room} Gaussians: kernels on the device")
 
 
-def timed_training(scene: Scene, model: HybridModel, setup: Setup) -> Training:
+def timed_training(room: str, scene: Scene, model: HybridModel, setup: Setup) -> Training:
     """Train `model` on the scene for a while: warm-up, timed steps, then a few under the profiler."""
     device, count = setup.torch_device, len(model)
     trainer = Trainer(scene, TrainConfig(steps=FULL_STEPS, max_gaussians=count), device=device, model=model)
@@ -70,8 +69,8 @@ def timed_training(scene: Scene, model: HybridModel, setup: Setup) -> Training:
     stages = {name: value - stages.get(name, 0.0) for name, value in trainer.seconds.items()}
     kernels = kernel_times(lambda: advance(trainer, PROFILED_STEPS, setup.step_seconds, []), 1, device)
     return Training(
+        room=room,
         model=trainer.model,
-        gaussians=count,
         steps=steps,
         seconds=seconds,
         psnr=(decibels(fmean(errors[:5])), decibels(fmean(errors[-5:]))),
