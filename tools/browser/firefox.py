@@ -166,7 +166,8 @@ class Firefox:
     def _listen(self) -> None:
         """Have pages' console.error and console.warn, which stay in their processes, told to the browser's window."""
         script = (
-            "{const tell = ({ wrappedJSObject: { level, arguments: said } }) => {"
+            "{const tell = ({ wrappedJSObject: { level, innerID, arguments: said } }) => {"
+            '  if (typeof innerID !== "number") return;'  # a module of Firefox itself
             '  if (level === "error" || level === "warn") sendAsyncMessage("said", said.map(String).join(" "));'
             "};"
             'const storage = Cc["@mozilla.org/consoleAPI-storage;1"].getService(Ci.nsIConsoleAPIStorage);'

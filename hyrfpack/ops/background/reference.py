@@ -10,7 +10,7 @@ from torch import Tensor
 from hyrfpack.ops.contraction import contract
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
-from hyrfpack.ops.poses import camera_center, rotate
+from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.shade.directions import encode_directions
 from hyrfpack.ops.transfer import tensor_like
 
@@ -32,7 +32,7 @@ def sphere_points(origin: Tensor, directions: Tensor) -> Tensor:
     Returns:
         (N, 3) local units.
     """
-    nearest = origin - (directions * origin).sum(-1, keepdim=True) * directions
+    nearest = origin - (directions @ origin)[:, None] * directions
     inside = (RADIUS**2 - nearest.square().sum(-1)).clamp_min(0)
     return nearest + inside.sqrt()[:, None] * directions
 
@@ -50,7 +50,7 @@ def pixel_directions(points: Tensor, intrinsics: tuple[float, float, float, floa
     """
     fx, fy, cx, cy = intrinsics
     x, y = (points[:, 0] - cx) / fx, (points[:, 1] - cy) / fy
-    directions = rotate(torch.stack((x, y, torch.ones_like(x)), dim=-1), pose[:3, :3].T)
+    directions = torch.stack((x, y, torch.ones_like(x)), dim=-1) @ pose[:3, :3]
     return directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True)
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.poses import rotate
-
 
 def frustum_cull(
     positions: Tensor,
@@ -30,7 +28,7 @@ def frustum_cull(
         (n,) int64, ascending.
     """
     fx, fy, cx, cy = intrinsics
-    x, y, z = (rotate(positions, pose[:3, :3]) + pose[:3, 3]).unbind(-1)
+    x, y, z = (positions @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
     margin_x, margin_y = tolerance * width / 2, tolerance * height / 2
     u, v = fx * x, fy * y  # compared after multiplying by z > 0: no division, nothing to guard
     inside = (
