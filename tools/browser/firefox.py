@@ -312,6 +312,8 @@ class Firefox:
         self.evaluate("new Promise((done) => setTimeout(done, 50))")  # what came before this has arrived
         return self._privileged(
             "const found = Services.console.getMessageArray().filter((message) =>"
-            "  message instanceof Ci.nsIScriptError && message.innerWindowID && !(message.flags & 1));"
+            "  message instanceof Ci.nsIScriptError && !(message.flags & 1) &&"
+            # Errors that are thrown later, as of timers, know no window.
+            '  (message.innerWindowID || message.category === "content javascript"));'
             "return [...found.map(({ errorMessage }) => errorMessage), ...window.said];"
         )
