@@ -173,7 +173,7 @@ def calibrate(
         _, plan, planned = placed
         quantized = quantize(planned, plan, scaled, sections=[name for part in parts for name in part])
         told, stored = _added(planned, quantized, scaled), quantized.arrays()
-        there = to_arrays(model)[POSITIONS][plan.kept]
+        there = model.gaussians.positions.detach().cpu().numpy()[plan.kept]
 
         def found(part: Part) -> float:
             if part == (POSITIONS,):

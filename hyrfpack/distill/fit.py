@@ -124,7 +124,7 @@ def distill_splats(
     started = time.perf_counter()
     Outputs(overwrite=True).file(target)
     taught = teach(splats, config, name=name, cameras=cameras, say=say, quiet=quiet)
-    unpacked = _mean(likeness(taught.model, taught.original, taught.test))
+    unpacked = float(np.mean(likeness(taught.model, taught.original, taught.test)))
     say(f"{unpacked:.2f} dB before packing")
     imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
     provenance = {"steps": config.steps, "seed": config.seed, "psnr": unpacked, "choices": {"imported": imported}}
@@ -132,14 +132,15 @@ def distill_splats(
     write_atomic(target, data)  # only now: an interrupt leaves what was there before
     decoded = hyrf_format.load(target)
     scores = likeness(decoded, taught.original, taught.test)
-    if _below(_mean(scores), config.psnr):
-        say(_shortfall(_mean(scores), unpacked, config, made_up=cameras is None))
+    reached = float(np.mean(scores))
+    if _below(reached, config.psnr):
+        say(_shortfall(reached, unpacked, config, made_up=cameras is None))
     return DistillReport(
         gaussians_before=len(splats),
         gaussians_after=len(decoded),
         degree=splats.degree,
         views=len(scores),
-        psnr=_mean(scores),
+        psnr=reached,
         psnr_worst=min(scores),
         psnr_unpacked=unpacked,
         psnr_asked=config.psnr,
@@ -172,7 +173,3 @@ def _bytes_at(path: Path) -> int:
     if folder.is_dir():
         return sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
     return path.stat().st_size
-
-
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from hyrfpack.compress.packer import Packer
 from hyrfpack.distill.teach import Taught
 from hyrfpack.distill.teacher import likeness
 from hyrfpack.format.codec import decode_model
+from hyrfpack.model import HybridModel
 
 PACKED = 0.8  # of what packing may add, to ask for
 LEAST_ADDED = 0.25  # of the error before packing, that packing may add in any case
@@ -34,8 +35,8 @@ def pack(taught: Taught, psnr: float, provenance: dict, say: Callable[[str], Non
         >>> pack(taught, psnr=15, provenance={})[:4]
         b'HYRF'
     """
-    model, views, original = taught.model, taught.deciding, taught.original
-    allowed, error = _mse(psnr), _mse(_mean(likeness(model, original, views)))
+    model = taught.model
+    allowed, error = _mse(psnr), _error(model, taught)
     room = max(allowed - error, min(LEAST_ADDED * error, HOPELESS * allowed))
     say(f"measuring what each number does to pictures, at {len(taught.train)} cameras and between them")
     wanted = PACKED * room
@@ -44,7 +45,7 @@ def pack(taught: Taught, psnr: float, provenance: dict, say: Callable[[str], Non
     packer = Packer(model, provenance, sensitivity, scene=None, finetune_steps=0, prune=True, say=say)
     trial = packer.settled(wanted, originals)
     for _ in range(TRIALS):
-        off = _mse(_mean(likeness(decode_model(trial.data), original, views))) - error
+        off = _error(decode_model(trial.data), taught) - error
         if off <= room:
             break
         wanted *= max(PACKED * room / off, 1 / 16)
@@ -57,5 +58,6 @@ def _mse(psnr: float) -> float:
     return 10 ** (-psnr / 10)
 
 
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values))
+def _error(model: HybridModel, taught: Taught) -> float:
+    """Of the mean PSNR at the viewpoints to decide by, as mean squared error."""
+    return _mse(float(np.mean(likeness(model, taught.original, taught.deciding))))

@@ -18,15 +18,16 @@ import torch
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import decibels
 from hyrfpack.train.progress import Pace
+from hyrfpack.train.trainer import is_recorded
 
-RECORDS, LONGEST = 200, 10.0  # records of a run, at least; seconds between two of them, at most
+LONGEST = 10.0  # seconds between two records, at most
 SCALARS = ("loss", "psnr", "gaussians", "steps_per_second", "memory_bytes", "gpu_memory_bytes")
 
 
 class TrainingLog:
     """Writes records of a run to a file as they come, each at once: whoever reads it sees the run as it is.
 
-    Each line is an object with "event": "step" (every 1/RECORDS of the run and every LONGEST seconds), or "end" (where
+    Each line is an object with "event": "step" (where `is_recorded` says so, every LONGEST seconds), or "end" (where
     "complete" says whether it is, "error" why not). That of a step has
 
         step, steps         taken and to be taken
@@ -67,8 +68,7 @@ class TrainingLog:
         if mse == mse:  # not all of the photo is masked
             self.losses.append(loss)
             self.errors.append(mse)
-        due = step % max(1, self.steps // RECORDS) == 0 or step == self.steps or now - self.last >= LONGEST
-        if not due:
+        if not (is_recorded(step, self.steps) or now - self.last >= LONGEST):
             return
         count = len(self.errors)
         record = {

@@ -43,6 +43,11 @@ def shuffled(views: Sequence[View], seed: int, steps: range) -> Iterator[View]:
         yield views[order[place]]
 
 
+def is_recorded(step: int, steps: int) -> bool:
+    """Whether this step of a run is one of the about RECORDS that are written down, the last one among them."""
+    return step % max(1, steps // RECORDS) == 0 or step == steps
+
+
 class Trainer:
     """Holds a run: model, optimiser, strategy of density control, and the step they are at.
 
@@ -194,7 +199,7 @@ class Trainer:
     def _record(self, loss: float, mse: float) -> None:
         """Keep what the step came to for the curve, unless all of its photo is masked."""
         steps = self.config.steps
-        if not np.isnan(mse) and (self.step % max(1, steps // RECORDS) == 0 or self.step == steps):
+        if not np.isnan(mse) and is_recorded(self.step, steps):
             record = {"step": self.step, "loss": loss, "psnr": decibels(mse), "gaussians": len(self.model)}
             self.records.append({**record, "seconds": round(self.elapsed, 3)})
 

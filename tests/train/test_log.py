@@ -16,7 +16,8 @@ from scenes import ball_scene
 from hyrfpack.errors import HyrfError
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, log, train
-from hyrfpack.train.log import RECORDS, TrainingLog, peak_memory
+from hyrfpack.train.log import TrainingLog, peak_memory
+from hyrfpack.train.trainer import RECORDS
 
 CPU = torch.device("cpu")
 CONFIG = TrainConfig(steps=30, seed=1, max_gaussians=120, checkpoint_every=1)
