@@ -11,6 +11,7 @@ from torch import Tensor
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.ops.dispatch import has_triton
+from hyrfpack.parallel.ranks import Ranks
 from hyrfpack.scene import Picture
 
 NO_TRITON = (
@@ -71,6 +72,27 @@ def choose_device(
             raise HyrfError("device 'mps' is not there, torch sees no Apple GPU; use --device cpu")
         say(NO_METAL)
     return torch.device(name)
+
+
+def choose_own_device(
+    name: str | torch.device, ranks: Ranks, say: Callable[[str], None] = lambda sentence: None
+) -> torch.device:
+    """As `choose_device`, for one of several processes: "auto" and "cuda" are another GPU for each on a machine.
+
+    Raises:
+        HyrfError: on all of them, as `choose_device`, or two would have the same GPU.
+    """
+    device = ranks.agree(lambda: choose_device(name, say))
+    if device.type == "cuda" and not ranks.alone:
+        if device.index is None:
+            device = choose_device(f"cuda:{ranks.local_rank % torch.cuda.device_count()}")
+        gpus = ranks.told(str(torch.cuda.get_device_properties(device).uuid))
+        if len(set(gpus)) < len(gpus):
+            raise HyrfError(
+                f"{ranks.size} processes have {len(set(gpus))} GPUs between them, and each needs its own; start as "
+                "many as there are GPUs, with --device cuda, or use --device cpu"
+            )
+    return device
 
 
 def describe_device(device: torch.device) -> str:

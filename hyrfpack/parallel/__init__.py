@@ -1,4 +1,5 @@
-"""Compiled CPU kernels and the threads that run them. Knows nothing of what is computed."""
+"""What work is shared among: compiled CPU kernels, the threads that run them, and processes. Knows nothing of what is
+computed."""
 
 from __future__ import annotations
 

@@ -26,6 +26,11 @@ def thread_count() -> int:
     asked = os.environ.get("HYRFPACK_THREADS", "")
     if asked.isdigit() and int(asked) > 0:
         return int(asked)
+    return cores()
+
+
+def cores() -> int:
+    """Cores this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

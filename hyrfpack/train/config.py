@@ -41,10 +41,14 @@ class LearningRates:
             for rate in getattr(self, group.name):
                 check_float(f"a rate of {group.name}", rate, SMALLEST_RATE)
 
-    def at(self, name: str, step: int, steps: int) -> float:
-        """The rate of one group for `step` (from 0) of a run of `steps`."""
+    def at(self, name: str, step: int, steps: int, views: int = 1) -> float:
+        """The rate of one group for `step` (from 0) of a run of `steps`, each by the mean gradient of so many views.
+
+        The mean of W gradients has 1 / sqrt(W) of the noise of one, and there are as many steps fewer: the rate grows
+        with sqrt(W).
+        """
         first, last = getattr(self, name)
-        pace = math.sqrt(FULL_STEPS / min(max(steps, SHORT_STEPS), FULL_STEPS))
+        pace = math.sqrt(views * FULL_STEPS / min(max(steps * views, SHORT_STEPS), FULL_STEPS))
         return pace * first * (last / first) ** (step / steps)
 
 

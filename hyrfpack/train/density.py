@@ -14,6 +14,7 @@ from torch import Tensor
 from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.ops.transfer import tensor_like
+from hyrfpack.parallel.ranks import ALONE, Ranks
 from hyrfpack.render import Rendering
 from hyrfpack.scene import Camera
 from hyrfpack.train.config import DensityConfig
@@ -35,6 +36,8 @@ class DensityControl:
     dL/dx / (1 - o) by the opacity's logit x. The sum of its squares over views is the Gauss-Newton estimate of the
     loss's rise, up to a factor, where residuals are as good as random; a view that does not show it adds nothing.
 
+    Each process of several collects of its own views; a round begins with the sums, so that all decide alike.
+
     Attributes:
         gradients: (N,) sum over views of the mean2d gradient's norm, NDC units.
         views: (N,) in how many views each Gaussian was visible since the last round.
@@ -49,7 +52,9 @@ class DensityControl:
         initial: int,
         seed: int,
         device: torch.device | None = None,
+        ranks: Ranks = ALONE,
     ) -> None:
+        self.ranks = ranks
         self.config = config
         self.budget = budget
         self.initial = initial
@@ -106,6 +111,8 @@ class DensityControl:
 
     @torch.no_grad()
     def _round(self, step: int, model: HybridModel, optimizer: Optimizer) -> None:
+        for name in COLLECTED:
+            self.ranks.add(getattr(self, name))
         explicit = model.gaussians
         geometry = model.decode_geometry()
         bounds = model.scale_bounds(explicit.positions)
@@ -128,6 +135,8 @@ class DensityControl:
         # What two share is each one's half.
         self.squares[cloned] /= 2
         self.squares = FADING * torch.cat((self.squares[keep], self.squares[cloned], self.squares[split.repeat(2)] / 2))
+        if not self.ranks.leads:  # what came before is summed once
+            self.squares.zero_()
         self.clear(len(model))
 
     def _alive(self, geometry: Geometry, sizes: Tensor, target: int) -> Tensor:

@@ -6,7 +6,7 @@ mean of their logarithms over all training photos is zero, so that the model has
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import cg
-from torch import Tensor
+from torch import Tensor, nn
 
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
@@ -145,42 +145,38 @@ class Exposures:
     def __init__(self, views: Sequence[View], gains: np.ndarray, device: torch.device) -> None:
         """Args: gains: (N, 3) logarithms to start from."""
         self._row = {view.name: row for row, view in enumerate(views)}
-        self.values = torch.from_numpy(gains - gains.mean(0)).float().to(device)
+        self.values = nn.Parameter(torch.from_numpy(gains - gains.mean(0)).float().to(device))
         self._exp_avg, self._exp_avg_sq = torch.zeros_like(self.values), torch.zeros_like(self.values)
         self._steps = [0] * len(views)
-        self._used: tuple[int, Tensor] | None = None
 
     def exposed(self, rgb: Tensor, view: View) -> Tensor:
-        """A render (H, W, 3) as the view's photo was exposed; differentiable. Each `step` wants one such call."""
-        row = self._row[view.name]
-        logs = self.values[row].clone().requires_grad_()
-        self._used = row, logs
-        return expose(rgb, logs.exp())
+        """A render (H, W, 3) as the view's photo was exposed; differentiable."""
+        return expose(rgb, self.values[self._row[view.name]].exp())
 
-    def step(self, rate: float) -> Tensor:
-        """One step of Adam for the photo that was last exposed; then the mean of all is taken off.
+    @torch.no_grad()
+    def step(self, rate: float, views: Iterable[View]) -> Tensor:
+        """One step of Adam for the photos of these views, by the gradients of `values`, which are cleared; then the
+        mean of all is taken off.
 
         Returns:
             Bool scalar on the device: whether a gradient was not finite, whose gain took no step. Nothing waits for
             the device.
         """
-        assert self._used is not None
-        row, logs = self._used
-        assert logs.grad is not None
-        self._steps[row] += 1
-        moments = (self._exp_avg[row], self._exp_avg_sq[row])
-        gradient = logs.grad + PULL * self.values[row]
-        broken = adam_step(
-            [self.values[row]], [gradient], *([moment] for moment in moments), step=self._steps[row], rate=rate
-        )
-        self.values -= self.values.mean(0)
-        self._used = None
+        assert self.values.grad is not None
+        broken = torch.zeros((), dtype=torch.bool, device=self.values.device)
+        for row in sorted({self._row[view.name] for view in views}):
+            self._steps[row] += 1
+            value, gradient = self.values[row], self.values.grad[row] + PULL * self.values[row]
+            moments = ([self._exp_avg[row]], [self._exp_avg_sq[row]])
+            broken = broken | adam_step([value], [gradient], *moments, step=self._steps[row], rate=rate)
+        self.values.grad = None
+        self.values.sub_(self.values.mean(0))
         return broken
 
     def state_dict(self) -> dict[str, Tensor]:
         """Gains, moments and step counts."""
         return {
-            "values": self.values,
+            "values": self.values.detach(),
             "exp_avg": self._exp_avg,
             "exp_avg_sq": self._exp_avg_sq,
             "steps": torch.tensor(self._steps),
@@ -189,9 +185,10 @@ class Exposures:
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """The inverse of `state_dict`; the views must be those of then."""
         device = self.values.device
-        self.values, self._exp_avg, self._exp_avg_sq = (
+        values, self._exp_avg, self._exp_avg_sq = (
             state[name].to(device).clone() for name in ("values", "exp_avg", "exp_avg_sq")
         )
+        self.values = nn.Parameter(values)
         self._steps = state["steps"].tolist()
 
 

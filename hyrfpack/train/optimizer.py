@@ -15,6 +15,7 @@ from hyrfpack.ops.adam import adam_step
 from hyrfpack.train.config import LearningRates
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
+BETAS = 0.9, 0.999
 
 
 @dataclass
@@ -29,13 +30,20 @@ class _State:
 class Optimizer:
     """Adam (betas 0.9, 0.999, eps 1e-15) with one group for each kind of Gaussian property and one for the fields.
 
+    Where a step takes the mean gradient of W views, its means run over as many views as with one: b becomes
+    1 - W (1 - b).
+
     Attributes:
         groups: parameters by the group's name, which is that of its learning rate.
     """
 
-    def __init__(self, model: HybridModel, rates: LearningRates) -> None:
+    def __init__(self, model: HybridModel, rates: LearningRates, views: int = 1) -> None:
+        """Args: views: W."""
         self.model = model
         self.rates = rates
+        self.views = views
+        first, second = (beta if views == 1 else max(0.0, 1 - views * (1 - beta)) for beta in BETAS)
+        self.betas = first, second
         self.groups: dict[str, list[nn.Parameter]] = {
             name: [getattr(model.gaussians, name)] for name in Gaussians.NAMES
         }
@@ -70,7 +78,8 @@ class Optimizer:
                     [state.exp_avg for state in states],
                     [state.exp_avg_sq for state in states],
                     step=count,
-                    rate=self.rates.at(name, step, steps),
+                    rate=self.rates.at(name, step, steps, self.views),
+                    betas=self.betas,
                 )
                 for parameter in some:
                     parameter.grad = None

@@ -20,12 +20,14 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.capture import provenance_of
 from hyrfpack.checks import check_type
 from hyrfpack.data import PictureCache
-from hyrfpack.device import choose_device, describe_device
+from hyrfpack.data.cache import memory_bytes
+from hyrfpack.device import choose_own_device, describe_device
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate import Evaluation, evaluate, picture_names
 from hyrfpack.evaluate.figures import training_curve
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
+from hyrfpack.parallel.ranks import ALONE, Ranks
 from hyrfpack.render import render
 from hyrfpack.scene import Scene, View, evenly_spaced
 from hyrfpack.train.checkpoint import saved_budget_factor
@@ -71,6 +73,7 @@ def train(
     quiet: bool = False,
     report: Report | None = None,
     log: Path | str | None = None,
+    ranks: Ranks = ALONE,
 ) -> TrainResult:
     """Train a model on a scene and leave everything about the run in a folder.
 
@@ -94,6 +97,9 @@ def train(
             while pilots run.
         log: a file that gets a line of JSON every few steps, and TensorBoard's files beside it where that is
             installed; see `hyrfpack.train.log.TrainingLog`. A resumed run adds to it.
+        ranks: processes that train together, from `hyrfpack.parallel.ranks.joined`: all call this with the same scene
+            and settings. Rank 0 alone writes and speaks, and returns metrics. When their launcher starts them anew,
+            as torchrun does after one has ended, they go on from the checkpoint if there is one.
 
     Raises:
         HyrfError: the folder holds another run, training cannot start or go on, no photo has a pixel to train on or to
@@ -114,38 +120,51 @@ def train(
     config = TrainConfig() if config is None else config
     check_type("config", config, TrainConfig)
     checkpoint = out / CHECKPOINT
-    device = choose_device(device)
-    _prepare(out, scene, resume, overwrite)
-    if log is not None:
-        Outputs(scene=scene, overwrite=resume or overwrite).file(log)
-    cache = cache or PictureCache()
-    _check_photos(scene, cache)
-    silent = quiet or report is not None
+    device = choose_own_device(device, ranks)
+    resume = ranks.first(resume or (ranks.restarts > 0 and checkpoint.is_file()))
+    cache = cache or PictureCache(memory_bytes() // 4 // ranks.local_size)
+
+    def check() -> None:
+        if not ranks.leads:
+            return
+        _prepare(out, scene, resume, overwrite)
+        if log is not None:
+            Outputs(scene=scene, overwrite=resume or overwrite).file(log)
+        _check_photos(scene, cache)
+
+    ranks.agree(check)
+    silent = quiet or report is not None or not ranks.leads
     why = ""
     if resume and is_undecided(config):
-        config = dataclasses.replace(config, budget_factor=saved_budget_factor(checkpoint))
+        saved = ranks.agree(lambda: saved_budget_factor(checkpoint) if ranks.leads else None)
+        config = dataclasses.replace(config, budget_factor=ranks.first(saved))
     elif not resume and measures_budget(scene, config):
         with ProgressLine(MOST_STEPS, 0, silent) as line, _stop_requests() as stop:
             line.note("how many Gaussians is the scene worth? Short runs tell")
             tell: Report = line.update if report is None else partial(_as_step_nought, report)
-            measured = measure_budget(scene, config, cache, device, tell, stop)
+            # Each does it for itself: none waits for another.
+            pilots = partial(measure_budget, scene, config, cache, device, tell, stop)
+            answers = ranks.told(ranks.agree(pilots))
+            measured = None if None in answers else answers[0]
             if measured is None:
                 return TrainResult(False, 0, None, {})
             config, why = dataclasses.replace(config, budget_factor=measured[0]), f": {measured[1]}"
-    trainer = Trainer(scene, config, cache, device)
+    trainer = ranks.agree(lambda: Trainer(scene, config, cache, device, ranks=ranks))
     trainer.choices["max_gaussians"] += why
     if resume:
         trainer.load(checkpoint)
+    elif ranks.leads and not ranks.alone:  # one of an earlier run is not what to go on from, should we be started anew
+        checkpoint.unlink(missing_ok=True)
     with _naming_the_checkpoint(trainer, overwrite), ExitStack() as stack:
         with (
-            ProgressLine(config.steps, trainer.step, silent, _shorter(device)) as line,
+            ProgressLine(trainer.steps, trainer.step, silent, _shorter(device)) as line,
             _stop_requests() as stop,
         ):
             if why:
                 line.note(f"Gaussians at most: {trainer.choices['max_gaussians']}")
             written = None
-            if log is not None:
-                written = stack.enter_context(TrainingLog(Path(log), config.steps, trainer.step, device, line.note))
+            if log is not None and ranks.leads:
+                written = stack.enter_context(TrainingLog(Path(log), trainer.steps, trainer.step, device, line.note))
             told = [report or line.update, *([written.step] if written else [])]
 
             def tell_all(trainer: Trainer, loss: float, mse: float) -> None:
@@ -153,7 +172,7 @@ def train(
                     tell(trainer.step, loss, mse, len(trainer.model))
 
             complete = trainer.run(checkpoint=checkpoint, report=tell_all, stop=stop, warn=line.note)
-        metrics = _finish(trainer, out) if complete else {}
+        metrics = _finish(trainer, out) if complete and ranks.leads else {}
         if written:
             facts = {name: metrics[name] for name in ("gaussians", "bytes") if complete}
             scores = metrics.get("evaluation", {})
@@ -161,7 +180,8 @@ def train(
             written.end(complete=complete, step=trainer.step, **facts)
     if not complete:
         return TrainResult(False, trainer.step, None, {})
-    checkpoint.unlink(missing_ok=True)
+    if ranks.leads:
+        checkpoint.unlink(missing_ok=True)
     return TrainResult(True, trainer.step, out / MODEL, metrics)
 
 
@@ -174,7 +194,7 @@ def _finish(trainer: Trainer, out: Path) -> dict:
     scene, config = trainer.scene, trainer.config
     if not trainer.records:
         raise HyrfTrainingError(
-            f"{scene.path}: masks leave no pixel of the photos that the {config.steps:,} steps came to; "
+            f"{scene.path}: masks leave no pixel of the photos that the {trainer.steps:,} steps came to; "
             "take more steps than there are photos"
         )
 
@@ -191,6 +211,7 @@ def _finish(trainer: Trainer, out: Path) -> dict:
     metrics = {
         "settings": config.to_dict(),
         "device": describe_device(trainer.device),
+        "processes": trainer.ranks.size,
         "scene": {
             "path": scene.path,
             "layout": scene.layout,
@@ -204,7 +225,7 @@ def _finish(trainer: Trainer, out: Path) -> dict:
         "gaussians": len(model),
         "bytes": report.bytes_after,
         "seconds": trainer.elapsed,
-        "steps_per_second": config.steps / max(trainer.elapsed, 1e-9),
+        "steps_per_second": trainer.steps / max(trainer.elapsed, 1e-9),
         "stage_seconds": {name: round(value, 3) for name, value in sorted(trainer.seconds.items())},
         "curve": trainer.records,
     }

@@ -17,7 +17,9 @@ class Strategy(Protocol):
 
     The trainer calls it in every step: `watching` before the view is rendered, `observe` when its gradients are there,
     `act` after the optimiser's step. What it draws at random it draws from the seed and the step, and what it collects
-    is in its state, so that a run that goes on from a checkpoint ends like one that never stopped.
+    is in its state, so that a run that goes on from a checkpoint ends like one that never stopped. Of several processes
+    each has a strategy that observes its own views: what decides has to be summed first, as by `Ranks.add`, so that all
+    decide alike.
 
     `hyrfpack.train.DensityControl` is the one that there is by default.
 

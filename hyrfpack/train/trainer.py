@@ -1,4 +1,4 @@
-"""The trainer: one view a step, until the run is done, interrupted or broken."""
+"""The trainer: one view a step and process, until the run is done, interrupted or broken."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+import hyrfpack
 from hyrfpack.data import PictureCache
 from hyrfpack.device import upload, upload_array
 from hyrfpack.errors import HyrfError, HyrfTrainingError
@@ -21,6 +23,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
+from hyrfpack.parallel.ranks import ALONE, Ranks
 from hyrfpack.render import render
 from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
@@ -30,16 +33,18 @@ from hyrfpack.train.exposure import exposures_for
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.setup import build_model
 from hyrfpack.train.strategy import Strategy
+from hyrfpack.train.together import Told, averaged, check_settings, digest, to_tell
 
 RECORDS = 200  # points on the training curve
 
 
-def shuffled(views: Sequence[View], seed: int, steps: range) -> Iterator[View]:
-    """The view of each of these steps, counted from 0: each epoch is a permutation of its own."""
-    for step in steps:
-        epoch, place = divmod(step, len(views))
-        if place == 0 or step == steps.start:
-            order = np.random.default_rng((seed, epoch)).permutation(len(views))
+def shuffled(views: Sequence[View], seed: int, places: range) -> Iterator[View]:
+    """The views at these places, counted from 0, of an endless order: each epoch is a permutation of its own."""
+    there, order = -1, np.zeros(0, np.int64)
+    for index in places:
+        epoch, place = divmod(index, len(views))
+        if epoch != there:
+            there, order = epoch, np.random.default_rng((seed, epoch)).permutation(len(views))
         yield views[order[place]]
 
 
@@ -50,6 +55,13 @@ def is_recorded(step: int, steps: int) -> bool:
 
 class Trainer:
     """Holds a run: model, optimiser, strategy of density control, and the step they are at.
+
+    On several processes (ranks) each renders another view of a step, and all take it by the mean of their gradients:
+    `TrainConfig.steps` counts views, so W processes take as many steps over W, larger ones (`LearningRates.at`).
+    All hold the same model, bit by bit, for they see the same gradients and decide by the same numbers.
+
+    Attributes:
+        steps: of the optimiser, until the end.
 
     Example:
         >>> trainer = Trainer(scene, TrainConfig(steps=2000))
@@ -65,13 +77,17 @@ class Trainer:
         device: torch.device = torch.device("cpu"),  # noqa: B008 - a constant
         model: HybridModel | None = None,
         strategy: Strategy | None = None,
+        ranks: Ranks = ALONE,
     ) -> None:
         """Set up a run.
 
         Args:
             model: to go on with, changed in place; None builds an untrained one that fits the scene.
             strategy: what adds and removes Gaussians; None for `DensityControl` as configured.
+            ranks: the processes that train together, each of which sets up the same run.
         """
+        self.ranks = ranks
+        self.steps = -(-config.steps // ranks.size)
         self.scene = scene
         self.config = config
         self.cache = cache or PictureCache()
@@ -84,7 +100,7 @@ class Trainer:
         self.exposures, self.choices["exposure"] = exposures_for(scene, config, self.cache, device)
         self._take(model)
         self.strategy: Strategy = strategy or DensityControl(
-            config.density, config.steps, self.budget, len(self.model), config.seed, device
+            config.density, self.steps, self.budget, len(self.model), config.seed, device, ranks
         )
         self.step = 0
         self.saved: int | None = None  # the step that the checkpoint on disk is of
@@ -98,7 +114,7 @@ class Trainer:
         if not any(parameter.requires_grad for parameter in model.parameters()):  # as of a model that was loaded
             model.requires_grad_(True)
         self.model = model.to(self.device)
-        self.optimizer = Optimizer(self.model, self.config.learning_rates)
+        self.optimizer = Optimizer(self.model, self.config.learning_rates, self.ranks.size)
 
     # -- the loop ------------------------------------------------------------------------------------------------
 
@@ -116,7 +132,7 @@ class Trainer:
             checkpoint: where to keep the run's state; written every `checkpoint_every` steps and when stopped early.
             report: called after each step with the loss and the mean squared error of its view (NaN where the whole
                 photo is masked).
-            stop: asked after each step.
+            stop: asked after each step; by several processes during each, to be the last.
             warn: told when a checkpoint cannot be written, as on a full disk. Training goes on and tries again at the
                 next one, for hours of work are worth more than a checkpoint.
 
@@ -125,21 +141,22 @@ class Trainer:
 
         Raises:
             HyrfTrainingError: a parameter, the loss or a gradient is not finite; step, view and group are named.
-            HyrfError: stopped early, and the checkpoint cannot be written.
+            HyrfError: stopped early, and the checkpoint cannot be written; or, on all processes, one of them cannot go
+                on or has gone.
         """
-        every = self.config.checkpoint_every or max(1, self.config.steps // 20)
+        every = self.config.checkpoint_every or max(1, self.steps // 20)
+        check_settings(self.ranks, {**self._settings(), "versions": (hyrfpack.__version__, torch.__version__)})
         keep_freed_memory()
         with closing(self.cache.stream(self._order())) as views, torch_on_one_thread():
-            while self.step < self.config.steps:
+            while self.step < self.steps:
                 start = time.perf_counter()
-                with self._timed("data"):
-                    view, picture = next(views)
-                loss, mse = self._train_step(view, picture)
+                self.step += 1
+                loss, mse, stopped = self._train_step(views, stop)
                 self.elapsed += time.perf_counter() - start
                 self._record(loss, mse)
                 report(self, loss, mse)
-                complete = self.step == self.config.steps
-                stopped = stop() and not complete
+                complete = self.step == self.steps
+                stopped = (stop() if self.ranks.alone else stopped) and not complete
                 if checkpoint and (stopped or (self.step % every == 0 and not complete)):
                     try:
                         self.save(checkpoint)
@@ -148,16 +165,59 @@ class Trainer:
                             raise
                         warn(f"{error}; training goes on, without the checkpoint of step {self.step:,}")
                 if stopped:
+                    self.ranks.told(None)  # none leaves before the checkpoint is written: the others would be ended
                     return False
         return True
 
     def _order(self) -> Iterator[View]:
-        """Views in the order of the steps still to come."""
-        return shuffled(self.scene.train, self.config.seed, range(self.step, self.config.steps))
+        """This rank's views, in the order of the steps still to come."""
+        first, count = self.step * self.ranks.size, self.steps * self.ranks.size
+        return shuffled(self.scene.train, self.config.seed, range(first + self.ranks.rank, count, self.ranks.size))
 
-    def _train_step(self, view: View, picture: Picture) -> tuple[float, float]:
-        config = self.config
-        self.step += 1
+    def _train_step(self, views: Iterator[tuple[View, Picture]], stop: Callable[[], bool]) -> tuple[float, float, bool]:
+        """Take a step: loss and mean squared error, means over all ranks' views, and whether one of them is to stop."""
+        problem: HyrfError | None = None
+        try:
+            with self._timed("data"):
+                view, picture = next(views)
+            loss, error = self._gradients(view, picture)
+        except HyrfError as refusal:
+            if self.ranks.alone:
+                raise
+            problem = refusal
+            loss = error = torch.zeros((), device=self.device)
+        said = torch.stack((loss, error))
+        if not self.ranks.alone:
+            with self._timed("exchange"):
+                mine = to_tell(loss, error, stop=stop(), problem=problem is not None)
+                said = averaged(self.ranks, self._learnt(), mine)
+        with self._timed("optimizer"):
+            broken = self.optimizer.step(self.step - 1, self.steps)
+            if self.exposures is not None:
+                # A photo's gains take as many steps as in one process.
+                seen, all_seen = (self.ranks.size * steps for steps in (self.step - 1, self.steps))
+                rate = self.config.learning_rates.at("exposure", seen, all_seen)
+                broken = torch.cat((broken, self.exposures.step(rate, self._views_of_step())[None]))
+        with self._timed("loss"):
+            # All that the host wants to know of this step, in one wait for the device.
+            numbers = torch.cat((said, broken)).tolist()
+        said_numbers, flags = numbers[: len(said)], numbers[len(said) :]
+        told = Told(*said_numbers) if self.ranks.alone else Told.of(said_numbers, self.ranks.size)
+        if told.problem:
+            self.ranks.refuse(problem)
+        if not np.isfinite(told.loss):
+            self._refuse("the loss is not finite", self._nonfinite_parameters())
+        if any(flags):
+            self._refuse("a gradient is not finite", self._groups(flags))
+        with self._timed("density"):
+            before = self.model.gaussians.positions
+            self.strategy.act(self.step, self.model, self.optimizer)
+            if not self.ranks.alone and self.model.gaussians.positions is not before:
+                self._stay_alike()
+        return told.loss, told.error, told.stop
+
+    def _gradients(self, view: View, picture: Picture) -> tuple[Tensor, Tensor]:
+        """Add a view's gradients: its loss and mean squared error (NaN where all of the photo is masked), scalars."""
         with self._timed("data"):
             solid = self._solid()
             target, mask = upload(picture, solid, self.device)
@@ -169,37 +229,36 @@ class Trainer:
                 solid=None if solid is None else upload_array(solid, self.device),
             )
         except HyrfError:
-            self._refuse(view, "a number to be rendered is not finite", self._nonfinite_parameters())
+            self._refuse("a number to be rendered is not finite", self._nonfinite_parameters())
         for stage, seconds in rendering.seconds.items():
             self.seconds[stage] += seconds
         with self._timed("loss"):
             image = rendering.rgb if self.exposures is None else self.exposures.exposed(rendering.rgb, view)
-            loss = photometric_loss(image, target, mask, ssim_weight=config.ssim_weight)
+            loss = photometric_loss(image, target, mask, ssim_weight=self.config.ssim_weight)
         with self._timed("backward"):
             loss.backward()
         with self._timed("density"):
             self.strategy.observe(rendering, view.camera, self.model)
-        with self._timed("optimizer"):
-            broken = self.optimizer.step(self.step - 1, config.steps)
-            if self.exposures is not None:
-                rate = config.learning_rates.at("exposure", self.step - 1, config.steps)
-                broken = torch.cat((broken, self.exposures.step(rate)[None]))
         with self._timed("loss"):
-            # All that the host wants to know of this step, in one wait for the device.
-            error = _mean_square(image.detach() - target, mask)
-            value, mse, *flags = torch.stack((loss.detach(), error, *broken)).tolist()
-        if not np.isfinite(value):
-            self._refuse(view, "the loss is not finite", self._nonfinite_parameters())
-        if any(flags):
-            self._refuse(view, "a gradient is not finite", self._groups(flags))
-        with self._timed("density"):
-            self.strategy.act(self.step, self.model, self.optimizer)
-        return value, mse
+            return loss.detach(), _mean_square(image.detach() - target, mask)
+
+    def _learnt(self) -> list[nn.Parameter]:
+        """What gradients are shared of."""
+        return [*self.model.parameters(), *([] if self.exposures is None else [self.exposures.values])]
+
+    def _views_of_step(self) -> list[View]:
+        """The views that the ranks render in this step."""
+        places = range((self.step - 1) * self.ranks.size, self.step * self.ranks.size)
+        return list(shuffled(self.scene.train, self.config.seed, places))
+
+    def _stay_alike(self) -> None:
+        """See that all ranks still hold the same numbers after Gaussians came and went; else take those of rank 0."""
+        if len(set(self.ranks.told(digest(self.model.parameters())))) > 1:
+            self._restore(self.ranks.first(self._tensors()))
 
     def _record(self, loss: float, mse: float) -> None:
         """Keep what the step came to for the curve, unless all of its photo is masked."""
-        steps = self.config.steps
-        if not np.isnan(mse) and is_recorded(self.step, steps):
+        if not np.isnan(mse) and is_recorded(self.step, self.steps):
             record = {"step": self.step, "loss": loss, "psnr": decibels(mse), "gaussians": len(self.model)}
             self.records.append({**record, "seconds": round(self.elapsed, 3)})
 
@@ -208,7 +267,8 @@ class Trainer:
         if self.model.config.background:
             return None
         if self.config.background_color == "random":
-            return np.random.default_rng((self.config.seed, 1, self.step)).random(3, dtype=np.float32)
+            number = (self.step - 1) * self.ranks.size + self.ranks.rank + 1  # of the view, from 1
+            return np.random.default_rng((self.config.seed, 1, number)).random(3, dtype=np.float32)
         return np.array(self.model.config.solid, np.float32)
 
     def _groups(self, flags: Sequence[float]) -> list[str]:
@@ -219,10 +279,11 @@ class Trainer:
     def _nonfinite_parameters(self) -> list[str]:
         return [name for name, p in self.model.named_parameters() if not torch.isfinite(p).all()]
 
-    def _refuse(self, view: View, what: str, groups: list[str]) -> None:
+    def _refuse(self, what: str, groups: list[str]) -> NoReturn:
         where = ", ".join(groups) if groups else "none; look at the photo itself"
+        views = " or ".join(f"'{view.name}'" for view in self._views_of_step())
         raise HyrfTrainingError(
-            f"training stopped at step {self.step} on view '{view.name}': {what} (parameter groups: {where}); "
+            f"training stopped at step {self.step} on view {views}: {what} (parameter groups: {where}); "
             "lower the learning rates or remove the view"
         )
 
@@ -237,15 +298,37 @@ class Trainer:
     def _settings(self) -> dict:
         views = [[view.name, view.camera.width, view.camera.height] for view in self.scene.train]
         chosen = {"exposure": self.exposures is not None, "model": self.model.config.to_dict()}
+        if not self.ranks.alone:
+            chosen["processes"] = self.ranks.size
         return {**self.config.to_dict(), "views": views, "strategy": type(self.strategy).__qualname__, **chosen}
 
-    def save(self, path: Path) -> None:
-        """Write the run's state to `path`."""
+    def _tensors(self) -> dict[str, Tensor]:
+        """The run's state, but for what each rank has collected for density control, on the CPU."""
         tensors: dict[str, Tensor] = {f"model.{name}": p for name, p in self.model.named_parameters()}
         tensors |= {f"adam.{name}": value for name, value in self.optimizer.state_dict().items()}
         if self.exposures is not None:
             tensors |= {f"exposure.{name}": value for name, value in self.exposures.state_dict().items()}
-        tensors |= {f"density.{name}": value for name, value in self.strategy.state_dict().items()}
+        return _on_cpu(tensors)
+
+    def _restore(self, tensors: dict[str, Tensor]) -> None:
+        """The inverse of `_tensors`."""
+        explicit = [tensors[f"model.gaussians.{name}"] for name in Gaussians.NAMES]
+        model = HybridModel(self.model.config, Gaussians(*explicit))
+        model.load_state_dict(_under("model.", tensors))
+        self._take(model)
+        self.optimizer.load_state_dict(_under("adam.", tensors))
+        if self.exposures is not None:
+            self.exposures.load_state_dict(_under("exposure.", tensors))
+
+    def save(self, path: Path) -> None:
+        """Write the run's state to `path`; rank 0 does, and all have to call it."""
+        collected = self.ranks.told(_on_cpu(self.strategy.state_dict()))
+        if not self.ranks.leads:
+            self.saved = self.step
+            return
+        tensors = self._tensors()
+        for rank, values in enumerate(collected):
+            tensors |= {f"{_collected_by(rank)}{name}": value for name, value in values.items()}
         progress = {
             "step": self.step,
             "records": self.records,
@@ -253,37 +336,37 @@ class Trainer:
             "elapsed": self.elapsed,
             "choices": self.choices,
         }
-        tensors = {name: value.detach().cpu() for name, value in tensors.items()}
         save_checkpoint(path, settings=self._settings(), tensors=tensors, progress=progress)
         self.saved = self.step
 
     def load(self, path: Path) -> None:
-        """Go on from the state at `path`; the result is the one an uninterrupted run gives.
+        """Go on from the state at `path`, which rank 0 reads; the result is the one an uninterrupted run gives.
 
         Raises:
             HyrfTrainingError: as `load_checkpoint`.
         """
-        tensors, progress = load_checkpoint(path, self._settings())
-        explicit = [tensors[f"model.gaussians.{name}"] for name in Gaussians.NAMES]
-        model = HybridModel(self.model.config, Gaussians(*explicit))
-        model.load_state_dict(
-            {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
-        )
-        self._take(model)
-        self.optimizer.load_state_dict(
-            {name.removeprefix("adam."): value for name, value in tensors.items() if name.startswith("adam.")}
-        )
-        if self.exposures is not None:
-            self.exposures.load_state_dict(
-                {n.removeprefix("exposure."): value for n, value in tensors.items() if n.startswith("exposure.")}
-            )
-        self.strategy.load_state_dict(
-            {name.removeprefix("density."): value for name, value in tensors.items() if name.startswith("density.")}
-        )
+        saved = self.ranks.agree(lambda: load_checkpoint(path, self._settings()) if self.ranks.leads else ({}, {}))
+        tensors, progress = self.ranks.first(saved)
+        self._restore(tensors)
+        self.strategy.load_state_dict(_under(_collected_by(self.ranks.rank), tensors))
         self.step, self.records = progress["step"], progress["records"]
         self.saved = self.step
         self.seconds, self.elapsed = defaultdict(float, progress["seconds"]), progress["elapsed"]
         self.choices |= progress.get("choices", {})
+
+
+def _on_cpu(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: value.detach().cpu() for name, value in tensors.items()}
+
+
+def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Those whose names start so, by the rest of their names."""
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+
+def _collected_by(rank: int) -> str:
+    """What names start with in a checkpoint of what a rank has collected for density control."""
+    return f"density{rank or ''}."
 
 
 def _mean_square(error: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:

@@ -47,6 +47,39 @@ def test_rates_fall_evenly_in_their_logarithm_and_are_higher_in_short_runs(name,
     assert RATES.at(name, steps - 1, steps) == pytest.approx(pace * last * (first / last) ** (1 / steps), rel=1e-12)
 
 
+@pytest.mark.parametrize("views", [2, 4, 16])
+@pytest.mark.parametrize("seen", [200, 3000, 30_000])
+def test_steps_of_several_views_are_as_much_larger_as_the_root_of_their_number(views, seen):
+    for name in (*Gaussians.NAMES, "fields"):
+        for share in (0, 0.25, 1):
+            alone, together = (
+                RATES.at(name, share * seen, seen),
+                RATES.at(name, share * seen / views, seen / views, views),
+            )
+            assert together == pytest.approx(views**0.5 * alone, rel=1e-12)
+
+
+@pytest.mark.parametrize(("views", "betas"), [(1, (0.9, 0.999)), (4, (0.6, 0.996)), (16, (0.0, 0.984))])
+def test_running_means_cover_as_many_views_whatever_a_step_has_of_them(views, betas):
+    model = a_model()
+    plain = {name: p.detach().clone().requires_grad_() for name, p in model.named_parameters()}
+    adam = torch.optim.Adam(
+        [{"params": [p]} for p in plain.values()], betas=betas, eps=1e-15, foreach=False, fused=False
+    )
+    optimizer = Optimizer(model, RATES, views)
+    for step in range(3):
+        for group, name in zip(adam.param_groups, plain, strict=True):
+            kind = name.removeprefix("gaussians.")
+            group["lr"] = RATES.at(kind if kind in Gaussians.NAMES else "fields", step, 20, views)
+        set_gradients(model, step)
+        for name, parameter in model.named_parameters():
+            plain[name].grad = parameter.grad.clone()
+        optimizer.step(step, 20)
+        adam.step()
+    for name, parameter in model.named_parameters():
+        torch.testing.assert_close(parameter.detach(), plain[name].detach(), rtol=1e-4, atol=1e-5)
+
+
 def test_rates_fall_tenfold_or_more_by_default():
     rates = LearningRates()
     for name in (*Gaussians.NAMES, "fields"):

@@ -1,0 +1,13 @@
+"""Loaded by the process that `ranked` forks others from: what takes long is done once, before there are any."""
+
+from __future__ import annotations
+
+import torch
+from scenes import ball_scene
+
+import hyrfpack.compress
+import hyrfpack.evaluate  # noqa: F401
+from hyrfpack.train import TrainConfig, Trainer
+
+torch.set_num_threads(1)
+Trainer(ball_scene(2, 20, side=16), TrainConfig(steps=1)).run()  # loads the kernels

@@ -1,0 +1,320 @@
+"""Processes that train one model together, against one that does the same alone; how they stop, go on and refuse."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import shutil
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import ranked_work as work
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from ranked import Ended, needs_ranks, together
+
+from hyrfpack.errors import HyrfError
+from hyrfpack.ops.ssim import photometric_loss
+from hyrfpack.parallel.ranks import ALONE
+from hyrfpack.render import render
+from hyrfpack.scene import Scene
+from hyrfpack.train import TrainConfig, Trainer
+from hyrfpack.train.density import DensityControl
+from hyrfpack.train.optimizer import Optimizer
+from hyrfpack.train.together import Told, averaged, check_settings, digest, to_tell
+from hyrfpack.train.trainer import shuffled
+
+SIZE = 2
+
+
+class Row(NamedTuple):
+    """What a step comes to."""
+
+    loss: float
+    error: float
+    gaussians: int
+
+
+def one_for_all(scene: Scene, config: TrainConfig) -> tuple[list[Row], Trainer]:
+    """What processes should come to: one that renders the views of all in turn and takes the mean of their gradients.
+
+    Also returns the trainer, whose model and exposures it has trained.
+    """
+    trainer = Trainer(scene, config)
+    model, exposures = trainer.model, trainer.exposures
+    optimizer = Optimizer(model, config.learning_rates, SIZE)
+    steps = math.ceil(config.steps / SIZE)
+    density = DensityControl(config.density, steps, trainer.budget, len(model), config.seed)
+    views, rows = list(shuffled(scene.train, config.seed, range(steps * SIZE))), []
+    for step in range(1, steps + 1):
+        own, losses, errors = views[(step - 1) * SIZE : step * SIZE], [], []
+        learnt = [*model.parameters(), *([exposures.values] if exposures else [])]
+        sums = [torch.zeros_like(parameter) for parameter in learnt]
+        for view in own:
+            drawn = render(model, view.camera, absgrad=density.watching(step))
+            image = exposures.exposed(drawn.rgb, view) if exposures else drawn.rgb
+            photo = torch.from_numpy(view.load().composite())
+            loss = photometric_loss(image, photo, None, ssim_weight=config.ssim_weight)
+            loss.backward()
+            density.observe(drawn, view.camera, model)
+            for total, parameter in zip(sums, learnt, strict=True):
+                if parameter.grad is not None:
+                    total += parameter.grad
+                parameter.grad = None
+            losses.append(loss.item())
+            errors.append((image.detach() - photo).square().mean().item())
+        for total, parameter in zip(sums, learnt, strict=True):
+            parameter.grad = total / SIZE
+        optimizer.step(step - 1, steps)
+        if exposures:
+            exposures.step(config.learning_rates.at("exposure", SIZE * (step - 1), SIZE * steps), own)
+        density.act(step, model, optimizer)
+        rows.append(Row(float(np.mean(losses)), float(np.mean(errors)), len(model)))
+    return rows, trainer
+
+
+# -- what is told ----------------------------------------------------------------------------------------------------
+
+NUMBERS = st.floats(0, 10, width=32)
+
+
+@given(st.lists(st.tuples(NUMBERS, st.none() | NUMBERS, st.booleans(), st.booleans()), min_size=1, max_size=6))
+def test_what_ranks_tell_is_means_over_views_and_whether_any_stops_or_has_a_problem(rows):
+    """An error of None: all of the photo is masked."""
+    told = [
+        to_tell(torch.tensor(loss), torch.tensor(math.nan if error is None else error), stop=stop, problem=problem)
+        for loss, error, stop, problem in rows
+    ]
+    found = Told.of(torch.stack(told).sum(0).tolist(), len(rows))
+    errors = [error for _, error, _, _ in rows if error is not None]
+    assert found.loss == pytest.approx(np.mean([row[0] for row in rows]), rel=1e-5, abs=1e-30)
+    assert found.error == pytest.approx(np.mean(errors) if errors else math.nan, rel=1e-5, abs=1e-30, nan_ok=True)
+    assert found.stop is any(row[2] for row in rows) and found.problem is any(row[3] for row in rows)
+
+
+def test_a_loss_that_is_not_finite_is_told_as_such():
+    told = torch.stack(
+        [to_tell(torch.tensor(loss), torch.tensor(1.0), stop=False, problem=False) for loss in (1, math.nan)]
+    )
+    assert math.isnan(Told.of(told.sum(0).tolist(), 2).loss)
+
+
+def test_one_process_keeps_its_gradients_and_its_settings():
+    weight = torch.nn.Parameter(torch.zeros(3, 2))
+    weight.grad = torch.arange(6.0).view(3, 2)
+    expected = weight.grad.clone()
+    assert averaged(ALONE, [weight], torch.tensor([2.0, 5.0])).tolist() == [2.0, 5.0]
+    assert torch.equal(weight.grad, expected)
+    check_settings(ALONE, {"seed": 1})
+
+
+def test_a_digest_is_of_every_bit():
+    tensors = [torch.zeros(3), torch.arange(4.0).view(2, 2).T]
+    changed = [tensors[0].clone(), tensors[1]]
+    changed[0][1] = -0.0
+    assert digest(tensors) == digest([tensor.clone() for tensor in tensors]) != digest(changed)
+
+
+# -- two against one -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def both() -> list[Ended]:
+    return together(work.train_both)
+
+
+CASES = {"six photos": (0, work.even_scene, work.EVEN), "three photos, exposed": (1, work.three_photos, work.EXPOSED)}
+
+
+@pytest.fixture(scope="module", params=CASES)
+def compared(request, both) -> tuple[list[dict], list[Row], Trainer]:
+    """What each rank came to, and what one process that does the work of both does."""
+    number, scene, config = CASES[request.param]
+    return [end.result[number] for end in both], *one_for_all(scene(), config)
+
+
+@needs_ranks
+def test_two_processes_come_to_the_numbers_of_one_that_averages_their_views(compared):
+    (first, second), expected, _ = compared
+    assert first["rows"] == second["rows"] and len(expected) in (30, 60)
+    np.testing.assert_allclose(first["rows"], expected, rtol=0, atol=1e-5)
+
+
+@needs_ranks
+def test_two_processes_end_with_the_model_of_one_that_averages_their_views(compared):
+    (first, _), _, trainer = compared
+    for name, parameter in trainer.model.named_parameters():
+        np.testing.assert_allclose(first["parameters"][name], parameter.detach(), rtol=0, atol=1e-3)
+    if trainer.exposures is not None:
+        np.testing.assert_allclose(first["gains"], trainer.exposures.values.detach(), rtol=0, atol=1e-5)
+
+
+@needs_ranks
+def test_gaussians_come_and_go_in_the_runs_that_are_compared(compared):
+    """Else it would say little."""
+    (first, _), _, _ = compared
+    counts = [count for _, _, count in first["rows"]]
+    assert len(set(counts)) >= 3 and counts[0] < counts[-1] < max(counts)
+
+
+@needs_ranks
+def test_both_hold_the_same_bits_after_every_step(compared):
+    (first, second), _, _ = compared
+    assert first["digests"] == second["digests"] and len(set(first["digests"])) == len(first["digests"])
+
+
+@needs_ranks
+def test_both_keep_the_same_curve_but_for_the_time(compared):
+    (first, second), _, _ = compared
+    curves = [[{**record, "seconds": 0} for record in rank["records"]] for rank in (first, second)]
+    assert curves[0] == curves[1] and [record["step"] for record in curves[0]] == list(range(1, len(curves[0]) + 1))
+
+
+@needs_ranks
+def test_exposures_are_learnt_together_also_where_both_have_the_same_photo(both):
+    names = [view.name for view in shuffled(work.three_photos().train, work.EXPOSED.seed, range(60))]
+    assert sum(names[place] == names[place + 1] for place in range(0, 60, 2)) > 1  # else it would say little
+    gains = [end.result[1]["gains"] for end in both]
+    np.testing.assert_array_equal(gains[0], gains[1])
+    untrained = Trainer(work.three_photos(), work.EXPOSED).exposures.values
+    assert np.abs(gains[0] - untrained.detach().numpy()).max() > 1e-3
+
+
+@pytest.mark.parametrize(("size", "steps"), [(1, 7), (2, 4), (3, 3), (7, 1), (8, 1)])
+def test_steps_count_views_and_all_ranks_see_the_order_of_one(size, steps):
+    config = dataclasses.replace(work.EVEN, steps=7)
+    trainers = [
+        Trainer(work.even_scene(), config, ranks=dataclasses.replace(ALONE, rank=r, size=size)) for r in range(size)
+    ]
+    orders = [[view.name for view in trainer._order()] for trainer in trainers]
+    assert {trainer.steps for trainer in trainers} == {steps}
+    together = [name for step in zip(*orders, strict=True) for name in step]
+    assert together == [view.name for view in shuffled(work.even_scene().train, config.seed, range(size * steps))]
+
+
+# -- stopping and going on -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory) -> tuple[Path, list[Ended]]:
+    """A folder with a run of one piece and one of three, and what was said."""
+    folder = tmp_path_factory.mktemp("parts")
+    alone = Trainer(work.run_scene(), work.RUN)
+    (folder / "alone").mkdir()
+    alone.run(checkpoint=folder / "alone" / "checkpoint.pt", stop=lambda: alone.step == 3)
+    return folder, together(work.stop_and_resume, folder / "whole", folder / "parts", folder / "alone")
+
+
+def model_of(folder: Path) -> bytes:
+    return (folder / "model.hyrf").read_bytes()
+
+
+@needs_ranks
+def test_a_request_to_one_stops_all_after_the_same_step_and_the_checkpoint_stays(parts):
+    folder, ends = parts
+    for end in ends:
+        assert end.result["first"] == (False, 3, False) and end.result["second"] == (False, 17, False)
+        assert end.result["checkpoint stays"]
+    assert not (folder / "parts" / "model.hyrf").exists()
+
+
+@needs_ranks
+def test_a_run_that_was_stopped_and_resumed_gives_the_bytes_of_the_uninterrupted_one(parts, tmp_path):
+    folder, ends = parts
+    resumed = tmp_path / "resumed"
+    shutil.copytree(folder / "parts", resumed)
+    again = together(work.run, resumed, True)
+    assert (
+        [end.result for end in again] == [end.result["whole"] for end in ends] == [(True, 30, True), (True, 30, False)]
+    )
+    assert model_of(resumed) == model_of(folder / "whole")
+    assert not (resumed / "checkpoint.pt").exists()
+
+
+@needs_ranks
+def test_only_rank_0_writes_and_what_it_writes_is_said_of_two(parts):
+    folder, _ = parts
+    assert {path.name for path in (folder / "whole").iterdir()} == {"model.hyrf", "metrics.json", "curve.png", "views"}
+    assert {path.name for path in (folder / "parts").iterdir()} == {"checkpoint.pt"}
+
+
+@needs_ranks
+def test_a_run_is_resumed_by_as_many_processes_only(parts):
+    folder, ends = parts
+    with pytest.raises(HyrfError, match=r"other settings \(processes\)"):
+        Trainer(work.run_scene(), work.RUN).load(folder / "parts" / "checkpoint.pt")
+    assert all("other settings (processes)" in end.result["other size"] for end in ends)
+    assert len({end.result["other size"] for end in ends}) == 1
+
+
+@needs_ranks
+def test_all_refuse_a_folder_that_holds_a_run(parts):
+    _, ends = parts
+    assert {"the folder holds an earlier run" in end.result["there already"] for end in ends} == {True}
+
+
+@needs_ranks
+def test_processes_that_are_started_anew_go_on_from_the_checkpoint_if_there_is_one(parts, tmp_path):
+    folder, _ = parts
+    shutil.copytree(folder / "parts", tmp_path / "some")
+    for end in together(work.started_anew, tmp_path):
+        assert end.result == [2, list(range(18, 31))]
+    assert model_of(tmp_path / "some") == model_of(folder / "whole")
+
+
+@needs_ranks
+@pytest.mark.parametrize(("killed", "step"), [(0, 17), (1, 13)])
+def test_a_process_that_is_killed_ends_the_other_and_the_run_can_be_resumed(killed, step, parts, tmp_path):
+    ends = together(work.run_and_die, tmp_path, killed, step, patience=30)
+    assert ends[killed].exit_code == -9
+    assert "one of the 2 processes has ended" in ends[1 - killed].refusal
+    assert f"the checkpoint of step {step // 5 * 5} is kept" in ends[1 - killed].refusal
+    assert "\n" not in ends[1 - killed].refusal
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
+
+    together(work.run, tmp_path, True)
+    assert model_of(tmp_path) == model_of(parts[0] / "whole")
+
+
+# -- refusals --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def refused() -> list[dict]:
+    return [end.result for end in together(work.refusals)]
+
+
+@needs_ranks
+@pytest.mark.parametrize(
+    ("case", "words"),
+    [
+        ("photo", ["process 1 of 2: 003.png: cannot be read"]),
+        ("nan", ["'003.png'", "not finite", "photo itself"]),
+        ("nan on one", ["'003.png'", "not finite", "photo itself"]),
+        ("seed", ["process 1 of 2", "other settings", "(seed)", "versions"]),
+        ("photos", ["process 1 of 2", "views)"]),
+        ("version", ["process 1 of 2", "(versions)"]),
+        ("checkpoint", ["no checkpoint to resume"]),
+    ],
+)
+def test_what_one_cannot_take_ends_both_with_the_same_sentence(case, words, refused):
+    first, second = (rank[case] for rank in refused)
+    assert first == second and all(word in first for word in words), first
+
+
+@needs_ranks
+def test_after_a_refusal_they_can_still_work_together(refused):
+    assert [rank["none"] for rank in refused] == [None, None]
+
+
+@needs_ranks
+def test_what_cannot_be_trained_on_is_refused_on_both_before_the_first_step(tmp_path):
+    first, second = (end.result for end in together(work.refused_set_up, tmp_path))
+    assert first == second
+    assert "held.png: cannot be read" in first["held out"]
+    assert "there is no checkpoint to resume" in first["nothing to resume"]
+    assert "process 1 of 2: 'what' is not a device" in first["device"]
+    assert list(tmp_path.iterdir()) == []
