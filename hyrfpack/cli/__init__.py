@@ -21,7 +21,7 @@ from hyrfpack.cli.export import export
 from hyrfpack.cli.files import compress, decompress, info
 from hyrfpack.cli.imports import import_
 from hyrfpack.cli.make import make
-from hyrfpack.cli.manners import add_manners, is_verbose, mend_streams, note
+from hyrfpack.cli.manners import add_manners, is_verbose, keep_arguments, mend_streams, note
 from hyrfpack.cli.poses import poses
 from hyrfpack.cli.train import train
 from hyrfpack.cli.view import view
@@ -35,6 +35,10 @@ class _Commands(click.Group):
     def main(self, *args: Any, **options: Any) -> Any:
         mend_streams()
         return super().main(*args, **options)
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        keep_arguments(ctx, args)
+        return super().parse_args(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
         try:

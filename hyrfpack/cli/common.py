@@ -19,6 +19,7 @@ from hyrfpack.errors import HyrfError
 if TYPE_CHECKING:
     import torch
 
+    from hyrfpack.parallel.ranks import Ranks
     from hyrfpack.scene import Camera, Scene, View
 
 Command = TypeVar("Command", bound=Callable)
@@ -146,11 +147,11 @@ def device_options(command: Command) -> Command:
     return device_option(precision(command))
 
 
-def chosen_device(name: str) -> torch.device:
-    """The device of --device, with a word about it where it is slow."""
-    from hyrfpack.device import choose_device, describe_device
+def chosen_device(name: str, ranks: Ranks | None = None) -> torch.device:
+    """The device of --device, with a word about it where it is slow; each of several processes has its own."""
+    from hyrfpack.device import choose_device, choose_own_device, describe_device
 
-    device = choose_device(name, note)
+    device = choose_device(name, note) if ranks is None else choose_own_device(name, ranks, note)
     detail(f"device: {describe_device(device)}")
     return device
 

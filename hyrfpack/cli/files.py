@@ -25,11 +25,13 @@ from hyrfpack.cli.common import (
     scene_options,
     table,
 )
+from hyrfpack.cli.processes import on_processes
 from hyrfpack.errors import printable
 from hyrfpack.outputs import ARCHIVES, PICTURES, VIDEOS, Outputs
 
 if TYPE_CHECKING:
     from hyrfpack.format import CompressionReport
+    from hyrfpack.parallel.ranks import Ranks
     from hyrfpack.scene import Scene
 
 # Those of hyrfpack.format.codec, without loading torch.
@@ -72,6 +74,7 @@ PROFILES, DEFAULT_PROFILE = ("raw", "paper", "compact"), "compact"
     "--report", type=OUTPUT, metavar="DIR", help="Write a page there: size against loss, pictures, error maps."
 )
 @overwrite_option
+@on_processes
 @scene_options
 @device_option
 @json_option
@@ -90,12 +93,13 @@ def compress(
     reading: dict[str, Any],
     device: str,
     as_json: bool,
+    ranks: Ranks,
 ) -> None:
     """Pack MODEL, a .hyrf file or the folder of a run, into a smaller file and show what each part takes.
 
     The default profile renders the model to see what each number does to pictures, and spends bits where they show.
     With the photos it also says what was lost. The folder of a run knows where its photos are, so that they need not
-    be named.
+    be named. Several processes share the photos of --finetune; the rest each does for itself.
 
     \b
     Examples:
@@ -112,17 +116,22 @@ def compress(
     from hyrfpack.format import describe
     from hyrfpack.train.run import MODEL
 
-    place = chosen_device(device)
+    place = chosen_device(device, ranks)
     if model.is_dir():
         model /= MODEL
-    if data is not None:
-        scene: Scene | None = read_scene(data, reading, describe(model))
-    else:
-        scene = None if no_data or profile != DEFAULT_PROFILE else _photos_of(model)
-    outputs = Outputs(model, scene=scene, overwrite=overwrite)
-    outputs.file(output, ".hyrf")
-    if report is not None:
-        outputs.folder(report, FILES)
+
+    def read() -> Scene | None:
+        if data is not None:
+            scene: Scene | None = read_scene(data, reading, describe(model))
+        else:
+            scene = None if no_data or profile != DEFAULT_PROFILE else _photos_of(model)
+        outputs = Outputs(model, scene=scene, overwrite=overwrite)
+        outputs.file(output, ".hyrf")
+        if report is not None:
+            outputs.folder(report, FILES)
+        return scene
+
+    scene = ranks.agree(read)
     result = pack(
         model,
         output,
@@ -134,7 +143,10 @@ def compress(
         max_psnr_drop=max_psnr_drop,
         device=place,
         say=note,
+        ranks=ranks,
     )
+    if not ranks.leads:
+        return
     scores = _scores(model, output, scene)
     if report is not None:
         from hyrfpack.compress.report import write_report

@@ -16,7 +16,8 @@ import click
 import hyrfpack
 
 T = TypeVar("T")
-_MANNER, _STARTED = "hyrfpack.manner", "hyrfpack.started"  # in click's context, where all commands see them
+# In click's context, where all commands see them.
+_MANNER, _STARTED, _ARGUMENTS = "hyrfpack.manner", "hyrfpack.started", "hyrfpack.arguments"
 _PACKAGES = ("torch", "numpy", "numba", "triton", "pycolmap")
 
 
@@ -53,6 +54,16 @@ def _versions() -> str:
         with suppress(PackageNotFoundError):
             known.append(f"{package} {version(package)}")
     return ", ".join(known)
+
+
+def keep_arguments(ctx: click.Context, arguments: Iterable[str]) -> None:
+    """Remember what follows `hyrfpack` on the command line."""
+    ctx.meta[_ARGUMENTS] = list(arguments)
+
+
+def arguments_of(ctx: click.Context) -> list[str]:
+    """What follows `hyrfpack` on the command line."""
+    return ctx.meta[_ARGUMENTS]
 
 
 def is_verbose() -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -22,7 +22,11 @@ from hyrfpack.cli.common import (
     read_scene,
     scene_options,
 )
+from hyrfpack.cli.processes import on_processes
 from hyrfpack.errors import HyrfNoPosesError
+
+if TYPE_CHECKING:
+    from hyrfpack.parallel.ranks import Ranks
 
 PRESETS = ("auto", "synthetic", "standard", "large", "street")  # hyrfpack.train.PRESETS, without loading torch
 BACKGROUND_COLORS = ("black", "white", "random")
@@ -68,6 +72,7 @@ BACKGROUND_COLORS = ("black", "white", "random")
 @click.option("--poses", is_flag=True, help="Where DATA has no poses, estimate them first, into RUN/scene.")
 @click.option("--resume", is_flag=True, help="Go on from the run's checkpoint.")
 @click.option("--overwrite", is_flag=True, help="Replace what an earlier run left in the folder.")
+@on_processes
 @device_options
 @json_option
 def train(
@@ -81,6 +86,7 @@ def train(
     overwrite: bool,
     device: str,
     as_json: bool,
+    ranks: Ranks,
     **settings: Any,
 ) -> None:
     """Train a model on DATA, a folder of photos and poses, or a .zip of it.
@@ -89,6 +95,9 @@ def train(
     RealityScan's, Polycam's or Record3D's.
 
     With --poses, DATA may be photos without poses, or a video.
+
+    With --processes, or started by torchrun or srun, each process renders another photo of a step, on a GPU of its own
+    where there are any; --steps counts photos, and --cache-mb is for all of a machine.
 
     RUN gets model.hyrf, metrics.json, the training curve and pictures of held-out views. Ctrl-C saves a checkpoint
     and exits with code 1, as SIGTERM and a terminal that is closed do; --resume goes on with it and ends with the same
@@ -102,29 +111,34 @@ def train(
       hyrfpack train lego -o runs/lego --background-color white --max-gaussians 50000
       hyrfpack train photos/garden -o runs/garden --images images_4 --steps 30000 --resume
       hyrfpack train photos/desk -o runs/desk --poses
+      hyrfpack train photos/garden -o runs/garden --processes 4
     """
     if resume and overwrite:
         raise click.UsageError("--resume goes on with a run and --overwrite replaces it; give one of them")
     if None not in (settings["max_gaussians"], settings["target_bytes"]):
         raise click.UsageError("--max-gaussians and --target-size each decide how large the model is; give one of them")
+    if poses and not ranks.alone:
+        raise click.UsageError("--poses is the work of one process; 'hyrfpack poses' first, then train from its folder")
     from hyrfpack.data import PictureCache
     from hyrfpack.device import describe_device
     from hyrfpack.train import TrainConfig
     from hyrfpack.train import train as run
     from hyrfpack.train.run import resuming
 
-    place = chosen_device(device)
+    place = chosen_device(device, ranks)
     try:
-        scene = read_scene(data, reading)
+        scene = ranks.agree(lambda: read_scene(data, reading))
     except HyrfNoPosesError:
         if not poses:
             raise
         scene = read_scene(_posed(data, out, reading["images"], resume, overwrite), {**reading, "images": None})
-    where = describe_device(place)
+    where = describe_device(place) + ("" if ranks.alone else f" in each of {ranks.size} processes")
     note(f"{scene.layout} scene: {len(scene.train)} photos to train on, {len(scene.test)} held out; on {where}")
-    cache = None if cache_mb is None else PictureCache(cache_mb * 2**20)
+    cache = None if cache_mb is None else PictureCache(cache_mb * 2**20 // ranks.local_size)
     config = TrainConfig(**settings)
-    result = run(scene, out, config, resume=resume, overwrite=overwrite, cache=cache, device=place, log=log)
+    result = run(
+        scene, out, config, resume=resume, overwrite=overwrite, cache=cache, device=place, log=log, ranks=ranks
+    )
     detail("seconds: " + ", ".join(f"{part} {t:.1f}" for part, t in result.metrics.get("stage_seconds", {}).items()))
     if not result.complete and result.step == 0:
         note("stopped before the first step; the same command begins anew")
@@ -132,7 +146,7 @@ def train(
         note(f"stopped after step {result.step:,}; {resuming(overwrite)} goes on from there")
     if as_json:
         print_json({"complete": result.complete, "step": result.step, **result.metrics})
-    elif result.complete:
+    elif result.complete and ranks.leads:
         metrics = result.metrics
         click.echo(
             f"{result.model}: {metrics['gaussians']:,} Gaussians, {metrics['bytes']:,} bytes, "

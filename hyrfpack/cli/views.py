@@ -24,10 +24,14 @@ from hyrfpack.cli.common import (
     table,
 )
 from hyrfpack.cli.manners import counted
+from hyrfpack.cli.processes import on_processes
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
     from hyrfpack.evaluate import Evaluation, ViewScore
+    from hyrfpack.model import HybridModel
+    from hyrfpack.parallel.ranks import Ranks
+    from hyrfpack.scene import Scene, View
 
 SPLITS = ("test", "train", "all")
 DEFAULT_ORBIT = 60  # frames
@@ -47,6 +51,7 @@ DEFAULT_ORBIT = 60  # frames
     "--allow-partial", is_flag=True, help="Take a file that is cut short: a coarser model, if enough is there."
 )
 @overwrite_option
+@on_processes
 @device_options
 @json_option
 def render(
@@ -64,6 +69,7 @@ def render(
     device: str,
     precision: str,
     as_json: bool,
+    ranks: Ranks,
 ) -> None:
     """Render MODEL, a .hyrf file, to PNG pictures: the views of photos, cameras of a file, or an orbit of 60 frames.
 
@@ -85,10 +91,10 @@ def render(
     from hyrfpack.render.files import render_files, rendered_names
     from hyrfpack.render.video import has_ffmpeg, write_video
 
-    place = chosen_device(device)
+    place = chosen_device(device, ranks)
     part, scene = 1.0 if allow_partial else None, None
     if data is not None:
-        scene = read_scene(data, reading, describe(model, part))
+        scene = ranks.agree(lambda: read_scene(data, reading, describe(model, part)))
         views = split_views(scene, split)
         named = [(view.name, view.camera) for view in views]
     elif cameras is not None:
@@ -98,12 +104,19 @@ def render(
         named = [(f"{number:04d}", camera) for number, camera in enumerate(cameras_around)]
     film = output / "video.mp4" if video and has_ffmpeg() else None
     names = rendered_names([name for name, _ in named], depth)
-    Outputs(model, cameras, scene=scene, overwrite=overwrite).folder(output, [*names, *([film.name] if film else [])])
+    outputs = Outputs(model, cameras, scene=scene, overwrite=overwrite)
+    ranks.agree(lambda: outputs.folder(output, [*names, *([film.name] if film else [])]))
 
-    loaded = load(model, place, part)
-    loaded.precision = precision
-    pictures = render_files(loaded, named, output, depth=depth)
-    written = list(counted(pictures, len(named), "rendering"))
+    def write() -> list[Path]:
+        loaded = load(model, place, part)
+        loaded.precision = precision
+        pictures = render_files(loaded, named, output, depth=depth, ranks=ranks)
+        return list(counted(pictures, len(ranks.share(named)), "rendering"))
+
+    parts = ranks.told(ranks.agree(write))
+    if not ranks.leads:
+        return
+    written = [parts[place % ranks.size][place // ranks.size] for place in range(len(named))]
     if film:
         write_video(written, film)
     elif video:
@@ -126,6 +139,7 @@ def render(
     "--allow-partial", is_flag=True, help="Take a file that is cut short: a coarser model, if enough is there."
 )
 @overwrite_option
+@on_processes
 @device_options
 @json_option
 def evaluate(
@@ -140,6 +154,7 @@ def evaluate(
     device: str,
     precision: str,
     as_json: bool,
+    ranks: Ranks,
 ) -> None:
     """Score MODEL, a .hyrf file, against photos it has not seen: PSNR, SSIM, LPIPS, bytes on disk, seconds a frame.
 
@@ -158,13 +173,22 @@ def evaluate(
     from hyrfpack.format import describe, load
 
     part = 1.0 if allow_partial else None
-    loaded = load(model, chosen_device(device), part)
-    loaded.precision = precision
-    scene = read_scene(data, reading, describe(model, part))
-    views = split_views(scene, split)
-    if pictures is not None:
-        Outputs(model, lpips_weights, scene=scene, overwrite=overwrite).folder(pictures, picture_names(views).values())
-    scores = score(loaded, views, training=scene.train, lpips_weights=lpips_weights, pictures=pictures)
+    device_here = chosen_device(device, ranks)
+
+    def read() -> tuple[HybridModel, Scene, list[View]]:
+        loaded = load(model, device_here, part)
+        loaded.precision = precision
+        scene = read_scene(data, reading, describe(model, part))
+        views = split_views(scene, split)
+        if pictures is not None:
+            outputs = Outputs(model, lpips_weights, scene=scene, overwrite=overwrite)
+            outputs.folder(pictures, picture_names(views).values())
+        return loaded, scene, views
+
+    loaded, scene, views = ranks.agree(read)
+    scores = score(loaded, views, training=scene.train, lpips_weights=lpips_weights, pictures=pictures, ranks=ranks)
+    if not ranks.leads:
+        return
     size = os.path.getsize(model)
     width, height = largest_picture(view.camera for view in views)
     if scores.skipped:

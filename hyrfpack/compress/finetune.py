@@ -16,7 +16,7 @@ from hyrfpack.compress.rate_distortion import ERROR_PER_BIT
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.device import upload
-from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate.exposure import expose, fitted_gains
 from hyrfpack.format.arrays import by_parameter
 from hyrfpack.format.compact.plan import Plan, from_lattice
@@ -25,11 +25,13 @@ from hyrfpack.format.sections import COLORS, POSITIONS
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
+from hyrfpack.parallel.ranks import ALONE, Ranks
 from hyrfpack.quant.steps import ONE, step_of
 from hyrfpack.render import render
-from hyrfpack.scene import View
+from hyrfpack.scene import Picture, View
 from hyrfpack.train.config import LearningRates
 from hyrfpack.train.optimizer import Optimizer
+from hyrfpack.train.together import averaged
 from hyrfpack.train.trainer import shuffled
 
 RATES = LearningRates(
@@ -54,6 +56,7 @@ def finetune(
     gains: Mapping[str, Tensor] | None = None,
     cache: PictureCache | None = None,
     report: Callable[[int, float], None] = lambda step, loss: None,
+    ranks: Ranks = ALONE,
 ) -> tuple[HybridModel, Plan]:
     """Fit a model's numbers to the photos as they will be decoded.
 
@@ -70,11 +73,12 @@ def finetune(
         plan: its plan.
         sensitivity: that the plan was made by.
         views: photos to fit.
-        steps: optimiser steps, one view each.
+        steps: optimiser steps of one process, one view each; several take as many views together.
         seed: of the order of views.
         gains: of each photo, that renders are exposed by before they are compared, see `gains_of_photos`.
         cache: holds decoded photos.
         report: called after each step with its number, from 1, and the photometric loss.
+        ranks: processes that fit the same model together, as in `Trainer`; all get the same.
 
     Returns:
         The fitted part of the model that is stored, to be quantised with `reach` 0, for its numbers sit where they
@@ -88,34 +92,54 @@ def finetune(
     tuned.requires_grad_(True)
     share = min(1.0, steps / FULL_RATES)
     rates = {name: (share * first, share * last) for name, (first, last) in dataclasses.asdict(RATES).items()}
-    optimizer = Optimizer(tuned, LearningRates(**rates))
+    optimizer = Optimizer(tuned, LearningRates(**rates), ranks.size)
+    steps = -(-steps // ranks.size)
     quantized: Quantized | None = None
     keep_freed_memory()
-    order = shuffled(views, seed, range(steps))
+    order = shuffled(views, seed, range(ranks.rank, steps * ranks.size, ranks.size))
     with closing((cache or PictureCache()).stream(order)) as pictures, torch_on_one_thread():
-        for step, (view, picture) in enumerate(pictures):
+        for step in range(steps):
             quantized = quantize(tuned, plan, sensitivity, reach=0, like=quantized)
             exact = {name: value.clone() for name, value in tuned.state_dict().items()}
             decoded = {**quantized.arrays(), POSITIONS: _on_lattice(tuned, plan)}
             tuned.load_state_dict(dict(by_parameter(decoded, tuned)), strict=False)
-            solid = None if tuned.config.background else np.array(tuned.config.solid, np.float32)
-            target, mask = upload(picture, solid, tuned.gaussians.positions.device)
-            image = render(tuned, view.camera).rgb
-            if gains is not None:
-                image = expose(image, gains[view.name])
-            loss = photometric_loss(image, target, mask)
-            loss.backward()
+            problem: HyrfError | None = None
+            try:
+                loss = _fit(tuned, *next(pictures), gains)
+            except HyrfError as refusal:
+                if ranks.alone:
+                    raise
+                problem, loss = refusal, tuned.gaussians.positions.new_zeros(())
+            if not ranks.alone:
+                said = averaged(ranks, list(tuned.parameters()), loss.new_tensor((loss, problem is not None)))
+                loss, problems = said / ranks.size
+                if problems:
+                    ranks.refuse(problem)
             tuned.load_state_dict(exact)
             _add_rate(tuned, quantized, LOSS_PER_ERROR * ERROR_PER_BIT * plan.distortion_per_number)
             broken = optimizer.step(step, steps)
             if not torch.isfinite(loss) or broken.any():
+                views_of_step = shuffled(views, seed, range(step * ranks.size, (step + 1) * ranks.size))
                 raise HyrfTrainingError(
-                    f"fine-tuning stopped at step {step + 1} on view '{view.name}': the loss or a gradient is not "
+                    f"fine-tuning stopped at step {step + 1} on view "
+                    f"{' or '.join(repr(view.name) for view in views_of_step)}: the loss or a gradient is not "
                     "finite; compress without --finetune"
                 )
-            report(step + 1, float(loss.detach()))
+            report(step + 1, float(loss))
     plan, placed = follow(plan, tuned)
     return placed, plan
+
+
+def _fit(model: HybridModel, view: View, picture: Picture, gains: Mapping[str, Tensor] | None) -> Tensor:
+    """Add the gradients of a view's photometric loss; the loss, a scalar."""
+    solid = None if model.config.background else np.array(model.config.solid, np.float32)
+    target, mask = upload(picture, solid, model.gaussians.positions.device)
+    image = render(model, view.camera).rgb
+    if gains is not None:
+        image = expose(image, gains[view.name])
+    loss = photometric_loss(image, target, mask)
+    loss.backward()
+    return loss.detach()
 
 
 @torch.no_grad()

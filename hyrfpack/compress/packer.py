@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import os
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cached_property, partial
+from typing import Any, cast
 
 import torch
 
@@ -22,7 +22,7 @@ from hyrfpack.compress.quantize import quantize
 from hyrfpack.compress.search import coarsest, fullest
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
-from hyrfpack.device import choose_device
+from hyrfpack.device import choose_own_device
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
 from hyrfpack.format.codec import (
@@ -37,6 +37,7 @@ from hyrfpack.format.codec import (
 from hyrfpack.format.info import describe
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
+from hyrfpack.parallel.ranks import ALONE, Ranks
 from hyrfpack.scene import Scene, View
 
 TOLERATED, MENDED = 1.2, 3  # factor from the distortion asked for, and how often another file is made beyond it
@@ -74,6 +75,7 @@ def compress(
     distortion: float | None = None,
     device: str | torch.device = "auto",
     say: Callable[[str], None] = lambda sentence: None,
+    ranks: Ranks = ALONE,
     **settings: Any,
 ) -> CompressionReport:
     """Pack a `.hyrf` file into a smaller one.
@@ -96,6 +98,7 @@ def compress(
         device: where pictures are drawn, see `hyrfpack.device.choose_device`. On the CPU the same input gives the same
             bytes; on a GPU sums of gradients vary in their last bits, and bytes with them.
         say: told what is going on.
+        ranks: processes that share the photos of fine-tuning; rank 0 writes the file.
         settings: of "paper", see `hyrfpack.format.paper`; `noise` is the old word for `distortion`.
 
     Raises:
@@ -118,7 +121,8 @@ def compress(
     if profile != "compact":
         if data is not None or finetune_steps or target_bytes or max_psnr_drop is not None or distortion:
             raise HyrfError(f"profile '{profile}' has no settings to fit to photos, sizes or losses; use 'compact'")
-        return repack(source, target, profile, **settings)
+        repacked = ranks.agree(lambda: repack(source, target, profile, **settings) if ranks.leads else None)
+        return cast(CompressionReport, ranks.first(repacked))
     if settings:
         raise HyrfError(f"profile 'compact' has no setting '{next(iter(settings))}'")
     if data is None and (finetune_steps or max_psnr_drop is not None):
@@ -130,7 +134,7 @@ def compress(
             f"{data.path}: all photos are held out, so there is none to measure at; use a larger --test-every"
         )
     model, provenance = load_with_provenance(source)
-    model = model.to(choose_device(device, say))
+    model = model.to(choose_own_device(device, ranks, say))
     model.precision = "float32"  # what is looked for is smaller than what a GPU rounds away otherwise
     if len(model) == 0:
         raise HyrfError(f"{source}: there is no Gaussian in it, so there is nothing to measure; use profile 'paper'")
@@ -138,14 +142,17 @@ def compress(
     say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
     start = distortion or default_distortion(provenance, finetune_steps)
     sensitivity, originals = calibrated(model, cameras, start, prune)
-    packer = Packer(model, coarse(provenance, model.config.frame.scale), sensitivity, data, finetune_steps, prune, say)
+    sensitivity = ranks.first(sensitivity)  # on GPUs those of others differ in their last bits
+    kept = coarse(provenance, model.config.frame.scale)
+    packer = Packer(model, kept, sensitivity, data, finetune_steps, prune, say, ranks=ranks)
     if target_bytes is not None:
         trial, found = packer.within_bytes(target_bytes, start)
     elif max_psnr_drop is not None:
         trial, found = packer.within_drop(max_psnr_drop, start)
     else:
         trial, found = packer.attempt(start) if finetune_steps else packer.settled(start, originals), ""
-    report = write_model(trial.data, target)
+    written = ranks.agree(lambda: write_model(trial.data, target) if ranks.leads else None)
+    report = cast(CompressionReport, ranks.first(written))
     total = sum(trial.errors.values())
     shares = {part: error / (total or 1.0) for part, error in trial.errors.items()}
     return dataclasses.replace(
@@ -166,6 +173,7 @@ class Packer:
         prune: leave out Gaussians that cost more in bytes than they give to pictures.
         say: told what is going on.
         cache: of the photos.
+        ranks: processes that fine-tune together.
     """
 
     model: HybridModel
@@ -176,6 +184,7 @@ class Packer:
     prune: bool
     say: Callable[[str], None]
     cache: PictureCache = field(default_factory=PictureCache)
+    ranks: Ranks = ALONE
 
     def attempt(self, distortion: float) -> Trial:
         """A file that adds about so large a mean squared error to pictures."""
@@ -184,9 +193,8 @@ class Packer:
         if steps:
             assert self.scene is not None
             self.say(f"fine-tuning for {steps:,} steps")
-            planned, plan = finetune(
-                model, plan, self.sensitivity, self.scene.train, steps, gains=self._gains, cache=self.cache
-            )
+            fit = partial(finetune, gains=self._gains, cache=self.cache, ranks=self.ranks)
+            planned, plan = fit(model, plan, self.sensitivity, self.scene.train, steps)
         else:
             planned = plan.apply(model)
         quantized = quantize(planned, plan, self.sensitivity, reach=0 if steps else 1)
@@ -254,7 +262,7 @@ class Packer:
         distortion, trial = answer
         return trial, f"distortion {distortion:.2g} loses {trial.lost:+.3f} of {limit:g} dB on {len(views)} photos"
 
-    @functools.cached_property
+    @cached_property
     def _gains(self) -> dict[str, torch.Tensor] | None:
         """Of the photos to fine-tune on; None where the model has the exposure of each."""
         assert self.scene is not None

@@ -21,6 +21,7 @@ from hyrfpack.evaluate.figures import comparison
 from hyrfpack.evaluate.lpips import LPIPS
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.model import HybridModel
+from hyrfpack.parallel.ranks import ALONE, Ranks
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.render.files import file_names, save_picture
 from hyrfpack.scene import View, evenly_spaced
@@ -94,6 +95,7 @@ def evaluate(
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     pictures: str | os.PathLike[str] | None = None,
     picture_count: int = PICTURES,
+    ranks: Ranks = ALONE,
 ) -> Evaluation:
     """Render held-out views and score them against their photos.
 
@@ -107,6 +109,7 @@ def evaluate(
         lpips_weights: see `hyrfpack.evaluate.lpips`; without it lpips is None.
         settings: how to render.
         pictures: folder for photo | render | error pictures of `picture_count` views spread over `views`.
+        ranks: processes that share the views, each of which gets all scores.
 
     Raises:
         HyrfError: there is no view to score, or a file cannot be read or written.
@@ -126,52 +129,57 @@ def evaluate(
     if not views:
         raise HyrfError("there is no view to score; name a split that has photos or a smaller --test-every")
     perceptual = None if lpips_weights is None else LPIPS.load(lpips_weights)
-    decoded = model.decode()
     solid = np.array(model.config.solid, dtype=np.float32)
     device = model.gaussians.positions.device
     drawn = picture_names(views, picture_count)
     trained = {view.name: view for view in training}
 
-    @functools.cache
-    def gains_of(name: str) -> np.ndarray:
-        photo, mask = upload(trained[name].load(), solid, device)
-        return fitted_gains(render(model, trained[name].camera, settings, decoded=decoded).rgb, photo, mask)
+    def scored() -> list[tuple[int, ViewScore | None, float]]:
+        """Place, score (None where the mask leaves nothing) and seconds of each view that is this rank's."""
+        decoded = model.decode()
 
-    render(model, views[0].camera, settings, decoded=decoded)  # compiles kernels and fills caches
-    scores: list[ViewScore] = []
-    skipped: list[str] = []
-    seconds: list[float] = []
-    for number, view in enumerate(views):
-        photo = view.load()
-        reference, mask = upload(photo, solid, device)
-        if mask is not None and not mask.any():
-            skipped.append(view.name)
-            continue
-        started = _now(device)
-        rendering = render(model, view.camera, settings, decoded=decoded)
-        seconds.append(_now(device) - started)
-        image = to_8bit(rendering.rgb)
-        foretold = None
-        if trained.keys() - {view.name}:
-            gains = torch.from_numpy(predicted_gains(view.name, list(trained), gains_of)).to(rendering.rgb)
-            foretold = to_8bit(expose(rendering.rgb, gains))
-        distance = None
-        if perceptual is not None:
-            seen = image if mask is None else torch.where(mask[..., None], image, reference)
-            distance = perceptual(seen, reference)
-        score = ViewScore(
-            name=view.name,
-            psnr=psnr(image, reference, mask),
-            psnr_predicted=None if foretold is None else psnr(foretold, reference, mask),
-            psnr_corrected=psnr(corrected(image, reference, mask), reference, mask),
-            ssim=ssim(image, reference, mask),
-            ssim_predicted=None if foretold is None else ssim(foretold, reference, mask),
-            lpips=distance,
-        )
-        scores.append(score)
-        if pictures is not None and number in drawn:
-            sheet = comparison(reference, image, mask, _caption(score))
-            save_picture(Path(pictures, drawn[number]), sheet)
+        @functools.cache
+        def gains_of(name: str) -> np.ndarray:
+            photo, mask = upload(trained[name].load(), solid, device)
+            return fitted_gains(render(model, trained[name].camera, settings, decoded=decoded).rgb, photo, mask)
+
+        render(model, views[0].camera, settings, decoded=decoded)  # compiles kernels and fills caches
+        scores: list[tuple[int, ViewScore | None, float]] = []
+        for number, view in ranks.share(list(enumerate(views))):
+            photo = view.load()
+            reference, mask = upload(photo, solid, device)
+            if mask is not None and not mask.any():
+                scores.append((number, None, 0.0))
+                continue
+            started = _now(device)
+            rendering = render(model, view.camera, settings, decoded=decoded)
+            seconds = _now(device) - started
+            image = to_8bit(rendering.rgb)
+            foretold = None
+            if trained.keys() - {view.name}:
+                gains = torch.from_numpy(predicted_gains(view.name, list(trained), gains_of)).to(rendering.rgb)
+                foretold = to_8bit(expose(rendering.rgb, gains))
+            distance = None
+            if perceptual is not None:
+                seen = image if mask is None else torch.where(mask[..., None], image, reference)
+                distance = perceptual(seen, reference)
+            score = ViewScore(
+                name=view.name,
+                psnr=psnr(image, reference, mask),
+                psnr_predicted=None if foretold is None else psnr(foretold, reference, mask),
+                psnr_corrected=psnr(corrected(image, reference, mask), reference, mask),
+                ssim=ssim(image, reference, mask),
+                ssim_predicted=None if foretold is None else ssim(foretold, reference, mask),
+                lpips=distance,
+            )
+            scores.append((number, score, seconds))
+            if pictures is not None and number in drawn:
+                sheet = comparison(reference, image, mask, _caption(score))
+                save_picture(Path(pictures, drawn[number]), sheet)
+        return scores
+
+    told = sorted((row for rows in ranks.told(ranks.agree(scored)) for row in rows), key=lambda row: row[0])
+    scores = [score for _, score, _ in told if score is not None]
     if not scores:
         raise HyrfError("the masks of all views leave no pixel to score; check that white means 'use this pixel'")
     return Evaluation(
@@ -183,9 +191,9 @@ def evaluate(
         lpips=_mean(score.lpips for score in scores),
         lpips_reason=NO_LPIPS if perceptual is None else f"network {perceptual.name}",
         gaussians=len(model),
-        seconds_per_frame=statistics.median(seconds),
+        seconds_per_frame=statistics.median(seconds for _, score, seconds in told if score is not None),
         views=scores,
-        skipped=skipped,
+        skipped=[views[number].name for number, score, _ in told if score is None],
     )
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from hyrfpack.atomic import write_atomic
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import PICTURES
+from hyrfpack.parallel.ranks import ALONE, Ranks
 from hyrfpack.render.renderer import RenderSettings, render
 from hyrfpack.scene import Camera
 
@@ -25,6 +26,7 @@ def render_files(
     *,
     depth: bool = False,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    ranks: Ranks = ALONE,
 ) -> Iterator[Path]:
     """Render named cameras to `folder/<name>.png`, sub-folders kept; yields each path once it is written.
 
@@ -35,13 +37,15 @@ def render_files(
         depth: also write `<name>.depth.tiff`: one float32 channel, depth along the view axis in world units, 0 where
             no Gaussian is hit.
         settings: how to render.
+        ranks: processes that share the cameras; each yields what it has written.
 
     Raises:
         HyrfError: a picture cannot be written.
     """
     with torch.no_grad():
         decoded = model.decode()
-    for name, (_, camera) in zip(file_names([name for name, _ in cameras]), cameras, strict=True):
+    named = list(zip(file_names([name for name, _ in cameras]), cameras, strict=True))
+    for name, (_, camera) in ranks.share(named):
         with torch.no_grad():
             rendering = render(model, camera, settings, decoded=decoded, depth=depth)
         path = Path(folder) / f"{name}.png"
