@@ -15,7 +15,7 @@ from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import ALPHA_MIN
-from hyrfpack.ops.shade import Shading, shade
+from hyrfpack.ops.shade import Shading, reference
 from hyrfpack.parallel.pool import run_tasks, side_by_side, torch_on_one_thread
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
@@ -26,12 +26,19 @@ from hyrfpack.splats.splats import Splats, normalized_quats
 SPHERE_DIRECTIONS = 32
 SPHERE_WEIGHT = 3e-3  # of all these together, against 1 for all cameras
 RIDGE = 1e-5
-BLOCK = 2048  # Gaussians that a thread fits together: 24 kB each with 128 cameras
+# Gaussians that a thread fits together, 24 kB each with 128 cameras: of fewer at once Python itself takes longest, and
+# one thread at a time can run that. BLOCKS of them at least, where there are enough, so that all threads have some.
+LEAST_BLOCK, LARGEST_BLOCK, BLOCKS = 2048, 8192, 8
 
 
 @torch_on_one_thread()
 @torch.no_grad()
-def bake(model: HybridModel, cameras: Sequence[Camera], degrees: Sequence[int] = (3,)) -> dict[int, Splats]:
+def bake(
+    model: HybridModel,
+    cameras: Sequence[Camera],
+    degrees: Sequence[int] = (3,),
+    sights: Sequence[Sight] | None = None,
+) -> dict[int, Splats]:
     """A model as explicit Gaussians in world units, in the model's order, for each degree of spherical harmonics.
 
     Scales, rotations and opacities are the model's own. Colours minimise, for each Gaussian over the cameras v that it
@@ -53,6 +60,7 @@ def bake(model: HybridModel, cameras: Sequence[Camera], degrees: Sequence[int] =
         cameras: from where it was photographed, world units; when there are none, colours are fitted on the sphere
             alone and no opacity changes.
         degrees: of the harmonics, each 0 to 3. More than one costs little more.
+        sights: what `sights_of` told of these cameras, where it is known already.
 
     Raises:
         HyrfError: a number of the model, or a camera's pose, is NaN, infinite or beyond float32.
@@ -61,7 +69,7 @@ def bake(model: HybridModel, cameras: Sequence[Camera], degrees: Sequence[int] =
     scales = geometry.scales * model.config.frame.scale
     for name, values in {**vars(geometry), "positions": positions, "scales": scales}.items():
         refuse_nonfinite(name, values)
-    views = side_by_side(partial(_view, model, geometry), cameras)  # much of one runs on one core only
+    views = sights_of(model, cameras) if sights is None else sights
     light, stray = torch.zeros(2, len(model), dtype=torch.float64)
     for view in views:
         light[view.index] += view.light
@@ -76,15 +84,18 @@ def bake(model: HybridModel, cameras: Sequence[Camera], degrees: Sequence[int] =
         normalized_quats(geometry.quats.numpy()),
         opacities.numpy(),
     )
+    fitted = _fit(model, views, light, degrees)
     baked = {}
-    for degree, harmonics in _fit(model, views, light, degrees).items():
+    for degree in list(fitted):  # one at a time: all harmonics of many Gaussians are a lot
+        harmonics = fitted.pop(degree)
         refuse_nonfinite("colors", harmonics)
-        baked[degree] = Splats(*shared, harmonics.numpy(), model.config.antialiased)[keep]
+        splats = Splats(*shared, harmonics.numpy(), model.config.antialiased)
+        baked[degree] = splats if keep.all() else splats[keep]
     return baked
 
 
 @dataclass(frozen=True)
-class _View:
+class Sight:
     """The light that Gaussians send to a picture: the sum over its pixels of T alpha.
 
     Attributes:
@@ -100,8 +111,20 @@ class _View:
     stray: Tensor
 
 
+@torch_on_one_thread()
+@torch.no_grad()
+def sights_of(model: HybridModel, cameras: Sequence[Camera]) -> list[Sight]:
+    """What each camera sees of a model.
+
+    Raises:
+        HyrfError: a camera's pose is NaN, infinite or beyond float32.
+    """
+    # Much of one runs on one core only.
+    return side_by_side(partial(_sight, model, model.decode_geometry()), cameras)
+
+
 @torch.no_grad()  # of each thread
-def _view(model: HybridModel, geometry: Geometry, camera: Camera) -> _View:
+def _sight(model: HybridModel, geometry: Geometry, camera: Camera) -> Sight:
     settings, positions = RenderSettings(), model.gaussians.positions.detach()
     camera = small_camera(camera)
     pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=torch.float32)
@@ -116,23 +139,24 @@ def _view(model: HybridModel, geometry: Geometry, camera: Camera) -> _View:
     received, all_drawn = light(positions[drawn], geometry[drawn]), light(positions, geometry)
     all_drawn[drawn] = 0
     lit, left_out = received > 0, torch.nonzero(all_drawn).squeeze(-1)
-    return _View(camera_center(pose), drawn[lit], received[lit], left_out, all_drawn[left_out])
+    return Sight(camera_center(pose), drawn[lit], received[lit], left_out, all_drawn[left_out])
 
 
-def _fit(model: HybridModel, views: Sequence[_View], light: Tensor, degrees: Iterable[int]) -> dict[int, Tensor]:
+def _fit(model: HybridModel, views: Sequence[Sight], light: Tensor, degrees: Iterable[int]) -> dict[int, Tensor]:
     """Harmonics (N, K, 3) of all Gaussians by degree."""
     shading, positions = model.shading(), model.gaussians.positions.detach()
     fitted = {degree: positions.new_empty(len(model), terms_of(degree), 3) for degree in degrees}
     highest = max(fitted)
     sphere = fibonacci_sphere(SPHERE_DIRECTIONS).float()
-    edges = torch.arange(0, len(model) + BLOCK, BLOCK)
+    size = min(max(len(model) // BLOCKS, LEAST_BLOCK), LARGEST_BLOCK)
+    edges = torch.arange(0, len(model) + size, size)
     ranges = [torch.searchsorted(view.index, edges) for view in views]
 
     def fit_block(block: int) -> None:
-        start, stop = block * BLOCK, min((block + 1) * BLOCK, len(model))
+        start, stop = block * size, min((block + 1) * size, len(model))
         # Rows of the least-squares problem, one for each camera and direction: basis functions and colour.
-        rows = positions.new_zeros(len(views) + len(sphere), stop - start, terms_of(highest) + 3)
-        for row, view, bounds in zip(rows, views, ranges, strict=False):
+        rows = positions.new_zeros(stop - start, len(views) + len(sphere), terms_of(highest) + 3)
+        for row, view, bounds in zip(rows.unbind(1), views, ranges, strict=False):
             seen = slice(int(bounds[block]), int(bounds[block + 1]))
             index = view.index[seen]
             directions = torch.nn.functional.normalize(positions[index] - view.viewpoint, dim=-1, eps=1e-12)
@@ -140,10 +164,9 @@ def _fit(model: HybridModel, views: Sequence[_View], light: Tensor, degrees: Ite
             row[index - start] = _equations(directions, _part(shading, index), weights.float(), highest)
         here = _part(shading, slice(start, stop))
         weights = torch.full((stop - start,), SPHERE_WEIGHT / len(sphere))
-        for row, direction in zip(rows[len(views) :], sphere, strict=True):
-            row[:] = _equations(direction.expand(stop - start, 3), here, weights, highest)
-        rows = rows.permute(1, 2, 0)
-        products = (rows @ rows.mT).double()
+        for row, direction in zip(rows[:, len(views) :].unbind(1), sphere, strict=True):
+            row[:] = _equations(direction[None], here, weights, highest)
+        products = (rows.mT @ rows).double()
         for degree, harmonics in fitted.items():
             terms = terms_of(degree)
             ridge = torch.full((terms,), RIDGE, dtype=torch.float64)
@@ -156,9 +179,11 @@ def _fit(model: HybridModel, views: Sequence[_View], light: Tensor, degrees: Ite
 
 
 def _equations(directions: Tensor, shading: Shading, weights: Tensor, degree: int) -> Tensor:
-    """(n, K + 3) basis functions and the colours less 0.5 along directions (n, 3), times the roots of weights (n,)."""
-    colors = shade(directions, torch.zeros(3), shading, implementation="reference")
-    return torch.cat((harmonics_basis(directions, degree), colors - 0.5), -1) * weights.sqrt()[:, None]
+    """(n, K + 3) basis functions and the colours less 0.5 along directions (n, 3), or one for all (1, 3), times the
+    roots of weights (n,)."""
+    colors = reference.shade(directions, torch.zeros(3), shading)  # which takes one direction for all
+    basis = harmonics_basis(directions, degree).expand(len(colors), -1)
+    return torch.cat((basis, colors - 0.5), -1) * weights.sqrt()[:, None]
 
 
 def _part(shading: Shading, index: Tensor | slice) -> Shading:

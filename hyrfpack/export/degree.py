@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from hyrfpack.cameras.between import small_camera
-from hyrfpack.export.bake import bake
+from hyrfpack.export.bake import Sight, bake
 from hyrfpack.export.measure import likeness
 from hyrfpack.export.source import FEW, MEASURED
 from hyrfpack.model import HybridModel
@@ -17,7 +17,9 @@ KEPT_BACK = slice(4, None, 9)
 TOLERANCE = 0.2  # dB that a lower degree, which takes fewer bytes, may score less than the best
 
 
-def choose_degree(model: HybridModel, cameras: Sequence[Camera], highest: int) -> tuple[int, dict[int, float]]:
+def choose_degree(
+    model: HybridModel, cameras: Sequence[Camera], highest: int, sights: Sequence[Sight] | None = None
+) -> tuple[int, dict[int, float]]:
     """The lowest degree of harmonics, 0 to `highest`, that looks as good as any, and the score of each, dB.
 
     The model is baked at all degrees with every ninth of the cameras kept back, and its pictures (of at most 512
@@ -28,12 +30,15 @@ def choose_degree(model: HybridModel, cameras: Sequence[Camera], highest: int) -
         model: on the CPU.
         cameras: that colours shall be fitted at, world units; none of those that a result will be judged by.
         highest: degree to think of, 0 to 3.
+        sights: what `sights_of` told of the cameras, where it is known already.
     """
     fitted, kept = list(cameras), list(cameras)
+    seen = None if sights is None else list(sights)
     if len(cameras) >= FEW:
         kept = fitted[KEPT_BACK]
-        del fitted[KEPT_BACK]
-    baked = bake(model, fitted, range(highest + 1))
+        for some in (fitted, seen or []):
+            del some[KEPT_BACK]
+    baked = bake(model, fitted, range(highest + 1), seen)
     contenders = {str(degree): (splats, None) for degree, splats in baked.items()}
     views = [(small_camera(camera), None) for camera in evenly_spaced(kept, MEASURED)]
     found = likeness(model, contenders, views, sphere=False)

@@ -14,7 +14,7 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_type
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.background import background_picture, background_splats
-from hyrfpack.export.bake import bake
+from hyrfpack.export.bake import bake, sights_of
 from hyrfpack.export.cameras import encode_transforms, write_colmap
 from hyrfpack.export.degree import choose_degree
 from hyrfpack.export.folder import player
@@ -122,9 +122,11 @@ def export(
     )
     highest = kind.degree if degree is None else min(degree, kind.degree)
     chosen_by: dict[int, float] = {}
+    sights = None
     if degree is None and highest:
         say(f"choosing the degree of the colours among {places}")
-        degree, chosen_by = choose_degree(read.model, read.fitted, highest)
+        sights = sights_of(read.model, read.fitted)
+        degree, chosen_by = choose_degree(read.model, read.fitted, highest, sights)
         say(f"degree {degree} it is: {_listed(chosen_by)}, for degrees 0 to {highest} against the model")
     else:
         degree = highest
@@ -132,7 +134,9 @@ def export(
     if points:
         return _export_points(read, kind, target, chosen(bake(read.model, read.fitted, (0,))[0], crop, min_opacity))
     degrees = (degree,) if crop is not None else range(highest + 1)
-    bakes = {d: chosen(splats, crop, min_opacity) for d, splats in bake(read.model, read.fitted, degrees).items()}
+    fits = bake(read.model, read.fitted, degrees, sights)
+    bakes = {d: chosen(splats, crop, min_opacity) for d, splats in fits.items()}
+    del fits, sights  # of many Gaussians and cameras they are large
     say(f"writing {len(bakes[degree]):,} Gaussians{' and the background' if sphere else ''}")
     what = read, bakes, degree, sphere, Path(target)
     packed = _pack_splats(*what, kind, spz_version) if isinstance(kind, Format) else _pack_page(*what)

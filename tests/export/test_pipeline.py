@@ -71,7 +71,8 @@ def sphere(tmp_path_factory):
 @pytest.fixture
 def no_bake(monkeypatch):
     """Fails the test when work begins."""
-    monkeypatch.setattr(pipeline, "bake", lambda *arguments: pytest.fail("the bake began"))
+    for name in ("bake", "sights_of"):
+        monkeypatch.setattr(pipeline, name, lambda *arguments: pytest.fail("the bake began"))
 
 
 def read_back(path):
@@ -301,7 +302,7 @@ def test_held_out_photos_score_the_model_and_the_file_and_are_not_fitted(plain, 
     scene = replace(ball_scene(8), train=photos[1::2], test=photos[::2])
     fitted = []
     monkeypatch.setattr(
-        pipeline, "bake", lambda model, cameras, degrees: fitted.extend(cameras) or bake(model, [], degrees)
+        pipeline, "bake", lambda model, cameras, degrees, sights: fitted.extend(cameras) or bake(model, [], degrees)
     )
     report = export(plain, tmp_path / "a.ply", data=scene)
     assert fitted == [view.camera for view in scene.train] and report.views == 4
