@@ -26,7 +26,6 @@ from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.compact.quantized import Quantized
 from hyrfpack.format.sections import COLORS, MLPS, OPACITIES, POSITIONS, SCALES, TABLES
 from hyrfpack.model import HybridModel
-from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.parallel.pool import side_by_side
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, evenly_spaced
@@ -155,12 +154,12 @@ def calibrate(
     def without_pruned(scaled: Sensitivity, _: list[Part]) -> dict[Part, Tried]:
         removals = removal_error(model, scaled)
         kept = worth_keeping(removals, each)
-        return {(PRUNED,): Tried(originals.error(_only(model, kept)), float(np.delete(removals, kept).sum()))}
+        return {(PRUNED,): Tried(originals.error(_part(model, kept)), float(np.delete(removals, kept).sum()))}
 
     if prune:
         sensitivity = _corrected(sensitivity, ((PRUNED,),), distortion, without_pruned)
     kept = worth_keeping(removal_error(model, sensitivity), each) if prune else np.arange(len(model))
-    left = _only(model, kept)
+    left = _part(model, kept)
     whole = Originals.seen(originals.views, left)
 
     placed: tuple[np.ndarray, Plan, HybridModel] | None = None
@@ -239,11 +238,8 @@ def _corrected(
     return scaled({part: factor.final for part, factor in factors.items()})
 
 
-def _only(model: HybridModel, kept: np.ndarray) -> HybridModel:
-    """A model of some of a model's Gaussians (n,)."""
-    only, index = deepcopy(model), torch.as_tensor(kept, device=model.gaussians.positions.device)
-    only.gaussians = Gaussians(*(getattr(model.gaussians, name).detach()[index] for name in Gaussians.NAMES))
-    return only
+def _part(model: HybridModel, kept: np.ndarray) -> HybridModel:
+    return model.part(torch.as_tensor(kept, device=model.gaussians.positions.device))
 
 
 def _changed(model: HybridModel, arrays: dict[str, np.ndarray]) -> HybridModel:

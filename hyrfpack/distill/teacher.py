@@ -12,10 +12,11 @@ from torch import Tensor
 from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.rasterize.cull import frustum_cull
+from hyrfpack.ops.rasterize.light import sent_light
 from hyrfpack.parallel.pool import side_by_side, torch_on_one_thread
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Camera, Picture, Scene, View
-from hyrfpack.splats.draw import Drawable, draw, sent_light
+from hyrfpack.splats.draw import Drawable, draw
 
 LIT_AT_ONCE = 8  # views whose light is in memory together
 LEAST_ALPHA = 1e-6  # below it a pixel has no colour of its own
@@ -54,7 +55,10 @@ def light_of(drawable: Drawable, cameras: Sequence[Camera]) -> Tensor:
         index = frustum_cull(drawable.positions, pose, *size, settings.near, settings.cull_tolerance)
         parts = (drawable.positions, drawable.quats, drawable.scales, drawable.opacities)
         means, quats, scales, opacities = (part[index] for part in parts)
-        return index, sent_light(means, quats, scales, opacities, camera, pose, drawable.antialiased)
+        light, _ = sent_light(
+            means, quats, scales, opacities, pose, *size, near=settings.near, antialiased=drawable.antialiased
+        )
+        return index, light
 
     for first in range(0, len(cameras), LIT_AT_ONCE):
         for index, sent in side_by_side(light, cameras[first : first + LIT_AT_ONCE]):

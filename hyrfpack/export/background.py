@@ -8,19 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from hyrfpack.cameras.between import small_camera
-from hyrfpack.export.bake import refuse_nonfinite
-from hyrfpack.model import BACKGROUND_RADIUS, Frame, Geometry, HybridModel
+from hyrfpack.export.bake import Sight, refuse_nonfinite, sights_of
+from hyrfpack.model import BACKGROUND_RADIUS, Frame, HybridModel
 from hyrfpack.ops.background import pixel_directions, sphere_points
 from hyrfpack.ops.poses import camera_center
-from hyrfpack.ops.rasterize import rasterize
-from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.shade import encode_directions
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.render import RenderSettings
@@ -46,7 +43,12 @@ POINTS_AT_ONCE = 1 << 18
 
 @torch_on_one_thread()
 @torch.no_grad()
-def background_splats(model: HybridModel, cameras: Sequence[Camera], largest_scale: float = math.inf) -> Splats:
+def background_splats(
+    model: HybridModel,
+    cameras: Sequence[Camera],
+    largest_scale: float = math.inf,
+    sights: Sequence[Sight] | None = None,
+) -> Splats:
     """The background as round splats of one colour each (degree 0) around the scene, world units.
 
     They tile a sphere of `BACKGROUND_RADIUS` about the frame's centre, or somewhat larger where they are coarse, and
@@ -59,6 +61,7 @@ def background_splats(model: HybridModel, cameras: Sequence[Camera], largest_sca
         model: on the CPU.
         cameras: from where it was photographed, world units; without any, cells are divided where colours differ.
         largest_scale: that the splats may have, world units: where they would be larger, the whole sphere is smaller.
+        sights: what `sights_of` told of the cameras, where it is known already.
 
     Returns:
         Splats to be drawn together with the model's; none when the model has no learnt background.
@@ -69,7 +72,7 @@ def background_splats(model: HybridModel, cameras: Sequence[Camera], largest_sca
     if not model.config.background:
         none = np.zeros((0, 3))
         return Splats(none, none, np.zeros((0, 4)), np.zeros(0), none[:, None], model.config.antialiased)
-    sums, largest = _seen(model, cameras)
+    sums, largest = _seen(model, cameras, sights_of(model, cameras) if sights is None else sights)
     directions, sides, levels, colors = _tile(sums, largest, max(LEAST_SPLATS, int(MOST_SHARE * len(model))))
     radii = BACKGROUND_RADIUS * RECEDE ** (levels.max() - levels)
     count, frame = len(colors), model.config.frame
@@ -143,7 +146,7 @@ def _sphere_colors(model: HybridModel, directions: Tensor) -> Tensor:
     return colors
 
 
-def _seen(model: HybridModel, cameras: Sequence[Camera]) -> tuple[np.ndarray, float]:
+def _seen(model: HybridModel, cameras: Sequence[Camera], sights: Sequence[Sight]) -> tuple[np.ndarray, float]:
     """What cameras see of the sphere.
 
     Returns:
@@ -161,9 +164,10 @@ def _seen(model: HybridModel, cameras: Sequence[Camera]) -> tuple[np.ndarray, fl
 
     net = torch.from_numpy(cell_centers(np.arange(6 * 4 ** (COARSEST + 2)), COARSEST + 2)[0]).float()
     add(net, _sphere_colors(model, net), np.full(len(net), UNSEEN))
-    geometry, largest, threshold = model.decode_geometry(), math.inf, RenderSettings().background_threshold
-    for camera in map(small_camera, cameras):
-        light = _transmittance(model, geometry, camera)[::STRIDE, ::STRIDE]
+    largest, threshold = math.inf, RenderSettings().background_threshold
+    for camera, sight in zip(map(small_camera, cameras), sights, strict=True):
+        refuse_nonfinite("Gaussians", sight.passed)
+        light = sight.passed[::STRIDE, ::STRIDE]
         rows, columns = torch.nonzero(light > threshold).unbind(1)
         if len(rows):
             pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=torch.float32)
@@ -175,20 +179,6 @@ def _seen(model: HybridModel, cameras: Sequence[Camera]) -> tuple[np.ndarray, fl
             narrow = math.atan(min(camera.width / camera.fx, camera.height / camera.fy) / 2)
             largest = min(largest, LARGEST_CELL * narrow)
     return sums, largest
-
-
-def _transmittance(model: HybridModel, geometry: Geometry, camera: Camera) -> Tensor:
-    """(H, W) the share of light that passes the model's Gaussians."""
-    settings, positions = RenderSettings(), model.gaussians.positions.detach()
-    pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=torch.float32)
-    refuse_nonfinite("camera poses", pose)
-    size = camera.intrinsics, camera.width, camera.height
-    index = frustum_cull(positions, pose, *size, settings.near, settings.cull_tolerance)
-    means, here = positions[index], geometry[index]
-    how: dict[str, Any] = {"near": settings.near, "antialiased": model.config.antialiased}
-    raster = rasterize(means, here.quats, here.scales, here.opacities, torch.zeros_like(means), pose, *size, **how)
-    refuse_nonfinite("Gaussians", raster.transmittance)
-    return raster.transmittance
 
 
 def _tile(sums: np.ndarray, largest: float, budget: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

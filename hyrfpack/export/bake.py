@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,14 +13,16 @@ from torch import Tensor
 from hyrfpack.cameras.between import small_camera
 from hyrfpack.errors import HyrfError
 from hyrfpack.model import Geometry, HybridModel
+from hyrfpack.ops.least_squares import least_squares
+from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize.cull import frustum_cull
+from hyrfpack.ops.rasterize.light import sent_light
 from hyrfpack.ops.rasterize.reference import ALPHA_MIN
-from hyrfpack.ops.shade import Shading, reference
+from hyrfpack.ops.shade import Shading, encode_directions
 from hyrfpack.parallel.pool import run_tasks, side_by_side, torch_on_one_thread
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
-from hyrfpack.splats.draw import sent_light
 from hyrfpack.splats.harmonics import fibonacci_sphere, harmonics_basis, terms_of
 from hyrfpack.splats.splats import Splats, normalized_quats
 
@@ -100,8 +103,9 @@ class Sight:
 
     Attributes:
         viewpoint: (3,) where the camera stands, local units.
-        index, light: (n,) int64 ascending and float32: of those that the model draws.
+        index, light: (n,) int32 ascending and float32: of those that the model draws.
         left_out, stray: (m,) the same of those that it leaves out, were all drawn.
+        passed: (H, W) the share of each pixel's light that passes those that it draws.
     """
 
     viewpoint: Tensor
@@ -109,6 +113,7 @@ class Sight:
     light: Tensor
     left_out: Tensor
     stray: Tensor
+    passed: Tensor
 
 
 @torch_on_one_thread()
@@ -129,17 +134,21 @@ def _sight(model: HybridModel, geometry: Geometry, camera: Camera) -> Sight:
     camera = small_camera(camera)
     pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=torch.float32)
     refuse_nonfinite("camera poses", pose)
-    size = camera.intrinsics, camera.width, camera.height
-    drawn = frustum_cull(positions, pose, *size, settings.near, settings.cull_tolerance)
+    view = pose, camera.intrinsics, camera.width, camera.height
+    how: dict[str, Any] = {"near": settings.near, "antialiased": model.config.antialiased}
+    drawn = frustum_cull(positions, *view, settings.near, settings.cull_tolerance)
 
-    def light(means: Tensor, some: Geometry) -> Tensor:
-        shape = some.quats, some.scales, some.opacities
-        return sent_light(means, *shape, camera, pose, model.config.antialiased)
+    def light(means: Tensor, some: Geometry) -> tuple[Tensor, Tensor]:
+        return sent_light(means, some.quats, some.scales, some.opacities, *view, **how)
 
-    received, all_drawn = light(positions[drawn], geometry[drawn]), light(positions, geometry)
-    all_drawn[drawn] = 0
-    lit, left_out = received > 0, torch.nonzero(all_drawn).squeeze(-1)
-    return Sight(camera_center(pose), drawn[lit], received[lit], left_out, all_drawn[left_out])
+    stray, passed = light(positions, geometry)
+    received = stray[drawn]
+    stray[drawn] = 0
+    left_out = torch.nonzero(stray).squeeze(-1)
+    if len(left_out):  # they took light from others
+        received, passed = light(positions[drawn], geometry[drawn])
+    lit = received > 0
+    return Sight(camera_center(pose), drawn[lit].int(), received[lit], left_out.int(), stray[left_out], passed)
 
 
 def _fit(model: HybridModel, views: Sequence[Sight], light: Tensor, degrees: Iterable[int]) -> dict[int, Tensor]:
@@ -148,46 +157,46 @@ def _fit(model: HybridModel, views: Sequence[Sight], light: Tensor, degrees: Ite
     fitted = {degree: positions.new_empty(len(model), terms_of(degree), 3) for degree in degrees}
     highest = max(fitted)
     sphere = fibonacci_sphere(SPHERE_DIRECTIONS).float()
+    terms = terms_of(highest)
+    net = harmonics_basis(sphere, highest)
+    around = (SPHERE_WEIGHT / len(sphere) * net.T).contiguous()
+    ridge = torch.full((terms,), RIDGE, dtype=torch.float64)
+    ridge[0] = 0
+    gram = around.double() @ net.double() + ridge.diag()
     size = min(max(len(model) // BLOCKS, LEAST_BLOCK), LARGEST_BLOCK)
-    edges = torch.arange(0, len(model) + size, size)
+    edges = torch.arange(0, len(model) + size, size, dtype=torch.int32)
     ranges = [torch.searchsorted(view.index, edges) for view in views]
 
     def fit_block(block: int) -> None:
         start, stop = block * size, min((block + 1) * size, len(model))
-        # Rows of the least-squares problem, one for each camera and direction: basis functions and colour.
-        rows = positions.new_zeros(stop - start, len(views) + len(sphere), terms_of(highest) + 3)
-        for row, view, bounds in zip(rows.unbind(1), views, ranges, strict=False):
+        here = slice(start, stop)
+        far = torch.stack([_colors(direction[None], shading, here) for direction in sphere]).flatten(1)
+        right = (around @ far).reshape(terms, stop - start, 3).transpose(0, 1)
+        rows = [(torch.empty(0, dtype=torch.int64), net[:0], net.new_empty(0, 3), net.new_empty(0))]
+        for view, bounds in zip(views, ranges, strict=True):
             seen = slice(int(bounds[block]), int(bounds[block + 1]))
-            index = view.index[seen]
+            index = view.index[seen].long()
             directions = torch.nn.functional.normalize(positions[index] - view.viewpoint, dim=-1, eps=1e-12)
-            weights = view.light[seen] / light[index]
-            row[index - start] = _equations(directions, _part(shading, index), weights.float(), highest)
-        here = _part(shading, slice(start, stop))
-        weights = torch.full((stop - start,), SPHERE_WEIGHT / len(sphere))
-        for row, direction in zip(rows[:, len(views) :].unbind(1), sphere, strict=True):
-            row[:] = _equations(direction[None], here, weights, highest)
-        products = (rows.mT @ rows).double()
+            colors, weights = _colors(directions, shading, index), (view.light[seen] / light[index]).float()
+            rows.append((index - start, harmonics_basis(directions, highest), colors, weights))
+        owners, basis, colors, weights = map(torch.cat, zip(*rows, strict=True))
         for degree, harmonics in fitted.items():
-            terms = terms_of(degree)
-            ridge = torch.full((terms,), RIDGE, dtype=torch.float64)
-            ridge[0] = 0
-            factors = torch.linalg.cholesky_ex(products[:, :terms, :terms] + ridge.diag()).L
-            harmonics[start:stop] = torch.cholesky_solve(products[:, :terms, -3:], factors)
+            some = slice(terms_of(degree))
+            harmonics[here] = least_squares(owners, basis[:, some], colors, weights, gram[some, some], right[:, some])
 
     run_tasks(fit_block, len(edges) - 1)
     return fitted
 
 
-def _equations(directions: Tensor, shading: Shading, weights: Tensor, degree: int) -> Tensor:
-    """(n, K + 3) basis functions and the colours less 0.5 along directions (n, 3), or one for all (1, 3), times the
-    roots of weights (n,)."""
-    colors = reference.shade(directions, torch.zeros(3), shading)  # which takes one direction for all
-    basis = harmonics_basis(directions, degree).expand(len(colors), -1)
-    return torch.cat((basis, colors - 0.5), -1) * weights.sqrt()[:, None]
-
-
-def _part(shading: Shading, index: Tensor | slice) -> Shading:
-    return replace(shading, first_layer=shading.first_layer[index], color_logits=shading.color_logits[index])
+def _colors(directions: Tensor, shading: Shading, index: Tensor | slice) -> Tensor:
+    """Colours (n, 3) less 0.5 of the Gaussians at `index` along directions (n, 3), or of a slice along one (1, 3)."""
+    encoded = encode_directions(directions, shading.encoding)
+    if isinstance(index, slice):
+        first = shading.first_layer[index] + encoded @ shading.direction_weight.T
+    else:
+        first = shading.first_layer[index].addmm_(encoded, shading.direction_weight.T)
+    rest = mlp(first.relu_(), shading.weights, shading.biases)
+    return rest.add_(shading.color_logits[index]).sigmoid_().sub_(0.5)
 
 
 def refuse_nonfinite(name: str, values: Tensor) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
+
 from hyrfpack.cameras.between import small_camera
 from hyrfpack.export.bake import Sight, bake
 from hyrfpack.export.measure import likeness
@@ -14,6 +16,7 @@ from hyrfpack.scene import Camera, evenly_spaced
 # Every ninth of the cameras, from the fifth on, is not fitted but chosen by; of those that `Source` makes up,
 # which stand three above one another, it is a middle one.
 KEPT_BACK = slice(4, None, 9)
+MANY = 200_000  # Gaussians; of more, so many spread over them are chosen by, drawn by themselves
 TOLERANCE = 0.2  # dB that a lower degree, which takes fewer bytes, may score less than the best
 
 
@@ -25,6 +28,7 @@ def choose_degree(
     The model is baked at all degrees with every ninth of the cameras kept back, and its pictures (of at most 512
     pixels, without the background) are compared with the model's from those. Where there are too few cameras to spare
     one (fewer than FEW), all are fitted and compared: nothing then tells a degree that fits too well from a good one.
+    Where there are MANY Gaussians and more, some are enough.
 
     Args:
         model: on the CPU.
@@ -33,6 +37,9 @@ def choose_degree(
         sights: what `sights_of` told of the cameras, where it is known already.
     """
     fitted, kept = list(cameras), list(cameras)
+    every = -(-len(model) // MANY)
+    if every > 1:
+        model, sights = model.part(torch.arange(0, len(model), every)), None
     seen = None if sights is None else list(sights)
     if len(cameras) >= FEW:
         kept = fitted[KEPT_BACK]

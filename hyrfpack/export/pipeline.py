@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -131,77 +131,65 @@ def export(
     else:
         degree = highest
     say(f"fitting colours of degree {degree} at {places}")
+    sights = sights or sights_of(read.model, read.fitted)
+    splats = chosen(bake(read.model, read.fitted, (degree,), sights)[degree], crop, min_opacity)
     if points:
-        return _export_points(read, kind, target, chosen(bake(read.model, read.fitted, (0,))[0], crop, min_opacity))
-    degrees = (degree,) if crop is not None else range(highest + 1)
-    fits = bake(read.model, read.fitted, degrees, sights)
-    bakes = {d: chosen(splats, crop, min_opacity) for d, splats in fits.items()}
-    del fits, sights  # of many Gaussians and cameras they are large
-    say(f"writing {len(bakes[degree]):,} Gaussians{' and the background' if sphere else ''}")
-    what = read, bakes, degree, sphere, Path(target)
-    packed = _pack_splats(*what, kind, spz_version) if isinstance(kind, Format) else _pack_page(*what)
-    write_atomic(target, packed.data)
+        return _export_points(read, kind, target, splats)
+    say(f"writing {len(splats):,} Gaussians{' and the background' if sphere else ''}")
+    count = 0
+    if isinstance(kind, Format):
+        if sphere:
+            behind = background_splats(read.model, read.fitted, kind.largest_scale, sights)
+            splats, count = concatenate((splats, behind)), len(behind)
+        del sights  # of many Gaussians and cameras they are large
+        packed, shown = _pack_splats(read, splats, Path(target), kind, spz_version)
+    else:
+        packed, shown = _pack_page(read, splats, sphere, Path(target))
+    write_atomic(target, packed)
     report = ExportReport(
         str(target),
-        len(packed.data),
-        len(packed.before[degree][0]),
-        background=packed.background,
+        len(packed),
+        len(splats),
+        background=count,
         degree=degree,
         chosen_by=chosen_by,
     )
+    del packed
     if crop is not None:
         say("nothing is measured, for a part of the scene was cropped")
         return report
-    return _measured(report, read, packed, kind, sphere, say)
+    return _measured(report, read, shown, kind, sphere, say)
 
 
-@dataclass(frozen=True)
-class _Packed:
-    """A file's bytes, and what it shows: splats and the picture behind them.
-
-    Attributes:
-        data: the bytes.
-        before: what was to be written, by degree.
-        after: what is read back.
-        background: how many of the splats make the background.
-    """
-
-    data: bytes
-    before: dict[int, tuple[Splats, np.ndarray | None]]
-    after: tuple[Splats, np.ndarray | None]
-    background: int = 0
+# Splats and the picture behind them: those that were to be written ("baked"), and those read back ("file").
+Shown = dict[str, tuple[Splats, np.ndarray | None]]
 
 
-def _pack_page(read: Source, baked: dict[int, Splats], degree: int, sphere: bool, target: Path) -> _Packed:
+def _pack_page(read: Source, splats: Splats, sphere: bool, target: Path) -> tuple[bytes, Shown]:
+    """A file's bytes, and what it shows."""
     picture = background_picture(read.model) if sphere else None
-    data = baked_page(read, baked[degree], picture, target.stem)
-    before = {d: (splats, picture) for d, splats in baked.items()}
-    return _Packed(data, before, decode_page(data, str(target)))
+    data = baked_page(read, splats, picture, target.stem)
+    return data, {"baked": (splats, picture), "file": decode_page(data, str(target))}
 
 
-def _pack_splats(
-    read: Source, baked: dict[int, Splats], degree: int, sphere: bool, target: Path, form: Format, spz_version: int
-) -> _Packed:
-    behind = [background_splats(read.model, read.fitted, form.largest_scale)] if sphere else []
-    whole = {d: concatenate((splats, *behind)) for d, splats in baked.items()}
+def _pack_splats(read: Source, splats: Splats, target: Path, form: Format, spz_version: int) -> tuple[bytes, Shown]:
+    """A file's bytes, and what it shows."""
     first = read.cameras[0][1] if read.cameras else None
-    data = form.encode(whole[degree], Hints(read.up, first, spz_version))
-    after = form.decode(data, str(target)), None
-    return _Packed(data, {d: (splats, None) for d, splats in whole.items()}, after, sum(map(len, behind)))
+    data = form.encode(splats, Hints(read.up, first, spz_version))
+    return data, {"baked": (splats, None), "file": (form.decode(data, str(target)), None)}
 
 
-def _measured(report: ExportReport, read: Source, packed: _Packed, kind: Kind, sphere: bool, say: Say) -> ExportReport:
+def _measured(report: ExportReport, read: Source, shown: Shown, kind: Kind, sphere: bool, say: Say) -> ExportReport:
     """The report with all PSNR filled in."""
     if not read.measured:
         say("nothing is measured, for no photo is held out")
         return report
     say(f"measuring at {len(read.measured)} views")
-    contenders = {**{str(d): shown for d, shown in packed.before.items()}, "file": packed.after}
-    scores = likeness(read.model, contenders, read.measured, sphere=sphere)
+    scores = likeness(read.model, shown, read.measured, sphere=sphere)
     if not scores:
         say("nothing is measured, for the masks leave no pixel of the held-out photos")
         return report
-    file, before = scores["file"], scores[str(report.degree)]
+    file, before = scores["file"], scores["baked"]
     cost = _cost(before, file, read.error)
     if cost > COARSE:
         seen = "" if read.cameras else ", seen from made-up viewpoints (name photos with --data to be sure)"
@@ -216,7 +204,7 @@ def _measured(report: ExportReport, read: Source, packed: _Packed, kind: Kind, s
     return replace(
         report,
         views=file.views,
-        by_degree={d: scores[str(d)].model for d in packed.before},
+        psnr_baked=before.model,
         psnr=file.model,
         photos_model=scores["model"].photos,
         photos_file=file.photos,

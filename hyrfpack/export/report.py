@@ -19,8 +19,8 @@ class ExportReport:
         chosen_by: PSNR of the baked model's pictures against the model's own, by degree, at cameras kept back for the
             purpose: what the degree was chosen by; empty where it was given.
         views: how many views the loss was measured at; 0 where it was not.
-        by_degree: PSNR of the baked model's pictures against the model's own, by degree, before anything is rounded
-            to what the file holds.
+        psnr_baked: PSNR of the baked model's pictures against the model's own, before anything is rounded to what the
+            file holds; None where it was not measured.
         psnr: PSNR of the file's pictures, as read back from its bytes, against the model's own.
         photos_model, photos_file: PSNR of the model's and of the file's pictures against held-out photos, if given.
         cameras: in the file, where it is one of points or cameras.
@@ -34,7 +34,7 @@ class ExportReport:
     degree: int = 0
     chosen_by: dict[int, float] = field(default_factory=dict)
     views: int = 0
-    by_degree: dict[int, float] = field(default_factory=dict)
+    psnr_baked: float | None = None
     psnr: float | None = None
     photos_model: float | None = None
     photos_file: float | None = None

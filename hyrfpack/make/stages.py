@@ -192,7 +192,7 @@ def write(work: Work, model: Path, name: str, scene: Scene | None) -> tuple[dict
             report: dict[str, Any] = {"bytes": target.stat().st_size}
         else:
             made = export(model, target, data=scene, say=say)
-            report = {**asdict(made), "file": name, "by_degree": {}, "chosen_by": {}}
+            report = {**asdict(made), "file": name, "chosen_by": {}}
         files = sorted(target.rglob("*")) if target.is_dir() else [target]
         return report, [path.relative_to(work.folder).as_posix() for path in files if path.is_file()]
 

@@ -90,6 +90,13 @@ class HybridModel(nn.Module):
             generator=generator,
         )
 
+    def part(self, index: Tensor) -> HybridModel:
+        """A model of the Gaussians at `index` (n,) int64, copied. The fields are this model's own."""
+        explicit = (getattr(self.gaussians, name).detach()[index] for name in Gaussians.NAMES)
+        part = HybridModel(self.config, Gaussians(*explicit))
+        part.geometry, part.radiance, part.precision = self.geometry, self.radiance, self.precision
+        return part
+
     def cube_coords(self, positions: Tensor) -> Tensor:
         """Local positions (N, 3) to the hash grids' unit cube."""
         return contract(self.config.frame.normalize(positions))

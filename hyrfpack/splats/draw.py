@@ -99,32 +99,3 @@ def draw(
         antialiased=drawable.antialiased,
         transmittance_min=settings.transmittance_min,
     )
-
-
-def sent_light(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    camera: Camera,
-    pose: Tensor,
-    antialiased: bool,
-) -> Tensor:
-    """The light (N,) that each Gaussian sends to a picture, in pixels: the sum of T alpha.
-
-    A picture is the sum of T alpha color, so this is the derivative of its summed pixels by the Gaussians' colours.
-
-    Args:
-        means, quats, scales, opacities: as in `rasterize`, local units; all are drawn.
-        camera: its size and intrinsics count.
-        pose: (4, 4) its camera_from_local.
-        antialiased: as in `rasterize`.
-    """
-    size = camera.intrinsics, camera.width, camera.height
-    with torch.enable_grad():
-        colors = torch.zeros_like(means, requires_grad=True)
-        near = RenderSettings().near
-        raster = rasterize(means, quats, scales, opacities, colors, pose, *size, near=near, antialiased=antialiased)
-        if not raster.rgb.requires_grad:  # nothing is drawn
-            return means.new_zeros(len(means))
-        return torch.autograd.grad(raster.rgb[..., 0].sum(), colors)[0][:, 0]

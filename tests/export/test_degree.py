@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from scenes import ring, small_model
 
@@ -10,6 +11,7 @@ from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
 from hyrfpack.export import degree as degrees
 from hyrfpack.export import export, pipeline
+from hyrfpack.export.bake import sights_of
 from hyrfpack.export.degree import choose_degree, lowest_as_good
 from hyrfpack.export.source import Source
 from hyrfpack.format import save
@@ -29,7 +31,7 @@ def test_colours_that_follow_no_direction_take_degree_0(tmp_path):
     source = written(tmp_path / "m.hyrf", 0.0, ring(20))
     report = export(source, tmp_path / "a.spz")
     assert report.degree == read_splats(tmp_path / "a.spz").degree == 0
-    assert list(report.chosen_by) == list(report.by_degree) == [0, 1, 2, 3]
+    assert list(report.chosen_by) == [0, 1, 2, 3]
 
 
 def test_colours_that_follow_the_direction_take_more_and_the_reason_is_told(tmp_path):
@@ -83,6 +85,23 @@ def test_cameras_are_kept_back_unless_there_are_too_few_and_the_measured_ones_ne
         assert not measured & (set(fitted) | set(judged))
     if len(source.fitted) >= 16:
         assert not set(fitted) & set(judged)
+
+
+def test_of_many_gaussians_some_are_chosen_by(monkeypatch):
+    counts = []
+
+    def watched_bake(model, *others):
+        counts.append(len(model))
+        return bake(model, *others)
+
+    bake = degrees.bake
+    monkeypatch.setattr(degrees, "bake", watched_bake)
+    positions = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 3))
+    model, cameras = small_model(positions, fields=4.0, direction_encoding="sh"), ring(40)
+    whole = choose_degree(model, cameras, 3)
+    monkeypatch.setattr(degrees, "MANY", 60)
+    some = choose_degree(model, cameras, 3, sights_of(model, cameras))
+    assert counts == [200, 50] and some[0] == whole[0] and some[1] != whole[1]
 
 
 def test_a_crop_is_of_the_degree_of_the_whole(tmp_path):

@@ -52,7 +52,7 @@ def test_the_page_holds_the_file_and_what_is_known_of_it(model, tmp_path):
     first = np.array(scene["cameras"][0]["camera_from_world"])
     assert len(scene["cameras"]) == 12 and np.allclose(first, ring(20)[0].camera_from_world, atol=1e-6)
     assert (report.native, report.bytes, report.gaussians) == (True, len(page), 40)
-    assert (report.views, report.psnr, report.by_degree, report.chosen_by) == (0, None, {}, {})
+    assert (report.views, report.psnr, report.psnr_baked, report.chosen_by) == (0, None, None, {})
 
 
 def test_the_same_export_gives_the_same_bytes(model, tmp_path):

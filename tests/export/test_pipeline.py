@@ -166,7 +166,7 @@ def test_a_crop_keeps_exactly_what_is_inside_and_leaves_the_background_out(endin
     expected, back = inside(load(sphere).gaussians.positions.detach().numpy()), read_back(tmp_path / f"part{ending}")
     assert 3 < len(expected) < 40 and len(back) == report.gaussians == len(expected) and report.background == 0
     assert nearest(expected, back.positions).max() < 1e-3
-    assert (report.views, report.psnr, report.by_degree) == (0, None, {})
+    assert (report.views, report.psnr, report.psnr_baked) == (0, None, None)
     assert said[-1] == "nothing is measured, for a part of the scene was cropped"
 
 
@@ -194,7 +194,7 @@ def test_the_background_goes_along_unless_it_shall_not(sphere, tmp_path):
     assert page.gaussians == 40 and b'<img id="background"' in (tmp_path / "a.html").read_bytes()
     export(sphere, tmp_path / "b.html", background=False)
     assert b'<img id="background"' not in (tmp_path / "b.html").read_bytes()
-    assert min(whole.psnr, alone.psnr, page.by_degree[3]) > 25
+    assert min(whole.psnr, alone.psnr, page.psnr_baked) > 25
     assert page.psnr > 20  # what is nearly noise suffers in WebP
 
 
@@ -210,18 +210,17 @@ def test_models_before_a_solid_colour_have_it_behind_them(tmp_path):
 
 def test_psnr_rises_with_the_degree_where_colour_depends_on_the_direction(tmp_path):
     source = write(tmp_path / "model.hyrf", fields=4.0, direction_encoding="sh", cameras=ring(12))
-    scores = list(export(source, tmp_path / "a.ply").by_degree.values())
-    assert len(scores) == 4 and scores == sorted(scores) and scores[3] > scores[0] + 6
+    scores = [export(source, tmp_path / "a.ply", degree=degree).psnr for degree in range(4)]
+    assert scores == sorted(scores) and scores[3] > scores[0] + 6
 
 
 @pytest.mark.parametrize("ending", [".ply", ".spz", ".splat", ".sog"])
 def test_the_psnr_is_that_of_the_file(ending, plain, tmp_path):
     report = export(plain, tmp_path / f"a{ending}", degree=2)
-    assert list(report.by_degree) == list(range(report.degree + 1))
     views = [(camera, None) for camera in Source.read(plain).fitted]
     file = likeness(load(plain), {"file": (read_back(tmp_path / f"a{ending}"), None)}, views, sphere=False)["file"]
     assert report.psnr == pytest.approx(file.model, abs=1e-3)
-    assert (report.psnr == pytest.approx(report.by_degree[report.degree], abs=1e-3)) == (ending == ".ply")
+    assert (report.psnr == pytest.approx(report.psnr_baked, abs=1e-3)) == (ending == ".ply")
 
 
 def test_a_file_that_lost_something_scores_less(plain, tmp_path, monkeypatch):
@@ -229,7 +228,7 @@ def test_a_file_that_lost_something_scores_less(plain, tmp_path, monkeypatch):
     lossy = replace(form, decode=lambda *arguments: form.decode(*arguments)[:20])
     monkeypatch.setattr(pipeline, "kind_of", lambda *target: lossy)
     report = export(plain, tmp_path / "a.ply")
-    assert report.psnr < report.by_degree[3] - 3
+    assert report.psnr < report.psnr_baked - 3
 
 
 def test_a_format_that_forgets_antialiasing_is_told_from_a_coarse_one(tmp_path):
@@ -285,7 +284,7 @@ def test_a_unit_of_length_that_a_format_cannot_hold_is_told(unit, judged, tmp_pa
 @pytest.mark.parametrize("judged", JUDGED)
 def test_rounding_that_photos_do_not_show_is_no_alarm(judged, tmp_path):
     told, report = told_of(1.0, judged, tmp_path)
-    assert min(report.by_degree[0], 50) - report.psnr > 3  # much, beside the model itself
+    assert min(report.psnr_baked, 50) - report.psnr > 3  # much, beside the model itself
     assert told == f"measuring at {report.views} views"
 
 

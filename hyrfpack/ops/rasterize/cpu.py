@@ -66,8 +66,61 @@ def rasterize(
     absgrad: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, int, dict[str, float]]:
     """Arguments and results (a tuple in the order of the fields) as in `hyrfpack.ops.rasterize.rasterize`."""
+    where = camera_from_world, intrinsics, width, height
+    view = _view(*where, near, antialiased, transmittance_min, depth, None if absgrad is None else absgrad.detach())
+    report: dict = {}
+    rgb, transmittance, depths, visible = _Rasterize.apply(means, quats, scales, opacities, colors, view, report)
+    return rgb, transmittance, depths, visible, report["pairs"], report["seconds"]
+
+
+@torch.no_grad()
+def sent_light(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    camera_from_world: Tensor,
+    intrinsics: tuple[float, float, float, float],
+    width: int,
+    height: int,
+    *,
+    near: float,
+    antialiased: bool,
+    transmittance_min: float,
+) -> tuple[Tensor, Tensor]:
+    """Arguments and results as in `hyrfpack.ops.rasterize.light.sent_light`."""
+    view = _view(camera_from_world, intrinsics, width, height, near, antialiased, transmittance_min)
+    inputs = (means, quats, scales, opacities, means)  # no one looks at colours
+    records, keys, boxes = _project(tuple(tensor.detach().contiguous().numpy() for tensor in inputs), view)
+    tiles = _bin(cpu_bin.sort_by_depth(keys), records, boxes, view)
+    of_pairs, runs = np.zeros(len(tiles.pairs), np.float32), _tile_runs(tiles.starts)
+    transmittance = np.empty((view.height, view.width), np.float32)
+
+    def task(run: int) -> None:
+        cpu_blend.light_tiles(
+            *runs[run], tiles.starts, tiles.pairs, tiles.records, view.width, view.height, view.transmittance_min,
+            of_pairs, transmittance,
+        )  # fmt: skip
+
+    run_tasks(task, len(runs))
+    sums = np.empty(len(means), np.float32)
+    run_ranges(lambda start, stop: cpu_blend.sum_slots(start, stop, tiles.first, of_pairs, sums), len(means))
+    return torch.from_numpy(sums), torch.from_numpy(transmittance)
+
+
+def _view(
+    camera_from_world: Tensor,
+    intrinsics: tuple[float, float, float, float],
+    width: int,
+    height: int,
+    near: float,
+    antialiased: bool,
+    transmittance_min: float,
+    depth: bool = False,
+    absgrad: Tensor | None = None,
+) -> _View:
     camera = camera_from_world.detach().double().tolist()[:3]
-    view = _View(
+    return _View(
         axes=tuple(tuple(row[:3]) for row in camera),
         shift=tuple(row[3] for row in camera),
         lens=tuple(float(number) for number in (*intrinsics, *jacobian_limits(intrinsics, width, height))),
@@ -77,11 +130,8 @@ def rasterize(
         antialiased=bool(antialiased),
         transmittance_min=np.float32(transmittance_min),
         depth=depth,
-        absgrad=None if absgrad is None else absgrad.detach().numpy(),
+        absgrad=None if absgrad is None else absgrad.numpy(),
     )
-    report: dict = {}
-    rgb, transmittance, depths, visible = _Rasterize.apply(means, quats, scales, opacities, colors, view, report)
-    return rgb, transmittance, depths, visible, report["pairs"], report["seconds"]
 
 
 class _Rasterize(torch.autograd.Function):

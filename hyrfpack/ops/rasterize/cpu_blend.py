@@ -138,6 +138,63 @@ def blend_tiles(
 
 
 @_kernel
+def light_tiles(
+    first_tile, last_tile, tile_starts, pairs, records, width, height, transmittance_min, light, transmittance
+):
+    """Write the light of each pair of tiles first_tile to last_tile, its sum over pixels of T alpha, at its slot.
+
+    light: (P,) zeros; those of pairs behind finished tiles stay so. transmittance: (H, W), written.
+    """
+    s = _scratch(3)
+    tiles_x = (width + TILE - 1) // TILE
+    for tile in range(first_tile, last_tile):
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        columns, lines = min(TILE, width - left), min(TILE, height - top)
+        for k in range(np.uint64(_PIXELS)):
+            inside = (k & _U15) < np.uint64(columns) and k // _SIDE < np.uint64(lines)
+            s[k + _T] = _ONE if inside else -_ONE
+        begin, end = np.uint64(tile_starts[tile]), np.uint64(tile_starts[tile + 1])
+        for pair in range(begin, end):
+            packed = pairs[pair]
+            g = packed >> POSITION_SHIFT
+            prefetch_row(records, pairs[min(pair + _AHEAD, end - _U1)] >> POSITION_SHIFT)
+            dx, dy = np.float64(records[g, MEAN_X]) - left, np.float64(records[g, MEAN_Y]) - top
+            u_x, u_y, v_y = records[g, U_X], records[g, U_Y], records[g, V_Y]
+            u_0, v_0 = np.float32(u_x * dx + u_y * dy), np.float32(v_y * dy)
+            cut, opacity = -records[g, CUT], records[g, OPACITY]
+            total = _ZERO
+            for k in range((packed & _U15) * _SIDE, (((packed >> _FOUR) & _U15) + _U1) * _SIDE):
+                u = u_0 - u_x * s[k + _X] - u_y * s[k + _Y]
+                v = v_0 - v_y * s[k + _Y]
+                x = -(u * u + v * v)
+                alpha = min(opacity * _exp8(x), _CAP)
+                t = s[k + _T]
+                weight = alpha * t if x >= cut and t > transmittance_min else _ZERO
+                s[k + _T] = t - weight
+                total += weight
+            light[(packed >> SLOT_SHIFT) & SLOT_MASK] = total
+            if (pair + _U1 - begin) & _CHECK_EVERY == np.uint64(0):
+                going = _ZERO
+                for k in range(np.uint64(_PIXELS)):
+                    going += max(s[k + _T] - transmittance_min, _ZERO)
+                if going == _ZERO:
+                    break
+        for row in range(lines):
+            for column in range(columns):
+                transmittance[top + row, left + column] = s[np.uint64(row * TILE + column) + _T]
+
+
+@_kernel
+def sum_slots(start, stop, first, values, sums):
+    """Write the sums (N,) of what Gaussians start to stop have at their slots (P,), which begin at first (N + 1,)."""
+    for i in range(np.uint64(start), np.uint64(stop)):
+        total = _ZERO
+        for slot in range(np.uint64(first[i]), np.uint64(first[i + np.uint64(1)])):
+            total += values[slot]
+        sums[i] = total
+
+
+@_kernel
 def blend_tiles_backward(
     first_tile, last_tile, tile_starts, pairs, blended, records, width, height, transmittance_min,
     rgb, transmittance, grad_rgb, grad_transmittance, absgrad, gradient_rows,

@@ -7,6 +7,8 @@ rot_0..3 (quaternion wxyz).
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 from scipy.special import expit
 
@@ -44,13 +46,14 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     table = np.zeros((len(splats), len(names)), "<f4")
     table[:, :3] = splats.positions
     table[:, 6:9] = splats.harmonics[:, 0]
-    table[:, 9 : 9 + rest] = splats.harmonics[:, 1:].transpose(0, 2, 1).reshape(len(splats), rest)
+    for column, (channel, term) in enumerate(product(range(3), range(1, splats.harmonics.shape[1])), 9):
+        table[:, column] = splats.harmonics[:, term, channel]
     table[:, -8] = np.clip(logits, _LEAST, _MOST)
     table[:, -7:-4] = np.maximum(scales, _LEAST)
     table[:, -4:] = splats.quats
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(splats)}"]
     header += [f"property float {name}" for name in names] + ["end_header\n"]
-    return "\n".join(header).encode() + table.tobytes()
+    return b"".join(("\n".join(header).encode(), table.data))
 
 
 def decode(data: bytes, name: str) -> Splats:
@@ -93,9 +96,8 @@ def decode_plain(data: bytes, name: str) -> Splats:
     harmonics = np.empty((len(rows), min(terms, terms_of(MAX_DEGREE)), 3), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused; NaN may signal
         harmonics[:, 0] = columns(rows, _COLOR)
-        higher = columns(rows, _rest_names(rest)).reshape(len(rows), 3, terms - 1) if rest else None
-        if higher is not None:
-            harmonics[:, 1:] = higher.transpose(0, 2, 1)[:, : harmonics.shape[1] - 1]
+        for channel, term in product(range(3), range(1, harmonics.shape[1])):
+            harmonics[:, term, channel] = rows[f"f_rest_{channel * (terms - 1) + term - 1}"]
         return checked_splats(
             name,
             columns(rows, _POSITION),

@@ -1,0 +1,87 @@
+"""The light that Gaussians send to a picture: in one pass, and as the derivative of pictures."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.rasterize.light import sent_light
+
+SIZE = ((50.0, 50.0, 24.0, 20.0), 48, 40)
+
+
+def scene(kind: str, count: int = 300) -> tuple[Tensor, ...]:
+    generator = torch.Generator().manual_seed(len(kind))
+    means = torch.randn(count, 3, generator=generator) * 0.8
+    means[:, 2] += 4.0
+    scales = 0.1 * torch.exp(0.5 * torch.randn(count, 3, generator=generator))
+    opacities = torch.sigmoid(1.5 * torch.randn(count, generator=generator))
+    if kind == "opaque, so that tiles end early":
+        scales, opacities = scales * 8, torch.full_like(opacities, 0.99)
+    if kind == "coincident":
+        means[:] = means[0]
+    if kind == "behind the camera and beside the picture":
+        means[::2, 2] -= 9.0
+        means[1::4, 0] += 40.0
+    if kind == "needles":
+        scales[:, 0] *= 300
+    if kind == "too faint":
+        opacities[::2] = 1 / 256
+    return means, torch.randn(count, 4, generator=generator), scales, opacities
+
+
+KINDS = [
+    "a cloud",
+    "opaque, so that tiles end early",
+    "coincident",
+    "behind the camera and beside the picture",
+    "needles",
+    "too faint",
+]
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_one_pass_finds_the_derivative_that_float64_finds(kind: str, antialiased: bool) -> None:
+    gaussians, camera = scene(kind), torch.eye(4, dtype=torch.float64)
+    expected = sent_light(*(part.double() for part in gaussians), camera, *SIZE, antialiased=antialiased)
+    found = sent_light(*gaussians, camera, *SIZE, antialiased=antialiased, implementation="cpu")
+    assert expected[0].max() > 1 > expected[1].min()
+    for tensor, wanted in zip(found, expected, strict=True):
+        torch.testing.assert_close(tensor, wanted.float(), atol=2e-4, rtol=2e-4)
+
+
+def test_all_light_is_what_does_not_pass() -> None:
+    gaussians, camera = scene("a cloud"), torch.eye(4)
+    picture = rasterize(*gaussians, torch.ones(300, 3), camera, *SIZE)
+    light, passed = sent_light(*gaussians, camera, *SIZE)
+    assert torch.equal(passed, picture.transmittance)
+    assert float(light.sum()) == pytest.approx(float((1 - picture.transmittance).sum()), rel=1e-5)
+    assert not light.requires_grad and not light[~picture.visible].any()
+
+
+@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+def test_where_nothing_is_drawn_there_is_no_light(implementation: str) -> None:
+    means, *rest = scene("a cloud")
+    nothing, passed = sent_light(
+        means - torch.tensor([0.0, 0.0, 99.0]), *rest, torch.eye(4), *SIZE, implementation=implementation
+    )
+    assert nothing.shape == (300,) and not nothing.any() and bool((passed == 1).all())
+    none, _ = sent_light(*(part[:0] for part in scene("a cloud")), torch.eye(4), *SIZE, implementation=implementation)
+    assert none.shape == (0,)
+
+
+def test_same_bytes_with_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    gaussians, found = scene("a cloud", 3000), set()
+    for threads in (1, 2, 5):
+        monkeypatch.setenv("HYRFPACK_THREADS", str(threads))
+        found.add(sent_light(*gaussians, torch.eye(4), *SIZE)[0].numpy().tobytes())
+    assert len(found) == 1
+
+
+def test_shapes_that_do_not_fit_are_refused() -> None:
+    means, quats, scales, opacities = scene("a cloud")
+    with pytest.raises(ValueError, match="scales"):
+        sent_light(means, quats, scales[:9], opacities, torch.eye(4), *SIZE)
