@@ -149,9 +149,10 @@ def device_options(command: Command) -> Command:
 
 def chosen_device(name: str, ranks: Ranks | None = None) -> torch.device:
     """The device of --device, with a word about it where it is slow; each of several processes has its own."""
-    from hyrfpack.device import choose_device, choose_own_device, describe_device
+    from hyrfpack.device import choose_own_device, describe_device
+    from hyrfpack.parallel.ranks import ALONE
 
-    device = choose_device(name, note) if ranks is None else choose_own_device(name, ranks, note)
+    device = choose_own_device(name, ranks or ALONE, note)
     detail(f"device: {describe_device(device)}")
     return device
 

@@ -87,14 +87,15 @@ def torch_on_one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def run_tasks(task: Callable[[int], None], count: int) -> None:
+def run_tasks(task: Callable[[int], None], count: int, *, little: bool = False) -> None:
     """Call task(0) ... task(count - 1) on the pool's threads and wait for all; then the first error is raised here.
 
     Tasks are pulled one by one, so uneven ones balance. Results must not depend on which thread ran what: each
-    task writes to its own place. Inside of a task, further ones run one after the other.
+    task writes to its own place. Inside of a task, further ones run one after the other, and so do those that are so
+    `little` work all together that they are done before a thread is awake (some 50 microseconds).
     """
     threads = thread_count()
-    if count == 1 or threads == 1 or getattr(_this_thread, "works", False):
+    if little or count == 1 or threads == 1 or getattr(_this_thread, "works", False):
         for index in range(count):
             task(index)
         return

@@ -163,12 +163,13 @@ class Exposures:
             the device.
         """
         assert self.values.grad is not None
-        broken = torch.zeros((), dtype=torch.bool, device=self.values.device)
-        for row in sorted({self._row[view.name] for view in views}):
+        rows = sorted({self._row[view.name] for view in views})
+        for row in rows:
             self._steps[row] += 1
-            value, gradient = self.values[row], self.values.grad[row] + PULL * self.values[row]
-            moments = ([self._exp_avg[row]], [self._exp_avg_sq[row]])
-            broken = broken | adam_step([value], [gradient], *moments, step=self._steps[row], rate=rate)
+        gradients = [self.values.grad[row] + PULL * self.values[row] for row in rows]
+        changed = ([tensor[row] for row in rows] for tensor in (self.values, self._exp_avg, self._exp_avg_sq))
+        values, *moments = changed
+        broken = adam_step(values, gradients, *moments, step=[self._steps[row] for row in rows], rate=rate).any()
         self.values.grad = None
         self.values.sub_(self.values.mean(0))
         return broken

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -49,46 +48,41 @@ class Optimizer:
         }
         self.groups["fields"] = [*model.geometry.parameters(), *model.radiance.parameters()]
         self._states: dict[nn.Parameter, _State] = {}
+        self._stepped: list[str] = []  # groups of the parameters that the last step was of
 
     def step(self, step: int, steps: int) -> Tensor:
         """Take one step with the learning rates due at `step` (from 0) of `steps`, and clear the gradients.
 
         Returns:
-            (groups,) float32 on the model's device: not 0 for a group with a gradient that is not finite; what has one
-            took no step. Nothing waits for the device.
+            (tensors,) float32 on the model's device, for `names`: not 0 for a parameter with gradients that are not
+            finite; these numbers took no step. Nothing waits for the device.
         """
-        broken = []
-        for name, parameters in self.groups.items():
-            alike: dict[int, list[nn.Parameter]] = defaultdict(list)  # by the steps taken
-            for parameter in parameters:
-                if parameter.grad is None:
-                    continue
-                if parameter not in self._states:
-                    zeros = torch.zeros_like(parameter, memory_format=torch.contiguous_format)
-                    self._states[parameter] = _State(zeros, zeros.clone())
-                state = self._states[parameter]
-                state.step += 1
-                alike[state.step].append(parameter)
-            flag = self.model.gaussians.positions.new_zeros(())
-            for count, some in alike.items():
-                states = [self._states[parameter] for parameter in some]
-                flag = flag + adam_step(
-                    [parameter.detach() for parameter in some],
-                    [parameter.grad for parameter in some if parameter.grad is not None],
-                    [state.exp_avg for state in states],
-                    [state.exp_avg_sq for state in states],
-                    step=count,
-                    rate=self.rates.at(name, step, steps, self.views),
-                    betas=self.betas,
-                )
-                for parameter in some:
-                    parameter.grad = None
-            broken.append(flag)
-        return torch.stack(broken)
+        stepped = [(name, p) for name, group in self.groups.items() for p in group if p.grad is not None]
+        self._stepped = [name for name, _ in stepped]
+        if not stepped:
+            return self.model.gaussians.positions.new_zeros(0)
+        for _, parameter in stepped:
+            if parameter not in self._states:
+                zeros = torch.zeros_like(parameter, memory_format=torch.contiguous_format)
+                self._states[parameter] = _State(zeros, zeros.clone())
+            self._states[parameter].step += 1
+        states = [self._states[parameter] for _, parameter in stepped]
+        broken = adam_step(
+            [parameter.detach() for _, parameter in stepped],
+            [parameter.grad for _, parameter in stepped if parameter.grad is not None],
+            [state.exp_avg for state in states],
+            [state.exp_avg_sq for state in states],
+            step=[state.step for state in states],
+            rate=[self.rates.at(name, step, steps, self.views) for name, _ in stepped],
+            betas=self.betas,
+        )
+        for _, parameter in stepped:
+            parameter.grad = None
+        return broken.float()
 
     def names(self, broken: Sequence[float]) -> list[str]:
-        """The groups that `step` found broken."""
-        return [name for name, flag in zip(self.groups, broken, strict=True) if flag]
+        """The groups that the last `step` found broken."""
+        return list(dict.fromkeys(name for name, flag in zip(self._stepped, broken, strict=True) if flag))
 
     def replace_gaussians(self, keep: Tensor, new: dict[str, Tensor]) -> None:
         """Keep the rows at `keep` (int64), with their moments, and append new rows with moments of zero."""

@@ -273,7 +273,7 @@ class Trainer:
 
     def _groups(self, flags: Sequence[float]) -> list[str]:
         """The parameter groups with a gradient that is not finite."""
-        count = len(self.optimizer.groups)
+        count = len(flags) - (self.exposures is not None)
         return self.optimizer.names(flags[:count]) + ["exposure"] * any(flags[count:])
 
     def _nonfinite_parameters(self) -> list[str]:

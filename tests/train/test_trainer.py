@@ -201,7 +201,7 @@ def test_learning_rates_fall_from_the_first_value_to_the_last(monkeypatch):
     rates = []
 
     def recorded(*arguments, rate, **others):
-        rates.append(rate)
+        rates.append(rate[:5])  # the first of each group; the fields have many, of one rate
         return adam_step(*arguments, rate=rate, **others)
 
     monkeypatch.setattr("hyrfpack.train.optimizer.adam_step", recorded)

@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015): one step of a group of parameters that share a learning rate, in place."""
+"""Adam (Kingma and Ba 2015): one step of many parameters, in place."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def adam_step(
     exp_avg: Sequence[Tensor],
     exp_avg_sq: Sequence[Tensor],
     *,
-    step: int,
-    rate: float,
+    step: int | Sequence[int],
+    rate: float | Sequence[float],
     betas: tuple[float, float] = (0.9, 0.999),
     eps: float = 1e-15,
     implementation: str = "auto",
 ) -> Tensor:
-    """Take one step of Adam, without weight decay, on every tensor of a group.
+    """Take one step of Adam, without weight decay, on every tensor.
 
         m <- b1 m + (1 - b1) g        v <- b2 v + (1 - b2) g^2
         x <- x - rate (m / (1 - b1^step)) / (sqrt(v / (1 - b2^step)) + eps)
@@ -38,15 +38,15 @@ def adam_step(
         values: x of each tensor, of any shape, contiguous. Changed.
         gradients: g of each tensor, of the same shapes, in any layout.
         exp_avg, exp_avg_sq: m and v of each tensor, as the values; zero before the first step. Changed.
-        step: number of this step, from 1; the same for all tensors.
-        rate: learning rate.
+        step: number of this step, from 1, of all tensors or of each.
+        rate: learning rate, of all tensors or of each.
         betas: b1 and b2, in [0, 1).
         eps: positive.
         implementation: "auto", "reference", "cpu" (float32; torch's fused kernel, bit by bit as
             torch.optim.Adam(fused=True)) or "gpu" (float32; one launch for all tensors).
 
     Returns:
-        Bool scalar on the tensors' device: whether any element was left out. Nothing waits for the device.
+        Bool, one for each tensor, on their device: whether any element was left out. Nothing waits for the device.
 
     Raises:
         ValueError: lists, shapes, types, devices or layouts do not fit together, or `step` is below 1.
@@ -54,8 +54,8 @@ def adam_step(
     Example:
         >>> x, m, v = torch.ones(3), torch.zeros(3), torch.zeros(3)
         >>> broken = adam_step([x], [torch.full((3,), 2.0)], [m], [v], step=1, rate=0.1)
-        >>> x, float(broken)
-        (tensor([0.9000, 0.9000, 0.9000]), 0.0)
+        >>> x, broken
+        (tensor([0.9000, 0.9000, 0.9000]), tensor([False]))
     """
     tensors = list(zip(values, gradients, exp_avg, exp_avg_sq, strict=True))
     for value, *others in tensors:
@@ -63,8 +63,12 @@ def adam_step(
             raise ValueError(f"shapes differ: {tuple(value.shape)} and {[tuple(other.shape) for other in others]}")
         if not all(tensor.is_contiguous() for tensor in (value, *others[1:])):
             raise ValueError(f"values and moments of shape {tuple(value.shape)} must be contiguous to change in place")
-    if not tensors or step < 1:
+    steps = [step] * len(tensors) if isinstance(step, int) else list(step)
+    rates = list(rate) if isinstance(rate, Sequence) else [rate] * len(tensors)
+    if not tensors or min(steps) < 1:
         raise ValueError(f"{len(tensors)} tensors and step {step}; there must be a tensor, and steps count from 1")
+    if not len(steps) == len(rates) == len(tensors):
+        raise ValueError(f"{len(tensors)} tensors, {len(steps)} steps and {len(rates)} rates")
     chosen = choose(implementation, ("reference", "cpu", "gpu"), *(tensor for group in tensors for tensor in group))
     run: Callable[..., Tensor] = reference.adam_step
     if chosen == "gpu":
@@ -75,4 +79,4 @@ def adam_step(
         from hyrfpack.ops.adam import cpu
 
         run = cpu.adam_step
-    return run(*map(list, zip(*tensors, strict=True)), step, rate, betas, eps)
+    return run(*map(list, zip(*tensors, strict=True)), steps, rates, betas, eps)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+
 import torch
 from torch import Tensor
 from torch.optim.adam import adam
@@ -14,26 +16,31 @@ def adam_step(
     gradients: list[Tensor],
     exp_avg: list[Tensor],
     exp_avg_sq: list[Tensor],
-    step: int,
-    rate: float,
+    steps: list[int],
+    rates: list[float],
     betas: tuple[float, float],
     eps: float,
 ) -> Tensor:
     """As `hyrfpack.ops.adam.adam_step`."""
     gradients = [gradient.contiguous() for gradient in gradients]  # the kernel counts through all four alike
-    broken = not all(_squares_are_finite(gradient) for gradient in gradients)
-    if broken:
-        reference.adam_step(values, gradients, exp_avg, exp_avg_sq, step, rate, betas, eps)
-    else:
-        # Torch counts the steps, in one number for each tensor, before it uses them.
-        steps = list(torch.full((len(values),), step - 1.0).unbind())
+    broken = [not _squares_are_finite(gradient) for gradient in gradients]
+    # Torch counts the steps, in one number for each tensor, before it uses them.
+    counts = (torch.tensor(steps, dtype=torch.float32) - 1).unbind()
+    alike: dict[float, list[int]] = defaultdict(list)  # what the kernel takes together
+    for place, rate in enumerate(rates):
+        if broken[place]:
+            one = [[tensors[place]] for tensors in (values, gradients, exp_avg, exp_avg_sq)]
+            reference.adam_step(one[0], one[1], one[2], one[3], [steps[place]], [rate], betas, eps)
+        else:
+            alike[rate].append(place)
+    for rate, places in alike.items():
         adam(
-            values,
-            gradients,
-            exp_avg,
-            exp_avg_sq,
+            [values[place] for place in places],
+            [gradients[place] for place in places],
+            [exp_avg[place] for place in places],
+            [exp_avg_sq[place] for place in places],
             [],
-            steps,
+            [counts[place] for place in places],
             fused=True,
             amsgrad=False,
             beta1=betas[0],

@@ -1,8 +1,8 @@
-"""A step of Adam in one Triton launch for all tensors of a group.
+"""A step of Adam in one Triton launch for all tensors.
 
-A group may hold tensors of 8 numbers and of 100 million. A small table on the device says where each tensor's numbers
-lie and which program is its first; a program finds its tensor there and does a block of it. Each number is read and
-written once, in 16-byte pieces.
+There may be tensors of 8 numbers and of 100 million. A small table on the device says where each tensor's numbers lie
+and which program is its first, another how far each moves; a program finds its tensor there and does a block of it.
+Each number is read and written once, in 16-byte pieces.
 """
 
 from __future__ import annotations
@@ -47,11 +47,10 @@ def _update(values, gradients, exp_avg, exp_avg_sq, broken, inside, lane, gain1,
 @triton.jit
 def step_numbers(
     table,
+    paces,
     broken,
     gain1,
     gain2,
-    rate,
-    root,
     eps,
     SLOTS: tl.constexpr,
     ALIGNED: tl.constexpr,
@@ -62,10 +61,9 @@ def step_numbers(
     Args:
         table: (6, SLOTS) int64: first program, number of numbers, addresses of values, gradients, exp_avg and
             exp_avg_sq of each tensor; unused slots have a first program beyond all.
-        broken: uint8, set to 1 where a squared gradient is not finite.
+        paces: (2, SLOTS): learning rate / (1 - b1^step) and 1 / sqrt(1 - b2^step) of each tensor.
+        broken: (tensors,) uint8, set to 1 where a squared gradient is not finite.
         gain1, gain2: 1 - b1 and 1 - b2.
-        rate: learning rate / (1 - b1^step).
-        root: 1 / sqrt(1 - b2^step).
         ALIGNED: whether all addresses are multiples of 16.
     """
     program = tl.program_id(0)
@@ -73,15 +71,18 @@ def step_numbers(
     slot = tl.sum((firsts <= program).to(tl.int32)) - 1
     start = (program - tl.load(table + slot)) * BLOCK
     left = tl.load(table + SLOTS + slot) - start
+    rate, root = tl.load(paces + slot), tl.load(paces + SLOTS + slot)
     values = _numbers(table, 2, slot, start, SLOTS, ALIGNED)
     gradients = _numbers(table, 3, slot, start, SLOTS, ALIGNED)
     exp_avg = _numbers(table, 4, slot, start, SLOTS, ALIGNED)
     exp_avg_sq = _numbers(table, 5, slot, start, SLOTS, ALIGNED)
     lane = tl.arange(0, BLOCK)
     if left >= BLOCK:  # a mask known when this is compiled does not take the 16-byte reads apart
-        _update(values, gradients, exp_avg, exp_avg_sq, broken, lane < BLOCK, lane, gain1, gain2, rate, root, eps)
+        _update(
+            values, gradients, exp_avg, exp_avg_sq, broken + slot, lane < BLOCK, lane, gain1, gain2, rate, root, eps
+        )
     else:
-        _update(values, gradients, exp_avg, exp_avg_sq, broken, lane < left, lane, gain1, gain2, rate, root, eps)
+        _update(values, gradients, exp_avg, exp_avg_sq, broken + slot, lane < left, lane, gain1, gain2, rate, root, eps)
 
 
 @lru_cache(maxsize=256)
@@ -102,8 +103,8 @@ def adam_step(
     gradients: list[Tensor],
     exp_avg: list[Tensor],
     exp_avg_sq: list[Tensor],
-    step: int,
-    rate: float,
+    steps: list[int],
+    rates: list[float],
     betas: tuple[float, float],
     eps: float,
 ) -> Tensor:
@@ -113,17 +114,23 @@ def adam_step(
     sizes = tuple(value.numel() for value in values)
     addresses = tuple(t.data_ptr() for tensors in (values, gradients, exp_avg, exp_avg_sq) for t in tensors)
     table, programs = _table(sizes, addresses, device)
-    broken = torch.zeros((), dtype=torch.bool, device=device)
+    broken = torch.zeros(len(values), dtype=torch.bool, device=device)
     if programs:
+        slots = table.shape[1]
+        columns = (
+            [rate / (1 - betas[0] ** step) for rate, step in zip(rates, steps, strict=True)],
+            [1 / math.sqrt(1 - betas[1] ** step) for step in steps],
+        )
+        rows = [[*column, *[0.0] * (slots - len(values))] for column in columns]
+        paces = torch.tensor(rows, pin_memory=device.type == "cuda").to(device, non_blocking=True)
         step_numbers[(programs,)](
             table,
+            paces,
             broken.view(torch.uint8),
             1.0 - betas[0],
             1.0 - betas[1],
-            rate / (1 - betas[0] ** step),
-            1 / math.sqrt(1 - betas[1] ** step),
             float(eps),
-            SLOTS=table.shape[1],
+            SLOTS=slots,
             ALIGNED=all(address % 16 == 0 for address in addresses),
             BLOCK=_BLOCK,
             num_warps=_WARPS,

@@ -13,21 +13,21 @@ def adam_step(
     gradients: list[Tensor],
     exp_avg: list[Tensor],
     exp_avg_sq: list[Tensor],
-    step: int,
-    rate: float,
+    steps: list[int],
+    rates: list[float],
     betas: tuple[float, float],
     eps: float,
 ) -> Tensor:
     """As `hyrfpack.ops.adam.adam_step`."""
     beta1, beta2 = betas
-    correction1, correction2 = 1 - beta1**step, 1 - beta2**step
-    broken = torch.zeros((), dtype=torch.bool, device=values[0].device)
-    for x, g, m, v in zip(values, gradients, exp_avg, exp_avg_sq, strict=True):
+    broken = []
+    for x, g, m, v, step, rate in zip(values, gradients, exp_avg, exp_avg_sq, steps, rates, strict=True):
+        correction1, correction2 = 1 - beta1**step, 1 - beta2**step
         finite = (g * g).isfinite()
-        broken |= ~finite.all()
+        broken.append(~finite.all())
         new_m = beta1 * m + (1 - beta1) * g
         new_v = beta2 * v + (1 - beta2) * (g * g)
         new_x = x - rate / correction1 * new_m / (new_v.sqrt() / math.sqrt(correction2) + eps)
         for old, new in ((x, new_x), (m, new_m), (v, new_v)):
             old.copy_(torch.where(finite, new, old))
-    return broken
+    return torch.stack(broken)

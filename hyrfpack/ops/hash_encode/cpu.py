@@ -20,6 +20,7 @@ njit = compiled(fastmath={"contract", "nsz", "nnan", "reassoc", "arcp"})
 
 _BLOCK = 64  # points whose rows and weights (4 KiB) stay in the first cache
 _POINTS_PER_TASK = 16384
+_FEW = 512  # points, of which another thread would not be awake before they are done
 _B = np.uint64(_BLOCK)
 _0, _1, _2 = np.uint64(0), np.uint64(1), np.uint64(2)
 _PRIME_Y, _PRIME_Z = np.uint32(PRIME_Y), np.uint32(PRIME_Z)
@@ -172,7 +173,7 @@ def encode(coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_tab
         mask = _mask(resolutions[level], log2_table_size)
         _encode(planes, tables[level], resolutions[level], mask, start, stop, out[2 * level : 2 * level + 2])
 
-    run_tasks(task, parts * len(resolutions))
+    run_tasks(task, parts * len(resolutions), little=points < _FEW)
     return features.T
 
 
@@ -188,7 +189,7 @@ def grad_table(
         mask = _mask(resolutions[level], log2_table_size)
         _scatter(planes, grads[2 * level : 2 * level + 2], resolutions[level], mask, levels[level])
 
-    run_tasks(task, len(resolutions))
+    run_tasks(task, len(resolutions), little=planes.shape[1] < _FEW)
     return result
 
 

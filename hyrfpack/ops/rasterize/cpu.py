@@ -14,6 +14,8 @@ from hyrfpack.ops.rasterize import cpu_bin, cpu_blend, cpu_project
 from hyrfpack.ops.rasterize.reference import TILE, jacobian_limits
 from hyrfpack.parallel.pool import run_ranges, run_tasks, thread_count
 
+LEAST_RUN = 128  # pairs, about, that a thread blends while another wakes
+
 
 @dataclass(frozen=True)
 class _View:
@@ -223,9 +225,9 @@ def _bin(order: np.ndarray, records: np.ndarray, boxes: np.ndarray, view: _View)
 
 
 def _tile_runs(starts: np.ndarray) -> list[tuple[int, int]]:
-    """Contiguous runs of tiles of about equal work, 16 for each thread."""
+    """Contiguous runs of tiles of about equal work, 16 for each thread where that is enough."""
     work = starts + 4 * np.arange(len(starts))  # an empty tile costs about as much as four pairs
-    count = min(16 * thread_count(), len(starts) - 1)
+    count = max(1, min(16 * thread_count(), len(starts) - 1, work[-1] // LEAST_RUN))
     edges = np.searchsorted(work, work[-1] * np.arange(1, count) // count)
     edges = np.unique(np.concatenate([[0], edges, [len(starts) - 1]])).tolist()
     return list(zip(edges[:-1], edges[1:], strict=True))
