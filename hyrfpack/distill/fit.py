@@ -17,7 +17,6 @@ from hyrfpack.checks import check_type
 from hyrfpack.distill.config import DistillConfig
 from hyrfpack.distill.pack import pack
 from hyrfpack.distill.teach import teach
-from hyrfpack.distill.teacher import likeness
 from hyrfpack.outputs import Outputs
 from hyrfpack.scene import Camera
 from hyrfpack.splats.files import read_splats
@@ -124,14 +123,14 @@ def distill_splats(
     started = time.perf_counter()
     Outputs(overwrite=True).file(target)
     taught = teach(splats, config, name=name, cameras=cameras, say=say, quiet=quiet)
-    unpacked = float(np.mean(likeness(taught.model, taught.original, taught.test)))
+    unpacked = float(np.mean(taught.test.likeness(taught.model)))
     say(f"{unpacked:.2f} dB before packing")
     imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
     provenance = {"steps": config.steps, "seed": config.seed, "psnr": unpacked, "choices": {"imported": imported}}
     data = pack(taught, config.psnr, provenance, say)
     write_atomic(target, data)  # only now: an interrupt leaves what was there before
     decoded = hyrf_format.load(target)
-    scores = likeness(decoded, taught.original, taught.test)
+    scores = taught.test.likeness(decoded)
     reached = float(np.mean(scores))
     if _below(reached, config.psnr):
         say(_shortfall(reached, unpacked, config, made_up=cameras is None))

@@ -10,7 +10,6 @@ from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.compress.calibrate import calibrated
 from hyrfpack.compress.packer import Packer
 from hyrfpack.distill.teach import Taught
-from hyrfpack.distill.teacher import likeness
 from hyrfpack.format.codec import decode_model
 from hyrfpack.model import HybridModel
 
@@ -60,4 +59,4 @@ def _mse(psnr: float) -> float:
 
 def _error(model: HybridModel, taught: Taught) -> float:
     """Of the mean PSNR at the viewpoints to decide by, as mean squared error."""
-    return _mse(float(np.mean(likeness(model, taught.original, taught.deciding))))
+    return _mse(float(np.mean(taught.deciding.likeness(model))))

@@ -12,7 +12,7 @@ from hyrfpack.cameras.between import small_camera, views_between
 from hyrfpack.data import PictureCache
 from hyrfpack.distill.config import DistillConfig
 from hyrfpack.distill.start import initial_model
-from hyrfpack.distill.teacher import light_of, teaching_scene
+from hyrfpack.distill.teacher import Sample, light_of, teaching_scene
 from hyrfpack.distill.views import Weighted, surrounds, viewpoints
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.model import HybridModel
@@ -44,16 +44,15 @@ class Taught:
 
     Attributes:
         model: the model.
-        original: the splats.
-        train, deciding, test: where they were looked at from to teach it, where files are looked at from to decide how
-            fine they need be, and where scores are of.
+        train: where they were looked at from to teach it.
+        deciding, test: what they look like where files are looked at from to decide how fine they need be, and where
+            scores are of.
     """
 
     model: HybridModel
-    original: Drawable
     train: list[Camera]
-    deciding: list[Camera]
-    test: list[Camera]
+    deciding: Sample
+    test: Sample
 
 
 def teach(
@@ -90,7 +89,7 @@ def teach(
     model = initial_model(*lit, train, config.seed, share)
     scene, cache = teaching_scene(name, original, train, test), PictureCache()
     _fit_to_pictures(model, scene, config, cache, quiet)
-    return Taught(model, original, train, deciding, test)
+    return Taught(model, train, *(Sample.of(original, cameras) for cameras in (deciding, test)))
 
 
 def _cameras(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -66,14 +67,32 @@ def light_of(drawable: Drawable, cameras: Sequence[Camera]) -> Tensor:
     return total / max(1, len(cameras))
 
 
-@torch.no_grad()
-def likeness(model: HybridModel, drawable: Drawable, cameras: Sequence[Camera]) -> list[float]:
-    """PSNR in dB of a model's pictures against the original's, both over black and cut to [0, 1], by camera."""
-    decoded = model.decode()
+@dataclass(frozen=True)
+class Sample:
+    """What splats look like from some cameras, for models to be compared with.
 
-    @torch.no_grad()  # of this thread
-    def score(camera: Camera) -> float:
-        wanted = draw(drawable, camera).rgb.clamp(0, 1)
-        return psnr(render(model, camera, decoded=decoded).rgb.clamp(0, 1), wanted)
+    Attributes:
+        cameras: where from.
+        pictures: of each, (H, W, 3) over black, cut to [0, 1].
+    """
 
-    return side_by_side(score, cameras)
+    cameras: list[Camera]
+    pictures: list[Tensor]
+
+    @classmethod
+    def of(cls, drawable: Drawable, cameras: Sequence[Camera]) -> Sample:
+        """Draw the splats once, however many models are compared with them."""
+        pictures = side_by_side(lambda camera: draw(drawable, camera).rgb.clamp(0, 1), cameras)
+        return cls(list(cameras), pictures)
+
+    @torch.no_grad()
+    def likeness(self, model: HybridModel) -> list[float]:
+        """PSNR in dB of a model's pictures, over black and cut to [0, 1], against these, by camera."""
+        decoded = model.decode()
+
+        @torch.no_grad()  # of this thread
+        def score(place: int) -> float:
+            shown = render(model, self.cameras[place], decoded=decoded).rgb
+            return psnr(shown.clamp(0, 1), self.pictures[place])
+
+        return side_by_side(score, range(len(self.cameras)))

@@ -10,7 +10,7 @@ from explicit_balls import LITTLE, ball
 import hyrfpack
 from hyrfpack.compress import calibrate
 from hyrfpack.distill import DistillConfig, distill_splats, fit, pack, teach, teacher
-from hyrfpack.distill.teacher import likeness, teaching_scene
+from hyrfpack.distill.teacher import Sample, teaching_scene
 from hyrfpack.distill.views import Weighted, viewpoints
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.scene import Camera
@@ -24,7 +24,7 @@ def test_report_says_what_is_in_the_file(tmp_path: Path) -> None:
     weighted = Weighted.of(splats, "ball")
     original = Drawable.of(splats, weighted.frame)
     held_out = viewpoints(weighted, original, LITTLE.test_views, LITTLE.size, 1)
-    scores = likeness(model, original, held_out)
+    scores = Sample.of(original, held_out).likeness(model)
     assert (report.psnr, report.psnr_worst) == (np.mean(scores), min(scores))
     assert (report.gaussians_before, report.gaussians_after) == (200, len(model))
     assert report.bytes_after == target.stat().st_size

@@ -28,10 +28,8 @@ import numpy as np
 from hyrfpack.distill import DistillConfig
 from hyrfpack.distill.pack import pack
 from hyrfpack.distill.teach import Taught, teach
-from hyrfpack.distill.teacher import likeness
 from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.format.codec import decode_model
-from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.formats import ply
@@ -74,7 +72,7 @@ def ours(taught: Taught, asked: list[float]) -> Iterator[Point]:
         began = time.perf_counter()
         data = pack(taught, wanted, {})
         seconds = time.perf_counter() - began
-        scores = likeness(decode_model(data), taught.original, taught.test)
+        scores = taught.test.likeness(decode_model(data))
         yield Point("hyrfpack", f"--psnr {wanted:g}", len(data), float(np.mean(scores)), min(scores), seconds)
 
 
@@ -111,13 +109,9 @@ def converted(source: Path, target: Path) -> None:
 
 def measured(encoder: str, setting: str, file: Path, taught: Taught, seconds: float) -> Point:
     """A file of splats, beside the original."""
-    drawable = Drawable.of(read_splats(file), taught.original.frame)
-
-    def score(camera: Camera) -> float:
-        wanted, given = (draw(splats, camera).rgb.clamp(0, 1) for splats in (taught.original, drawable))
-        return psnr(given, wanted)
-
-    scores = [score(camera) for camera in taught.test]
+    drawable = Drawable.of(read_splats(file), taught.model.config.frame)
+    pairs = zip(taught.test.cameras, taught.test.pictures, strict=True)
+    scores = [psnr(draw(drawable, camera).rgb.clamp(0, 1), picture) for camera, picture in pairs]
     return Point(encoder, setting, file.stat().st_size, float(np.mean(scores)), min(scores), seconds)
 
 
