@@ -33,6 +33,8 @@ SILENT = HashGridConfig(4, levels=1, base=2, finest=2)  # of a field that has no
 SMALLEST = 2e-4  # local units that scales are told apart down to: half a pixel, at 1000 across the box
 BATCH = 4096  # Gaussians a step: many small steps come nearer than few large ones that take as long
 EPOCHS, LEAST_STEPS, MOST_STEPS = 80, 2400, 6000
+# Of many Gaussians a step takes the longer for the tables' size, whatever its batch: fewer steps, of larger batches.
+MOST_WORK, LEAST_EPOCHS = 1_000_000_000, 16  # steps times Gaussians
 RATES = LearningRates(fields=(4e-3, 1e-4), color_logits=(1e-2, 1e-3))
 SIZE_WEIGHT = 0.1  # of the squared error of a size that the field may guess, against those of shapes that it must know
 MOST_WEIGHT = 10.0  # of a Gaussian, in means
@@ -118,10 +120,10 @@ def initial_model(
     return model
 
 
-def _batches(count: int, generator: torch.Generator) -> Iterator[Tensor]:
-    """Indices of BATCH of `count` rows, without end: none twice in one batch (see `take_rows`), all in each round."""
+def _batches(count: int, batch: int, generator: torch.Generator) -> Iterator[Tensor]:
+    """Indices of `batch` of `count` rows, without end: none twice in one batch (see `take_rows`), all in each round."""
     while True:
-        yield from torch.randperm(count, generator=generator).split(BATCH)
+        yield from torch.randperm(count, generator=generator).split(batch)
 
 
 def _fit(
@@ -142,10 +144,11 @@ def _fit(
     poses = [torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32) for camera in cameras]
     no_turn = torch.eye(1, 4)
     optimizer = Optimizer(model, RATES)
-    steps = math.ceil(share * min(max(LEAST_STEPS, EPOCHS * count // BATCH), MOST_STEPS))
+    whole = min(max(LEAST_STEPS, EPOCHS * count // BATCH), MOST_STEPS, max(1, MOST_WORK // count))
+    batch, steps = max(BATCH, LEAST_EPOCHS * count // whole), math.ceil(share * whole)
     keep_freed_memory()
     with torch_on_one_thread():
-        for step, some in zip(range(steps), _batches(count, generator), strict=False):
+        for step, some in zip(range(steps), _batches(count, batch, generator), strict=False):
             raw = model.geometry(coords[some])
             made = _Shapes.of(raw[:, 1:4], raw[:, 4:] + no_turn)
             errors = (made.matrices - shapes.matrices[some]).square().sum((1, 2))

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.cameras.between import small_camera
-from hyrfpack.export.bake import Sight, refuse_nonfinite, sights_of
+from hyrfpack.export.bake import STRIDE, Sight, refuse_nonfinite, sights_of
 from hyrfpack.model import BACKGROUND_RADIUS, Frame, HybridModel
 from hyrfpack.ops.background import pixel_directions, sphere_points
 from hyrfpack.ops.poses import camera_center
@@ -29,7 +29,6 @@ from hyrfpack.splats.splats import Splats
 COARSEST, FINEST = 3, 9
 LARGEST_CELL = 0.4  # where light was seen: of the angle from a picture's middle to its nearest edge
 UNSEEN = 1e-6  # weight of each of the colours where no camera saw light, against 1 for a pixel
-STRIDE = 2  # every so many pixels of a picture, in both directions, tell what is seen
 
 LEAST_SPLATS, MOST_SHARE = 1000, 0.1  # the share is of the model's Gaussians
 EVEN = 1 / 512  # cells whose colours differ less from their mean, root mean square, are not divided
@@ -167,15 +166,14 @@ def _seen(model: HybridModel, cameras: Sequence[Camera], sights: Sequence[Sight]
     largest, threshold = math.inf, RenderSettings().background_threshold
     for camera, sight in zip(map(small_camera, cameras), sights, strict=True):
         refuse_nonfinite("Gaussians", sight.passed)
-        light = sight.passed[::STRIDE, ::STRIDE]
-        rows, columns = torch.nonzero(light > threshold).unbind(1)
+        rows, columns = torch.nonzero(sight.passed > threshold).unbind(1)
         if len(rows):
             pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=torch.float32)
             points = torch.stack((columns, rows), -1) * STRIDE + 0.5
             colors = model.decode_background(points, camera.intrinsics, pose)
             refuse_nonfinite("background", colors)
             places = sphere_points(camera_center(pose), pixel_directions(points, camera.intrinsics, pose))
-            add(places, colors, light[rows, columns].double().square().numpy())
+            add(places, colors, sight.passed[rows, columns].double().square().numpy())
             narrow = math.atan(min(camera.width / camera.fx, camera.height / camera.fy) / 2)
             largest = min(largest, LARGEST_CELL * narrow)
     return sums, largest

@@ -29,6 +29,7 @@ from hyrfpack.splats.splats import Splats, normalized_quats
 SPHERE_DIRECTIONS = 32
 SPHERE_WEIGHT = 3e-3  # of all these together, against 1 for all cameras
 RIDGE = 1e-5
+STRIDE = 2
 # Gaussians that a thread fits together, 24 kB each with 128 cameras: of fewer at once Python itself takes longest, and
 # one thread at a time can run that. BLOCKS of them at least, where there are enough, so that all threads have some.
 LEAST_BLOCK, LARGEST_BLOCK, BLOCKS = 2048, 8192, 8
@@ -105,7 +106,8 @@ class Sight:
         viewpoint: (3,) where the camera stands, local units.
         index, light: (n,) int32 ascending and float32: of those that the model draws.
         left_out, stray: (m,) the same of those that it leaves out, were all drawn.
-        passed: (H, W) the share of each pixel's light that passes those that it draws.
+        passed: (H / STRIDE, W / STRIDE) the share of a pixel's light that passes those that it draws, of every
+            STRIDE-th pixel in both directions.
     """
 
     viewpoint: Tensor
@@ -148,7 +150,8 @@ def _sight(model: HybridModel, geometry: Geometry, camera: Camera) -> Sight:
     if len(left_out):  # they took light from others
         received, passed = light(positions[drawn], geometry[drawn])
     lit = received > 0
-    return Sight(camera_center(pose), drawn[lit].int(), received[lit], left_out.int(), stray[left_out], passed)
+    left_out_light, some = stray[left_out], passed[::STRIDE, ::STRIDE].clone()
+    return Sight(camera_center(pose), drawn[lit].int(), received[lit], left_out.int(), left_out_light, some)
 
 
 def _fit(model: HybridModel, views: Sequence[Sight], light: Tensor, degrees: Iterable[int]) -> dict[int, Tensor]:
