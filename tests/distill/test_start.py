@@ -53,6 +53,25 @@ def test_fields_learn_shapes_and_colours(degree: int, monkeypatch: pytest.Monkey
     assert float((colors - wanted).abs().mean()) < (0.01 if degree == 0 else 0.1)
 
 
+def test_many_gaussians_take_fewer_steps_of_larger_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = []
+
+    def watched(*arguments):
+        for some in batches(*arguments):
+            taken.append(len(some))
+            yield some
+
+    batches = start._batches
+    monkeypatch.setattr(start, "_batches", watched)
+    monkeypatch.setattr(start, "BATCH", 8)
+    drawable, cameras = drawable_of(ball(100))
+    for work, steps, batch in ((10**9, 1000, 8), (100 * 40, 40, 40), (100, 1, 100)):
+        taken.clear()
+        monkeypatch.setattr(start, "MOST_WORK", work)
+        initial_model(drawable, torch.ones(100), cameras, 0)
+        assert len(taken) in (steps, steps + 1) and max(taken) == batch
+
+
 def test_trainer_goes_on_with_a_model_that_is_given() -> None:
     splats = ball(50)
     drawable, cameras = drawable_of(splats)
