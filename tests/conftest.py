@@ -68,6 +68,15 @@ def signals() -> Iterator[None]:
         signal.signal(number, handler)
 
 
+@pytest.fixture
+def short_imports(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As little work of an import as still makes a model."""
+    from hyrfpack.distill import pack, start
+
+    monkeypatch.setattr(start, "LEAST_STEPS", 100)
+    monkeypatch.setattr(pack, "TRIALS", 2)
+
+
 @pytest.fixture(scope="session")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten small photos of the demo's scene, with poses; not to be changed."""

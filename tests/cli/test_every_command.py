@@ -386,6 +386,7 @@ def copy_of(template: Path, folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("short_imports")
 @pytest.mark.parametrize("overwrite", [False, True], ids=["plain", "overwrite"])
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_every_command_keeps_what_a_person_has(case, overwrite, worlds, monkeypatch):
@@ -407,6 +408,7 @@ def test_the_table_names_every_command_that_writes():
     assert {case.command.split()[0] for case in CASES} == writes
 
 
+@pytest.mark.usefixtures("short_imports")
 def test_a_world_is_one_that_commands_can_read(worlds, monkeypatch):
     """Else they would refuse for another reason."""
     monkeypatch.chdir(worlds.new())

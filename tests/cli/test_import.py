@@ -16,6 +16,7 @@ from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.formats import ply
 
 QUICK = ("--steps", 2, "--size", 24)
+pytestmark = pytest.mark.usefixtures("short_imports")
 
 
 @pytest.fixture

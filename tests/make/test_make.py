@@ -99,6 +99,7 @@ def test_a_video_gets_poses(poses, tmp_path):
     assert poses == [tmp_path / "clip.MP4"]
 
 
+@pytest.mark.usefixtures("short_imports")
 def test_splats_of_other_programs_are_imported(tmp_path):
     (tmp_path / "ball.ply").write_bytes(ply.encode(ball(40)))
     result = make(tmp_path / "ball.ply", tmp_path / "scene.html", quality="draft")
