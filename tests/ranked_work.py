@@ -23,7 +23,7 @@ from hyrfpack.train.together import averaged, digest
 
 DENSITY = DensityConfig(start=0.05, stop=0.68, peak=0.4, excess=1.5, rounds=5, gradient=1e-5, resets=1)
 # Two processes take 60 steps, with rounds of density control after each 7th from 3 to 38, of which the last take away.
-EVEN = TrainConfig(steps=120, seed=3, max_gaussians=80, density=DENSITY)
+EVEN = TrainConfig(steps=400, seed=3, max_gaussians=80, density=DENSITY)
 # Three photos for two processes: in some steps both have the same.
 EXPOSED = dataclasses.replace(EVEN, steps=59, exposure=True)
 RUN = dataclasses.replace(EVEN, steps=60, checkpoint_every=5)

@@ -64,9 +64,9 @@ def test_many_gaussians_take_fewer_steps_of_larger_batches(monkeypatch: pytest.M
     batches = start._batches
     monkeypatch.setattr(start, "_batches", watched)
     monkeypatch.setattr(start, "BATCH", 8)
-    monkeypatch.setattr(start, "EPOCHS", 8)
+    monkeypatch.setattr(start, "EPOCHS", 16)
     drawable, cameras = drawable_of(ball(100))
-    for work, steps, batch in ((10**9, 100, 8), (100 * 40, 40, 40), (100, 1, 100)):
+    for work, steps, batch in ((10**9, 200, 8), (100 * 40, 40, 40), (100, 1, 100)):
         taken.clear()
         monkeypatch.setattr(start, "MOST_WORK", work)
         initial_model(drawable, torch.ones(100), cameras, 0)
