@@ -95,16 +95,8 @@ def sent_light(
     inputs = (means, quats, scales, opacities, means)  # no one looks at colours
     records, keys, boxes = _project(tuple(tensor.detach().contiguous().numpy() for tensor in inputs), view)
     tiles = _bin(cpu_bin.sort_by_depth(keys), records, boxes, view)
-    of_pairs, runs = np.zeros(len(tiles.pairs), np.float32), _tile_runs(tiles.starts)
-    transmittance = np.empty((view.height, view.width), np.float32)
-
-    def task(run: int) -> None:
-        cpu_blend.light_tiles(
-            *runs[run], tiles.starts, tiles.pairs, tiles.records, view.width, view.height, view.transmittance_min,
-            of_pairs, transmittance,
-        )  # fmt: skip
-
-    run_tasks(task, len(runs))
+    of_pairs, transmittance = np.zeros(len(tiles.pairs), np.float32), np.empty((view.height, view.width), np.float32)
+    _blend_into(tiles, view, None, transmittance, None, of_pairs)
     sums = np.empty(len(means), np.float32)
     run_ranges(lambda start, stop: cpu_blend.sum_slots(start, stop, tiles.first, of_pairs, sums), len(means))
     return torch.from_numpy(sums), torch.from_numpy(transmittance)
@@ -237,17 +229,29 @@ def _blend(tiles: _Tiles, view: _View) -> tuple[np.ndarray, np.ndarray, np.ndarr
     size = view.height, view.width
     rgb, transmittance = np.empty((*size, 3), np.float32), np.empty(size, np.float32)
     depths = np.empty(size, np.float32) if view.depth else None
+    return rgb, transmittance, depths, _blend_into(tiles, view, rgb, transmittance, depths, None)
+
+
+def _blend_into(
+    tiles: _Tiles,
+    view: _View,
+    rgb: np.ndarray | None,
+    transmittance: np.ndarray,
+    depths: np.ndarray | None,
+    light: np.ndarray | None,
+) -> np.ndarray:
+    """Blend all tiles into these arrays; after how many pairs each was finished."""
     blended = np.empty(len(tiles.starts) - 1, np.uint32)
     runs = _tile_runs(tiles.starts)
 
     def task(run: int) -> None:
         cpu_blend.blend_tiles(
             *runs[run], tiles.starts, tiles.pairs, tiles.records, view.width, view.height, view.transmittance_min,
-            rgb, transmittance, depths, blended,
+            rgb, transmittance, depths, light, blended,
         )  # fmt: skip
 
     run_tasks(task, len(runs))
-    return rgb, transmittance, depths, blended
+    return blended
 
 
 def _blend_backward(

@@ -76,11 +76,12 @@ def _scratch(planes):
 @_kernel
 def blend_tiles(
     first_tile, last_tile, tile_starts, pairs, records, width, height, transmittance_min,
-    rgb, transmittance, depth, blended,
+    rgb, transmittance, depth, light, blended,
 ):  # fmt: skip
-    """Blend tiles first_tile to last_tile into rgb (H, W, 3), transmittance (H, W) and depth (H, W), if not None.
+    """Blend tiles first_tile to last_tile into rgb (H, W, 3), transmittance (H, W) and depth (H, W).
 
-    blended: (tiles,) after how many pairs each tile was finished.
+    rgb and depth may be None, where nobody wants them, and so may light: (P,) zeros, to which each pair's sum over
+    pixels of T alpha is written at its slot. blended: (tiles,) after how many pairs each tile was finished.
     """
     s = _scratch(7)
     tiles_x = (width + TILE - 1) // TILE
@@ -103,6 +104,7 @@ def blend_tiles(
             u_0, v_0 = np.float32(u_x * dx + u_y * dy), np.float32(v_y * dy)
             cut, opacity = -records[g, CUT], records[g, OPACITY]
             red, green, blue, z = records[g, RED], records[g, GREEN], records[g, BLUE], records[g, DEPTH]
+            total = _ZERO
             for k in range((packed & _U15) * _SIDE, (((packed >> _FOUR) & _U15) + _U1) * _SIDE):
                 u = u_0 - u_x * s[k + _X] - u_y * s[k + _Y]
                 v = v_0 - v_y * s[k + _Y]
@@ -112,11 +114,16 @@ def blend_tiles(
                 t = s[k + _T]
                 weight = alpha * t if t > transmittance_min else _ZERO
                 s[k + _T] = t - weight
-                s[k + _P0] += weight * red
-                s[k + _P1] += weight * green
-                s[k + _P2] += weight * blue
+                if rgb is not None:
+                    s[k + _P0] += weight * red
+                    s[k + _P1] += weight * green
+                    s[k + _P2] += weight * blue
                 if depth is not None:
                     s[k + _P3] += weight * z
+                if light is not None:
+                    total += weight
+            if light is not None:
+                light[(packed >> SLOT_SHIFT) & SLOT_MASK] = total
             pair += _U1
             if (pair - begin) & _CHECK_EVERY == np.uint64(0):
                 going = _ZERO  # a sum, for a maximum would not be vectorised
@@ -130,58 +137,12 @@ def blend_tiles(
                 k = np.uint64(row * TILE + column)
                 t = s[k + _T]
                 transmittance[top + row, left + column] = t
-                rgb[top + row, left + column, 0] = s[k + _P0]
-                rgb[top + row, left + column, 1] = s[k + _P1]
-                rgb[top + row, left + column, 2] = s[k + _P2]
+                if rgb is not None:
+                    rgb[top + row, left + column, 0] = s[k + _P0]
+                    rgb[top + row, left + column, 1] = s[k + _P1]
+                    rgb[top + row, left + column, 2] = s[k + _P2]
                 if depth is not None:
                     depth[top + row, left + column] = s[k + _P3] / (_ONE - t) if t < _ONE else _ZERO
-
-
-@_kernel
-def light_tiles(
-    first_tile, last_tile, tile_starts, pairs, records, width, height, transmittance_min, light, transmittance
-):
-    """Write the light of each pair of tiles first_tile to last_tile, its sum over pixels of T alpha, at its slot.
-
-    light: (P,) zeros; those of pairs behind finished tiles stay so. transmittance: (H, W), written.
-    """
-    s = _scratch(3)
-    tiles_x = (width + TILE - 1) // TILE
-    for tile in range(first_tile, last_tile):
-        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        columns, lines = min(TILE, width - left), min(TILE, height - top)
-        for k in range(np.uint64(_PIXELS)):
-            inside = (k & _U15) < np.uint64(columns) and k // _SIDE < np.uint64(lines)
-            s[k + _T] = _ONE if inside else -_ONE
-        begin, end = np.uint64(tile_starts[tile]), np.uint64(tile_starts[tile + 1])
-        for pair in range(begin, end):
-            packed = pairs[pair]
-            g = packed >> POSITION_SHIFT
-            prefetch_row(records, pairs[min(pair + _AHEAD, end - _U1)] >> POSITION_SHIFT)
-            dx, dy = np.float64(records[g, MEAN_X]) - left, np.float64(records[g, MEAN_Y]) - top
-            u_x, u_y, v_y = records[g, U_X], records[g, U_Y], records[g, V_Y]
-            u_0, v_0 = np.float32(u_x * dx + u_y * dy), np.float32(v_y * dy)
-            cut, opacity = -records[g, CUT], records[g, OPACITY]
-            total = _ZERO
-            for k in range((packed & _U15) * _SIDE, (((packed >> _FOUR) & _U15) + _U1) * _SIDE):
-                u = u_0 - u_x * s[k + _X] - u_y * s[k + _Y]
-                v = v_0 - v_y * s[k + _Y]
-                x = -(u * u + v * v)
-                alpha = min(opacity * _exp8(x), _CAP)
-                t = s[k + _T]
-                weight = alpha * t if x >= cut and t > transmittance_min else _ZERO
-                s[k + _T] = t - weight
-                total += weight
-            light[(packed >> SLOT_SHIFT) & SLOT_MASK] = total
-            if (pair + _U1 - begin) & _CHECK_EVERY == np.uint64(0):
-                going = _ZERO
-                for k in range(np.uint64(_PIXELS)):
-                    going += max(s[k + _T] - transmittance_min, _ZERO)
-                if going == _ZERO:
-                    break
-        for row in range(lines):
-            for column in range(columns):
-                transmittance[top + row, left + column] = s[np.uint64(row * TILE + column) + _T]
 
 
 @_kernel
