@@ -167,8 +167,7 @@ class Exposures:
         for row in rows:
             self._steps[row] += 1
         gradients = [self.values.grad[row] + PULL * self.values[row] for row in rows]
-        changed = ([tensor[row] for row in rows] for tensor in (self.values, self._exp_avg, self._exp_avg_sq))
-        values, *moments = changed
+        values, *moments = ([tensor[row] for row in rows] for tensor in (self.values, self._exp_avg, self._exp_avg_sq))
         broken = adam_step(values, gradients, *moments, step=[self._steps[row] for row in rows], rate=rate).any()
         self.values.grad = None
         self.values.sub_(self.values.mean(0))

@@ -25,7 +25,6 @@ from PIL import Image
 
 import hyrfpack
 from hyrfpack.model import HybridModel
-from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.log import peak_memory
@@ -38,12 +37,11 @@ def of_so_many(model: HybridModel, count: int) -> HybridModel:
     """The model with so many of its Gaussians, spread over them; further ones a standard deviation off."""
     there, generator = len(model), torch.Generator().manual_seed(0)
     chosen = torch.arange(count) * there // count if count <= there else torch.arange(count) % there
-    explicit = {name: getattr(model.gaussians, name).detach()[chosen].clone() for name in Gaussians.NAMES}
-    again = torch.arange(count) >= there
-    scales = model.decode_geometry().scales[chosen[again]]
-    explicit["positions"][again] += scales * torch.randn(len(scales), 3, generator=generator)
-    model.gaussians = Gaussians(*(explicit[name] for name in Gaussians.NAMES))
-    return model
+    part, again = model.part(chosen), torch.arange(count) >= there
+    with torch.no_grad():
+        scales = model.decode_geometry().scales[chosen[again]]
+        part.gaussians.positions[again] += scales * torch.randn(len(scales), 3, generator=generator)
+    return part
 
 
 def scaled(view: View, width: int, height: int) -> View:
