@@ -118,14 +118,59 @@ def upload(picture: Picture, solid: np.ndarray | None, device: torch.device) -> 
     Returns:
         (H, W, 3) float32 in [0, 1], and the (H, W) bool mask or None. As `Picture.composite`.
     """
-    mask = None if picture.mask is None else upload_array(picture.mask, device)
     if device.type == "cpu":
+        mask = None if picture.mask is None else torch.from_numpy(picture.mask)
         return torch.from_numpy(picture.composite(solid)), mask
-    # Bytes travel, a quarter of the floats; the arithmetic is done there.
-    rgb = upload_array(picture.rgb, device).float() * (1 / 255)
-    if picture.alpha is not None:
-        alpha = upload_array(picture.alpha, device).float()[..., None] * (1 / 255)
+    return _composite(*_sent(picture, device), solid)
+
+
+class Photos:
+    """Photos on a device for a run that comes back to each of them, as `upload` brings them.
+
+    On CUDA the bytes of those that come first stay there, while they take no more than an eighth of its memory: each
+    is wanted once a round, so that no choice is better.
+
+    Attributes:
+        device: theirs.
+        limit_bytes: the most that is kept.
+        nbytes: what is kept now.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        on_gpu = device.type == "cuda"
+        self.limit_bytes = torch.cuda.get_device_properties(device).total_memory // 8 if on_gpu else 0
+        self.nbytes = 0
+        self._kept: dict[str, tuple[Tensor, Tensor | None, Tensor | None]] = {}
+
+    def get(self, name: str, picture: Picture, solid: np.ndarray | None) -> tuple[Tensor, Tensor | None]:
+        """As `upload`, of the picture that has this name on every call."""
+        if self.device.type != "cuda":
+            return upload(picture, solid, self.device)
+        sent = self._kept.get(name)
+        if sent is None:
+            sent = _sent(picture, self.device)
+            if self.nbytes + picture.nbytes <= self.limit_bytes:
+                self._kept[name] = sent
+                self.nbytes += picture.nbytes
+        return _composite(*sent, solid)
+
+
+def _sent(picture: Picture, device: torch.device) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    """Colours, alpha and mask: bytes travel, a quarter of the floats; the arithmetic is done there."""
+    alpha = None if picture.alpha is None else upload_array(picture.alpha, device)
+    mask = None if picture.mask is None else upload_array(picture.mask, device)
+    return upload_array(picture.rgb, device), alpha, mask
+
+
+def _composite(
+    colors: Tensor, alphas: Tensor | None, mask: Tensor | None, solid: np.ndarray | None
+) -> tuple[Tensor, Tensor | None]:
+    """As `Picture.composite`, from bytes."""
+    rgb = colors.float() * (1 / 255)
+    if alphas is not None:
+        alpha = alphas.float()[..., None] * (1 / 255)
         rgb *= alpha
         if solid is not None:
-            rgb += (1 - alpha) * upload_array(solid, device)
+            rgb += (1 - alpha) * upload_array(solid, rgb.device)
     return rgb, mask

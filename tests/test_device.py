@@ -134,6 +134,34 @@ def test_a_photo_is_the_same_on_any_device(has_alpha, solid):
     assert torch.equal(mask_there.here, mask_here) and torch.equal(mask_here, torch.from_numpy(picture.mask))
 
 
+def test_photos_stay_on_a_gpu_as_far_as_they_fit(monkeypatch):
+    rgb = np.random.default_rng(0).integers(0, 256, (2, 4, 5, 3), dtype=np.uint8)
+    first, second = (Picture(one, None, None) for one in rgb)
+    solid = np.zeros(3, np.float32)
+    sent = []
+    monkeypatch.setattr(devices, "_sent", lambda *args, send=devices._sent: sent.append(args[0]) or send(*args))
+    with pretended_gpu() as gpu:
+        photos = devices.Photos(gpu)
+        assert photos.limit_bytes == 1 << 30
+        photos.limit_bytes = first.nbytes + second.nbytes - 1
+        drawn = [
+            photos.get(name, picture, solid)[0].here
+            for name, picture in [("first", first), ("second", second), ("first", first), ("second", second)]
+        ]
+    assert [picture is first for picture in sent] == [True, False, False]
+    assert photos.nbytes == first.nbytes
+    for found, picture in zip(drawn, (first, second, first, second), strict=True):
+        torch.testing.assert_close(found, torch.from_numpy(picture.composite(solid)), rtol=0, atol=1e-7)
+
+
+def test_photos_on_the_cpu_are_those_of_upload():
+    picture = Picture(np.full((2, 3, 3), 51, np.uint8), None, np.ones((2, 3), bool))
+    photos = devices.Photos(torch.device("cpu"))
+    found, mask = photos.get("one", picture, None)
+    torch.testing.assert_close(found, torch.full((2, 3, 3), 0.2))
+    assert mask.all() and photos.nbytes == 0
+
+
 # -- the pretended GPU finds what a real one would -----------------------------------------------------------------
 
 

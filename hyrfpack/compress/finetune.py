@@ -15,7 +15,7 @@ from hyrfpack.compress.quantize import quantize
 from hyrfpack.compress.rate_distortion import ERROR_PER_BIT
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
-from hyrfpack.device import upload
+from hyrfpack.device import Photos, upload
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate.exposure import expose, fitted_gains
 from hyrfpack.format.arrays import by_parameter
@@ -96,6 +96,7 @@ def finetune(
     steps = -(-steps // ranks.size)
     quantized: Quantized | None = None
     keep_freed_memory()
+    photos = Photos(tuned.gaussians.positions.device)
     order = shuffled(views, seed, range(ranks.rank, steps * ranks.size, ranks.size))
     with closing((cache or PictureCache()).stream(order)) as pictures, torch_on_one_thread():
         for step in range(steps):
@@ -105,7 +106,7 @@ def finetune(
             tuned.load_state_dict(dict(by_parameter(decoded, tuned)), strict=False)
             problem: HyrfError | None = None
             try:
-                loss = _fit(tuned, *next(pictures), gains)
+                loss = _fit(tuned, photos, *next(pictures), gains)
             except HyrfError as refusal:
                 if ranks.alone:
                     raise
@@ -130,10 +131,12 @@ def finetune(
     return placed, plan
 
 
-def _fit(model: HybridModel, view: View, picture: Picture, gains: Mapping[str, Tensor] | None) -> Tensor:
+def _fit(
+    model: HybridModel, photos: Photos, view: View, picture: Picture, gains: Mapping[str, Tensor] | None
+) -> Tensor:
     """Add the gradients of a view's photometric loss; the loss, a scalar."""
     solid = None if model.config.background else np.array(model.config.solid, np.float32)
-    target, mask = upload(picture, solid, model.gaussians.positions.device)
+    target, mask = photos.get(view.name, picture, solid)
     image = render(model, view.camera).rgb
     if gains is not None:
         image = expose(image, gains[view.name])

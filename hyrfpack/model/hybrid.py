@@ -11,10 +11,11 @@ from torch import Tensor, nn
 from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.field import Field
 from hyrfpack.model.gaussians import Gaussians, take_rows
+from hyrfpack.ops import activate
 from hyrfpack.ops.background import background_colors, background_grid
 from hyrfpack.ops.contraction import contract
 from hyrfpack.ops.mlp import mlp
-from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_directions
+from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_views
 
 SHADED_AT_ONCE = 1 << 20  # Gaussians whose hash features are in memory together in `shading`
 
@@ -56,9 +57,7 @@ def scale_bounds(positions: Tensor, config: ModelConfig) -> Tensor:
 
     S(p) = max(1, |u|) with u = p / half_extent, or 1 everywhere when `config.scale_grows` is off.
     """
-    if not config.scale_grows:
-        return positions.new_ones(len(positions), 1)
-    return torch.linalg.vector_norm(config.frame.normalize(positions), dim=-1, keepdim=True).clamp_min(1)
+    return activate.scale_bounds(positions, config.frame.half_extent if config.scale_grows else None)
 
 
 class HybridModel(nn.Module):
@@ -99,7 +98,7 @@ class HybridModel(nn.Module):
 
     def cube_coords(self, positions: Tensor) -> Tensor:
         """Local positions (N, 3) to the hash grids' unit cube."""
-        return contract(self.config.frame.normalize(positions))
+        return contract(positions, self.config.frame.half_extent)
 
     def scale_bounds(self, positions: Tensor) -> Tensor:
         """S(p), (N, 1), at local positions (N, 3); see `scale_bounds`."""
@@ -145,16 +144,16 @@ class HybridModel(nn.Module):
         pick = (lambda values: values) if index is None else (lambda values: take_rows(values, index))
         positions = self._field_positions(pick(explicit.positions))
         raw = self.geometry(self.cube_coords(positions), mixed=self._mixed)
-        opacities = torch.sigmoid(raw[:, 0] + pick(explicit.opacity_logits)[:, 0])
-        scales = self.activate_scales(raw[:, 1:4], pick(explicit.scale_logits)) * self.scale_bounds(positions)
-        no_turn = torch.eye(1, 4, dtype=raw.dtype, device=raw.device)  # made there: a copy would make the host wait
-        return Geometry(scales, raw[:, 4:] + no_turn, opacities)
+        return self.activate(raw, positions, pick(explicit.scale_logits), pick(explicit.opacity_logits))
 
-    def activate_scales(self, neural: Tensor, explicit: Tensor) -> Tensor:
-        """Scales (N, 3) as a fraction of S(p), from neural (N, 3) and explicit (N, 1) logits."""
-        if self.config.scale_rule == "sum":
-            return torch.sigmoid(neural + explicit)
-        return torch.sigmoid(neural) * torch.sigmoid(explicit)
+    def activate(self, raw: Tensor, positions: Tensor, scale_logits: Tensor, opacity_logits: Tensor) -> Geometry:
+        """What the geometry field says (n, 8) and what is stored, put together; see `activate_geometry`."""
+        half_extent = self.config.frame.half_extent if self.config.scale_grows else None
+        rule = self.config.scale_rule
+        parts = activate.activate_geometry(
+            raw, positions, scale_logits, opacity_logits, half_extent=half_extent, rule=rule
+        )
+        return Geometry(*parts)
 
     def decode_colors(self, viewpoint: Tensor, index: Tensor | None = None) -> Tensor:
         """Colours (n, 3) in (0, 1) of the Gaussians at `index`, seen from `viewpoint` (3,) local units."""
@@ -165,8 +164,7 @@ class HybridModel(nn.Module):
         if self.radiance.silent:
             return torch.sigmoid(logits)
         positions = self._field_positions(positions)
-        directions = torch.nn.functional.normalize(positions - viewpoint, dim=-1, eps=1e-12)
-        return torch.sigmoid(self._radiance(positions, directions) + logits)
+        return torch.sigmoid(self._radiance(positions, viewpoint) + logits)
 
     def decode_background(self, points: Tensor, intrinsics: tuple[float, float, float, float], pose: Tensor) -> Tensor:
         """Background colours (n, 3) in (0, 1) at points (n, 2) of the picture, in pixels.
@@ -208,9 +206,9 @@ class HybridModel(nn.Module):
         """Weights and biases of the decoder of colours."""
         return list(self.radiance.weights), list(self.radiance.biases)
 
-    def _radiance(self, positions: Tensor, directions: Tensor) -> Tensor:
-        encoded = encode_directions(directions, self.config.direction_encoding)
-        return self.radiance(self.cube_coords(positions), encoded, mixed=self._mixed)
+    def _radiance(self, positions: Tensor, viewpoint: Tensor) -> Tensor:
+        seen = encode_views(positions, viewpoint, self.config.direction_encoding)
+        return self.radiance(self.cube_coords(positions), seen, mixed=self._mixed)
 
     def __len__(self) -> int:
         return len(self.gaussians)

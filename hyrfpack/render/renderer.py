@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from math import inf, isfinite
+from math import inf
 from typing import Any
 
 import torch
@@ -16,13 +16,14 @@ from hyrfpack.checks import check_float, check_int, check_type
 from hyrfpack.errors import HyrfError
 from hyrfpack.model import Decoded, HybridModel
 from hyrfpack.model.gaussians import take_rows
+from hyrfpack.ops.composite import composite
+from hyrfpack.ops.finite import all_finite
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
 from hyrfpack.ops.rasterize.shaded import rasterize_shaded
 from hyrfpack.ops.transfer import tensor_like
-from hyrfpack.ops.upsample import upsample
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.scene import Camera
 
@@ -108,7 +109,8 @@ def render(
         background: False leaves the background sphere out.
 
     Raises:
-        HyrfError: a number that the view needs is NaN or infinite.
+        HyrfError: a number that the view needs is NaN or infinite. On a GPU, while gradients are recorded, a
+            background that is not finite passes: see that the loss is finite before you step.
         TypeError: the model, the camera or the settings are something else.
 
     Example:
@@ -140,13 +142,15 @@ def render(
         index = torch.arange(len(model), device=positions.device)
         raster = rasterize_shaded(*explicit, decoded.shading, *view, cull_tolerance=settings.cull_tolerance, **how)
     else:
-        _refuse_nonfinite(positions=positions)  # culling would leave them out
-        pose = pose_here.to(positions.device, non_blocking=positions.is_cuda)
         with _timed(seconds, "cull"), torch.no_grad():
-            index = frustum_cull(positions, pose, *view[1:], settings.near, settings.cull_tolerance)
+            try:
+                index = frustum_cull(positions, *view, settings.near, settings.cull_tolerance)
+            except FloatingPointError:
+                raise _nonfinite("positions") from None
         with _timed(seconds, "decode"):
             geometry = model.decode_geometry(index) if decoded is None else decoded.geometry[index]
-            colors = model.decode_colors(camera_center(pose), index)
+            viewpoint = camera_center(pose_here).to(positions.device, non_blocking=positions.is_cuda)
+            colors = model.decode_colors(viewpoint, index)
         gradients = positions.new_zeros(len(index), 2) if absgrad else None
         explicit = take_rows(positions, index), geometry.quats, geometry.scales, geometry.opacities
         raster = rasterize(*explicit, colors, *view, absgrad=gradients, **how)
@@ -155,14 +159,18 @@ def render(
     seconds.update(raster.seconds)
     with _timed(seconds, "background"):
         if model.config.background and background:
-            behind = _background(model, camera, pose_here, raster.transmittance, settings)
+            stride, light = settings.background_stride, raster.transmittance
+            behind = model.background_grid(
+                light, camera.intrinsics, pose_here, threshold=settings.background_threshold, stride=stride
+            )
+            rgb = composite(raster.rgb, light, behind, stride)
         else:
             behind = tensor_like(model.config.solid, positions) if solid is None else solid
-            if on_cpu:
-                _refuse_nonfinite(background=behind)
-        rgb = raster.rgb + raster.transmittance[..., None] * behind
-    if not on_cpu:  # once, at the end, for each question waits for the device
-        _refuse_nonfinite(background=rgb)
+            rgb = raster.rgb + raster.transmittance[..., None] * behind
+        # On a GPU each question waits for the device. There the picture is asked, and where it will be learnt from,
+        # its loss tells as much.
+        if on_cpu or not rgb.requires_grad:
+            _refuse_nonfinite(background=behind if on_cpu else rgb)
     return Rendering(
         rgb=rgb,
         alpha=1 - raster.transmittance,
@@ -178,7 +186,7 @@ def render(
 def _refuse_nonfinite(**values: Tensor) -> None:
     """Raise HyrfError for NaN and infinity: further on they fail every comparison and are left out without a word."""
     for name, tensor in values.items():
-        if tensor.numel() and not all(map(isfinite, torch.stack(tensor.detach().aminmax()).tolist())):
+        if not all_finite(tensor):
             raise _nonfinite(name)
 
 
@@ -187,20 +195,6 @@ def _nonfinite(name: str) -> HyrfError:
         f"the view's {name} hold NaN or infinity, from a broken model or a pose beyond float32; "
         "train the model again or correct the pose"
     )
-
-
-def _background(
-    model: HybridModel, camera: Camera, pose: Tensor, transmittance: Tensor, settings: RenderSettings
-) -> Tensor:
-    """(H, W, 3) colours of the sphere where it shines through; anything where it does not."""
-    height, width = transmittance.shape
-    stride = settings.background_stride
-    grid = model.background_grid(
-        transmittance, camera.intrinsics, pose, threshold=settings.background_threshold, stride=stride
-    )
-    if grid.device.type == "cpu":  # on a GPU, what is NaN is NaN in the picture
-        _refuse_nonfinite(background=grid)
-    return upsample(grid.permute(2, 0, 1), stride)[:, :height, :width].permute(1, 2, 0)
 
 
 @contextmanager

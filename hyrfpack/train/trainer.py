@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 import hyrfpack
 from hyrfpack.data import PictureCache
-from hyrfpack.device import upload, upload_array
+from hyrfpack.device import Photos, upload_array
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate.metrics import decibels
 from hyrfpack.model import HybridModel
@@ -92,6 +92,7 @@ class Trainer:
         self.config = config
         self.cache = cache or PictureCache()
         self.device = device
+        self.photos = Photos(device)
         self.choices: dict[str, str] = {}  # what was chosen for the run, each with its reason
         if model is None:
             model, self.budget, self.choices = build_model(scene, config)
@@ -220,7 +221,7 @@ class Trainer:
         """Add a view's gradients: its loss and mean squared error (NaN where all of the photo is masked), scalars."""
         with self._timed("data"):
             solid = self._solid()
-            target, mask = upload(picture, solid, self.device)
+            target, mask = self.photos.get(view.name, picture, solid)
         try:
             rendering = render(
                 self.model,

@@ -148,13 +148,23 @@ def test_roofline_is_the_slower_of_memory_and_arithmetic() -> None:
 
 def test_kernels_of_the_profiler_are_added_up_and_grouped_by_stage() -> None:
     class Event:
-        def __init__(self, key: str, microseconds: float, device: str = "DeviceType.CUDA") -> None:
+        def __init__(self, key: str, microseconds: float, count: int, device: str = "DeviceType.CUDA") -> None:
             self.key, self.self_device_time_total, self.device_type = key, microseconds, device
+            self.count = count
 
-    events = [Event("project_kernel", 2000), Event("blend_kernel", 6000), Event("aten::sort", 5000, "DeviceType.CPU")]
-    times = gpu_timing.sum_kernels([*events, Event("DeviceRadixSortKernel", 1000), Event("memset", 500)], runs=2)
-    assert list(times) == ["blend_kernel", "project_kernel", "DeviceRadixSortKernel", "memset"]
-    stages = gpu_timing.group_kernels(times, gpu_kernels.STAGES, "bin")
+    events = [
+        Event("project_kernel", 2000, 2),
+        Event("blend_kernel", 6000, 2),
+        Event("aten::sort", 5000, 2, "DeviceType.CPU"),
+        Event("cudaStreamSynchronize", 0, 6, "DeviceType.CPU"),
+        Event("cudaDeviceSynchronize", 0, 1, "DeviceType.CPU"),  # of the profile itself
+        Event("DeviceRadixSortKernel", 1000, 8),
+        Event("memset", 500, 2),
+    ]
+    profile = gpu_timing.sum_up(events, runs=2)
+    assert list(profile.times) == ["blend_kernel", "project_kernel", "DeviceRadixSortKernel", "memset"]
+    assert (profile.launches, profile.waits) == (7, 3)
+    stages = gpu_timing.group_kernels(profile.times, gpu_kernels.STAGES, "bin")
     assert stages == {"project": 1.0, "blend": 3.0, "bin": 0.75}
 
 

@@ -189,6 +189,55 @@ def background_runs(count: int, width: int, height: int) -> Iterator[Run]:
             "mixed": mixed,
         }
         yield partial(background_grid, torch.rand(height, width), **settings)
+        learnt = settings | {"table": torch.rand(grid.rows, 2, requires_grad=True)}
+        yield lambda settings=learnt: background_grid(torch.rand(height, width), **settings).sum().backward()
+
+
+def contraction_runs(count: int, width: int, height: int) -> Iterator[Run]:
+    from hyrfpack.ops.contraction import contract
+
+    yield partial(contract, torch.rand(count, 3), (1.0, 0.5, 2.0))
+
+
+def directions_runs(count: int, width: int, height: int) -> Iterator[Run]:
+    from hyrfpack.ops.shade import DIRECTION_FEATURES, encode_views
+
+    for encoding in DIRECTION_FEATURES:
+        yield partial(encode_views, torch.rand(count, 3), torch.zeros(3), encoding)
+
+
+def activate_runs(count: int, width: int, height: int) -> Iterator[Run]:
+    from hyrfpack.ops.activate import activate_geometry
+
+    def run(rule: str, half_extent: tuple[float, float, float] | None) -> None:
+        raw, logits = torch.rand(count, 8, requires_grad=True), torch.rand(count, 1)
+        parts = activate_geometry(raw, torch.rand(count, 3), logits, logits, half_extent=half_extent, rule=rule)
+        sum(part.sum() for part in parts).backward()
+
+    for options in (("sum", (1.0, 0.5, 2.0)), ("product", (1.0, 0.5, 2.0)), ("sum", None)):
+        yield partial(run, *options)
+
+
+def cull_runs(count: int, width: int, height: int) -> Iterator[Run]:
+    from hyrfpack.ops.rasterize.cull import frustum_cull
+
+    lens = (50.0, 50.0, width / 2, height / 2)
+    yield partial(frustum_cull, torch.rand(count, 3), torch.eye(4), lens, width, height, 0.01, 0.3)
+
+
+def composite_runs(count: int, width: int, height: int) -> Iterator[Run]:
+    from hyrfpack.ops.background import grid_size
+    from hyrfpack.ops.composite import composite
+
+    def run(stride: int) -> None:
+        light, grid = (torch.rand(*size, requires_grad=True) for size in ((height, width), (3, *nodes(stride))))
+        composite(torch.rand(height, width, 3), light, grid.permute(1, 2, 0), stride).sum().backward()
+
+    def nodes(stride: int) -> tuple[int, int]:
+        return grid_size(height, width, stride)
+
+    for stride in (2, 4):
+        yield partial(run, stride)
 
 
 OPERATIONS = {
@@ -199,6 +248,11 @@ OPERATIONS = {
     "ssim": ssim_runs,
     "hash_encode": hash_encode_runs,
     "adam": adam_runs,
+    "contraction": contraction_runs,
+    "directions": directions_runs,
+    "activate": activate_runs,
+    "cull": cull_runs,
+    "composite": composite_runs,
 }
 # All sizes (points, width, height) and runs on the first target; on the others those that take most registers.
 SIZES = (1003, 101, 67), (1024, 128, 96), (1, 1, 1)

@@ -27,7 +27,7 @@ from tools.gpu.scene import (
     splats_of,
 )
 from tools.gpu.setup import GOAL_ROOM, Setup
-from tools.gpu.timing import kernel_times, median_ms, peak_mb, reset_peak, synchronize
+from tools.gpu.timing import median_ms, peak_mb, profiled, reset_peak, synchronize
 from tools.gpu.worker import failure
 
 GOAL_FRAMES, GOAL_SPEED = 300.0, 0.8
@@ -109,7 +109,7 @@ def _frames(room: str, model: HybridModel, cameras: list[Camera], setup: Setup) 
             }
             if name == "decoded once" and room == GOAL_ROOM:
                 yield goal(f"frames of {room} Gaussians", 1e3 / ms, GOAL_FRAMES, "frames/s", at_least=True)
-        times = kernel_times(lambda: render(model, cameras[1], decoded=decoded), 5, device)
+        times = profiled(lambda: render(model, cameras[1], decoded=decoded), 5, device).times
     yield from kernel_rows(times, f"A frame of {room} Gaussians: kernels on the device")
 
 

@@ -32,7 +32,7 @@ from tools.gpu.roofline import Work
 from tools.gpu.rows import Row
 from tools.gpu.scene import TIDY, TRAINED, Look, Splats, count_blended, make_cameras, make_model, splats_of
 from tools.gpu.setup import Setup
-from tools.gpu.timing import group_kernels, kernel_times, measure_rates, median_ms
+from tools.gpu.timing import group_kernels, measure_rates, median_ms, profiled
 
 TABLE = "Kernels"
 # Words in the names of the GPU's kernels that tell which stage of the rasteriser they are; the rest of a forward pass,
@@ -82,7 +82,7 @@ def rasterize_rows(name: str, look: Look, setup: Setup) -> Iterator[Row]:
     yield from _timed(name, size, call, totals, setup, crop)
     forward, backward = call.passes(setup.implementation)
     for way, task, parts in (("forward", forward, works), ("backward", backward, back)):
-        measured = kernel_times(task, 5, setup.torch_device)
+        measured = profiled(task, 5, setup.torch_device).times
         for stage, ms in group_kernels(measured, STAGES, "bin" if way == "forward" else "other").items():
             if stage in parts and ms:
                 yield _row(f"- {stage}", way, size, ms, parts[stage], setup)
@@ -238,7 +238,7 @@ def rasterize_shaded_rows(setup: Setup) -> Iterator[Row]:
         size = f"{len(model):,} Gaussians, {seen:,} visible, {pairs:,} pairs, {setup.width} x {setup.height}"
         row = _row(f"rasterize shaded, {precision}", "forward", size, ms, whole, setup)
         yield row | {"value error": error} | within(error, 3e-3 if shading.mixed else 1e-3)
-        stages = group_kernels(kernel_times(draw, 5, setup.torch_device), STAGES, "bin")
+        stages = group_kernels(profiled(draw, 5, setup.torch_device).times, STAGES, "bin")
         if stages["project"]:
             yield _row("- project and shade", "forward", size, stages["project"], project, setup)
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import torch
 
@@ -15,6 +16,8 @@ from hyrfpack.measure.timing import Clock, take_turns
 # queued a short task before it begins.
 FLUSHED_BYTES = 1 << 30
 WARM_RUNS = 3
+# What torch calls to read a number from the device. It ends a profile by waiting for all of the device.
+WAITS = ("cudaStreamSynchronize", "hipStreamSynchronize")
 
 
 @dataclass(frozen=True)
@@ -108,13 +111,25 @@ def measure_rates(device: torch.device) -> Rates:
     )
 
 
-def kernel_times(task: Callable[[], object], runs: int, device: torch.device) -> dict[str, float]:
-    """Milliseconds that one run of the task spends in each kernel of the GPU, by name, longest first.
+@dataclass(frozen=True)
+class Profile:
+    """What one run of a task asks of a GPU.
 
-    From torch's profiler; empty where there is no GPU.
+    Attributes:
+        times: milliseconds in each kernel, by name, longest first; copies and fills are among them.
+        launches: how many there are.
+        waits: how often the host waits for the device.
     """
+
+    times: dict[str, float]
+    launches: float
+    waits: float
+
+
+def profiled(task: Callable[[], object], runs: int, device: torch.device) -> Profile:
+    """One run of a task, by torch's profiler; nothing where there is no GPU."""
     if device.type != "cuda":
-        return {}
+        return Profile({}, 0.0, 0.0)
     from torch.profiler import ProfilerActivity, profile
 
     task()
@@ -123,16 +138,20 @@ def kernel_times(task: Callable[[], object], runs: int, device: torch.device) ->
         for _ in range(runs):
             task()
         synchronize(device)
-    return sum_kernels(profiler.key_averages(), runs)
+    return sum_up(profiler.key_averages(), runs)
 
 
-def sum_kernels(events: object, runs: int) -> dict[str, float]:
-    """Milliseconds a run by kernel, longest first, from the averages of torch's profiler."""
+def sum_up(events: Iterable[Any], runs: int) -> Profile:
+    """One run's profile, from the averages of torch's profiler over so many runs."""
     times: dict[str, float] = {}
+    launches = waits = 0.0
     for event in events:
         if str(event.device_type).endswith("CUDA") and event.self_device_time_total:
             times[event.key] = times.get(event.key, 0.0) + 1e-3 * event.self_device_time_total / runs
-    return dict(sorted(times.items(), key=lambda item: -item[1]))
+            launches += event.count / runs
+        elif event.key in WAITS:
+            waits += event.count / runs
+    return Profile(dict(sorted(times.items(), key=lambda item: -item[1])), launches, waits)
 
 
 def group_kernels(

@@ -14,7 +14,7 @@ from hyrfpack.train import TrainConfig, Trainer
 from hyrfpack.train.config import FULL_STEPS
 from tools.gpu.rows import Row, goal, kernel_rows
 from tools.gpu.setup import GOAL_ROOM, Setup
-from tools.gpu.timing import kernel_times, peak_mb, reset_peak, synchronize
+from tools.gpu.timing import Profile, peak_mb, profiled, reset_peak, synchronize
 
 GOAL_MINUTES = 10.0
 PROFILED_STEPS = 5
@@ -22,7 +22,7 @@ PROFILED_STEPS = 5
 
 @dataclass(frozen=True)
 class Training:
-    """What a timed run in a room of that name came to; `kernels` are milliseconds a step by kernel of the device."""
+    """What a timed run in a room of that name came to; `profile` is of PROFILED_STEPS steps."""
 
     room: str
     model: HybridModel
@@ -31,7 +31,7 @@ class Training:
     psnr: tuple[float, float]
     stages: dict[str, float]
     peak: float | None
-    kernels: dict[str, float]
+    profile: Profile
 
     def rows(self) -> Iterator[Row]:
         """The run, its stages as the host saw them, and its kernels."""
@@ -47,11 +47,18 @@ class Training:
             "30,000 steps": full,
             "PSNR before, after": f"{self.psnr[0]:.1f}, {self.psnr[1]:.1f} dB",
             "peak MB": self.peak,
+            "launches, waits a step": self._asked(),
             "host's time": ", ".join(f"{stage} {seconds / total:.0%}" for stage, seconds in self.stages.items()),
         }
         if self.room == GOAL_ROOM:
             yield goal(f"30,000 steps of {self.room} Gaussians", minutes, GOAL_MINUTES, "min", at_least=False)
-        yield from kernel_rows(self.kernels, f"A training step of {self.room} Gaussians: kernels on the device")
+        kernels = {name: ms / PROFILED_STEPS for name, ms in self.profile.times.items()}
+        yield from kernel_rows(kernels, f"A training step of {self.room} Gaussians: kernels on the device")
+
+    def _asked(self) -> str | None:
+        if not self.profile.times:
+            return None
+        return f"{self.profile.launches / PROFILED_STEPS:.0f}, {self.profile.waits / PROFILED_STEPS:.1f}"
 
 
 def timed_training(room: str, scene: Scene, model: HybridModel, setup: Setup) -> Training:
@@ -67,7 +74,7 @@ def timed_training(room: str, scene: Scene, model: HybridModel, setup: Setup) ->
     synchronize(device)
     seconds, steps, peak = time.perf_counter() - start, trainer.step - first, peak_mb(device)
     stages = {name: value - stages.get(name, 0.0) for name, value in trainer.seconds.items()}
-    kernels = kernel_times(lambda: advance(trainer, PROFILED_STEPS, setup.step_seconds, []), 1, device)
+    profile = profiled(lambda: advance(trainer, PROFILED_STEPS, setup.step_seconds, []), 1, device)
     return Training(
         room=room,
         model=trainer.model,
@@ -76,7 +83,7 @@ def timed_training(room: str, scene: Scene, model: HybridModel, setup: Setup) ->
         psnr=(decibels(fmean(errors[:5])), decibels(fmean(errors[-5:]))),
         stages=dict(sorted(stages.items(), key=lambda item: -item[1])),
         peak=peak,
-        kernels={name: ms / PROFILED_STEPS for name, ms in kernels.items()},
+        profile=profile,
     )
 
 

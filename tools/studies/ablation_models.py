@@ -41,8 +41,8 @@ class SingleField(HybridModel):
         self.radiance = Field(grid, 3 + 8, config.hidden, extra_inputs=directions, generator=generator)
         self.geometry = _GeometryOf(self.radiance, directions)
 
-    def _radiance(self, positions: Tensor, directions: Tensor) -> Tensor:
-        return super()._radiance(positions, directions)[:, :3]
+    def _radiance(self, positions: Tensor, viewpoint: Tensor) -> Tensor:
+        return super()._radiance(positions, viewpoint)[:, :3]
 
     def _color_layers(self) -> tuple[list[Tensor], list[Tensor]]:
         *weights, weight = self.radiance.weights
@@ -77,10 +77,8 @@ class IsotropicDiffuse(HybridModel):
         explicit = self.gaussians
         pick = (lambda values: values) if index is None else (lambda values: values[index])
         positions = self._field_positions(pick(explicit.positions))
-        scales = self.activate_scales(torch.zeros_like(positions), pick(explicit.scale_logits))
-        quats = positions.new_tensor((1, 0, 0, 0)).expand(len(positions), 4)
-        opacities = torch.sigmoid(pick(explicit.opacity_logits)[:, 0])
-        return Geometry(scales * self.scale_bounds(positions), quats, opacities)
+        nothing = positions.new_zeros(len(positions), 8)
+        return self.activate(nothing, positions, pick(explicit.scale_logits), pick(explicit.opacity_logits))
 
     def decode_colors(self, viewpoint: Tensor, index: Tensor | None = None) -> Tensor:
         logits = self.gaussians.color_logits

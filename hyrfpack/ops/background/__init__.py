@@ -67,8 +67,9 @@ def background_grid(
         weights, biases: its decoder, as in `mlp`; three outputs.
         encoding: of d, "frequency" or "sh", see `encode_directions`.
         mixed: as in `mlp`.
-        implementation: "auto", "reference" or "gpu". "gpu" (float32, two features a level, at most 16 levels, two
-            hidden layers of at most 128) has no backward pass and is offered where no gradient is wanted.
+        implementation: "auto", "reference" or "gpu" (float32, two features a level, at most 16 levels, two hidden
+            layers of at most 128). "gpu" takes one launch where no gradient is wanted, and waits for the device once
+            where one is.
 
     Returns:
         (rows, columns, 3) in (0, 1), stored channel by channel, see `grid_size`; 0 at nodes that are not needed. Where
@@ -91,12 +92,12 @@ def background_grid(
     fits = table.shape[1] == 2 and len(resolutions) <= 16 and len(weights) == 3
     fits = fits and max(weight.shape[0] for weight in weights) <= WIDEST
     wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in field)
-    available = ("reference", "gpu") if fits and not wanted else ("reference",)
+    available = ("reference", "gpu") if fits else ("reference",)
     run: Callable[..., Tensor] = reference.background_grid
     if choose(implementation, available, transmittance, *field) == "gpu":
         from hyrfpack.ops.background import gpu
 
-        run = gpu.background_grid
+        run = gpu.learnable_grid if wanted else gpu.background_grid
     return run(
         transmittance,
         threshold=threshold,

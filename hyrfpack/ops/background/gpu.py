@@ -1,10 +1,12 @@
-"""The background at the nodes of a grid on a GPU: one kernel from the light that is left to colours. No gradients.
+"""The background at the nodes of a grid on a GPU: one kernel from the light that is left to colours. Where gradients
+are wanted, one kernel finds the nodes that are needed and another what the field is asked at each; the field's own
+kernels do the rest.
 
-A program does a block of neighbouring nodes, or nothing where no light passes. Neighbours look at neighbouring points
-of the sphere and so mostly read the same rows of the tables: hash features are tiles [level, node], and a warp's lanes
-are nodes. The decoder runs on the matrix units with nodes as rows, so that what comes out of one layer goes into the
-next without leaving the registers. A level's two features are two tiles, and with the direction's three products make
-the first layer.
+A program of the first does a block of neighbouring nodes, or nothing where no light passes. Neighbours look at
+neighbouring points of the sphere and so mostly read the same rows of the tables: hash features are tiles [level, node],
+and a warp's lanes are nodes. The decoder runs on the matrix units with nodes as rows, so that what comes out of one
+layer goes into the next without leaving the registers. A level's two features are two tiles, and with the direction's
+three products make the first layer.
 """
 
 from __future__ import annotations
@@ -16,14 +18,17 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyrfpack.ops.background.reference import RADIUS, grid_size
+from hyrfpack.ops.background.reference import RADIUS, field_colors, grid_size
+from hyrfpack.ops.contraction.gpu import contract_block
 from hyrfpack.ops.gpu_pairs import unpack
 from hyrfpack.ops.hash_encode.gpu import axis_vertices, level_numbers, vertex_row, whole_rows
 from hyrfpack.ops.mlp.tiles import factor, precision, product, relu_factor
 from hyrfpack.ops.poses import camera_center
+from hyrfpack.ops.shade.directions import DIRECTION_FEATURES
 from hyrfpack.ops.shade.gpu_directions import encode_block
 
 _BLOCK_ROWS = tl.constexpr(8)
+_NODES = 256  # of a program that does one thing for each
 _RADIUS, _OUTPUTS, _OUTPUTS_P = tl.constexpr(RADIUS), tl.constexpr(3), tl.constexpr(16)
 
 
@@ -58,13 +63,23 @@ def _light(transmittance, height, width, y, x, threshold, stride, STRIDE: tl.con
 
 
 @triton.jit
-def _contract(x, y, z):
-    """`contraction.contract`."""
-    largest = tl.maximum(tl.maximum(tl.maximum(tl.abs(x), tl.abs(y)), tl.abs(z)), 1.0)
-    a, b, c = x / largest, y / largest, z / largest
-    radius = tl.maximum(tl.sqrt_rn(a * a + b * b + c * c), 1 / largest) * largest
-    shrink = 0.25 * (2 - 1 / radius)
-    return shrink * (x / radius) + 0.5, shrink * (y / radius) + 0.5, shrink * (z / radius) + 0.5
+def _look(i, j, rays, half_extent):
+    """Where in the cube the rays of nodes (i, j) leave the sphere, and their directions; rays as of `_rays`."""
+    corner, right, down, origin = rays
+    row, column = i.to(tl.float32), j.to(tl.float32)
+    x = corner[0] + row * down[0] + column * right[0]
+    y = corner[1] + row * down[1] + column * right[1]
+    z = corner[2] + row * down[2] + column * right[2]
+    length = tl.sqrt_rn(x * x + y * y + z * z)
+    x, y, z = tl.div_rn(x, length), tl.div_rn(y, length), tl.div_rn(z, length)
+    # `reference.sphere_points`.
+    along = x * origin[0] + y * origin[1] + z * origin[2]
+    px, py, pz = origin[0] - along * x, origin[1] - along * y, origin[2] - along * z
+    outside = px * px + py * py + pz * pz - _RADIUS * _RADIUS
+    rest = tl.sqrt_rn(tl.maximum(-outside, 0.0))
+    px, py, pz = px + rest * x, py + rest * y, pz + rest * z
+    u, v, w = contract_block(px / half_extent[0], py / half_extent[1], pz / half_extent[2])
+    return u, v, w, x, y, z
 
 
 @triton.jit
@@ -126,7 +141,6 @@ def draw_nodes(
     Tuples: rays of `_rays`, half_extent, weights and biases of the three layers. Whole numbers stay out of them, for
     there Triton builds a kernel for each that is 1 or a multiple of 16.
     """
-    corner, right, down, origin = rays
     w1, w2, w3 = weights
     b1, b2, b3 = biases
     BLOCK: tl.constexpr = _BLOCK_ROWS * BLOCK_COLUMNS
@@ -139,19 +153,7 @@ def draw_nodes(
     needed = inside & _light(transmittance, height, width, i * STRIDE, j * STRIDE, threshold, stride, STRIDE)
     colors = tl.zeros([BLOCK, _OUTPUTS_P], tl.float32)
     if tl.max(needed.to(tl.int32), 0) > 0:
-        row, column = i.to(tl.float32), j.to(tl.float32)
-        x = corner[0] + row * down[0] + column * right[0]
-        y = corner[1] + row * down[1] + column * right[1]
-        z = corner[2] + row * down[2] + column * right[2]
-        length = tl.sqrt_rn(x * x + y * y + z * z)
-        x, y, z = tl.div_rn(x, length), tl.div_rn(y, length), tl.div_rn(z, length)
-        # `reference.sphere_points`.
-        along = x * origin[0] + y * origin[1] + z * origin[2]
-        px, py, pz = origin[0] - along * x, origin[1] - along * y, origin[2] - along * z
-        outside = px * px + py * py + pz * pz - _RADIUS * _RADIUS
-        rest = tl.sqrt_rn(tl.maximum(-outside, 0.0))
-        px, py, pz = px + rest * x, py + rest * y, pz + rest * z
-        u, v, w = _contract(px / half_extent[0], py / half_extent[1], pz / half_extent[2])
+        u, v, w, x, y, z = _look(i, j, rays, half_extent)
         features0, features1 = _features(u, v, w, table, levels, needed, LEVELS, LEVELS_P)
 
         hidden = _bias(b1, 0, H1, H1_P, BLOCK)
@@ -231,6 +233,69 @@ def background_grid(
         enable_fp_fusion=True,
     )
     return colors.permute(1, 2, 0)
+
+
+@triton.jit(do_not_specialize=["height", "width", "stride", "columns", "total"])
+def find_nodes(
+    transmittance, height, width, threshold, stride, columns, total, needed, STRIDE: tl.constexpr, BLOCK: tl.constexpr
+):
+    """Write which of the nodes are needed, (total,) uint8."""
+    node = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    y, x = node // columns * STRIDE, node % columns * STRIDE
+    lit = _light(transmittance, height, width, y, x, threshold, stride, STRIDE)
+    tl.store(needed + node, lit.to(tl.uint8), mask=node < total)
+
+
+@triton.jit(do_not_specialize=["columns", "total"])
+def look_from_nodes(
+    nodes, columns, total, rays, half_extent, coords, encoded,
+    EXTRA: tl.constexpr, FREQUENCY: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Write what the field is asked at nodes (total,) int64: coords planar (3, total), directions (EXTRA, total)."""
+    index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    live = index < total
+    node = tl.load(nodes + index, mask=live, other=0).to(tl.int32)
+    u, v, w, x, y, z = _look(node // columns, node % columns, rays, half_extent)
+    tl.store(coords + index, u, mask=live)
+    tl.store(coords + total + index, v, mask=live)
+    tl.store(coords + 2 * total.to(tl.int64) + index, w, mask=live)
+    for first in tl.static_range(0, EXTRA, 16):
+        row = first + tl.arange(0, 16)[:, None]
+        tile = encode_block(x, y, z, FREQUENCY, first, 16)
+        tl.store(encoded + row.to(tl.int64) * total + index[None, :], tile, mask=live[None, :] & (row < EXTRA))
+
+
+def learnable_grid(
+    transmittance: Tensor,
+    threshold: float,
+    stride: int,
+    pose: Tensor,
+    intrinsics: tuple[float, float, float, float],
+    half_extent: tuple[float, float, float],
+    encoding: str,
+    **field,
+) -> Tensor:
+    """As `hyrfpack.ops.background.background_grid`, differentiable in the field; `field` is what `field_colors` takes.
+
+    Waits for the device once, to learn how many nodes there are.
+    """
+    height, width = transmittance.shape
+    rows, columns = grid_size(height, width, stride)
+    needed = torch.empty(rows * columns, dtype=torch.uint8, device=transmittance.device)
+    find_nodes[(triton.cdiv(rows * columns, _NODES),)](
+        transmittance.detach().contiguous(), height, width, threshold, stride, columns, rows * columns, needed,
+        STRIDE=stride, BLOCK=_NODES, num_warps=4, enable_fp_fusion=True,
+    )  # fmt: skip
+    nodes = torch.nonzero(needed).squeeze(-1)
+    colors = transmittance.new_zeros(3, rows * columns)
+    if total := len(nodes):
+        coords, encoded = colors.new_empty(3, total), colors.new_empty(DIRECTION_FEATURES[encoding], total)
+        look_from_nodes[(triton.cdiv(total, _NODES),)](
+            nodes, columns, total, _rays(pose, intrinsics, stride), tuple(half_extent), coords, encoded,
+            EXTRA=len(encoded), FREQUENCY=encoding == "frequency", BLOCK=_NODES, num_warps=4, enable_fp_fusion=True,
+        )  # fmt: skip
+        colors.index_copy_(1, nodes, field_colors(coords.T, encoded.T, **field).T)
+    return colors.view(3, rows, columns).permute(1, 2, 0)
 
 
 def _rays(pose: Tensor, intrinsics: tuple[float, float, float, float], stride: int) -> tuple[tuple[float, ...], ...]:

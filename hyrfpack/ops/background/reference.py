@@ -12,7 +12,6 @@ from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.shade.directions import encode_directions
-from hyrfpack.ops.transfer import tensor_like
 
 RADIUS = 100.0  # local units, around the frame's centre
 
@@ -74,10 +73,25 @@ def background_colors(
     """
     pose = pose.to(table, non_blocking=table.is_cuda)
     directions = pixel_directions(points, intrinsics, pose)
-    u = sphere_points(camera_center(pose), directions) / tensor_like(half_extent, table)
-    features = hash_encode(contract(u), table, resolutions, log2_table_size)
+    coords = contract(sphere_points(camera_center(pose), directions), half_extent)
+    encoded = encode_directions(directions, encoding)
+    return field_colors(coords, encoded, table, resolutions, log2_table_size, weights, biases, mixed)
+
+
+def field_colors(
+    coords: Tensor,
+    encoded: Tensor,
+    table: Tensor,
+    resolutions: tuple[int, ...],
+    log2_table_size: int,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    mixed: bool,
+) -> Tensor:
+    """Colours (N, 3) that the field has at coords (N, 3) of the cube, seen along directions encoded as (N, E)."""
+    features = hash_encode(coords, table, resolutions, log2_table_size)
     # Hash features are stored by columns, and joined so.
-    inputs = torch.cat((features.T, encode_directions(directions, encoding).T)).T
+    inputs = torch.cat((features.T, encoded.T)).T
     return torch.sigmoid(mlp(inputs, weights, biases, mixed=mixed))
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from math import isfinite
 
 from torch import Tensor
 
 from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.finite import all_finite
 from hyrfpack.ops.rasterize import reference
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
 
@@ -132,7 +132,7 @@ def rasterize(
         absgrad=absgrad,
     )
     if chosen != "gpu":  # whose kernels look at every number anyway
-        results += (tuple(name for name, tensor in named.items() if not _finite(tensor.detach())),)
+        results += (tuple(name for name, tensor in named.items() if not all_finite(tensor)),)
     return Rasterization(*results)
 
 
@@ -157,7 +157,3 @@ def check(
         raise ValueError(f"transmittance_min is {transmittance_min}; it must lie in [0, 1)")
     if width < 1 or height < 1:
         raise ValueError(f"a picture of {width} x {height} has no pixels")
-
-
-def _finite(tensor: Tensor) -> bool:
-    return tensor.numel() == 0 or all(isfinite(extreme) for extreme in map(float, tensor.aminmax()))

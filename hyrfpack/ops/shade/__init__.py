@@ -15,6 +15,7 @@ from hyrfpack.ops.shade.directions import (
     DIRECTION_FEATURES,
     FREQUENCY_OCTAVES,
     encode_directions,
+    encode_views,
     frequency_encoding,
     spherical_harmonics,
 )
@@ -26,6 +27,7 @@ __all__ = [
     "check_shading",
     "choose_for",
     "encode_directions",
+    "encode_views",
     "frequency_encoding",
     "shade",
     "spherical_harmonics",

@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from hyrfpack.ops.dispatch import choose
+
 FREQUENCY_OCTAVES = 4
 DIRECTION_FEATURES = {"sh": 9, "frequency": 6 * FREQUENCY_OCTAVES}
 
@@ -52,3 +54,31 @@ def encode_directions(directions: Tensor, encoding: str) -> Tensor:
         torch.Size([1, 9])
     """
     return spherical_harmonics(directions) if encoding == "sh" else frequency_encoding(directions)
+
+
+def encode_views(points: Tensor, viewpoint: Tensor, encoding: str, *, implementation: str = "auto") -> Tensor:
+    """What a decoder sees of the directions in which points are seen: e(d), d = (p - o) / |p - o|.
+
+    Args:
+        points: (N, 3) p.
+        viewpoint: (3,) o, in the same units.
+        encoding: "sh" or "frequency", see `encode_directions`.
+        implementation: "auto", "reference" or "gpu" (float32), which has no backward pass and is offered where no
+            gradient is wanted.
+
+    Returns:
+        (N, E), see `DIRECTION_FEATURES`. A point at the viewpoint itself is seen along (0, 0, 0).
+
+    Raises:
+        ValueError: types or devices do not fit together.
+
+    Example:
+        >>> encode_views(torch.tensor([[0.0, 0.0, 5.0]]), torch.zeros(3), "sh").shape
+        torch.Size([1, 9])
+    """
+    wanted = torch.is_grad_enabled() and (points.requires_grad or viewpoint.requires_grad)
+    if choose(implementation, ("reference",) if wanted else ("reference", "gpu"), points, viewpoint) == "gpu":
+        from hyrfpack.ops.shade import gpu_directions
+
+        return gpu_directions.encode_views(points, viewpoint, encoding)
+    return encode_directions(torch.nn.functional.normalize(points - viewpoint, dim=-1, eps=1e-12), encoding)

@@ -13,7 +13,7 @@ import triton.language as tl
 from torch import Tensor
 
 from hyrfpack.ops.mlp.tiles import factor, linear, pack, precision, product, relu_factor, sizes
-from hyrfpack.ops.shade.gpu_directions import encode_block
+from hyrfpack.ops.shade.gpu_directions import encode_block, unit_block
 
 if TYPE_CHECKING:
     from hyrfpack.ops.shade import Shading
@@ -38,9 +38,7 @@ def shade_block(
         viewpoint: tuple of 3 numbers; first_layer, color_logits: pointers to (N, H1) and (N, 3).
         packed: of `tiles.pack`, the direction's weight first; b2, b3: the later biases.
     """
-    x, y, z = mean[0] - viewpoint[0], mean[1] - viewpoint[1], mean[2] - viewpoint[2]
-    inverse = 1 / tl.maximum(tl.sqrt(x * x + y * y + z * z), 1e-12)
-    x, y, z = x * inverse, y * inverse, z * inverse
+    x, y, z = unit_block(mean[0] - viewpoint[0], mean[1] - viewpoint[1], mean[2] - viewpoint[2])
     neuron = tl.arange(0, H1_P)[:, None]
     at = first_layer + index[None, :].to(tl.int64) * H1 + neuron
     hidden = tl.load(at, mask=live[None, :] & (neuron < H1), other=0.0).to(tl.float32)

@@ -1,9 +1,21 @@
-"""Encoding viewing directions: a device function for kernels that decode colours."""
+"""Encoding viewing directions: `encode_block` for kernels that decode colours, and a kernel that does no more."""
 
 from __future__ import annotations
 
 import triton
 import triton.language as tl
+from torch import Tensor
+
+from hyrfpack.ops.shade.directions import DIRECTION_FEATURES
+
+_BLOCK = 128
+
+
+@triton.jit
+def unit_block(x, y, z):
+    """Blocks of vectors, of length 1."""
+    inverse = 1 / tl.maximum(tl.sqrt(x * x + y * y + z * z), 1e-12)
+    return x * inverse, y * inverse, z * inverse
 
 
 @triton.jit
@@ -36,3 +48,30 @@ def encode_block(x, y, z, FREQUENCY: tl.constexpr, FIRST: tl.constexpr, HEIGHT: 
         encoded = tl.where(row == 6, 0.31539156525252005 * (3 * z * z - 1), encoded)
         encoded = tl.where(row == 7, 1.0925484305920792 * x * z, encoded)
     return encoded
+
+
+@triton.jit(do_not_specialize=["total"])
+def encode_seen(points, viewpoint, total, out, ROWS: tl.constexpr, FREQUENCY: tl.constexpr, BLOCK: tl.constexpr):
+    """Write what is encoded of the directions from a viewpoint (3,) to points (N, 3), planar (ROWS, N)."""
+    index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    live, at = index < total, points + index * 3
+    x = tl.load(at, mask=live, other=0.0) - tl.load(viewpoint)
+    y = tl.load(at + 1, mask=live, other=0.0) - tl.load(viewpoint + 1)
+    z = tl.load(at + 2, mask=live, other=0.0) - tl.load(viewpoint + 2)
+    x, y, z = unit_block(x, y, z)
+    for first in tl.static_range(0, ROWS, 16):
+        row = first + tl.arange(0, 16)[:, None]
+        encoded = encode_block(x, y, z, FREQUENCY, first, 16)
+        tl.store(out + row.to(tl.int64) * total + index[None, :], encoded, mask=live[None, :] & (row < ROWS))
+
+
+def encode_views(points: Tensor, viewpoint: Tensor, encoding: str) -> Tensor:
+    """As `directions.encode_views`, where no gradient is wanted; stored by columns, as hash features are."""
+    rows, total = DIRECTION_FEATURES[encoding], len(points)
+    encoded = points.new_empty(rows, total)
+    if total:
+        encode_seen[(triton.cdiv(total, _BLOCK),)](
+            points.detach().contiguous(), viewpoint.detach().contiguous(), total, encoded,
+            ROWS=rows, FREQUENCY=encoding == "frequency", BLOCK=_BLOCK, num_warps=4, enable_fp_fusion=True,
+        )  # fmt: skip
+    return encoded.T

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from hyrfpack.ops.mlp import mlp
-from hyrfpack.ops.shade.directions import encode_directions
+from hyrfpack.ops.shade.directions import encode_views
 
 if TYPE_CHECKING:
     from hyrfpack.ops.shade import Shading
@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 
 def shade(positions: Tensor, viewpoint: Tensor, shading: Shading) -> Tensor:
     """As `hyrfpack.ops.shade.shade`."""
-    directions = F.normalize(positions - viewpoint, dim=-1, eps=1e-12)
-    encoded = encode_directions(directions, shading.encoding)
+    encoded = encode_views(positions, viewpoint, shading.encoding, implementation="reference")
     # The first layer's rest is a layer of its own without a ReLU before it: its product is of the same kind.
     by_direction = mlp(encoded, [shading.direction_weight], [torch.zeros_like(shading.direction_weight[:, 0])],
                        mixed=shading.mixed, implementation="reference")  # fmt: skip

@@ -1,0 +1,51 @@
+"""Compositing: a picture in front of a background that is known at a grid of its pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from torch import Tensor
+
+from hyrfpack.ops.composite import reference
+from hyrfpack.ops.dispatch import choose
+
+__all__ = ["composite"]
+
+
+def composite(rgb: Tensor, transmittance: Tensor, grid: Tensor, stride: int, *, implementation: str = "auto") -> Tensor:
+    """Fill the light that is left: C = C_fg + T B, with B interpolated linearly between the nodes of a grid.
+
+    Args:
+        rgb: (H, W, 3) C_fg, what is in front.
+        transmittance: (H, W) T, the share of light that passes it.
+        grid: (R, S, 3) B at the pixels 0, stride, 2 stride, ... of both axes, the last at or past the picture's edge,
+            as `background_grid` gives it; in any layout.
+        stride: pixels from node to node, at least 1.
+        implementation: "auto", "reference" or "gpu" (float32). On CUDA the reference's gradient adds up by atomics,
+            so that equal runs differ; that of "gpu" gathers what is each node's.
+
+    Returns:
+        (H, W, 3). Differentiable once in all three.
+
+    Raises:
+        ValueError: shapes, types or devices do not fit together.
+
+    Example:
+        >>> import torch
+        >>> nodes = torch.tensor([0.0, 1.0, 2.0])[None, :, None].expand(1, 3, 3)
+        >>> composite(torch.zeros(1, 5, 3), torch.full((1, 5), 0.5), nodes, 2)[0, :, 0]
+        tensor([0.0000, 0.2500, 0.5000, 0.7500, 1.0000])
+    """
+    height, width = transmittance.shape
+    nodes = tuple(-(-(size - 1) // stride) + 1 for size in (height, width)) if stride >= 1 else None
+    if rgb.shape != (height, width, 3) or grid.shape != (*(nodes or ()), 3):
+        raise ValueError(
+            f"a picture {tuple(rgb.shape)}, transmittance {(height, width)} and a grid {tuple(grid.shape)} at every "
+            f"{stride}-th pixel do not fit together"
+        )
+    run: Callable[..., Tensor] = reference.composite
+    if choose(implementation, ("reference", "gpu"), rgb, transmittance, grid) == "gpu":
+        from hyrfpack.ops.composite import gpu
+
+        run = gpu.composite
+    return run(rgb, transmittance, grid, stride)

@@ -1,0 +1,46 @@
+"""The contraction in Triton: one launch, no gradients. `contract_block` is for kernels that contract on their way."""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+_BLOCK = 256
+
+
+@triton.jit
+def contract_block(x, y, z):
+    """`reference.contract` of blocks of coordinates u."""
+    largest = tl.maximum(tl.maximum(tl.maximum(tl.abs(x), tl.abs(y)), tl.abs(z)), 1.0)
+    a, b, c = x / largest, y / largest, z / largest
+    radius = tl.maximum(tl.sqrt_rn(a * a + b * b + c * c), 1 / largest) * largest
+    shrink = 0.25 * (2 - 1 / radius)
+    return shrink * (x / radius) + 0.5, shrink * (y / radius) + 0.5, shrink * (z / radius) + 0.5
+
+
+@triton.jit(do_not_specialize=["total"])
+def contract_points(points, half_extent, total, cube, BLOCK: tl.constexpr):
+    """Points (total, 3) to the cube (total, 3); half_extent is a tuple of 3 numbers."""
+    index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    live, at = index < total, points + index * 3
+    x = tl.load(at, mask=live, other=0.0) / half_extent[0]
+    y = tl.load(at + 1, mask=live, other=0.0) / half_extent[1]
+    z = tl.load(at + 2, mask=live, other=0.0) / half_extent[2]
+    u, v, w = contract_block(x, y, z)
+    at = cube + index * 3
+    tl.store(at, u, mask=live)
+    tl.store(at + 1, v, mask=live)
+    tl.store(at + 2, w, mask=live)
+
+
+def contract(points: Tensor, half_extent: tuple[float, float, float]) -> Tensor:
+    """As `hyrfpack.ops.contraction.contract`, where no gradient is wanted."""
+    points = points.detach().contiguous()
+    cube, total = torch.empty_like(points), points.numel() // 3
+    if total:
+        contract_points[(triton.cdiv(total, _BLOCK),)](
+            points, tuple(half_extent), total, cube, BLOCK=_BLOCK, num_warps=4, enable_fp_fusion=True
+        )
+    return cube
