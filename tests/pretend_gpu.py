@@ -1,7 +1,7 @@
 """A GPU that is not there: tensors that say they live on CUDA, compute on the CPU, and refuse to mix with others.
 
 What a mistake in devices does on a GPU ("expected all tensors to be on the same device", numpy on a CUDA tensor), it
-does here too. Triton's kernels run in its interpreter.
+does here too. Triton's kernels run in its interpreter. What a GPU would be asked to do, `listening` tells.
 """
 
 from __future__ import annotations
@@ -18,6 +18,29 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 aten = torch.ops.aten
 CUDA = torch.device("cuda", 0)
+
+Listener = Callable[[str, str], None]
+_listeners: list[Listener] = []
+
+
+@contextmanager
+def listening(listener: Listener) -> Iterator[None]:
+    """Within it, the listener is told of what a GPU is asked to do, by kind and name.
+
+    Kinds: a "launch" of a kernel, torch's or Triton's; a "wait" of the host for the device; a "copy" from the host,
+    which is a wait, too, unless it is asked not to block. Views and memory that is not written yet ask for nothing.
+    """
+    _listeners.append(listener)
+    try:
+        yield
+    finally:
+        _listeners.remove(listener)
+
+
+def _tell(name: str, *kinds: str) -> None:
+    for listener in _listeners:
+        for kind in kinds:
+            listener(kind, name)
 
 
 class OnGpu(torch.Tensor):
@@ -41,6 +64,7 @@ class OnGpu(torch.Tensor):
         return f"OnGpu({self.here})"
 
     def new_tensor(self, *args: Any, **kwargs: Any) -> OnGpu:
+        _tell("new_tensor", "copy", "wait")
         return OnGpu(self.here.new_tensor(*args, **kwargs))
 
     def numpy(self, *_: Any, **__: Any) -> None:
@@ -56,6 +80,7 @@ class OnGpu(torch.Tensor):
         return self.here.data_ptr()
 
     def tolist(self) -> Any:
+        _tell("tolist", "wait")
         return self.here.tolist()
 
     @classmethod
@@ -66,6 +91,8 @@ class OnGpu(torch.Tensor):
         for leaf in tree_leaves((args, kwargs)):
             if isinstance(leaf, torch.Tensor) and not isinstance(leaf, OnGpu) and leaf.ndim and not copies:
                 raise RuntimeError(f"{func}: expected all tensors to be on the same device, found cuda:0 and cpu")
+        if _listeners:
+            _tell(func.overloadpacket.__name__, *_kinds(func, args, kwargs))
         if func is aten.copy_.default and not isinstance(args[0], OnGpu):
             args[0].copy_(args[1].here)
             return args[0]
@@ -74,6 +101,31 @@ class OnGpu(torch.Tensor):
             if name.alias_info is not None and name.alias_info.is_write:
                 return value if isinstance(result, torch.Tensor) else tree_map(_pretend, result)
         return tree_map(_pretend, result)
+
+
+# They give memory, or an answer that needs no look at the numbers.
+NO_LAUNCH = ("_unsafe_view", "empty_like", "empty_strided", "is_same_size", "new_empty", "new_empty_strided")
+
+
+def _kinds(func: Any, args: tuple, kwargs: dict) -> Iterator[str]:
+    """What one of torch's operations asks of a GPU."""
+    name, second = func.overloadpacket.__name__, args[1] if len(args) > 1 else None
+    if name == "_local_scalar_dense" or (name == "copy_" and not isinstance(args[0], OnGpu)):
+        yield "wait"
+        return
+    if name == "copy_" and not isinstance(second, OnGpu):
+        yield from ("copy",) if len(args) > 2 and args[2] else ("copy", "wait")
+        return
+    leaves = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor) and leaf.ndim]
+    if not all(isinstance(leaf, OnGpu) for leaf in leaves):
+        yield from ("copy", "wait")
+    elif name.startswith("index") and isinstance(second, list | tuple):
+        if any(index is not None and index.dtype in (torch.bool, torch.uint8) for index in second):
+            yield "wait"  # how many a mask holds, the device knows
+    elif {torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape} & set(func.tags):
+        yield "wait"
+    if not (func.is_view or name in NO_LAUNCH):
+        yield "launch"
 
 
 def _behind(value: Any) -> Any:
@@ -102,6 +154,10 @@ def _makes(factory: Callable) -> Callable:
         kwargs.pop("pin_memory", None)
         if not _is_cuda(kwargs.get("device")):
             return factory(*args, **kwargs)
+        if factory.__name__ in ("as_tensor", "tensor"):
+            _tell(factory.__name__, "copy", "wait")
+        elif not factory.__name__.startswith("empty"):
+            _tell(factory.__name__, "launch")
         return OnGpu(factory(*tree_map(_behind, args), **{**kwargs, "device": "cpu"}))
 
     return make
@@ -114,6 +170,9 @@ def _move(tensor: torch.Tensor, *args: Any, **kwargs: Any) -> torch.Tensor:
     place = next((torch.device(v) for v in places if isinstance(v, torch.device | str)), tensor.device)
     dtypes = [v for v in (*args, kwargs.get("dtype"), getattr(other, "dtype", None)) if isinstance(v, torch.dtype)]
     if isinstance(tensor, OnGpu) != (place.type == "cuda"):
+        blocks = isinstance(tensor, OnGpu) or not kwargs.get("non_blocking")
+        kinds = [] if isinstance(tensor, OnGpu) else ["copy"]
+        _tell(f"to {place.type}", *kinds, *["wait"] * blocks)
         tensor = (_ToCpu if isinstance(tensor, OnGpu) else _ToGpu).apply(tensor)
     return _to(tensor, dtypes[0]) if dtypes else tensor
 
@@ -125,6 +184,7 @@ class _ToGpu(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad):
+        _tell("to cpu", "wait")
         return grad.here
 
 
@@ -135,6 +195,7 @@ class _ToCpu(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad):
+        _tell("to cuda", "copy", "wait")
         return OnGpu(grad)
 
 
@@ -145,6 +206,7 @@ def pretended_gpu() -> Iterator[torch.device]:
     launch = interpreter.GridExecutor.__call__
 
     def on_the_cpu(self, *args, **kwargs):
+        _tell(self.fn.__name__, "launch")
         return launch(self, *tree_map(_behind, args), **tree_map(_behind, kwargs))
 
     properties = SimpleNamespace(multi_processor_count=2, total_memory=1 << 33, name="a GPU that is not there")

@@ -17,7 +17,9 @@ from made_up_photos import write_photos
 import hyrfpack
 from hyrfpack import quant
 
-OPERATIONS = ("adam", "background", "contraction", "hash_encode", "mlp", "rasterize", "shade", "ssim")
+OPERATIONS = (
+    "activate", "adam", "background", "composite", "contraction", "hash_encode", "mlp", "rasterize", "shade", "ssim",
+)  # fmt: skip
 # Not for users: `background_grid` and `shade` take a whole decoder, which no short example makes.
 WITHOUT = {"background_colors", "background_grid", "check", "check_shading", "choose_for", "shade"}
 

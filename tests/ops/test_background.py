@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from ops.device import gpu, needs_triton
+from ops.device import INTERPRETED, gpu, needs_triton
+from pretend_gpu import pretended_gpu
 from scenes import look_at
 
 from hyrfpack.ops.background import (
@@ -78,8 +79,8 @@ class Case:
             "encoding": self.encoding,
         }
 
-    def run(self, dtype: torch.dtype, implementation: str, mixed: bool = False) -> torch.Tensor:
-        """The grid, on the CPU, with no gradients."""
+    def placed(self, dtype: torch.dtype, implementation: str) -> tuple[torch.Tensor, dict[str, Any]]:
+        """The transmittance and the other arguments, where this implementation takes them."""
 
         def placed(value: Any) -> Any:
             if isinstance(value, list):
@@ -90,9 +91,35 @@ class Case:
             return gpu(value) if implementation == "gpu" else value
 
         arguments = {name: value if name == "pose" else placed(value) for name, value in self.arguments().items()}
-        light = placed(self.transmittance())
+        return placed(self.transmittance()), arguments
+
+    def run(self, dtype: torch.dtype, implementation: str, mixed: bool = False) -> torch.Tensor:
+        """The grid, on the CPU, with no gradients."""
+        light, arguments = self.placed(dtype, implementation)
         with torch.no_grad():
             return background_grid(light, **arguments, mixed=mixed, implementation=implementation).cpu()
+
+    def learn(
+        self, dtype: torch.dtype, implementation: str, mixed: bool = False
+    ) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """The grid and the gradients of the table, the weights and the biases, on the CPU."""
+        light, arguments = self.placed(dtype, implementation)
+        return pulled(light, arguments | {"mixed": mixed}, implementation)
+
+
+def pulled(
+    light: torch.Tensor, arguments: dict[str, Any], implementation: str
+) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """As `Case.learn`, of tensors that are where they should be."""
+    field = [leaf.requires_grad_() for leaf in field_of(arguments)]
+    grid = background_grid(light, **arguments, implementation=implementation)
+    upstream = torch.randn(grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    gradients = torch.autograd.grad(grid, field, upstream.to(grid.device, grid.dtype))
+    return grid.detach().cpu(), [gradient.cpu() for gradient in gradients]
+
+
+def field_of(arguments: dict[str, Any]) -> list[torch.Tensor]:
+    return [arguments["table"], *arguments["weights"], *arguments["biases"]]
 
 
 CASES = {
@@ -171,6 +198,8 @@ def test_what_is_not_a_number_shows(implementation: str, part: str, monkeypatch:
     (arguments[part] if part == "table" else arguments[part][0]).fill_(math.nan)
     monkeypatch.setattr(Case, "arguments", lambda self: arguments)
     assert case.run(torch.float32, implementation).isnan().all()
+    grid, gradients = case.learn(torch.float32, implementation)
+    assert grid.isnan().all() and any(gradient.isnan().any() for gradient in gradients)
 
 
 def test_nodes_are_the_colors_at_their_pixels_centres() -> None:
@@ -196,13 +225,106 @@ def test_reference_passes_gradcheck_in_the_field() -> None:
     assert torch.autograd.gradcheck(run, inputs)
 
 
+# -- learning the field ----------------------------------------------------------------------------------------------
+
+
+def assert_learns_alike(
+    found: tuple[torch.Tensor, list[torch.Tensor]], expected: tuple[torch.Tensor, list[torch.Tensor]]
+) -> None:
+    """Colours as where no gradient is wanted, and gradients to a thousandth of the largest of each tensor."""
+    (grid, gradients), (wanted, wanted_gradients) = found, expected
+    torch.testing.assert_close(grid.double(), wanted.double(), rtol=0, atol=1e-4)
+    assert torch.equal(grid == 0, wanted == 0) and wanted.any()
+    for gradient, other in zip(gradients, wanted_gradients, strict=True):
+        scale = other.abs().max().item()
+        assert scale > 0
+        torch.testing.assert_close(gradient.double(), other.double(), rtol=0, atol=1e-3 * scale)
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("name", CASES)
+def test_gradients_match_the_float64_reference(implementation: str, name: str) -> None:
+    case = CASES[name]
+    found = case.learn(torch.float32, implementation)
+    assert_learns_alike(found, case.learn(torch.float64, "reference"))
+    if implementation == "gpu":
+        assert found[0].permute(2, 0, 1).is_contiguous()
+
+
 @needs_triton
-def test_the_kernel_is_not_taken_where_gradients_are_wanted() -> None:
-    case = Case()
-    arguments = case.arguments()
+@pytest.mark.parametrize(("encoding", "mixed"), [("frequency", False), ("sh", False), ("frequency", True)])
+def test_the_field_is_learnt_by_kernels_alone(encoding: str, mixed: bool) -> None:
+    """Where tensors say that they are on CUDA, hash features and the decoder are the gpu's, too."""
+    case = Case(height=7, width=9, levels=2, encoding=encoding)
+    if INTERPRETED:
+        with pretended_gpu() as device:
+            arguments = case.arguments() | {"mixed": mixed}
+            for name in ("weights", "biases"):
+                arguments[name] = [tensor.to(device) for tensor in arguments[name]]
+            arguments["table"] = arguments["table"].to(device)
+            found = pulled(case.transmittance().to(device), arguments, "auto")
+    else:
+        found = case.learn(torch.float32, "gpu", mixed)
+
+    exact = case.learn(torch.float64, "reference")
+    if not mixed:
+        assert_learns_alike(found, exact)
+        return
+    expected = case.learn(torch.float64, "reference", mixed)
+    torch.testing.assert_close(found[0].double(), expected[0], rtol=0, atol=3e-3)
+    assert (found[0] - expected[0]).abs().mean() < 0.2 * (exact[0] - expected[0]).abs().mean()
+    for gradient, wanted in zip(found[1], expected[1], strict=True):
+        assert (gradient - wanted).norm() < 0.02 * wanted.norm()
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("learnt", ["table", "weights", "biases"])
+def test_a_part_of_the_field_may_be_learnt_alone(learnt: str, implementation: str) -> None:
+    case = CASES["stride 2"]
+    wanted, gradients = case.learn(torch.float32, implementation)
+    light, arguments = case.placed(torch.float32, implementation)
+    part = arguments[learnt] if learnt == "table" else arguments[learnt][1]
+    part.requires_grad_()
+    grid = background_grid(light, **arguments, implementation=implementation)
+    upstream = torch.randn(grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    grid.backward(upstream.to(grid.device, grid.dtype))
+    torch.testing.assert_close(grid.detach().cpu(), wanted)
+    expected = gradients[{"table": 0, "weights": 2, "biases": 5}[learnt]]
+    torch.testing.assert_close(part.grad.cpu(), expected, rtol=1e-4, atol=1e-5 * expected.abs().max().item())
+    assert [leaf.grad is not None for leaf in field_of(arguments)] == [leaf is part for leaf in field_of(arguments)]
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_nothing_is_learnt_where_it_is_dark(implementation: str) -> None:
+    light, arguments = Case(light="0", threshold=0.0).placed(torch.float32, implementation)
+    field = [leaf.requires_grad_() for leaf in field_of(arguments)]
+    grid = background_grid(light, **arguments, implementation=implementation)
+    assert grid.shape == (7, 11, 3) and not grid.any()
+    (grid.sum() + sum(0 * leaf.sum() for leaf in field)).backward()
+    assert not any(leaf.grad.any() for leaf in field)
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_light_learns_nothing(implementation: str) -> None:
+    light, arguments = Case().placed(torch.float32, implementation)
     arguments["table"].requires_grad_()
+    background_grid(light.requires_grad_(), **arguments, implementation=implementation).sum().backward()
+    assert light.grad is None and arguments["table"].grad.any()
+
+
+@needs_triton
+@pytest.mark.parametrize("learnt", [False, True])
+@pytest.mark.parametrize(
+    "case",
+    [Case(levels=17, finest=60), Case(hidden=(129, 16)), Case(hidden=(16, 129))],
+    ids=["17 levels", "a wide first layer", "a wide second layer"],
+)
+def test_the_kernels_are_not_taken_where_the_field_does_not_fit(case: Case, learnt: bool) -> None:
+    light, arguments = case.placed(torch.float32, "gpu")
+    arguments["table"].requires_grad_(learnt)
     with pytest.raises(ValueError, match="no implementation 'gpu'"):
-        background_grid(case.transmittance(), **arguments, implementation="gpu")
+        background_grid(light, **arguments, implementation="gpu")
+    assert background_grid(light, **arguments).requires_grad == learnt
 
 
 @pytest.mark.parametrize(

@@ -1,62 +1,172 @@
+"""frustum_cull: every implementation against plain float64 arithmetic."""
+
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
+from ops.device import INTERPRETED, gpu, needs_triton
 from scenes import look_at
 
 from hyrfpack.ops.rasterize.cull import frustum_cull
 
 WIDTH, HEIGHT, INTRINSICS = 64, 40, (50.0, 60.0, 20.0, 25.0)
+IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
+POSE = look_at((0.0, -3.0, 0.0), (0.0, 0.0, 0.0))
+# Relative: the kernel works in float64, of positions in float32 and a pose in what it comes in.
+UNDECIDED = {"reference": 1e-4, "gpu": 1e-12}
+# numpy's, in the interpreter.
+INFINITY_TIMES_ZERO = pytest.mark.filterwarnings("ignore:invalid value encountered in multiply")
+AHEAD, BEHIND = (0.0, -2.0, 0.0), (0.0, -4.0, 0.0)
 
 
-def cull(points, pose, *, near=0.01, tolerance=0.3) -> torch.Tensor:
+def cull(points, pose=POSE, implementation="reference", *, near=0.01, tolerance=0.3) -> torch.Tensor:
     positions = torch.as_tensor(np.asarray(points), dtype=torch.float32).reshape(-1, 3)
-    return frustum_cull(positions, torch.from_numpy(pose).float(), INTRINSICS, WIDTH, HEIGHT, near, tolerance)
+    positions = gpu(positions) if implementation == "gpu" else positions
+    index = frustum_cull(
+        positions, torch.from_numpy(pose), INTRINSICS, WIDTH, HEIGHT, near, tolerance, implementation=implementation
+    )
+    assert index.dtype == torch.int64 and index.ndim == 1 and index.device == positions.device
+    return index.cpu()
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 0.3, 2.0])
-@pytest.mark.parametrize("near", [0.01, 1.0])
-def test_cull_keeps_what_projects_into_the_widened_picture(near, tolerance):
-    pose = look_at((1.0, -2.0, 0.5), (0.0, 0.0, 0.0))
-    points = np.random.default_rng(0).normal(size=(5000, 3)) * 3
+def in_view(points, pose, near: float, tolerance: float, undecided: float) -> tuple[set[int], set[int]]:
+    """Those inside and those too near to an edge to say, in float64 from positions as float32 holds them."""
     fx, fy, cx, cy = INTRINSICS
-    kept, undecided = set(), set()
-    for i, point in enumerate(points):
+    kept, unsure = set(), set()
+    for i, point in enumerate(np.asarray(points, np.float32).astype(np.float64)):
         x, y, z = pose[:3, :3] @ point + pose[:3, 3]
-        if abs(z - near) < 1e-4:
-            undecided.add(i)
+        if abs(z - near) < undecided:
+            unsure.add(i)
         elif z > near:
             # Distances from the picture's middle in units of half its size: inside is [-1, 1].
             across = (fx * x / z + cx - WIDTH / 2) / (WIDTH / 2)
             down = (fy * y / z + cy - HEIGHT / 2) / (HEIGHT / 2)
             excess = max(abs(across), abs(down)) - (1 + tolerance)
-            if abs(excess) < 1e-4:
-                undecided.add(i)
+            if abs(excess) < undecided:
+                unsure.add(i)
             elif excess < 0:
                 kept.add(i)
-
-    index = cull(points, pose, near=near, tolerance=tolerance)
-
-    assert len(kept) > 100 and len(undecided) < 20
-    assert set(index.tolist()) - undecided == kept - undecided
+    return kept, unsure
 
 
-def test_cull_returns_ascending_int64():
-    index = cull(np.random.default_rng(1).normal(size=(500, 3)), look_at((0, -3, 0), (0, 0, 0)))
-    assert index.dtype == torch.int64 and (index.diff() > 0).all()
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("tolerance", [0.0, 0.3, 2.0])
+@pytest.mark.parametrize("near", [0.01, 1.0])
+def test_cull_keeps_what_projects_into_the_widened_picture(near, tolerance, implementation):
+    pose = look_at((1.0, -2.0, 0.5), (0.0, 0.0, 0.0))
+    count = 900 if implementation == "gpu" and INTERPRETED else 5000
+    points = np.random.default_rng(0).normal(size=(count, 3)) * 3
+    kept, unsure = in_view(points, pose, near, tolerance, UNDECIDED[implementation])
+
+    index = cull(points, pose, implementation, near=near, tolerance=tolerance)
+
+    assert count // 50 < len(kept) < count and len(unsure) < 20
+    assert set(index.tolist()) - unsure == kept - unsure
+    assert (index.diff() > 0).all()
 
 
-def test_cull_drops_points_at_the_camera_and_behind_it():
-    pose = look_at((0.0, -3.0, 0.0), (0.0, 0.0, 0.0))
-    assert cull([[0, -3, 0], [0, -4, 0], [0, -1e6, 0], [0, -2, 0]], pose).tolist() == [3]
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("count", [1, 2, 127, 128, 129])
+def test_cull_of_any_number_of_points(count, implementation):
+    points = np.random.default_rng(count).normal(size=(count, 3))
+    kept, unsure = in_view(points, POSE, 0.01, 0.3, UNDECIDED[implementation])
+    assert not unsure
+    assert cull(points, implementation=implementation).tolist() == sorted(kept)
 
 
-def test_cull_drops_points_that_are_not_finite():
-    pose = look_at((0.0, -3.0, 0.0), (0.0, 0.0, 0.0))
-    bad = [[np.nan, 0, 0], [0, np.nan, 0], [0, 0, np.nan], [np.inf, 0, 0], [0, np.inf, 0], [0, 0, 0]]
-    assert cull(bad, pose).tolist() == [5]
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("count", [1, 130])
+def test_cull_keeps_all_or_none(count, implementation):
+    assert cull([AHEAD] * count, implementation=implementation).tolist() == list(range(count))
+    assert cull([BEHIND] * count, implementation=implementation).tolist() == []
 
 
-def test_cull_of_no_points_is_empty():
-    assert cull(np.zeros((0, 3)), np.eye(4)).shape == (0,)
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("place", [0, 127, 128, 129])
+def test_cull_finds_the_only_point_inside(place, implementation):
+    points = np.array([BEHIND] * 130)
+    points[place] = AHEAD
+    assert cull(points, implementation=implementation).tolist() == [place]
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_cull_of_no_points_is_empty(implementation):
+    assert cull(np.zeros((0, 3)), np.eye(4), implementation).shape == (0,)
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_cull_drops_points_at_the_camera_and_behind_it(implementation):
+    points = [[0, -3, 0], [0, -4, 0], [0, -1e6, 0], [0, -2, 0]]
+    assert cull(points, implementation=implementation).tolist() == [3]
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_the_near_plane_itself_is_left_out(implementation):
+    points = [[0, 0, 0.5], [0, 0, 0.50001], [0, 0, 0.49999]]
+    assert cull(points, np.eye(4), implementation, near=0.5).tolist() == [1]
+
+
+@needs_triton
+def test_the_kernel_loses_nothing_of_a_pose_in_float64():
+    """A turn of 1e-9, which float32 does not hold, decides of a point that is just out of the picture."""
+    width, angle = 64 / 2 * 1.3, 1e-9
+    turned = np.eye(4)
+    turned[:3, :3] = [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
+    lens = (width, 60.0, 32.0, 25.0)  # the edge of the band is at x = z
+    found = [
+        frustum_cull(gpu(torch.ones(1, 3) * torch.tensor([1.0, 0, 1])), torch.from_numpy(pose), lens, 64, 40, 0.01, 0.3,
+                     implementation="gpu").tolist()
+        for pose in (turned, turned.T.copy())
+    ]  # fmt: skip
+    assert found == [[0], []]
+
+
+@INFINITY_TIMES_ZERO
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("place", [0, 128, 129])
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+def test_cull_refuses_points_that_are_not_finite(number, place, implementation):
+    for axis in range(3):
+        points = np.array([AHEAD] * 130)
+        points[place, axis] = number
+        with pytest.raises(FloatingPointError, match="positions hold NaN or infinity"):
+            cull(points, implementation=implementation)
+    points[:] = BEHIND
+    points[place, 0] = number
+    with pytest.raises(FloatingPointError):
+        cull(points, implementation=implementation)
+
+
+@INFINITY_TIMES_ZERO
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_cull_refuses_the_only_point(number, implementation):
+    with pytest.raises(FloatingPointError):
+        cull([[0, 0, number]], implementation=implementation)
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_the_largest_numbers_are_finite(implementation):
+    largest = np.finfo(np.float32).max
+    points = [[largest, 0, 0], [0, -largest, 0], [0, 0, largest], [-largest, -largest, -largest], AHEAD]
+    assert cull(points, implementation=implementation).tolist() == [4]
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_layouts_and_gradients_of_positions_do_not_matter(implementation):
+    points = torch.from_numpy(np.random.default_rng(1).normal(size=(60, 3))).float()
+    points = gpu(points) if implementation == "gpu" else points
+    rest = torch.from_numpy(POSE).float(), INTRINSICS, WIDTH, HEIGHT, 0.01, 0.3
+    expected = frustum_cull(points, *rest, implementation=implementation)
+    assert 0 < len(expected) < 60
+    for other in (points.T.contiguous().T, points.repeat_interleave(2, 0)[::2], points.clone().requires_grad_()):
+        assert torch.equal(frustum_cull(other, *rest, implementation=implementation), expected)
+
+
+def test_types_and_implementations_that_there_are_not_are_refused():
+    rest = torch.eye(4), INTRINSICS, WIDTH, HEIGHT, 0.01, 0.3
+    with pytest.raises(ValueError, match="float32"):
+        frustum_cull(torch.zeros(2, 3).double(), *rest, implementation="gpu")
+    with pytest.raises(ValueError, match="no implementation 'cpu'"):
+        frustum_cull(torch.zeros(2, 3), *rest, implementation="cpu")

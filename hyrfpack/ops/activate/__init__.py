@@ -30,7 +30,7 @@ def activate_geometry(
         scale = S(p) sigmoid(s_n + s_e),  or S(p) sigmoid(s_n) sigmoid(s_e) with rule "product"
 
     Args:
-        raw: (N, 8) what the field says: a_n, s_n (3), r_n (4). In any layout; its gradient comes back in the same.
+        raw: (N, 8) what the field says: a_n, s_n (3), r_n (4). In any layout.
         positions: (N, 3) p, local units.
         scale_logits, opacity_logits: (N, 1) s_e and a_e.
         half_extent: of S(p), see `scale_bounds`.

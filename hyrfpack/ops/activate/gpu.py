@@ -47,16 +47,16 @@ def activate(
         tl.store(quats + index * 4 + part, neural + 1 if part == 0 else neural, mask=live)
 
 
-@triton.jit(do_not_specialize=["total", "raw_row", "raw_column"])
+@triton.jit(do_not_specialize=["total", "raw_row", "raw_column", "grad_row", "grad_column"])
 def activate_backward(
     raw, raw_row, raw_column, positions, scale_logits, half_extent, opacities, grad_scales, grad_quats, grad_opacities,
-    total, grad_raw, grad_scale_logits, grad_opacity_logits,
+    total, grad_raw, grad_row, grad_column, grad_scale_logits, grad_opacity_logits,
     GROWS: tl.constexpr, SUM: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write the gradients of raw (N, 8), as that is laid out, and of both logits (N, 1)."""
+    """Write the gradients of raw (N, 8) and of both logits (N, 1)."""
     index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = index < total
-    first, grad_first = raw + index * raw_row, grad_raw + index * raw_row
+    first, grad_first = raw + index * raw_row, grad_raw + index * grad_row
     opacity = tl.load(opacities + index, mask=live, other=0.0)
     grad = tl.load(grad_opacities + index, mask=live, other=0.0) * opacity * (1 - opacity)
     tl.store(grad_first, grad, mask=live)
@@ -76,11 +76,11 @@ def activate_backward(
             grad *= mine * theirs
             total_grad += grad * (1 - theirs)
             grad *= 1 - mine
-        tl.store(grad_first + (1 + axis) * raw_column, grad, mask=live)
+        tl.store(grad_first + (1 + axis) * grad_column, grad, mask=live)
     tl.store(grad_scale_logits + index, total_grad, mask=live)
     for part in tl.static_range(4):
         grad = tl.load(grad_quats + index * 4 + part, mask=live, other=0.0)
-        tl.store(grad_first + (4 + part) * raw_column, grad, mask=live)
+        tl.store(grad_first + (4 + part) * grad_column, grad, mask=live)
 
 
 class _Activate(torch.autograd.Function):
@@ -95,8 +95,6 @@ class _Activate(torch.autograd.Function):
         rule: str,
     ) -> tuple[Tensor, Tensor, Tensor]:
         raw, total = raw.detach(), len(raw)
-        if 0 in raw.stride():  # a gradient laid out so would have one place for many
-            raw = raw.contiguous()
         positions, scale_logits, opacity_logits = (
             tensor.detach().contiguous() for tensor in (positions, scale_logits, opacity_logits)
         )
@@ -116,13 +114,14 @@ class _Activate(torch.autograd.Function):
     def backward(ctx, grad_scales: Tensor, grad_quats: Tensor, grad_opacities: Tensor) -> tuple[Tensor | None, ...]:
         raw, positions, scale_logits, opacities = ctx.saved_tensors
         total = len(raw)
-        grad_raw = raw.new_empty_strided(raw.shape, raw.stride())
+        grad_raw = torch.empty_like(raw)  # laid out so where no two numbers share a place
         grad_scale_logits, grad_opacity_logits = raw.new_empty(total, 1), raw.new_empty(total, 1)
         if total:
             activate_backward[(triton.cdiv(total, _BLOCK),)](
                 raw, *raw.stride(), positions, scale_logits, ctx.numbers, opacities,
                 grad_scales.contiguous(), grad_quats.contiguous(), grad_opacities.contiguous(), total,
-                grad_raw, grad_scale_logits, grad_opacity_logits, **ctx.constants, enable_fp_fusion=True,
+                grad_raw, *grad_raw.stride(), grad_scale_logits, grad_opacity_logits,
+                **ctx.constants, enable_fp_fusion=True,
             )  # fmt: skip
         return grad_raw, None, grad_scale_logits, grad_opacity_logits, None, None
 

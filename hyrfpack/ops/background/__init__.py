@@ -72,7 +72,7 @@ def background_grid(
             where one is.
 
     Returns:
-        (rows, columns, 3) in (0, 1), stored channel by channel, see `grid_size`; 0 at nodes that are not needed. Where
+        (rows, columns, 3) in (0, 1), see `grid_size`; 0 at nodes that are not needed. Where
         the field says NaN, the colour is NaN. Differentiable in the field's parameters.
 
     Raises:

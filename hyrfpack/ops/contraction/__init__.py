@@ -36,12 +36,14 @@ def contract(
         (..., 3) in [0, 1]. Differentiable everywhere, also at |u| = 1 (C1).
 
     Raises:
-        ValueError: the implementation cannot take these points.
+        ValueError: the points have no three coordinates, or the implementation cannot take them.
 
     Example:
         >>> contract(torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))[:, 0]
         tensor([0.5000, 0.7500, 0.8750])
     """
+    if not points.ndim or points.shape[-1] != 3:
+        raise ValueError(f"points {tuple(points.shape)} do not end in 3 coordinates")
     wanted = torch.is_grad_enabled() and points.requires_grad
     if choose(implementation, ("reference",) if wanted else ("reference", "gpu"), points) == "gpu":
         from hyrfpack.ops.contraction import gpu

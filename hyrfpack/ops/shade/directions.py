@@ -70,12 +70,14 @@ def encode_views(points: Tensor, viewpoint: Tensor, encoding: str, *, implementa
         (N, E), see `DIRECTION_FEATURES`. A point at the viewpoint itself is seen along (0, 0, 0).
 
     Raises:
-        ValueError: types or devices do not fit together.
+        ValueError: shapes, types or devices do not fit together, or there is no such encoding.
 
     Example:
         >>> encode_views(torch.tensor([[0.0, 0.0, 5.0]]), torch.zeros(3), "sh").shape
         torch.Size([1, 9])
     """
+    if points.shape[1:] != (3,) or viewpoint.shape != (3,) or encoding not in DIRECTION_FEATURES:
+        raise ValueError(f"points {tuple(points.shape)} from {tuple(viewpoint.shape)}, encoding '{encoding}'")
     wanted = torch.is_grad_enabled() and (points.requires_grad or viewpoint.requires_grad)
     if choose(implementation, ("reference",) if wanted else ("reference", "gpu"), points, viewpoint) == "gpu":
         from hyrfpack.ops.shade import gpu_directions
