@@ -45,11 +45,14 @@ class Decoded:
     Attributes:
         geometry: of all Gaussians.
         shading: the colour decoder's first layer as far as places decide it, and what comes after it; None where
-            there is no kernel that is faster with it.
+            nothing is gained by it.
     """
 
     geometry: Geometry
     shading: Shading | None
+
+    def __getitem__(self, index: Tensor) -> Decoded:
+        return Decoded(self.geometry[index], None if self.shading is None else self.shading.part(index))
 
 
 def scale_bounds(positions: Tensor, config: ModelConfig) -> Tensor:
@@ -114,8 +117,8 @@ class HybridModel(nn.Module):
     @torch.no_grad()
     def decode(self) -> Decoded:
         """What does not depend on the view, of all Gaussians: for many views of a model that does not change."""
-        on_gpu = self.gaussians.positions.device.type == "cuda"
-        return Decoded(self.decode_geometry(), self.shading() if on_gpu else None)
+        gains = self.gaussians.positions.device.type in ("cpu", "cuda") and not self.radiance.silent
+        return Decoded(self.decode_geometry(), self.shading() if gains else None)
 
     @torch.no_grad()
     def shading(self) -> Shading:

@@ -23,6 +23,7 @@ from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
 from hyrfpack.ops.rasterize.shaded import rasterize_shaded
+from hyrfpack.ops.shade import shade
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.scene import Camera
@@ -136,11 +137,12 @@ def render(
         "depth": depth,
     }
     gradients = None
-    if decoded is not None and decoded.shading is not None:
+    shading = None if decoded is None else decoded.shading
+    if decoded is not None and shading is not None and not on_cpu:
         geometry = decoded.geometry
         explicit = positions, geometry.quats, geometry.scales, geometry.opacities
         index = torch.arange(len(model), device=positions.device)
-        raster = rasterize_shaded(*explicit, decoded.shading, *view, cull_tolerance=settings.cull_tolerance, **how)
+        raster = rasterize_shaded(*explicit, shading, *view, cull_tolerance=settings.cull_tolerance, **how)
     else:
         with _timed(seconds, "cull"), torch.no_grad():
             try:
@@ -150,7 +152,10 @@ def render(
         with _timed(seconds, "decode"):
             geometry = model.decode_geometry(index) if decoded is None else decoded.geometry[index]
             viewpoint = camera_center(pose_here).to(positions.device, non_blocking=positions.is_cuda)
-            colors = model.decode_colors(viewpoint, index)
+            if shading is None:
+                colors = model.decode_colors(viewpoint, index)
+            else:
+                colors = shade(positions, viewpoint, shading, index)
         gradients = positions.new_zeros(len(index), 2) if absgrad else None
         explicit = take_rows(positions, index), geometry.quats, geometry.scales, geometry.opacities
         raster = rasterize(*explicit, colors, *view, absgrad=gradients, **how)

@@ -6,12 +6,14 @@ import dataclasses
 
 import pytest
 import torch
-from ops.device import gpu, needs_triton
+from ops.device import DEVICE, gpu, needs_triton
 
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_directions, shade
 
-IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
+ROUNDING = ["reference", pytest.param("gpu", marks=needs_triton)]  # those that take factors in bfloat16
+ON_CPU = pytest.mark.skipif(DEVICE != "cpu", reason="tensors of these tests are on the GPU")
+IMPLEMENTATIONS = [*ROUNDING, pytest.param("cpu", marks=ON_CPU)]
 PLACES = 10
 
 
@@ -88,7 +90,7 @@ def test_matches_the_float64_reference(case: str, encoding: str, implementation:
     torch.testing.assert_close(colors.cpu().double(), expected, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", ROUNDING)
 @pytest.mark.parametrize("encoding", DIRECTION_FEATURES)
 def test_mixed_precision_stays_near(encoding: str, implementation: str) -> None:
     positions, viewpoint, widths = CASES["random"]
@@ -103,6 +105,32 @@ def test_mixed_precision_stays_near(encoding: str, implementation: str) -> None:
     error = (colors.cpu().double() - expected).abs()
     assert error.max() < 4e-3 and error.median() < 1e-5  # a factor that rounds the other way is off by 2^-9
     assert (colors.cpu().double() - exact).abs().max() < 2e-2
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("places", [[], [7], [299, 3, 3, 0]])
+def test_some_have_the_colours_that_they_have_among_all(places: list[int], implementation: str) -> None:
+    positions, viewpoint, widths = CASES["random"]
+    shading = single(shading_of(*decoder(len(positions), "sh", widths), "sh"))
+    positions, viewpoint, index = gpu(positions.float()), gpu(viewpoint.float()), gpu(torch.tensor(places).long())
+
+    colors = shade(positions, viewpoint, shading, index, implementation=implementation)
+
+    assert colors.shape == (len(places), 3)
+    torch.testing.assert_close(colors, shade(positions, viewpoint, shading, implementation=implementation)[index])
+
+
+@ON_CPU
+def test_chunks_of_the_cpu_join_and_do_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    positions = normal(5000, 3, seed=3).float()
+    shading = single(shading_of(*decoder(5000, "frequency", (64, 64)), "frequency"))
+    expected = shade(positions, torch.zeros(3), shading, implementation="reference")
+    found = []
+    for threads in ("1", "2"):
+        monkeypatch.setenv("HYRFPACK_THREADS", threads)
+        found.append(shade(positions, torch.zeros(3), shading, implementation="cpu"))
+    assert torch.equal(*found)
+    torch.testing.assert_close(found[0], expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)

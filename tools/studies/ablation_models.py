@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from hyrfpack.data import PictureCache
-from hyrfpack.model import Geometry, HybridModel, ModelConfig
+from hyrfpack.model import Decoded, Geometry, HybridModel, ModelConfig
 from hyrfpack.model.field import Field
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.shade import DIRECTION_FEATURES, spherical_harmonics
@@ -80,6 +80,9 @@ class IsotropicDiffuse(HybridModel):
         nothing = positions.new_zeros(len(positions), 8)
         return self.activate(nothing, positions, pick(explicit.scale_logits), pick(explicit.opacity_logits))
 
+    def decode(self) -> Decoded:
+        return Decoded(self.decode_geometry(), None)  # colours are no field's
+
     def decode_colors(self, viewpoint: Tensor, index: Tensor | None = None) -> Tensor:
         logits = self.gaussians.color_logits
         return torch.sigmoid(logits if index is None else logits[index])
@@ -99,6 +102,9 @@ class HarmonicColors(HybridModel):
             constant = (torch.sigmoid(gaussians.color_logits) - 0.5) / Y00
             stored = torch.cat((constant, constant.new_zeros(len(constant), 3 * (SH_NUMBERS - 1))), dim=1)
         gaussians.color_logits = nn.Parameter(stored)
+
+    def decode(self) -> Decoded:
+        return Decoded(self.decode_geometry(), None)  # colours are no field's
 
     def decode_colors(self, viewpoint: Tensor, index: Tensor | None = None) -> Tensor:
         positions, stored = self.gaussians.positions, self.gaussians.color_logits

@@ -76,10 +76,7 @@ def rasterize_shaded(
         )
     pose = camera_from_world.to(means)
     index = frustum_cull(means, pose, intrinsics, width, height, near, cull_tolerance)
-    seen = dataclasses.replace(
-        shading, first_layer=shading.first_layer[index], color_logits=shading.color_logits[index]
-    )
-    colors = shade(means[index], camera_center(pose), seen)
+    colors = shade(means, camera_center(pose), shading, index)
     drawn = rasterize(
         means[index],
         quats[index],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -58,6 +58,10 @@ class Shading:
     encoding: str
     mixed: bool
 
+    def part(self, index: Tensor) -> Shading:
+        """The decoder of the Gaussians at `index` (n,) int64."""
+        return replace(self, first_layer=self.first_layer[index], color_logits=self.color_logits[index])
+
     @cached_property
     def operands(self) -> tuple[tuple[Tensor, ...], dict]:
         """What GPU kernels take of it, packed once for all views: tensors, and constants by name."""
@@ -79,16 +83,27 @@ def check_shading(shading: Shading, count: int) -> None:
         )
 
 
-def choose_for(shading: Shading, implementation: str, *tensors: Tensor) -> str:
+def choose_for(
+    shading: Shading, implementation: str, *tensors: Tensor, available: tuple[str, ...] = ("reference", "gpu")
+) -> str:
     """As `dispatch.choose`, for kernels that take these tensors and a shading."""
     parameters = (shading.direction_weight, *shading.weights, *shading.biases, shading.color_logits)
-    hidden = max(weight.shape[1] for weight in shading.weights)
-    available = ("reference", "gpu") if hidden <= WIDEST else ("reference",)
+    if max(weight.shape[1] for weight in shading.weights) > WIDEST:
+        available = tuple(name for name in available if name != "gpu")
+    if shading.mixed:
+        available = tuple(name for name in available if name != "cpu")
     return choose(implementation, available, *tensors, *parameters)
 
 
 @torch.no_grad()
-def shade(positions: Tensor, viewpoint: Tensor, shading: Shading, *, implementation: str = "auto") -> Tensor:
+def shade(
+    positions: Tensor,
+    viewpoint: Tensor,
+    shading: Shading,
+    index: Tensor | None = None,
+    *,
+    implementation: str = "auto",
+) -> Tensor:
     """Colours of Gaussians seen from a point.
 
         d = (p - o) / |p - o|,   h1 = relu(first_layer + W1' e(d)),   h2 = relu(W2 h1 + b2)
@@ -98,10 +113,12 @@ def shade(positions: Tensor, viewpoint: Tensor, shading: Shading, *, implementat
         positions: (N, 3) p.
         viewpoint: (3,) o, in the same units.
         shading: of these N Gaussians.
-        implementation: "auto", "reference" or "gpu" (float32, two hidden layers of at most 128).
+        index: (n,) int64 which of them; all when None.
+        implementation: "auto", "reference", "cpu" (float32, not mixed) or "gpu" (float32, two hidden layers of at
+            most 128).
 
     Returns:
-        (N, 3) in (0, 1). Not differentiable.
+        (n, 3) in (0, 1). Not differentiable.
 
     Raises:
         ValueError: shapes, types or devices do not fit together.
@@ -109,7 +126,15 @@ def shade(positions: Tensor, viewpoint: Tensor, shading: Shading, *, implementat
     check_shading(shading, len(positions))
     if positions.shape != (len(positions), 3) or viewpoint.shape != (3,):
         raise ValueError(f"{tuple(positions.shape)} positions and viewpoint {tuple(viewpoint.shape)}, not (N, 3), (3,)")
-    if choose_for(shading, implementation, positions, viewpoint) == "gpu":
+    available = ("reference", "cpu", "gpu")
+    chosen = choose_for(shading, implementation, positions, viewpoint, available=available)
+    if chosen == "cpu":
+        from hyrfpack.ops.shade import cpu
+
+        return cpu.shade(positions, viewpoint, shading, index)
+    if index is not None:
+        positions, shading = positions[index], shading.part(index)
+    if chosen == "gpu":
         from hyrfpack.ops.shade import gpu
 
         return gpu.shade(positions, viewpoint, shading)
