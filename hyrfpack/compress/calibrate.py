@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -24,8 +24,18 @@ from hyrfpack.compress.sensitivity import PRUNED, Sensitivity, measure_sensitivi
 from hyrfpack.format.arrays import by_parameter, to_arrays
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.compact.quantized import Quantized
-from hyrfpack.format.sections import COLORS, MLPS, OPACITIES, POSITIONS, SCALES, TABLES
-from hyrfpack.model import HybridModel
+from hyrfpack.format.sections import (
+    COLORS,
+    GEOMETRY_TABLE,
+    LOGITS,
+    MLPS,
+    OPACITIES,
+    POSITIONS,
+    RADIANCE_TABLE,
+    SCALES,
+    TABLES,
+)
+from hyrfpack.model import Decoded, HybridModel
 from hyrfpack.parallel.pool import side_by_side
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, evenly_spaced
@@ -42,6 +52,7 @@ PARTS: tuple[Part, ...] = ((POSITIONS,), (COLORS,), (SCALES, OPACITIES), *zip(TA
 # Powers of found over foretold by which sensitivities are corrected. Errors of small independent numbers fall with the
 # square of their steps: 1. Those of swapped orders fall with the step: up to 2. What is pruned adds up: from 1/2.
 LAWS: dict[Part, float] = {(POSITIONS,): 1.5, (PRUNED,): 0.7}
+LEAST_LAW, MOST_LAW = 0.25, 3.0  # that two factors are believed to tell: those near each other may tell anything
 
 
 @dataclass
@@ -49,10 +60,11 @@ class Factor:
     """What a part's sensitivities are multiplied by, searched for.
 
     Attributes:
-        law: the power of found over foretold to go on by.
+        law: the power of found over foretold to go on by, until two factors tell it.
         value: the factor to be tried.
         low, high: the greatest that was seen to be too small, and the least that was seen not to be.
         done: whether errors are foretold well enough.
+        tried: the factor tried last, and its error found over that foretold.
     """
 
     law: float
@@ -60,9 +72,15 @@ class Factor:
     low: float = 0.0
     high: float = np.inf
     done: bool = False
+    tried: tuple[float, float] | None = None
 
     def correct(self, ratio: float) -> None:
         """Go on, by the error found over the error foretold with `value`."""
+        if self.tried is not None and ratio > 0:  # a secant, of logarithms
+            value, before = self.tried
+            told = np.log(self.value / value) / (np.log(before / ratio) or np.inf)
+            self.law = float(told) if LEAST_LAW < told < MOST_LAW else self.law
+        self.tried = (self.value, ratio) if ratio > 0 else None
         if ratio > 1:
             self.low = max(self.low, self.value)
         else:
@@ -113,9 +131,14 @@ class Originals:
         """A model's pictures from these views."""
         return cls(views, _pictures(model, views))
 
-    def error(self, model: HybridModel) -> float:
-        """Mean squared difference of colours in the median view: in a single one a Gaussian may come too close."""
-        pairs = zip(_pictures(model, self.views), self.pictures, strict=True)
+    def error(self, model: HybridModel, decoded: Decoded | None = None) -> float:
+        """Mean squared difference of colours in the median view: in a single one a Gaussian may come too close.
+
+        Args:
+            model: whose pictures are compared.
+            decoded: what `decode` says of it, where that is known.
+        """
+        pairs = zip(_pictures(model, self.views, decoded), self.pictures, strict=True)
         return float(np.median([float((mine - theirs).square().mean()) for mine, theirs in pairs]))
 
 
@@ -148,20 +171,22 @@ def calibrate(
     Raises:
         HyrfError: a parameter is NaN or infinite.
     """
-    each = of_each_number(model, distortion)
+    each, decoded = of_each_number(model, distortion), model.decode()
 
     # Pruning first: what the others do depends on what is left.
     def without_pruned(scaled: Sensitivity, _: list[Part]) -> dict[Part, Tried]:
         removals = removal_error(model, scaled)
         kept = worth_keeping(removals, each)
-        return {(PRUNED,): Tried(originals.error(_part(model, kept)), float(np.delete(removals, kept).sum()))}
+        index = torch.as_tensor(kept, device=decoded.geometry.scales.device)
+        found = originals.error(model.part(index), decoded[index])
+        return {(PRUNED,): Tried(found, float(np.delete(removals, kept).sum()))}
 
     if prune:
         sensitivity = _corrected(sensitivity, ((PRUNED,),), distortion, without_pruned)
     kept = worth_keeping(removal_error(model, sensitivity), each) if prune else np.arange(len(model))
-    left = _part(model, kept)
-    whole = Originals.seen(originals.views, left)
-
+    index = torch.as_tensor(kept, device=model.gaussians.positions.device)
+    left, decoded = model.part(index), decoded[index]
+    whole = Originals(originals.views, _pictures(left, originals.views, decoded))
     placed: tuple[np.ndarray, Plan, HybridModel] | None = None
 
     def as_stored(scaled: Sensitivity, parts: list[Part]) -> dict[Part, Tried]:
@@ -172,12 +197,15 @@ def calibrate(
         _, plan, planned = placed
         quantized = quantize(planned, plan, scaled, sections=[name for part in parts for name in part])
         told, stored = _added(planned, quantized, scaled), quantized.arrays()
-        there = model.gaussians.positions.detach().cpu().numpy()[plan.kept]
+        # In the order of those that are left, so that what they decode to but for the part that changes serves again.
+        order = np.argsort(plan.kept)
+        stored = {name: values[order] if name in LOGITS else values for name, values in stored.items()}
 
         def found(part: Part) -> float:
             if part == (POSITIONS,):
                 return whole.error(planned)
-            return whole.error(_changed(planned, {name: stored[name] for name in part} | {POSITIONS: there}))
+            changed = _changed(left, {name: stored[name] for name in part})
+            return whole.error(changed, _decoded_anew(changed, decoded, part))
 
         return {part: Tried(found(part), sum(told[name] for name in part)) for part in parts}
 
@@ -238,10 +266,6 @@ def _corrected(
     return scaled({part: factor.final for part, factor in factors.items()})
 
 
-def _part(model: HybridModel, kept: np.ndarray) -> HybridModel:
-    return model.part(torch.as_tensor(kept, device=model.gaussians.positions.device))
-
-
 def _changed(model: HybridModel, arrays: dict[str, np.ndarray]) -> HybridModel:
     """A model with other numbers in some sections."""
     changed = deepcopy(model)
@@ -249,9 +273,18 @@ def _changed(model: HybridModel, arrays: dict[str, np.ndarray]) -> HybridModel:
     return changed
 
 
+def _decoded_anew(model: HybridModel, before: Decoded, part: Part) -> Decoded:
+    """What a model decodes to, by what it did before these of its sections changed."""
+    if GEOMETRY_TABLE in part or OPACITIES in part:
+        return replace(before, geometry=model.decode_geometry())
+    if before.shading is None or RADIANCE_TABLE in part:
+        return replace(before, shading=None if before.shading is None else model.shading())
+    return replace(before, shading=replace(before.shading, color_logits=model.gaussians.color_logits.detach()))
+
+
 @torch.no_grad()
-def _pictures(model: HybridModel, cameras: Sequence[Camera]) -> list[Tensor]:
-    decoded = model.decode()
+def _pictures(model: HybridModel, cameras: Sequence[Camera], decoded: Decoded | None = None) -> list[Tensor]:
+    decoded = decoded or model.decode()
 
     @torch.no_grad()  # of this thread
     def picture(camera: Camera) -> Tensor:
