@@ -140,8 +140,15 @@ def test_types_and_implementations_that_do_not_fit_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("points", "viewpoint", "encoding"), [((4, 3), (3,), "none"), ((4, 2), (3,), "sh"), ((4, 3), (4, 3), "sh")]
+    ("points", "viewpoint", "encoding"), [((4, 3), (3,), "none"), ((4, 2), (3,), "sh"), ((4, 3), (5, 3), "sh")]
 )
 def test_what_does_not_fit_together_is_refused(points: tuple, viewpoint: tuple, encoding: str) -> None:
     with pytest.raises(ValueError, match="encoding '"):
         encode_views(torch.zeros(points), torch.zeros(viewpoint), encoding)
+
+
+def test_each_point_may_be_seen_from_a_place_of_its_own() -> None:
+    points, places = torch.randn(2, 5, 3, generator=torch.Generator().manual_seed(0))
+    found = encode_views(points, places, "sh")
+    expected = torch.cat([encode_views(points[i : i + 1], places[i], "sh") for i in range(5)])
+    torch.testing.assert_close(found, expected)

@@ -61,10 +61,10 @@ def encode_views(points: Tensor, viewpoint: Tensor, encoding: str, *, implementa
 
     Args:
         points: (N, 3) p.
-        viewpoint: (3,) o, in the same units.
+        viewpoint: (3,) o, in the same units, or (N, 3), one for each point.
         encoding: "sh" or "frequency", see `encode_directions`.
-        implementation: "auto", "reference" or "gpu" (float32), which has no backward pass and is offered where no
-            gradient is wanted.
+        implementation: "auto", "reference" or "gpu" (float32, one viewpoint), which has no backward pass and is
+            offered where no gradient is wanted.
 
     Returns:
         (N, E), see `DIRECTION_FEATURES`. A point at the viewpoint itself is seen along (0, 0, 0).
@@ -76,10 +76,16 @@ def encode_views(points: Tensor, viewpoint: Tensor, encoding: str, *, implementa
         >>> encode_views(torch.tensor([[0.0, 0.0, 5.0]]), torch.zeros(3), "sh").shape
         torch.Size([1, 9])
     """
-    if points.shape[1:] != (3,) or viewpoint.shape != (3,) or encoding not in DIRECTION_FEATURES:
+    single = viewpoint.shape == (3,)
+    if (
+        points.shape[1:] != (3,)
+        or not (single or viewpoint.shape == points.shape)
+        or encoding not in DIRECTION_FEATURES
+    ):
         raise ValueError(f"points {tuple(points.shape)} from {tuple(viewpoint.shape)}, encoding '{encoding}'")
     wanted = torch.is_grad_enabled() and (points.requires_grad or viewpoint.requires_grad)
-    if choose(implementation, ("reference",) if wanted else ("reference", "gpu"), points, viewpoint) == "gpu":
+    available = ("reference", "gpu") if single and not wanted else ("reference",)
+    if choose(implementation, available, points, viewpoint) == "gpu":
         from hyrfpack.ops.shade import gpu_directions
 
         return gpu_directions.encode_views(points, viewpoint, encoding)
