@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 import torch
 from scenes import ball_points, ring, small_model
 
-from hyrfpack.compress.calibrate import Originals, calibrate, foretold
+from hyrfpack.compress.calibrate import (
+    CLOSE,
+    PARTS,
+    ROUNDS,
+    Factor,
+    Originals,
+    _decoded_anew,
+    calibrate,
+    foretold,
+)
 from hyrfpack.compress.plan import make_plan, removal_error
 from hyrfpack.compress.quantize import decide
 from hyrfpack.compress.sensitivity import PRUNED, Sensitivity, measure_sensitivity
 from hyrfpack.format import decode_model, encode_model
+from hyrfpack.format.arrays import by_parameter, to_arrays
 from hyrfpack.format.sections import COLORS, OPACITIES, POSITIONS
 from hyrfpack.model import HybridModel
 
@@ -139,3 +151,52 @@ def test_one_and_two_cameras_will_do(count, model, first_order):
 
     assert all(np.isfinite(values).all() for values in (calibrated.positions, calibrated.colors))
     assert COLORS not in calibrated.fields
+
+
+# -- the search --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("at_first", [7.0, 3.0, 0.2])
+@pytest.mark.parametrize("power", [0.6, 1.0, 1.4, 2.0])
+@pytest.mark.parametrize("law", [0.7, 1.0, 1.5])
+def test_errors_that_fall_by_any_power_are_met_in_three_tries(law, power, at_first):
+    factor, tries = Factor(law), 0
+    while not factor.done:
+        factor.correct(at_first * factor.value**-power)
+        tries += 1
+    assert tries <= 3 and at_first * factor.final**-power < CLOSE
+
+
+def test_errors_that_jump_are_bracketed():
+    factor = Factor(0.7)
+    for _ in range(20):
+        if factor.done:
+            break
+        factor.correct(3.0 if factor.value < 5 else 0.1)
+    assert factor.done and 5 <= factor.final < 5 * CLOSE
+
+
+@pytest.mark.parametrize("ratio", [0.0, 1.0])
+def test_errors_that_do_not_change_end_no_search_badly(ratio):
+    factor = Factor(1.0)
+    for _ in range(ROUNDS):
+        factor.correct(ratio)
+        assert np.isfinite(factor.final) and factor.final >= 0
+
+
+@pytest.mark.parametrize("part", PARTS[1:], ids="".join)
+@pytest.mark.parametrize("says", [0.2, 0.0])
+def test_what_a_part_does_not_change_need_not_be_decoded_anew(part, says):
+    before = layers(200)
+    if not says:  # a decoder of colours that says nothing
+        before.radiance.weights[-1].data.zero_(), before.radiance.biases[-1].data.zero_()
+    changed = deepcopy(before)
+    arrays = to_arrays(before)
+    generator = np.random.default_rng(0)
+    other = {name: arrays[name] * generator.uniform(0.5, 1.5, arrays[name].shape).astype(np.float32) for name in part}
+    changed.load_state_dict(dict(by_parameter(other, changed)), strict=False)
+
+    found = Originals.of(before, CAMERAS).error(changed, _decoded_anew(changed, before.decode(), part))
+
+    expected = Originals.of(before, CAMERAS).error(changed)
+    assert found == pytest.approx(expected, rel=1e-3) and (expected > 1e-7 or not says)
