@@ -55,8 +55,8 @@ def render_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> 
         exact, others = values[0], sorted({*values[1:], default})
         tried = {in_words(value): pictures(replace(defaults, **{name: value})) for value in (exact, *others)}
         yield from _compare(subject, name, tried, in_words(default), repeats)
-    tried = {"decoded for each view": pictures(defaults, keep=False), "decoded once": pictures(defaults)}
-    yield from _compare(subject, "geometry", tried, "decoded once", repeats)
+    tried = {"for each view": pictures(defaults, keep=False), "once": pictures(defaults)}
+    yield from _compare(subject, "decoding", tried, "once", repeats)
     other = copy.copy(model)
     other.config = replace(model.config, antialiased=not model.config.antialiased)
     words = ["on" if one.config.antialiased else "off" for one in (model, other)]

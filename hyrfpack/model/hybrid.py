@@ -116,7 +116,10 @@ class HybridModel(nn.Module):
 
     @torch.no_grad()
     def decode(self) -> Decoded:
-        """What does not depend on the view, of all Gaussians: for many views of a model that does not change."""
+        """What does not depend on the view, of all Gaussians: for many views of a model that does not change.
+
+        Takes 4 (hidden + 8) bytes a Gaussian; on a GPU, where precision is mixed, 2 hidden + 32.
+        """
         gains = self.gaussians.positions.device.type in ("cpu", "cuda") and not self.radiance.silent
         return Decoded(self.decode_geometry(), self.shading() if gains else None)
 

@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import os
 import re
+import signal
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
+from threading import Thread
 from typing import TypeVar, cast
 
 import torch
@@ -161,6 +164,8 @@ def joined(environment: Mapping[str, str] | None = None) -> Iterator[Ranks]:
             f"torch {torch.__version__} was built without gloo, by which processes talk; install another build of it, "
             "or start one process"
         )
+    if "TORCHELASTIC_RUN_ID" in environment:
+        _stop_with_launcher()
     os.environ.setdefault("HYRFPACK_THREADS", str(max(1, cores() // ranks.local_size)))
     address, port = meeting_point(environment)
     devices = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and dist.is_nccl_available() else "gloo"
@@ -182,6 +187,21 @@ def joined(environment: Mapping[str, str] | None = None) -> Iterator[Ranks]:
         yield ranks
     finally:
         dist.destroy_process_group()
+
+
+def _stop_with_launcher() -> None:
+    """Be asked to stop when torchrun's launcher is killed, which then can tell nobody.
+
+    Looked for, because Linux's own signal of a parent's death comes once for each of the parent's threads.
+    """
+    launcher = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == launcher:
+            time.sleep(1)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    Thread(target=watch, daemon=True).start()
 
 
 def ranks_told_by(environment: Mapping[str, str]) -> Ranks:

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -293,6 +297,43 @@ def ended(*words: object, folder: Path, code: int) -> tuple[str, str]:
         process.wait()
     assert process.returncode == code, errors
     return output, errors
+
+
+def children(process: int) -> list[int]:
+    return [int(word) for word in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
+
+
+def until(happened: Callable[[], bool], seconds: float = 60) -> bool:
+    end = time.monotonic() + seconds
+    while not happened() and time.monotonic() < end:
+        time.sleep(0.05)
+    return happened()
+
+
+@needs_ranks
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+def test_processes_stop_when_their_launcher_is_killed(data, tmp_path):
+    checkpoint = tmp_path / "run" / "checkpoint.pt"
+    words = ["train", data, "-o", checkpoint.parent, "--processes", 2, "--steps", 4000, "--max-gaussians", 50]
+    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": paths, "HYRFPACK_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    with (tmp_path / "said").open("w") as said:
+        command = [sys.executable, "-m", "hyrfpack", *map(str, words)]
+        launcher = subprocess.Popen(command, env=environment, stdout=said, stderr=said)
+    workers: list[int] = []
+    try:
+        assert until(checkpoint.exists), (tmp_path / "said").read_text()
+        workers, before = children(launcher.pid), checkpoint.stat().st_mtime_ns
+        launcher.kill()
+        launcher.wait()
+        assert until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers), 30)
+    finally:
+        launcher.kill()
+        launcher.wait()
+        for worker in workers:
+            with suppress(ProcessLookupError):
+                os.kill(worker, signal.SIGKILL)
+    assert len(workers) == 2 and checkpoint.stat().st_mtime_ns > before  # saved on the way out
 
 
 @pytest.fixture(scope="module")
