@@ -156,7 +156,12 @@ def compress(
     total = sum(trial.errors.values())
     shares = {part: error / (total or 1.0) for part, error in trial.errors.items()}
     return dataclasses.replace(
-        report, shares=shares, error=trial.error or total, found=found, finetuned=finetune_steps > 0
+        report,
+        shares=shares,
+        error=trial.error or total,
+        found=found,
+        finetuned=finetune_steps > 0,
+        sensitivity=sensitivity,
     )
 
 

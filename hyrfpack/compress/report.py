@@ -20,6 +20,7 @@ from hyrfpack.compress.distortion import LIMITS, default_distortion
 from hyrfpack.compress.quantize import decide
 from hyrfpack.compress.report_page import FILES, PAGE, PLOT, SHOWN, Findings, Point, ShownView, page, picture_names
 from hyrfpack.compress.report_plot import draw
+from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import Evaluation, evaluate
 from hyrfpack.evaluate.metrics import psnr, to_8bit
@@ -36,7 +37,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
 from hyrfpack.render.files import save_picture, to_image
-from hyrfpack.scene import Camera, Picture, Scene, View, evenly_spaced
+from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 
 FACTORS = (1 / 16, 1 / 4, 1, 4, 16)  # of the file's distortion, for the curve
 LARGE = 200_000  # Gaussians from which on the curve takes the middle three alone
@@ -89,10 +90,13 @@ def write_report(
     profiles = _profiles(model, provenance, report.profile)
     curve = {}
     if len(model):
-        cameras = Capture(describe(source), scene).cameras
+        distortion = _distortion(facts, model, provenance)
+        sensitivity = report.sensitivity
+        if sensitivity is None:
+            sensitivity, _ = calibrated(model, Capture(describe(source), scene).cameras, distortion)
         # The file itself stands for the one of its distortion, unless it was fine-tuned, and so is off the curve.
         itself = data if report.profile == "compact" and not report.finetuned else None
-        curve = _finer_and_coarser(model, provenance, cameras, _distortion(facts, model, provenance), itself)
+        curve = _finer_and_coarser(model, provenance, sensitivity, distortion, itself)
     same = [name for name, other in curve.items() if other is data]
     files = {CHOSEN: data, **profiles, **{name: other for name, other in curve.items() if name not in same}}
     points, decoded = _measured(files, scored)
@@ -154,10 +158,9 @@ def _profiles(model: HybridModel, provenance: dict, done: str) -> dict[str, byte
 
 
 def _finer_and_coarser(
-    model: HybridModel, provenance: dict, cameras: Sequence[Camera], distortion: float, same: bytes | None
+    model: HybridModel, provenance: dict, sensitivity: Sensitivity, distortion: float, same: bytes | None
 ) -> dict[str, bytes]:
     """The model in profile "compact", finest first; `same` is the file of this distortion, where there is one."""
-    sensitivity, _ = calibrated(model, cameras, distortion)
     files = {}
     for factor in FACTORS if len(model) < LARGE else FACTORS[1:-1]:
         if factor == 1 and same is not None:

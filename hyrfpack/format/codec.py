@@ -53,6 +53,8 @@ class CompressionReport:
             not drawn.
         found: in words, what a search came to.
         finetuned: of "compact": whether its numbers were fitted to photos.
+        sensitivity: of "compact": what each number does to pictures (`hyrfpack.compress.sensitivity.Sensitivity`), by
+            which it was packed; kept so that a page about the file need not measure it again.
     """
 
     profile: str
@@ -64,6 +66,7 @@ class CompressionReport:
     error: float | None = None
     found: str = ""
     finetuned: bool = False
+    sensitivity: Any = field(default=None, repr=False, compare=False)
 
 
 def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | None = None, **settings: Any) -> bytes:

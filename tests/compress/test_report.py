@@ -14,6 +14,7 @@ from scenes import ball_points, ball_scene, ring, small_model
 
 from hyrfpack.cameras.capture import kept_cameras
 from hyrfpack.compress import compress
+from hyrfpack.compress.calibrate import calibrated
 from hyrfpack.compress.report import amplification, write_report
 from hyrfpack.compress.report_page import size_in_words
 from hyrfpack.errors import HyrfError
@@ -108,6 +109,19 @@ def reported(
 @pytest.fixture(scope="module")
 def with_photos(source, scene, tmp_path_factory) -> tuple[Path, CompressionReport, Page]:
     return reported(source, tmp_path_factory.mktemp("photos"), scene=scene, distortion=1e-4)
+
+
+@pytest.mark.parametrize(("profile", "measured"), [("compact", 0), ("paper", 1)])
+def test_what_packing_has_measured_is_not_measured_again(profile, measured, source, tmp_path, monkeypatch):
+    asked = []
+
+    def spy(*args: object) -> object:
+        asked.append(args)
+        return calibrated(*args)
+
+    monkeypatch.setattr("hyrfpack.compress.report.calibrated", spy)
+    reported(source, tmp_path, profile)
+    assert len(asked) == measured
 
 
 # -- the page as a file ----------------------------------------------------------------------------------------------
