@@ -133,7 +133,7 @@ class HybridModel(nn.Module):
             mlp(field.grid(self.cube_coords(some)), [weight[:, :places]], [bias], mixed=self._mixed)
             for some in explicit.positions.split(SHADED_AT_ONCE)
         ]
-        first = torch.cat(rows)
+        first = rows[0] if len(rows) == 1 else torch.cat(rows)  # which would copy
         return Shading(
             first.bfloat16() if self._mixed else first,
             weight[:, places:].contiguous(),
