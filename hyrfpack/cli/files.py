@@ -307,7 +307,7 @@ def _scores(before: Path, after: Path, scene: Scene | None) -> dict[str, float]:
 
 def _print_report(path: Path, report: CompressionReport, scores: dict[str, float], as_json: bool) -> None:
     if as_json:
-        print_json({"file": str(path), **asdict(report), **scores})
+        print_json({"file": str(path), **report.to_dict(), **scores})
         return
     sections = [asdict(part) for part in report.sections]
     click.echo(_section_table(sections, report.bytes_after, report.gaussians, report.shares))

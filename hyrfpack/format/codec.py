@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -67,6 +67,12 @@ class CompressionReport:
     found: str = ""
     finetuned: bool = False
     sensitivity: Any = field(default=None, repr=False, compare=False)
+
+    def to_dict(self) -> dict:
+        """All but the sensitivity, as plain numbers, strings, lists and dictionaries, ready for JSON."""
+        values = asdict(replace(self, sensitivity=None))
+        del values["sensitivity"]
+        return values
 
 
 def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | None = None, **settings: Any) -> bytes:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -120,8 +121,12 @@ def test_what_packing_has_measured_is_not_measured_again(profile, measured, sour
         return calibrated(*args)
 
     monkeypatch.setattr("hyrfpack.compress.report.calibrated", spy)
-    reported(source, tmp_path, profile)
+    _, report, _ = reported(source, tmp_path, profile)
     assert len(asked) == measured
+    assert (report.sensitivity is None) == bool(measured)
+    assert set(json.loads(json.dumps(report.to_dict()))) == {f.name for f in dataclasses.fields(report)} - {
+        "sensitivity"
+    }
 
 
 # -- the page as a file ----------------------------------------------------------------------------------------------
