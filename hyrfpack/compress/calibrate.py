@@ -127,9 +127,9 @@ class Originals:
         return cls.seen([*near, *views_between(near, seed)], model)
 
     @classmethod
-    def seen(cls, views: list[Camera], model: HybridModel) -> Originals:
-        """A model's pictures from these views."""
-        return cls(views, _pictures(model, views))
+    def seen(cls, views: list[Camera], model: HybridModel, decoded: Decoded | None = None) -> Originals:
+        """A model's pictures from these views; `decoded` as in `error`."""
+        return cls(views, _pictures(model, views, decoded))
 
     def error(self, model: HybridModel, decoded: Decoded | None = None) -> float:
         """Mean squared difference of colours in the median view: in a single one a Gaussian may come too close.
@@ -186,7 +186,7 @@ def calibrate(
     kept = worth_keeping(removal_error(model, sensitivity), each) if prune else np.arange(len(model))
     index = torch.as_tensor(kept, device=model.gaussians.positions.device)
     left, decoded = model.part(index), decoded[index]
-    whole = Originals(originals.views, _pictures(left, originals.views, decoded))
+    whole = Originals.seen(originals.views, left, decoded)
     placed: tuple[np.ndarray, Plan, HybridModel] | None = None
 
     def as_stored(scaled: Sensitivity, parts: list[Part]) -> dict[Part, Tried]:
@@ -277,8 +277,10 @@ def _decoded_anew(model: HybridModel, before: Decoded, part: Part) -> Decoded:
     """What a model decodes to, by what it did before these of its sections changed."""
     if GEOMETRY_TABLE in part or OPACITIES in part:
         return replace(before, geometry=model.decode_geometry())
-    if before.shading is None or RADIANCE_TABLE in part:
-        return replace(before, shading=None if before.shading is None else model.shading())
+    if before.shading is None:
+        return before
+    if RADIANCE_TABLE in part:
+        return replace(before, shading=model.shading())
     return replace(before, shading=replace(before.shading, color_logits=model.gaussians.color_logits.detach()))
 
 

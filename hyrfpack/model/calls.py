@@ -19,7 +19,7 @@ from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.rasterize import Rasterization, rasterize
-from hyrfpack.ops.shade import encode_directions
+from hyrfpack.ops.shade import encode_views
 from hyrfpack.ops.ssim import photometric_loss
 
 Gradients = tuple[Tensor, ...]
@@ -181,8 +181,8 @@ def splat_inputs(model: HybridModel, viewpoint: Tensor) -> dict[str, Tensor]:
 def decoder_inputs(model: HybridModel, viewpoint: Tensor) -> Iterator[tuple[str, Field, Tensor]]:
     """Name, field and what its decoder reads (N, inputs) of all Gaussians seen from a point (3,) in local units."""
     positions = model.gaussians.positions.detach()
-    directions = torch.nn.functional.normalize(positions - viewpoint.to(positions), dim=-1, eps=1e-12)
-    extra = {"geometry": None, "radiance": encode_directions(directions, model.config.direction_encoding)}
+    seen = encode_views(positions, viewpoint.to(positions), model.config.direction_encoding)
+    extra = {"geometry": None, "radiance": seen}
     for name, field in fields(model):
         yield name, field, field.features(model.cube_coords(positions), extra[name])
 

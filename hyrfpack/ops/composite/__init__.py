@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from torch import Tensor
 
+from hyrfpack.ops.background import grid_size
 from hyrfpack.ops.composite import reference
 from hyrfpack.ops.dispatch import choose
 
@@ -37,8 +38,8 @@ def composite(rgb: Tensor, transmittance: Tensor, grid: Tensor, stride: int, *, 
         tensor([0.0000, 0.2500, 0.5000, 0.7500, 1.0000])
     """
     height, width = transmittance.shape
-    nodes = [-(-(size - 1) // stride) + 1 for size in (height, width)] if stride >= 1 else None
-    if nodes is None or rgb.shape != (height, width, 3) or grid.shape != (*nodes, 3):
+    fits = stride >= 1 and grid.shape == (*grid_size(height, width, stride), 3)
+    if not fits or rgb.shape != (height, width, 3):
         raise ValueError(
             f"a picture {tuple(rgb.shape)}, transmittance {(height, width)} and a grid {tuple(grid.shape)} at every "
             f"{stride}-th pixel do not fit together"

@@ -7,9 +7,15 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyrfpack.ops.rasterize.gpu_project import BLOCK, WARPS, camera_numbers, in_frustum, load_camera, load_rows_3
-
-_FINITE_MAX = tl.constexpr(3.4028234663852886e38)
+from hyrfpack.ops.rasterize.gpu_project import (
+    BLOCK,
+    WARPS,
+    camera_numbers,
+    in_frustum,
+    is_finite,
+    load_camera,
+    load_rows_3,
+)
 
 
 @triton.jit(do_not_specialize=["total"])
@@ -18,7 +24,7 @@ def look(positions, camera, total, inside, broken, BLOCK: tl.constexpr):
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = index < total
     x, y, z = load_rows_3(positions, index, live)
-    finite = (tl.abs(x) <= _FINITE_MAX) & (tl.abs(y) <= _FINITE_MAX) & (tl.abs(z) <= _FINITE_MAX)
+    finite = is_finite(x) & is_finite(y) & is_finite(z)
     tl.store(inside + index, in_frustum((x, y, z), load_camera(camera)).to(tl.uint8), mask=live)
     one = tl.full([BLOCK], 1, tl.int64)
     tl.store(broken + tl.zeros_like(index), one, mask=live & (finite == 0))  # all who write, write the same

@@ -343,7 +343,7 @@ def store_colors(records, index, drawn, color, depth):
 
 
 @triton.jit
-def _finite(a):
+def is_finite(a):
     return tl.abs(a) <= _FLOAT_MAX
 
 
@@ -356,17 +356,17 @@ def _flag(flags, bits):
 @triton.jit
 def flag_geometry(flags, mean, quat, scale, opacity):
     """Set a bit, in the order of NAMES, of the one int64 `flags` for each input that is not finite somewhere."""
-    means = _finite(mean[0]) & _finite(mean[1]) & _finite(mean[2])
-    quats = _finite(quat[0]) & _finite(quat[1]) & _finite(quat[2]) & _finite(quat[3])
-    scales = _finite(scale[0]) & _finite(scale[1]) & _finite(scale[2])
+    means = is_finite(mean[0]) & is_finite(mean[1]) & is_finite(mean[2])
+    quats = is_finite(quat[0]) & is_finite(quat[1]) & is_finite(quat[2]) & is_finite(quat[3])
+    scales = is_finite(scale[0]) & is_finite(scale[1]) & is_finite(scale[2])
     bits = tl.where(means, 0, 1) | tl.where(quats, 0, 2) | tl.where(scales, 0, 4)
-    _flag(flags, bits | tl.where(_finite(opacity), 0, 8))
+    _flag(flags, bits | tl.where(is_finite(opacity), 0, 8))
 
 
 @triton.jit
 def flag_colors(flags, color):
     """As `flag_geometry`, the last bit, for colours."""
-    _flag(flags, tl.where(_finite(color[0]) & _finite(color[1]) & _finite(color[2]), 0, 16))
+    _flag(flags, tl.where(is_finite(color[0]) & is_finite(color[1]) & is_finite(color[2]), 0, 16))
 
 
 @triton.jit(do_not_specialize=["total", "width", "height"])

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.shade.directions import encode_directions
+from hyrfpack.ops.shade.directions import encode_views
 from hyrfpack.parallel.pool import run_tasks, torch_on_one_thread
 
 if TYPE_CHECKING:
@@ -32,8 +32,7 @@ def shade(positions: Tensor, viewpoint: Tensor, shading: Shading, index: Tensor 
             return values[some] if index is None else values.index_select(0, index[some])
 
         with torch.no_grad():
-            directions = torch.nn.functional.normalize(take(positions) - viewpoint, dim=-1, eps=1e-12)
-            encoded = encode_directions(directions, shading.encoding)
+            encoded = encode_views(take(positions), viewpoint, shading.encoding, implementation="reference")
             hidden = torch.addmm(take(shading.first_layer), encoded, shading.direction_weight.T).relu_()
             hidden = torch.addmm(b2, hidden, w2.T).relu_()
             logits = torch.addmm(b3, hidden, w3.T).add_(take(shading.color_logits))
