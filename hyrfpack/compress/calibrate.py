@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.cameras.between import views_between
-from hyrfpack.compress.plan import make_plan, of_each_number, removal_error, worth_keeping
+from hyrfpack.compress.plan import make_plan, of_each_number, worth_keeping
 from hyrfpack.compress.quantize import opacity_error, quantize
 from hyrfpack.compress.sensitivity import PRUNED, Sensitivity, measure_sensitivity
 from hyrfpack.format.arrays import by_parameter, to_arrays
@@ -175,15 +175,14 @@ def calibrate(
 
     # Pruning first: what the others do depends on what is left.
     def without_pruned(scaled: Sensitivity, _: list[Part]) -> dict[Part, Tried]:
-        removals = removal_error(model, scaled)
-        kept = worth_keeping(removals, each)
+        kept = worth_keeping(scaled.removals, each)
         index = torch.as_tensor(kept, device=decoded.geometry.scales.device)
         found = originals.error(model.part(index), decoded[index])
-        return {(PRUNED,): Tried(found, float(np.delete(removals, kept).sum()))}
+        return {(PRUNED,): Tried(found, float(np.delete(scaled.removals, kept).sum()))}
 
     if prune:
         sensitivity = _corrected(sensitivity, ((PRUNED,),), distortion, without_pruned)
-    kept = worth_keeping(removal_error(model, sensitivity), each) if prune else np.arange(len(model))
+    kept = worth_keeping(sensitivity.removals, each) if prune else np.arange(len(model))
     index = torch.as_tensor(kept, device=model.gaussians.positions.device)
     left, decoded = model.part(index), decoded[index]
     whole = Originals.seen(originals.views, left, decoded)
@@ -216,7 +215,7 @@ def foretold(
     model: HybridModel, planned: HybridModel, quantized: Quantized, sensitivity: Sensitivity
 ) -> dict[str, float]:
     """What storing a model adds to the pictures' mean squared error, by section and by what is pruned; by estimate."""
-    removed = np.delete(removal_error(model, sensitivity), quantized.plan.kept)
+    removed = np.delete(sensitivity.removals, quantized.plan.kept)
     return {PRUNED: float(removed.sum()), **_added(planned, quantized, sensitivity)}
 
 

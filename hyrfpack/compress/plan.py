@@ -35,7 +35,7 @@ def make_plan(model: HybridModel, sensitivity: Sensitivity, distortion: float, p
         HyrfError: a parameter is NaN or infinite.
     """
     each = of_each_number(model, distortion)
-    kept = worth_keeping(removal_error(model, sensitivity), each) if prune else np.arange(len(model))
+    kept = worth_keeping(sensitivity.removals, each) if prune else np.arange(len(model))
     of_kept = sensitivity.of(kept)
     cube, classes = _cube(model), importance_classes(of_kept)
     bits = position_bits(of_kept.positions, classes, each)
@@ -60,7 +60,7 @@ def worth_keeping(removals: np.ndarray, each: float) -> np.ndarray:
     """Indices (n,), ascending, of the Gaussians that give more to pictures than they cost in bytes.
 
     Args:
-        removals: (N,) what leaving out each adds, see `removal_error`.
+        removals: (N,) what leaving out each adds, see `Sensitivity`.
         each: what each number may add, see `of_each_number`.
     """
     return np.flatnonzero(removals >= ERROR_PER_BIT * each * BITS_OF_A_GAUSSIAN)
@@ -143,17 +143,6 @@ def position_bits(sensitivity: np.ndarray, classes: np.ndarray, distortion: floa
         step = np.sqrt(12 * distortion / max(float(sensitivity[classes == kind].mean()), 1e-300))
         bits[kind] = np.clip(np.round(-np.log2(max(step, 2.0**-MAX_BITS))), 1, MAX_BITS)
     return bits
-
-
-@torch.no_grad()
-def removal_error(model: HybridModel, sensitivity: Sensitivity) -> np.ndarray:
-    """(N,) what leaving out each Gaussian adds to the pictures' mean squared error.
-
-    By the opacity o itself the sensitivity is s / (o (1 - o))^2, s being that by its logit.
-    """
-    opacities = model.decode_geometry().opacities.double().cpu().numpy()
-    by_opacity = sensitivity.opacities / np.maximum(opacities * (1 - opacities), 1e-4) ** 2
-    return sensitivity.removals * by_opacity * opacities**2
 
 
 def color_basis(colors: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import torch
 from hyrfpack.cameras.between import views_between
 from hyrfpack.format.arrays import GROUPS
 from hyrfpack.format.sections import COLORS, MLPS, OPACITIES, POSITIONS, SCALES, TABLES
-from hyrfpack.model import HybridModel, expand
+from hyrfpack.model import Geometry, HybridModel, expand
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, evenly_spaced
 
@@ -37,37 +37,36 @@ class Sensitivity:
         positions: (N,) by a coordinate in the contracted cube, mean of the three axes.
         colors: (N,) by a colour logit, mean of the three.
         scales, opacities: (N,) by the explicit logits.
+        removals: (N,) what leaving out a Gaussian adds to the mean squared error itself, see `removal_error`.
         fields: by the numbers of each hash table and decoder, laid out as in the file, by section.
-        removals: factor of what leaving out a Gaussian adds, to what its `opacities` say.
     """
 
     positions: np.ndarray
     colors: np.ndarray
     scales: np.ndarray
     opacities: np.ndarray
+    removals: np.ndarray
     fields: dict[str, np.ndarray]
-    removals: float = 1.0
 
     def of(self, index: np.ndarray | slice) -> Sensitivity:
         """That of the Gaussians at `index` (n,) int64, and of all fields."""
-        explicit = self.positions[index], self.colors[index], self.scales[index], self.opacities[index]
-        return Sensitivity(*explicit, self.fields, self.removals)
+        positions, colors, scales = self.positions[index], self.colors[index], self.scales[index]
+        return Sensitivity(positions, colors, scales, self.opacities[index], self.removals[index], self.fields)
 
     def times(self, factors: dict[str, float]) -> Sensitivity:
         """Each section's, and what is PRUNED, multiplied by its factor; 1 where there is none."""
-        positions, colors, scales, opacities = (
+        positions, colors, scales, opacities, removals = (
             values * factors.get(group, 1.0)
             for group, values in (
                 (POSITIONS, self.positions),
                 (COLORS, self.colors),
                 (SCALES, self.scales),
                 (OPACITIES, self.opacities),
+                (PRUNED, self.removals),
             )
         )
         fields = {group: values * factors.get(group, 1.0) for group, values in self.fields.items()}
-        # What an opacity weighs is no measure of a removal's own factor.
-        removals = self.removals * factors.get(PRUNED, 1.0) / factors.get(OPACITIES, 1.0)
-        return Sensitivity(positions, colors, scales, opacities, fields, removals)
+        return Sensitivity(positions, colors, scales, opacities, removals, fields)
 
 
 def measure_sensitivity(model: HybridModel, cameras: Sequence[Camera], seed: int = 0) -> Sensitivity:
@@ -121,6 +120,7 @@ def measure_sensitivity(model: HybridModel, cameras: Sequence[Camera], seed: int
     return _gathered(model, squares, pixels, field_pixels, near, stretch)
 
 
+@torch.no_grad()
 def _gathered(
     model: HybridModel,
     squares: dict[str, torch.Tensor],
@@ -129,7 +129,8 @@ def _gathered(
     cameras: Sequence[Camera],
     stretch: torch.Tensor,
 ) -> Sensitivity:
-    expected = _expected(model, cameras, stretch)
+    geometry = model.decode_geometry()
+    expected = _expected(model, geometry, cameras, stretch)
     views = len(cameras) * 2
     explicit = []
     for name, guess in expected.items():
@@ -149,7 +150,20 @@ def _gathered(
         size = sum(float(parameters[name].detach().double().square().sum()) for name in GROUPS[group])
         fields[group] = np.maximum(fields[group], max(LEAST * fields[group].mean(), WITHOUT / max(size, 1e-30)))
     positions, colors, scales, opacities = explicit
-    return Sensitivity(positions, colors, scales, opacities, fields)
+    removals = removal_error(geometry.opacities.double().cpu().numpy(), opacities)
+    return Sensitivity(positions, colors, scales, opacities, removals, fields)
+
+
+def removal_error(opacities: np.ndarray, by_logit: np.ndarray) -> np.ndarray:
+    """(N,) what leaving out each Gaussian adds to the pictures' mean squared error.
+
+    By the opacity o itself the sensitivity is s / (o (1 - o))^2, s being that by its logit.
+
+    Args:
+        opacities: (N,) in [0, 1].
+        by_logit: (N,) sensitivities by explicit opacity logits.
+    """
+    return by_logit / np.maximum(opacities * (1 - opacities), 1e-4) ** 2 * opacities**2
 
 
 def _local(model: HybridModel, measured: np.ndarray, guess: np.ndarray) -> np.ndarray:
@@ -173,13 +187,14 @@ def _stretch(model: HybridModel) -> torch.Tensor:
 
 
 @torch.no_grad()
-def _expected(model: HybridModel, cameras: Sequence[Camera], stretch: torch.Tensor) -> dict[str, np.ndarray]:
+def _expected(
+    model: HybridModel, geometry: Geometry, cameras: Sequence[Camera], stretch: torch.Tensor
+) -> dict[str, np.ndarray]:
     """(N,) each: what a Gaussian's numbers would do to pictures, up to a factor, if nothing stood before it.
 
     Each pixel under a Gaussian of opacity o and standard deviations a, b (the larger two) depends on its colour by o at
     most, and there are pi f^2 a b / z^2 of them; on its opacity logit by o (1 - o); on its place by o / (a b)^(1/2).
     """
-    geometry = model.decode_geometry()
     sides = geometry.scales.double().sort(dim=1).values
     area, opacities = sides[:, 1] * sides[:, 2], geometry.opacities.double()
     total = torch.zeros_like(area)

@@ -22,7 +22,7 @@ from hyrfpack.compress.plan import (
     position_bits,
 )
 from hyrfpack.compress.quantize import decide, quantize
-from hyrfpack.compress.sensitivity import Sensitivity
+from hyrfpack.compress.sensitivity import Sensitivity, removal_error
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import GROUPS, group_shapes, to_arrays, to_model
 from hyrfpack.format.compact import encode
@@ -61,6 +61,7 @@ def a_sensitivity(model: HybridModel, spread: float = 2.0, seed: int = 0) -> Sen
     explicit = [together * np.exp(rng.normal(size=len(model)) / 4) for _ in range(4)]
     return Sensitivity(
         *explicit,
+        removals=removal_error(model.decode_geometry().opacities.detach().double().numpy(), explicit[-1]),
         fields={group: draw(sizes[group]) for group in ("GTAB", "RTAB", "GMLP", "RMLP")},
     )
 
@@ -181,7 +182,7 @@ def test_more_distortion_allowed_prunes_more() -> None:
 @settings(max_examples=80, deadline=None)
 def test_classes_fall_with_the_mean_sensitivity(rows: list[tuple[float, ...]]) -> None:
     positions, colors, scales, opacities = np.array(rows).T
-    sensitivity = Sensitivity(positions, colors, scales, opacities, {})
+    sensitivity = Sensitivity(positions, colors, scales, opacities, opacities, {})
 
     classes = importance_classes(sensitivity)
 
@@ -201,7 +202,7 @@ def test_unseen_gaussians_are_in_the_last_class() -> None:
     seen = np.where(np.arange(50) < 25, 0.0, 1e-3)
 
     with np.errstate(divide="ignore"):
-        classes = importance_classes(Sensitivity(seen, seen, seen, seen, {}))
+        classes = importance_classes(Sensitivity(*[seen] * 5, {}))
 
     assert (classes[:25] == CLASSES - 1).all() and (classes[25:] < CLASSES - 1).all()
 
@@ -321,7 +322,7 @@ def test_opacities_are_kept_and_not_their_tails() -> None:
     with torch.no_grad():
         model.gaussians.opacity_logits[::3] = 300.0
         model.gaussians.opacity_logits[1::3] = -300.0
-        before = model.decode_geometry().opacities.double().numpy()
+        before = model.decode_geometry().opacities.detach().double().numpy()
     quantized = decided(model, 1e-9, prune=False)
     plan, planned = quantized.plan, quantized.plan.apply(model)
 
@@ -329,8 +330,8 @@ def test_opacities_are_kept_and_not_their_tails() -> None:
 
     assert np.abs(arrays["OPAC"]).max() < 30
     with torch.no_grad():
-        after = to_model(model.config, arrays).decode_geometry().opacities.double().numpy()
-        exact = planned.decode_geometry().opacities.double().numpy()
+        after = to_model(model.config, arrays).decode_geometry().opacities.detach().double().numpy()
+        exact = planned.decode_geometry().opacities.detach().double().numpy()
     assert np.abs(after - exact).max() < 0.01
     assert (after[before[plan.kept] > 0.999] > 0.99).all() and (after[before[plan.kept] < 0.001] < 0.01).all()
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from hyrfpack.compress import plan as planning
 from hyrfpack.compress.quantize import decide
-from hyrfpack.compress.sensitivity import Sensitivity
+from hyrfpack.compress.sensitivity import Sensitivity, removal_error
 from hyrfpack.format import encode_model
 from hyrfpack.format.arrays import decoder_widths, grids, to_arrays
 from hyrfpack.format.compact.quantized import Quantized
@@ -39,7 +39,8 @@ def drawn_sensitivity(model: HybridModel, seed: int = 0) -> Sensitivity:
     for group, widths in decoder_widths(model.config).items():
         count = sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(widths))
         fields[group] = DECODER / count * np.exp(SPREAD * rng.normal(size=count))
-    return Sensitivity(POSITIONS * shares, *[LOGITS * shares] * 3, fields)
+    removals = removal_error(model.decode_geometry().opacities.detach().double().numpy(), LOGITS * shares)
+    return Sensitivity(POSITIONS * shares, *[LOGITS * shares] * 3, removals, fields)
 
 
 def drawn(model: HybridModel, distortion: float = DISTORTION, prune: bool = True, layered: bool = False) -> Quantized:
@@ -53,7 +54,7 @@ def even(model: HybridModel, step: float) -> Quantized:
     arrays = to_arrays(model)
     ones = {group: np.ones(values.size) for group, values in arrays.items()}
     distortion = step**2 / 12 * sum(values.size for values in arrays.values())
-    return decide(model, Sensitivity(*np.ones((4, len(model))), ones), distortion, prune=False)
+    return decide(model, Sensitivity(*np.ones((5, len(model))), ones), distortion, prune=False)
 
 
 def encode(model: HybridModel, profile: str, provenance: dict | None = None, **settings: object) -> bytes:
