@@ -91,7 +91,8 @@ def hash_encode_runs(count: int, width: int, height: int) -> Iterator[Run]:
     from hyrfpack.model.hash_grid import HashGridConfig
     from hyrfpack.ops.hash_encode import hash_encode, level_offsets
 
-    resolutions, size = HashGridConfig(log2_table_size=10).resolutions, 10
+    # So coarse a level has copies of its gradient for so few points.
+    resolutions, size = HashGridConfig(log2_table_size=10, base=4).resolutions, 10
     table = torch.rand(level_offsets(resolutions, size)[-1], 2, requires_grad=True)
     coords = torch.rand(count, 3, requires_grad=True)
     # By columns as `mlp` hands gradients on, and by rows.

@@ -4,6 +4,10 @@ A program does a block of points on one level. Programs run level after level, s
 megabytes, stays in the L2 cache while all points read it. A row of the table (two float32) is fetched as one 64-bit
 number. Features and their gradients are planar, (2L, N), so that neighbouring threads write neighbouring numbers.
 
+Points add to the table's gradient by atomics, and a row takes one at a time: on a level of 8 vertices an axis a third
+of the points may share one. So coarse levels have several copies that blocks add to by turns, and that are summed at
+last.
+
 The cell is the floor of the rounded product coords * span, as in `reference.cells`: a product that goes to a floor
 cannot be fused into anything. The place within the cell, product - cell, may be fused; it is then off the reference's
 by the rounding of the product, and only there.
@@ -11,7 +15,9 @@ by the rounding of the product, and only there.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 
 import torch
 import triton
@@ -25,6 +31,8 @@ from hyrfpack.ops.hash_encode.reference import PRIME_Y, PRIME_Z, level_offsets
 # that a multiprocessor can hold have its 8 fetches under way.
 _POINTS = 256
 _WARPS = _POINTS // (64 if torch.version.hip else 32)
+_MOST_COPIES = 32
+_SUMMED = 512  # numbers that a program sums the copies of
 
 
 @triton.jit
@@ -84,9 +92,10 @@ def encode_level(coords, axis_stride, point_stride, table, levels, out, points, 
 
 @triton.jit(do_not_specialize=["points", "axis_stride", "feature_stride"])
 def scatter_level(
-    coords, axis_stride, point_stride, levels, grad, feature_stride, grad_stride, out, points, POINTS: tl.constexpr
-):
-    """Add the gradients of a block of points (axis 0) on a level (axis 1) to the table's gradient `out` (rows, 2)."""
+    coords, axis_stride, point_stride, levels, copies,
+    grad, feature_stride, grad_stride, out, points, POINTS: tl.constexpr,
+):  # fmt: skip
+    """Add the gradients of a block of points (axis 0) on a level (axis 1) to a copy of it in `out` (rows, 2)."""
     start, level = tl.program_id(0).to(tl.int64) * POINTS, tl.program_id(1)
     lane = tl.arange(0, POINTS)
     inside = lane < points - start
@@ -97,7 +106,9 @@ def scatter_level(
     x1, y1, z1, row_x0, row_x1, row_y0, row_y1, row_z0, row_z1, span, mask, offset = _cell(
         coords, axis_stride, point_stride, levels, level, start, lane, live
     )
-    out += offset * 2
+    copies += level * 3
+    copy = tl.program_id(0) % tl.load(copies + 1)
+    out += tl.where(copy == 0, offset, tl.load(copies + 2) + (copy - 1) * tl.load(copies)) * 2
     pair = tl.join(grad0, grad1)
     feature = tl.arange(0, 2)
     for corner in tl.static_range(8):
@@ -109,6 +120,22 @@ def scatter_level(
         tl.atomic_add(
             out + (row[:, None] * 2 + feature[None, :]), weight[:, None] * pair, mask=live[:, None], sem="relaxed"
         )
+
+
+@triton.jit
+def sum_copies(levels, copies, out, BLOCK: tl.constexpr):
+    """Add the other copies of a level (axis 1) to its rows in `out` (rows, 2), a block of numbers (axis 0)."""
+    level = tl.program_id(1)
+    rows, count = tl.load(copies + level * 3), tl.load(copies + level * 3 + 1)
+    lane = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mine = (lane < rows * 2) & (count > 1)
+    to = out + tl.load(levels + level * 5 + 4) * 2 + lane
+    total = tl.load(to, mask=mine, other=0.0)
+    other = out + tl.load(copies + level * 3 + 2) * 2 + lane
+    for _ in range(1, count):
+        total += tl.load(other, mask=mine, other=0.0)
+        other += rows * 2
+    tl.store(to, total, mask=mine)
 
 
 @triton.jit(do_not_specialize=["points", "axis_stride", "feature_stride", "out_axis_stride"])
@@ -173,6 +200,47 @@ def level_numbers(resolutions: tuple[int, ...], log2_table_size: int, device: to
     return torch.tensor(rows, device=device)
 
 
+@dataclass(frozen=True)
+class Copies:
+    """Where points add to a table's gradient.
+
+    Attributes:
+        numbers: (L, 3) int64 on the device: a level's rows, its copies, and the first row of the second one.
+        levels: up to the last that has several.
+        widest: rows of the largest that has several.
+        rows: of all, the table's own first.
+    """
+
+    numbers: Tensor
+    levels: int
+    widest: int
+    rows: int
+
+
+def copies_for(points: int, resolutions: tuple[int, ...], log2_table_size: int, device: torch.device) -> Copies:
+    """Copies of the levels that so many points, at least one, add to.
+
+    Of a level that has no more vertices than there are points as many as take no more rows than there are points, so
+    that they cost an eighth of the additions at most; of finer ones one, for few points share a row there.
+    """
+    return _copies(points.bit_length() - 1, resolutions, log2_table_size, device)
+
+
+@cache
+def _copies(log2_points: int, resolutions: tuple[int, ...], log2_table_size: int, device: torch.device) -> Copies:
+    """As `copies_for`, of a power of two: points of a view differ from step to step."""
+    offsets = level_offsets(resolutions, log2_table_size)
+    points, numbers, end, levels, widest = 1 << log2_points, [], offsets[-1], 0, 0
+    for level, (resolution, (first, last)) in enumerate(zip(resolutions, pairwise(offsets), strict=True)):
+        rows = last - first
+        copies = min(_MOST_COPIES, points // rows) if resolution**3 <= points else 1
+        numbers.append((rows, copies, end))
+        end += (copies - 1) * rows
+        if copies > 1:
+            levels, widest = level + 1, max(widest, rows)
+    return Copies(torch.tensor(numbers, device=device), levels, widest, end)
+
+
 def _blocks(points: int) -> int:
     return triton.cdiv(points, _POINTS)
 
@@ -214,23 +282,21 @@ def grad_table(
     two gradients on a level are zero adds nothing there.
     """
     points = coords.shape[0]
-    result = table.new_zeros(table.shape)
-    if points:
-        scatter_level[_blocks(points), len(resolutions)](
-            coords.detach(),
-            coords.stride(1),
-            coords.stride(0),
-            level_numbers(resolutions, log2_table_size, coords.device),
-            grad,
-            grad.stride(1),
-            grad.stride(0),
-            result,
-            points,
-            POINTS=_POINTS,
-            num_warps=_WARPS,
-            enable_fp_fusion=True,
+    if not points:
+        return table.new_zeros(table.shape)
+    levels = level_numbers(resolutions, log2_table_size, coords.device)
+    copies = copies_for(points, resolutions, log2_table_size, coords.device)
+    result = table.new_zeros(copies.rows, 2)
+    scatter_level[_blocks(points), len(resolutions)](
+        coords.detach(), coords.stride(1), coords.stride(0), levels, copies.numbers,
+        grad, grad.stride(1), grad.stride(0), result, points,
+        POINTS=_POINTS, num_warps=_WARPS, enable_fp_fusion=True,
+    )  # fmt: skip
+    if copies.levels:
+        sum_copies[triton.cdiv(2 * copies.widest, _SUMMED), copies.levels](
+            levels, copies.numbers, result, BLOCK=_SUMMED, num_warps=_WARPS
         )
-    return result
+    return result[: len(table)]
 
 
 def grad_coords(
