@@ -45,6 +45,9 @@ def _be_one_core() -> None:
 
 @cache
 def _executor(threads: int) -> ThreadPoolExecutor:
+    # A thread that torch has not asked for its number yet takes the one that was set last, in whatever thread: asked
+    # now, this one keeps its own.
+    torch.get_num_threads()
     return ThreadPoolExecutor(threads, thread_name_prefix="hyrfpack", initializer=_be_one_core)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -48,3 +51,14 @@ def test_the_first_error_is_raised() -> None:
 
 def test_torch_does_not_fan_out_inside_of_a_task() -> None:
     assert side_by_side(lambda _: torch.get_num_threads(), [0, 1]) == [1, 1]
+
+
+def test_torch_keeps_its_threads_outside_of_tasks() -> None:
+    """In a fresh process, where the pool's threads are the first that torch hears of."""
+    script = (
+        "import torch\nfrom hyrfpack.parallel.pool import run_tasks\n"
+        "run_tasks(lambda _: None, 8)\nprint(torch.get_num_threads())"
+    )
+    environment = os.environ | {"OMP_NUM_THREADS": "2", "HYRFPACK_THREADS": "2"}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
+    assert done.stdout == "2\n", done.stderr
