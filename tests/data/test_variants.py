@@ -14,10 +14,12 @@ from scenes import ball_points, photograph, ring
 from hyrfpack.data import load_scene
 from hyrfpack.scene import Camera, Scene
 from hyrfpack.splats.splats import quaternion_of
-from tools.safety.variants import VARIANTS, WorkingSet, try_variant
+from tools.safety.variants.attempt import try_variant
+from tools.safety.variants.catalog import VARIANTS
+from tools.safety.variants.working_set import WorkingSet
 
 WIDTH, HEIGHT = 64, 40
-# Each variant in one of its layouts, by turns; `tools/safety/variants.py` tries all of them on real sets.
+# Each variant in one of its layouts, by turns; `tools/safety/variants/` tries all of them on real sets.
 CASES = [(variant, variant.layouts[number % len(variant.layouts)]) for number, variant in enumerate(VARIANTS)]
 NEEDS = {".avif": "avif", ".jp2": "jpg_2000", ".webp": "webp"}
 
