@@ -91,13 +91,11 @@ class WorkingSet:
         for table in ("rigs", "frames"):
             (self.model / f"{table}{'.txt' if text else '.bin'}").unlink(missing_ok=True)
 
-    def encode(
-        self, ending: str, change: Callable[[Image.Image], Image.Image] = lambda image: image, **options
-    ) -> None:
+    def encode(self, ending: str, **options) -> None:
         """Replace photo files by re-encoded ones."""
         for file in self.photos:
             with Image.open(file) as image:
-                picture = change(image.convert("RGBA" if "A" in image.getbands() else "RGB"))
+                picture = image.convert("RGBA" if "A" in image.getbands() else "RGB")
             file.unlink()
             if ending.lower() in (".jpg", ".jpeg", ".bmp", ".heic"):
                 picture = picture.convert("RGB")
