@@ -16,21 +16,40 @@ _NEAREST = 3  # neighbours that a camera is moved towards
 _TURN = 10.0  # what a turn by a radian counts as in finding them, in median distances between neighbours
 
 
-def views_between(cameras: Sequence[Camera], seed: int = 0) -> list[Camera]:
+def views_at_and_between(cameras: Sequence[Camera], count: int, seed: int = 0) -> tuple[list[Camera], list[Camera]]:
+    """A few views that stand for all that a scene is looked at from: `count` cameras at most, and as many between.
+
+    They lie in the middle of equal parts of all cameras: the first and the last, where a way around the scene begins
+    and ends, stand for the fewest. Those between are on the way to a neighbour among all cameras, see `views_between`.
+    """
+    count = min(count, len(cameras))
+    places = [(2 * part + 1) * len(cameras) // (2 * count) for part in range(count)]
+    return [cameras[place] for place in places], views_between(cameras, seed, places)
+
+
+def views_between(cameras: Sequence[Camera], seed: int = 0, some: Sequence[int] | None = None) -> list[Camera]:
     """For each camera one on the way to a neighbour that looks the same way, with a wider picture.
 
     What held-out photos see lies between the photos and just beside them.
+
+    Args:
+        cameras: among which neighbours are looked for.
+        seed: of the neighbours and of how far it is on the way to them.
+        some: indices of the cameras that a view is made for; None for all.
     """
+    some = range(len(cameras)) if some is None else some
     if len(cameras) < 2:
-        return list(cameras)
+        return [cameras[index] for index in some]
     rng = np.random.default_rng(seed)
     places = np.array([camera.position for camera in cameras])
     turns = Rotation.from_matrix(np.array([camera.rotation for camera in cameras]))
-    apart = np.linalg.norm(places[:, None] - places, axis=2) + np.diag(np.full(len(places), np.inf))
+    apart = np.linalg.norm(places[list(some), None] - places, axis=2)
+    apart[np.arange(len(some)), list(some)] = np.inf  # from itself
     unit = float(np.median(apart.min(axis=1))) or 1.0
     made = []
-    for index, camera in enumerate(cameras):
-        cost = apart[index] + _TURN * unit * (turns[index].inv() * turns).magnitude()
+    for row, index in enumerate(some):
+        camera = cameras[index]
+        cost = apart[row] + _TURN * unit * (turns[index].inv() * turns).magnitude()
         other = np.argsort(cost, kind="stable")[rng.integers(min(_NEAREST, len(cameras) - 1))]
         share = rng.uniform(0.25, 0.75)
         turn = Slerp((0, 1), Rotation.concatenate([turns[index], turns[other]]))(share).as_matrix()

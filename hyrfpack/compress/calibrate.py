@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.cameras.between import views_between
+from hyrfpack.cameras.between import views_at_and_between
 from hyrfpack.compress.plan import make_plan, of_each_number, worth_keeping
 from hyrfpack.compress.quantize import opacity_error, quantize
 from hyrfpack.compress.sensitivity import PRUNED, Sensitivity, measure_sensitivity
@@ -38,10 +38,10 @@ from hyrfpack.format.sections import (
 from hyrfpack.model import Decoded, HybridModel
 from hyrfpack.parallel.pool import side_by_side
 from hyrfpack.render import render
-from hyrfpack.scene import Camera, evenly_spaced
+from hyrfpack.scene import Camera
 
-DRAWN = 120_000  # Gaussians drawn in the views of one comparison, about
-FEWEST, MOST = 4, 6  # views of it
+DRAWN = 1_000_000  # Gaussians drawn in the views of one comparison, about
+FEWEST, MOST = 6, 10  # views of it, half of them at cameras
 ROUNDS = 5  # of correcting
 CLOSE = 1.2  # factor within which the largest parts shall be foretold
 MINOR = 0.03  # share of the distortion below which a part is left as it is
@@ -123,8 +123,8 @@ class Originals:
     def of(cls, model: HybridModel, cameras: Sequence[Camera], seed: int = 1) -> Originals:
         """Of a model: half at some of its cameras, half between them."""
         count = int(np.clip(DRAWN // max(len(model), 1), FEWEST, MOST)) // 2
-        near = evenly_spaced(cameras, count)
-        return cls.seen([*near, *views_between(near, seed)], model)
+        at, between = views_at_and_between(cameras, count, seed)
+        return cls.seen([*at, *between], model)
 
     @classmethod
     def seen(cls, views: list[Camera], model: HybridModel, decoded: Decoded | None = None) -> Originals:

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from hyrfpack.cameras.between import views_between
+from hyrfpack.cameras.between import views_at_and_between
 from hyrfpack.format.arrays import GROUPS
 from hyrfpack.format.sections import COLORS, MLPS, OPACITIES, POSITIONS, SCALES, TABLES
 from hyrfpack.model import Geometry, HybridModel, expand
 from hyrfpack.render import render
-from hyrfpack.scene import Camera, evenly_spaced
+from hyrfpack.scene import Camera
 
 DRAWN = 3_000_000  # Gaussians drawn in all views together, about: more views of smaller models
 FEWEST, MOST = 6, 96  # views
@@ -87,8 +87,8 @@ def measure_sensitivity(model: HybridModel, cameras: Sequence[Camera], seed: int
         HyrfError: a number of the model is NaN or infinite.
     """
     count = int(np.clip(DRAWN // max(len(model), 1), FEWEST, MOST)) // 2
-    near = evenly_spaced(cameras, count)
-    views = [view for pair in zip(near, views_between(near, seed), strict=True) for view in pair]
+    at, between = views_at_and_between(cameras, count, seed)
+    views = [view for pair in zip(at, between, strict=True) for view in pair]
     every = max(1, round(1 / FIELD_VIEWS))
     generator = torch.Generator().manual_seed(seed)
     squares = {name: torch.zeros_like(parameter) for name, parameter in model.named_parameters()}
@@ -117,7 +117,7 @@ def measure_sensitivity(model: HybridModel, cameras: Sequence[Camera], seed: int
             parameter.grad = None
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(wanted[name])
-    return _gathered(model, squares, pixels, field_pixels, near, stretch)
+    return _gathered(model, squares, pixels, field_pixels, at, stretch)
 
 
 @torch.no_grad()

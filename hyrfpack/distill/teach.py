@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from hyrfpack.cameras.between import small_camera, views_between
+from hyrfpack.cameras.between import small_camera, views_at_and_between
 from hyrfpack.data import PictureCache
 from hyrfpack.distill.config import DistillConfig
 from hyrfpack.distill.start import initial_model
@@ -110,7 +110,7 @@ def _cameras(
     fitting = [small_camera(camera, config.size) for camera in cameras]
     test = fitting[::TEST_EVERY]
     train = [camera for number, camera in enumerate(fitting) if number % TEST_EVERY] or test
-    return train, views_between(evenly_spaced(train, config.test_views), config.seed), test
+    return train, views_at_and_between(train, config.test_views, config.seed)[1], test
 
 
 def _lit(light: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scenes import ring
 
-from hyrfpack.cameras.between import LONGEST_SIDE, WIDER, small_camera, views_between
+from hyrfpack.cameras.between import LONGEST_SIDE, WIDER, small_camera, views_at_and_between, views_between
 from hyrfpack.scene import Camera
 
 CAMERAS = ring(48, elevation=1.2, width=16, height=16)
@@ -22,6 +22,23 @@ def test_views_between_lie_between_neighbours_that_look_the_same_way():
         assert (view.width, view.height) == (round(WIDER * camera.width), round(WIDER * camera.height))
         assert (view.fx, view.fy) == (camera.fx, camera.fy)
         assert view.cx - view.width / 2 == pytest.approx(camera.cx - camera.width / 2)
+
+
+@pytest.mark.parametrize(
+    ("count", "places"), [(1, [24]), (2, [12, 36]), (3, [8, 24, 40]), (48, range(48)), (99, range(48))]
+)
+def test_a_few_views_stand_in_the_middle_of_equal_parts_and_between_neighbours_among_all(count, places):
+    at, between = views_at_and_between(CAMERAS, count, seed=3)
+
+    assert at == [CAMERAS[place] for place in places]
+    chord = 3 * 2 * np.sin(np.pi * 2 / 48)
+    for camera, view in zip(at, between, strict=True):
+        assert 0.2 * chord / 2 < np.linalg.norm(view.position - camera.position) < chord
+
+
+def test_few_views_of_no_camera_are_none_and_of_one_it_and_itself():
+    assert views_at_and_between([], 3) == ([], [])
+    assert views_at_and_between(CAMERAS[:1], 3) == (CAMERAS[:1], CAMERAS[:1])
 
 
 def test_one_camera_has_no_neighbour_and_stays():
