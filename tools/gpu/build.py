@@ -406,7 +406,10 @@ def build_all() -> dict[str, list]:
         "builds": a row for each; "probes": one row a target of a kernel that must spill; "left_out": kernels that
         nothing launched.
     """
-    # Each task has a process of its own, as what operations choose when they are imported depends on the target.
+    # Each task has a process of its own, as what operations choose when they are imported depends on the target. What
+    # does not depend on it, each inherits: reading all of Triton for its digest takes longer than most tasks.
+    importlib.import_module("triton.experimental.gluon")
+    getattr(triton.runtime.cache, "triton_key", lambda: None)()
     with multiprocessing.get_context("fork").Pool(PROCESSES, maxtasksperchild=1) as pool:
         kernels = pool.apply_async(list_kernels)
         probes = sum(pool.map(build, [("probe", name) for name in TARGETS], chunksize=1), [])
