@@ -22,7 +22,7 @@ from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.paper import PaperSettings
 from hyrfpack.measure import timing
-from hyrfpack.model import calls
+from hyrfpack.model import HybridModel, calls
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.rasterize import rasterize
@@ -167,9 +167,15 @@ def test_quality_drops_are_differences_of_what_evaluate_scores():
     assert row.ssim_drop == pytest.approx(exact.ssim - cut.ssim, abs=1e-5)
 
 
-def test_raw_is_the_exact_codec_and_bytes_are_those_of_the_file():
+@pytest.fixture(scope="module")
+def coded() -> tuple[HybridModel, dict[str, dict]]:
+    """A model and what is measured of its coding; not to be changed."""
     model = model_of()
-    rows = by_setting(codec_rows(subject_of(model), 1, ignore))
+    return model, by_setting(codec_rows(subject_of(model), 1, ignore))
+
+
+def test_raw_is_the_exact_codec_and_bytes_are_those_of_the_file(coded):
+    model, rows = coded
     raw, paper = rows["profile"]["raw"], rows["profile"]["paper"]
     assert raw.is_reference and raw.error.max == 0 and all(part.max == 0 for part in raw.parts.values())
     assert raw.bytes == len(encode_model(model)) and paper.bytes == len(encode_model(model, "paper"))
@@ -178,9 +184,9 @@ def test_raw_is_the_exact_codec_and_bytes_are_those_of_the_file():
     assert paper.decode_ratio.wall == pytest.approx(paper.decode.ms / raw.decode.ms)
 
 
-def test_parameter_errors_of_the_paper_profile_follow_its_precision():
-    model = model_of()
-    row = by_setting(codec_rows(subject_of(model), 1, ignore))["profile"]["paper"]
+def test_parameter_errors_of_the_paper_profile_follow_its_precision(coded):
+    model, rows = coded
+    row = rows["profile"]["paper"]
     arrays = to_arrays(model)
     halves = arrays["POSI"].astype(np.float16).astype(np.float64)
     assert row.parts["positions"].max == pytest.approx(np.abs(halves - arrays["POSI"]).max(), rel=1e-6)
@@ -189,10 +195,9 @@ def test_parameter_errors_of_the_paper_profile_follow_its_precision():
     assert len(row.parts) == 8
 
 
-def test_every_knob_of_the_paper_profile_is_tried_with_its_default_marked():
+def test_every_knob_of_the_paper_profile_is_tried_with_its_default_marked(coded):
     assert set(KNOBS["paper"]) == {field.name for field in dataclasses.fields(PaperSettings)} - {"seed"}
-    model = model_of()
-    rows = by_setting(codec_rows(subject_of(model), 1, ignore))
+    model, rows = coded
     for knob in KNOBS["paper"]:
         (default,) = [row for row in rows[f"paper, {knob}"].values() if row.is_default]
         assert default.bytes == rows["profile"]["paper"].bytes
