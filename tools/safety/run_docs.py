@@ -29,7 +29,7 @@ DATA = Path(os.environ.get("HYRFPACK_DATA") or ROOT.parent / "shared" / "data") 
 BLOCK = re.compile(r"^```python\n(?P<fenced>.*?)^```$|(?P<indented>(?:^    [^\n]*\n|^\n)+)", re.MULTILINE | re.DOTALL)
 FEWER = """
 import runpy, sys
-from hyrfpack.distill import DistillConfig
+from hyrfpack.distill import DistillConfig, start
 from hyrfpack.train import TrainConfig
 def cut(settings):
     whole = settings.__post_init__
@@ -39,6 +39,7 @@ def cut(settings):
     settings.__post_init__ = fewer
 cut(TrainConfig)
 cut(DistillConfig)
+start.LEAST_STEPS = start.MOST_STEPS = {steps}
 runpy.run_path(sys.argv[1], run_name="__main__")
 """
 
