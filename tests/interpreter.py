@@ -8,6 +8,7 @@ from functools import cache
 from typing import Any
 
 import triton.language as tl
+from triton.language.semantic import TritonSemantic
 from triton.runtime import interpreter
 
 
@@ -62,6 +63,13 @@ def _make_types_once() -> None:
         _init_once(tl.tensor, lambda handle, type: type.name, "handle")
     if _takes(tl.block_type.__init__, "self", "element_ty", "shape"):
         _init_once(tl.block_type, _name_of_block)
+    if _takes(TritonSemantic.broadcast_impl_value, "self", "lhs", "rhs"):
+        broadcast = TritonSemantic.broadcast_impl_value
+
+        def broadcast_unlike(self: Any, lhs: Any, rhs: Any) -> Any:
+            return (lhs, rhs) if lhs.type.name == rhs.type.name else broadcast(self, lhs, rhs)
+
+        TritonSemantic.broadcast_impl_value = broadcast_unlike
 
 
 def _takes(function: Callable, *names: str) -> bool:
