@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+from scipy.optimize import brentq
 
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.compress.calibrate import calibrated
 from hyrfpack.compress.packer import Packer
 from hyrfpack.distill.teach import Taught
 from hyrfpack.format.codec import decode_model
-from hyrfpack.model import HybridModel
 
 PACKED = 0.8  # of what packing may add, to ask for
 LEAST_ADDED = 0.25  # of the error before packing, that packing may add in any case
@@ -35,16 +36,17 @@ def pack(taught: Taught, psnr: float, provenance: dict, say: Callable[[str], Non
         b'HYRF'
     """
     model = taught.model
-    allowed, error = _mse(psnr), _error(model, taught)
+    likeness = np.array(taught.deciding.likeness(model))
+    allowed, error = _mse(psnr), _mse(likeness.mean())
     room = max(allowed - error, min(LEAST_ADDED * error, HOPELESS * allowed))
     say(f"measuring what each number does to pictures, at {len(taught.train)} cameras and between them")
-    wanted = PACKED * room
+    wanted = PACKED * added_to_each(_mse(likeness), error + room)
     sensitivity, originals = calibrated(model, taught.train, wanted)
     provenance = {**provenance, "viewpoint": Viewpoint.of(taught.train).to_json()}
     packer = Packer(model, provenance, sensitivity, scene=None, finetune_steps=0, prune=True, say=say)
     trial = packer.settled(wanted, originals)
     for _ in range(TRIALS):
-        off = _error(decode_model(trial.data), taught) - error
+        off = _mse(np.mean(taught.deciding.likeness(decode_model(trial.data)))) - error
         if off <= room:
             break
         wanted *= max(PACKED * room / off, 1 / 16)
@@ -53,10 +55,23 @@ def pack(taught: Taught, psnr: float, provenance: dict, say: Callable[[str], Non
     return trial.data
 
 
-def _mse(psnr: float) -> float:
+def added_to_each(errors: np.ndarray, mean: float) -> float:
+    """What, added to the errors (n,) of all views, brings their geometric mean, that of the mean PSNR, to `mean`.
+
+    It is less than `mean` less their own: the views that are nearly right lose most.
+
+    Example:
+        >>> round(added_to_each(np.array([1.0, 100.0]), 20.0), 2)
+        2.89
+    """
+
+    def above(added: float) -> float:
+        return float(np.log(errors + added).mean() - np.log(mean))
+
+    least = 1e-6 * mean
+    return least if above(least) >= 0 else float(brentq(above, least, mean, xtol=1e-3 * least))
+
+
+def _mse(psnr: Any) -> Any:
+    """Mean squared errors, of colours in [0, 1], of PSNRs in dB."""
     return 10 ** (-psnr / 10)
-
-
-def _error(model: HybridModel, taught: Taught) -> float:
-    """Of the mean PSNR at the viewpoints to decide by, as mean squared error."""
-    return _mse(float(np.mean(taught.deciding.likeness(model))))

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from explicit_balls import LITTLE, ball
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import hyrfpack
 from hyrfpack.compress import calibrate
@@ -217,3 +219,21 @@ def test_teacher_shows_what_is_drawn() -> None:
     drawn = draw(original, camera)
     np.testing.assert_allclose(picture.alpha / 255, 1 - drawn.transmittance, atol=0.5 / 255 + 1e-6)
     np.testing.assert_allclose(picture.composite(), drawn.rgb.clamp(0, 1), atol=1.5 / 255)
+
+
+@given(st.lists(st.floats(1e-8, 1e-2), min_size=1, max_size=48), st.floats(1.001, 50.0))
+@settings(max_examples=60, deadline=None)
+def test_what_packing_adds_to_each_view_brings_their_mean_psnr_to_what_is_asked(errors, factor):
+    errors = np.array(errors)
+    own = np.exp(np.log(errors).mean())
+
+    added = pack.added_to_each(errors, factor * own)
+
+    # Where views are unequal, the nearly perfect ones lose most, and less is to be had.
+    assert 0 < added <= (factor - 1) * own * (1 + 1e-6)
+    if added > 2e-6 * factor * own:
+        assert np.exp(np.log(errors + added).mean()) == pytest.approx(factor * own, rel=1e-6)
+
+
+def test_what_is_added_to_views_without_error_is_all_that_is_asked():
+    assert pack.added_to_each(np.zeros(3), 1e-4) == pytest.approx(1e-4)
