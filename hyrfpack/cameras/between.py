@@ -37,14 +37,14 @@ def views_between(cameras: Sequence[Camera], seed: int = 0, some: Sequence[int] 
         seed: of the neighbours and of how far it is on the way to them.
         some: indices of the cameras that a view is made for; None for all.
     """
-    some = range(len(cameras)) if some is None else some
+    some = list(range(len(cameras)) if some is None else some)
     if len(cameras) < 2:
         return [cameras[index] for index in some]
     rng = np.random.default_rng(seed)
     places = np.array([camera.position for camera in cameras])
     turns = Rotation.from_matrix(np.array([camera.rotation for camera in cameras]))
-    apart = np.linalg.norm(places[list(some), None] - places, axis=2)
-    apart[np.arange(len(some)), list(some)] = np.inf  # from itself
+    apart = np.linalg.norm(places[some, None] - places, axis=2)
+    apart[np.arange(len(some)), some] = np.inf  # from itself
     unit = float(np.median(apart.min(axis=1))) or 1.0
     made = []
     for row, index in enumerate(some):

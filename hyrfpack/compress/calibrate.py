@@ -171,20 +171,20 @@ def calibrate(
     Raises:
         HyrfError: a parameter is NaN or infinite.
     """
-    each, decoded = of_each_number(model, distortion), model.decode()
+    each, decoded_all = of_each_number(model, distortion), model.decode()
+
+    def part_of(kept: np.ndarray) -> tuple[HybridModel, Decoded]:
+        index = torch.as_tensor(kept, device=model.gaussians.positions.device)
+        return model.part(index), decoded_all[index]
 
     # Pruning first: what the others do depends on what is left.
     def without_pruned(scaled: Sensitivity, _: list[Part]) -> dict[Part, Tried]:
-        kept = worth_keeping(scaled.removals, each)
-        index = torch.as_tensor(kept, device=decoded.geometry.scales.device)
-        found = originals.error(model.part(index), decoded[index])
-        return {(PRUNED,): Tried(found, float(np.delete(scaled.removals, kept).sum()))}
+        kept = worth_keeping(scaled, each)
+        return {(PRUNED,): Tried(originals.error(*part_of(kept)), float(np.delete(scaled.removals, kept).sum()))}
 
     if prune:
         sensitivity = _corrected(sensitivity, ((PRUNED,),), distortion, without_pruned)
-    kept = worth_keeping(sensitivity.removals, each) if prune else np.arange(len(model))
-    index = torch.as_tensor(kept, device=model.gaussians.positions.device)
-    left, decoded = model.part(index), decoded[index]
+    left, decoded = part_of(worth_keeping(sensitivity, each, prune))
     whole = Originals.seen(originals.views, left, decoded)
     placed: tuple[np.ndarray, Plan, HybridModel] | None = None
 

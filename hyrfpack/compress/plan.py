@@ -35,7 +35,7 @@ def make_plan(model: HybridModel, sensitivity: Sensitivity, distortion: float, p
         HyrfError: a parameter is NaN or infinite.
     """
     each = of_each_number(model, distortion)
-    kept = worth_keeping(sensitivity.removals, each) if prune else np.arange(len(model))
+    kept = worth_keeping(sensitivity, each, prune)
     of_kept = sensitivity.of(kept)
     cube, classes = _cube(model), importance_classes(of_kept)
     bits = position_bits(of_kept.positions, classes, each)
@@ -56,14 +56,16 @@ def of_each_number(model: HybridModel, distortion: float) -> float:
     return distortion / sum(parameter.numel() for parameter in model.parameters())
 
 
-def worth_keeping(removals: np.ndarray, each: float) -> np.ndarray:
+def worth_keeping(sensitivity: Sensitivity, each: float, prune: bool = True) -> np.ndarray:
     """Indices (n,), ascending, of the Gaussians that give more to pictures than they cost in bytes.
 
     Args:
-        removals: (N,) what leaving out each adds, see `Sensitivity`.
+        sensitivity: of all Gaussians (N,).
         each: what each number may add, see `of_each_number`.
+        prune: without, all are kept.
     """
-    return np.flatnonzero(removals >= ERROR_PER_BIT * each * BITS_OF_A_GAUSSIAN)
+    removals = sensitivity.removals
+    return np.flatnonzero(removals >= ERROR_PER_BIT * each * BITS_OF_A_GAUSSIAN) if prune else np.arange(len(removals))
 
 
 @torch.no_grad()
