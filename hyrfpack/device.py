@@ -95,6 +95,12 @@ def choose_own_device(
     return device
 
 
+def make_current(device: torch.device) -> None:
+    """Let kernels of this thread be launched on a GPU: each thread has a current one of its own."""
+    if device.type == "cuda" and device.index not in (None, torch.cuda.current_device()):
+        torch.cuda.set_device(device)
+
+
 def describe_device(device: torch.device) -> str:
     """What it is called, as "cuda:0 (NVIDIA H200)"."""
     if device.type != "cuda":

@@ -10,7 +10,7 @@ import torch
 from pretend_gpu import CUDA, OnGpu, pretended_gpu
 
 from hyrfpack import device as devices
-from hyrfpack.device import choose_device, describe_device, upload
+from hyrfpack.device import choose_device, describe_device, make_current, upload
 from hyrfpack.errors import HyrfError
 from hyrfpack.ops.dispatch import has_triton
 from hyrfpack.ops.hash_encode import hash_encode
@@ -30,6 +30,15 @@ def test_auto_is_cuda_where_there_is_a_gpu_with_triton(monkeypatch):
         assert choose_device() == torch.device("cuda")
         monkeypatch.setattr(devices, "has_triton", lambda: False)
         assert choose_device() == torch.device("cpu")
+
+
+def test_each_thread_takes_the_gpu_it_works_on(monkeypatch):
+    taken = []
+    with pretended_gpu():
+        monkeypatch.setattr(torch.cuda, "set_device", taken.append)
+        for name in ("cpu", "cuda", "cuda:0", "cuda:1"):
+            make_current(torch.device(name))
+    assert taken == [torch.device("cuda:1")]
 
 
 @needs_no_gpu

@@ -12,12 +12,14 @@ from contextlib import nullcontext
 import pytest
 import torch
 from commands import succeeded
+from explicit_balls import ball
 from ops.device import needs_triton
 from pretend_gpu import pretended_gpu
 from scenes import ball_points, ball_scene, camera_at, small_model
 
 import hyrfpack
 from hyrfpack.demo.scene import write_demo_scene
+from hyrfpack.distill import DistillConfig, distill_splats
 from hyrfpack.model import HashGridConfig
 from hyrfpack.render import render
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
@@ -159,3 +161,24 @@ def test_a_model_is_measured_packed_and_fine_tuned_on_a_gpu(gpu, tmp_path, monke
         target = tmp_path / f"{device}.hyrf"
         sizes[device] = hyrfpack.compress(model, target, data=scene, finetune_steps=1, device=device).bytes_after
     assert sizes["cuda"] == pytest.approx(sizes["cpu"], rel=0.02)
+
+
+def test_gaussians_from_elsewhere_are_learnt_on_a_gpu(gpu, tmp_path, monkeypatch):
+    for name, value in (("ROUNDS", 1), ("FEWEST", 2), ("MOST", 2)):
+        monkeypatch.setattr(f"hyrfpack.compress.calibrate.{name}", value)
+    monkeypatch.setattr("hyrfpack.distill.start.LEAST_STEPS", 3)
+    monkeypatch.setattr("hyrfpack.distill.start.HashGridConfig", lambda log2, finest: HashGridConfig(log2, levels=2))
+    # One thread: the interpreter runs one kernel at a time.
+    monkeypatch.setattr(
+        "hyrfpack.data.PictureCache.stream", lambda cache, views: ((view, cache.get(view)) for view in views)
+    )
+    monkeypatch.setattr("hyrfpack.distill.pack.TRIALS", 1)
+    cameras = [camera_at(place, width=12, height=12) for place in ((0.0, -3, 0.5), (0.0, 3, 0.5), (3.0, 0, -0.5))]
+    quick = DistillConfig(steps=1, test_views=2, psnr=12)
+    reports = [
+        distill_splats(ball(12), tmp_path / f"{device}.hyrf", quick, cameras=cameras, device=device)
+        for device in ("cpu", "cuda")
+    ]
+    here, there = (report.psnr_unpacked for report in reports)
+    assert there == pytest.approx(here, abs=0.05)
+    assert reports[1].bytes_after == pytest.approx(reports[0].bytes_after, rel=0.05)

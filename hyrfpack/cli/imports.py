@@ -7,7 +7,19 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hyrfpack.cli.common import OUTPUT, PATH, SEED, json_option, note, number, overwrite_option, print_json, table
+from hyrfpack.cli.common import (
+    OUTPUT,
+    PATH,
+    SEED,
+    chosen_device,
+    device_option,
+    json_option,
+    note,
+    number,
+    overwrite_option,
+    print_json,
+    table,
+)
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -42,7 +54,8 @@ if TYPE_CHECKING:
     metavar="PATH",
     help="Where it will be looked at from: JSON (nerfstudio's and 3DGS' too), or the folder of photos and poses.",
 )
-@click.option("--seed", type=SEED, default=0, show_default=True, help="Same seed, same bytes.")
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Same seed, same bytes on the CPU.")
+@device_option
 @overwrite_option
 @json_option
 def import_(
@@ -53,6 +66,7 @@ def import_(
     size: int,
     cameras: Path | None,
     seed: int,
+    device: str,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -75,8 +89,9 @@ def import_(
 
     cameras = cameras or _left_beside(source)
     given = None if cameras is None else _cameras(cameras)
+    place = chosen_device(device)
     config = DistillConfig(steps=steps, psnr=psnr, size=size, seed=seed)
-    report = distill(source, output, config, cameras=given, say=note, quiet=False)
+    report = distill(source, output, config, cameras=given, device=place, say=note, quiet=False)
     if as_json:
         print_json(report.to_dict())
         return

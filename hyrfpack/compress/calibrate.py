@@ -291,7 +291,4 @@ def _pictures(model: HybridModel, cameras: Sequence[Camera], decoded: Decoded | 
     def picture(camera: Camera) -> Tensor:
         return render(model, camera, decoded=decoded).rgb
 
-    if model.gaussians.positions.is_cuda:
-        return [picture(camera) for camera in cameras]
-    # A view a core: much of one runs on one core only.
-    return side_by_side(picture, cameras)
+    return side_by_side(picture, cameras, model.gaussians.positions.device)

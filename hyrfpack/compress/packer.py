@@ -214,7 +214,7 @@ class Packer:
 
         def attempt(distortion: float) -> Trial:
             trial = self.attempt(distortion)
-            return dataclasses.replace(trial, error=originals.error(self._decoded(trial)))
+            return dataclasses.replace(trial, error=originals.error(self.decoded(trial)))
 
         trial, distortion = attempt(wanted), wanted
         for _ in range(MENDED):
@@ -254,7 +254,7 @@ class Packer:
 
         def attempt(distortion: float) -> Trial:
             trial = self.attempt(distortion)
-            lost = before - self._psnr(self._decoded(trial), views)
+            lost = before - self._psnr(self.decoded(trial), views)
             trial = dataclasses.replace(trial, lost=lost)
             self.say(f"distortion {distortion:.2g}: {len(trial.data):,} bytes, {lost:+.3f} dB lost")
             return trial
@@ -275,7 +275,8 @@ class Packer:
             return None
         return gains_of_photos(self.model, self.scene.train, self.cache)
 
-    def _decoded(self, trial: Trial) -> HybridModel:
+    def decoded(self, trial: Trial) -> HybridModel:
+        """What a file holds, where the model is and as precise."""
         model = decode_model(trial.data).to(self.model.gaussians.positions.device)
         model.precision = self.model.precision
         return model

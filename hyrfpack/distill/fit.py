@@ -8,12 +8,15 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_type
+from hyrfpack.device import choose_device
 from hyrfpack.distill.config import DistillConfig
 from hyrfpack.distill.pack import pack
 from hyrfpack.distill.teach import teach
@@ -65,6 +68,7 @@ def distill(
     config: DistillConfig = DistillConfig(),  # noqa: B008 - frozen
     *,
     cameras: Sequence[Camera] | None = None,
+    device: str | torch.device = "auto",
     say: Callable[[str], None] = lambda sentence: None,
     quiet: bool = True,
 ) -> DistillReport:
@@ -87,7 +91,8 @@ def distill(
         check_type("each of the cameras", camera, Camera)
     Outputs(source, overwrite=True).file(target)
     splats = read_splats(source)
-    report = distill_splats(splats, target, config, name=str(source), cameras=cameras, say=say, quiet=quiet)
+    how: dict[str, Any] = {"cameras": cameras, "device": device, "say": say, "quiet": quiet}
+    report = distill_splats(splats, target, config, name=str(source), **how)
     return dataclasses.replace(report, bytes_source=_bytes_at(Path(source)))
 
 
@@ -98,6 +103,7 @@ def distill_splats(
     *,
     name: str = "the splats",
     cameras: Sequence[Camera] | None = None,
+    device: str | torch.device = "auto",
     say: Callable[[str], None] = lambda sentence: None,
     quiet: bool = True,
 ) -> DistillReport:
@@ -105,7 +111,7 @@ def distill_splats(
 
     Without cameras viewpoints are made up (`viewpoints`). The faintest Gaussians, as seen from there, are left out;
     the fields are fitted to the others' shapes and colours (`initial_model`), the whole is fitted to pictures of the
-    original. Same splats and settings, same bytes.
+    original. Same splats and settings, same bytes, on the CPU: on a GPU sums of gradients vary in their last bits.
 
     Args:
         splats: in any units, anywhere.
@@ -113,23 +119,26 @@ def distill_splats(
         name: what messages call the splats.
         cameras: that pictures shall hold at, made smaller where larger than `config.size`; one in TEST_EVERY is held
             out.
+        device: where pictures are drawn and the model learns, see `hyrfpack.device.choose_device`.
         say: told what is going on.
         quiet: show no progress line.
 
     Raises:
         HyrfDataError: no view shows any of the splats.
-        HyrfError: the file cannot be written.
+        HyrfError: the file cannot be written, or there is no such device.
     """
     started = time.perf_counter()
     Outputs(overwrite=True).file(target)
-    taught = teach(splats, config, name=name, cameras=cameras, say=say, quiet=quiet)
+    place = choose_device(device, say)
+    taught = teach(splats, config, name=name, cameras=cameras, device=place, say=say, quiet=quiet)
     unpacked = float(np.mean(taught.test.likeness(taught.model)))
     say(f"{unpacked:.2f} dB before packing")
     imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
     provenance = {"steps": config.steps, "seed": config.seed, "psnr": unpacked, "choices": {"imported": imported}}
     data = pack(taught, config.psnr, provenance, say)
     write_atomic(target, data)  # only now: an interrupt leaves what was there before
-    decoded = hyrf_format.load(target)
+    decoded = hyrf_format.load(target).to(place)
+    decoded.precision = taught.model.precision
     scores = taught.test.likeness(decoded)
     reached = float(np.mean(scores))
     if _below(reached, config.psnr):

@@ -12,7 +12,6 @@ from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.compress.calibrate import calibrated
 from hyrfpack.compress.packer import Packer
 from hyrfpack.distill.teach import Taught
-from hyrfpack.format.codec import decode_model
 
 PACKED = 0.8  # of what packing may add, to ask for
 LEAST_ADDED = 0.25  # of the error before packing, that packing may add in any case
@@ -46,7 +45,7 @@ def pack(taught: Taught, psnr: float, provenance: dict, say: Callable[[str], Non
     packer = Packer(model, provenance, sensitivity, scene=None, finetune_steps=0, prune=True, say=say)
     trial = packer.settled(wanted, originals)
     for _ in range(TRIALS):
-        off = _mse(np.mean(taught.deciding.likeness(decode_model(trial.data)))) - error
+        off = _mse(np.mean(taught.deciding.likeness(packer.decoded(trial)))) - error
         if off <= room:
             break
         wanted *= max(PACKED * room / off, 1 / 16)

@@ -49,7 +49,7 @@ class _Shapes:
 
     Attributes:
         sizes: (N,) the mean of the three scale logits.
-        matrices: (N, 3, 3) the rest of it, symmetric and traceless.
+        matrices: (9, N) the rest of it, symmetric and traceless, row by row.
     """
 
     sizes: Tensor
@@ -57,20 +57,27 @@ class _Shapes:
 
     @classmethod
     def of(cls, scale_logits: Tensor, quats: Tensor) -> _Shapes:
-        sizes = scale_logits.mean(1)
-        turns = rotations(quats)
-        return cls(sizes, (turns * (scale_logits - sizes[:, None])[:, None]) @ turns.transpose(1, 2))
+        """Of (N, 3) logits and (N, 4) quaternions."""
+        # Gaussians last: all of this runs along them.
+        logits, turns = scale_logits.T.contiguous(), rotations(quats)
+        sizes = logits.mean(0)
+        stretched = turns * (logits - sizes)
+        return cls(sizes, (stretched[:, None] * turns).sum(2).view(9, -1))
+
+    def part(self, some: Tensor) -> _Shapes:
+        """Those at `some` (n,) int64."""
+        return _Shapes(self.sizes.index_select(0, some), self.matrices.T.index_select(0, some).T)
 
 
 def rotations(quats: Tensor) -> Tensor:
-    """(N, 3, 3) of quaternions (N, 4) wxyz of any length."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    """(3, 3, N) of quaternions (N, 4) wxyz of any length."""
+    w, x, y, z = torch.nn.functional.normalize(quats.T.contiguous(), dim=0)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
-    return torch.stack([torch.stack(row, -1) for row in rows], 1)
+    return torch.stack([torch.stack(row) for row in rows])
 
 
 def model_shape(drawable: Drawable, degree: int) -> ModelConfig:
@@ -93,7 +100,7 @@ def initial_model(
     """A model of splats, as like them as regression makes it.
 
     Args:
-        drawable: the splats; at least one.
+        drawable: the splats; at least one. The model will be on their device.
         light: (N,) what each sends to pictures; errors count by its square root.
         cameras: that the splats' colours are looked at from.
         seed: of the first weights, and of the order.
@@ -106,7 +113,7 @@ def initial_model(
     opacity_logits = logit(drawable.opacities[:, None].clamp_max(OPAQUE))
     colors = (0.5 + BAND_0 * drawable.harmonics[:, 0]).clamp(*COLORS)
     gaussians = Gaussians(drawable.positions, logit(colors), shapes.sizes[:, None], opacity_logits)
-    model = HybridModel(config, gaussians, torch.Generator().manual_seed(seed))
+    model = HybridModel(config, gaussians, torch.Generator().manual_seed(seed)).to(drawable.positions.device)
     with torch.no_grad():
         for values in (model.radiance.weights[-1], model.radiance.biases[-1]):
             values.zero_()
@@ -120,10 +127,10 @@ def initial_model(
     return model
 
 
-def _batches(count: int, batch: int, generator: torch.Generator) -> Iterator[Tensor]:
+def _batches(count: int, batch: int, generator: torch.Generator, device: torch.device) -> Iterator[Tensor]:
     """Indices of `batch` of `count` rows, without end: none twice in one batch (see `take_rows`), all in each round."""
     while True:
-        yield from torch.randperm(count, generator=generator).split(batch)
+        yield from torch.randperm(count, generator=generator).to(device).split(batch)
 
 
 def _fit(
@@ -139,24 +146,26 @@ def _fit(
     count = len(model)
     generator = torch.Generator().manual_seed(seed)
     weights = (light / light.mean().clamp_min(1e-30)).clamp(0, MOST_WEIGHT).sqrt()
+    shapes = _Shapes(shapes.sizes, shapes.matrices.T.contiguous().T)
     typical = (weights * shapes.sizes).sum() / weights.sum().clamp_min(1e-30)
     coords = model.cube_coords(drawable.positions)
-    poses = [torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32) for camera in cameras]
-    no_turn = torch.eye(1, 4)
+    poses = (torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32) for camera in cameras)
+    viewpoints = [camera_center(pose).to(coords.device) for pose in poses]
+    no_turn = torch.eye(1, 4, device=coords.device)
     optimizer = Optimizer(model, RATES)
     whole = min(max(LEAST_STEPS, EPOCHS * count // BATCH), MOST_STEPS, max(1, MOST_WORK // count))
     batch, steps = max(BATCH, LEAST_EPOCHS * count // whole), math.ceil(share * whole)
     keep_freed_memory()
     with torch_on_one_thread():
-        for step, some in zip(range(steps), _batches(count, batch, generator), strict=False):
-            raw = model.geometry(coords[some])
-            made = _Shapes.of(raw[:, 1:4], raw[:, 4:] + no_turn)
-            errors = (made.matrices - shapes.matrices[some]).square().sum((1, 2))
-            errors = errors + SIZE_WEIGHT * (made.sizes + typical - shapes.sizes[some]).square()
-            errors = errors + SIZE_WEIGHT * raw[:, 0].square()
-            if poses:
-                viewpoint = camera_center(poses[int(torch.randint(0, len(poses), (1,), generator=generator))])
-                wanted = drawable.colors_from(viewpoint, some).clamp(0, 1)
-                errors = errors + COLOR_WEIGHT * (model.decode_colors(viewpoint, some) - wanted).square().sum(1)
-            (weights[some] * errors).mean().backward()
+        for step, some in zip(range(steps), _batches(count, batch, generator, coords.device), strict=False):
+            opacity, scales, turns = model.geometry(coords.index_select(0, some)).split((1, 3, 4), 1)
+            made, wanted = _Shapes.of(scales, turns + no_turn), shapes.part(some)
+            errors = (made.matrices - wanted.matrices).square().sum(0)
+            errors = errors + SIZE_WEIGHT * (made.sizes + typical - wanted.sizes).square()
+            errors = errors + SIZE_WEIGHT * opacity[:, 0].square()
+            if viewpoints:
+                viewpoint = viewpoints[int(torch.randint(0, len(viewpoints), (1,), generator=generator))]
+                colors = drawable.colors_from(viewpoint, some).clamp(0, 1)
+                errors = errors + COLOR_WEIGHT * (model.decode_colors(viewpoint, some) - colors).square().sum(1)
+            (weights.index_select(0, some) * errors).mean().backward()
             optimizer.step(step, steps)

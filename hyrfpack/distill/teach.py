@@ -61,6 +61,7 @@ def teach(
     *,
     name: str = "the splats",
     cameras: Sequence[Camera] | None = None,
+    device: torch.device = torch.device("cpu"),  # noqa: B008 - a constant
     say: Callable[[str], None] = lambda sentence: None,
     quiet: bool = True,
 ) -> Taught:
@@ -73,19 +74,19 @@ def teach(
         True
     """
     weighted = Weighted.of(splats, name)
-    original = Drawable.of(splats, weighted.frame)
+    original = Drawable.of(splats, weighted.frame, device)
     train, deciding, test = _cameras(weighted, original, config, cameras)
     say(
         f"{len(splats):,} Gaussians, harmonics of degree {splats.degree}; {len(train)} viewpoints "
         f"{'made up' if cameras is None else 'given'} to teach with, {len(test)} held out"
     )
-    light = light_of(original, evenly_spaced(train, LIT_FROM)).numpy()
+    light = light_of(original, evenly_spaced(train, LIT_FROM)).cpu().numpy()
     kept = _lit(light)
     if not len(kept):
         raise HyrfDataError(f"{name}: no view shows anything of the Gaussians; give others with --cameras")
     say(f"{len(splats) - len(kept):,} Gaussians are hardly seen and left out; fitting the fields to the others")
     share = min(1.0, max(LEAST_REGRESSED, config.steps / REGRESSED))
-    lit = Drawable.of(splats[kept], weighted.frame), torch.from_numpy(light[kept])
+    lit = Drawable.of(splats[kept], weighted.frame, device), torch.from_numpy(light[kept]).to(device)
     model = initial_model(*lit, train, config.seed, share)
     scene, cache = teaching_scene(name, original, train, test), PictureCache()
     _fit_to_pictures(model, scene, config, cache, quiet)
@@ -122,7 +123,13 @@ def _lit(light: np.ndarray) -> np.ndarray:
 
 def _fit_to_pictures(model: HybridModel, scene: Scene, config: DistillConfig, cache: PictureCache, quiet: bool) -> None:
     # No density control: every Gaussian has its place, and packing leaves out those that pictures do not miss.
-    settings = TrainConfig(steps=config.steps, seed=config.seed, learning_rates=RATES, density=DensityConfig(stop=0.0))
-    trainer = Trainer(scene, settings, cache, model=model)
+    settings = TrainConfig(
+        steps=config.steps,
+        seed=config.seed,
+        learning_rates=RATES,
+        density=DensityConfig(stop=0.0),
+        precision="float32",  # what is left to learn is smaller than what a GPU rounds away otherwise
+    )
+    trainer = Trainer(scene, settings, cache, model.gaussians.positions.device, model)
     with ProgressLine(config.steps, 0, quiet) as line:
         trainer.run(report=lambda t, loss, mse: line.update(t.step, loss, mse, len(t.model)))

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hyrfpack.device import make_current
 from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.rasterize.cull import frustum_cull
@@ -38,16 +39,18 @@ def teaching_scene(name: str, drawable: Drawable, train: Sequence[Camera], test:
 
 def photograph(drawable: Drawable, camera: Camera) -> Picture:
     """The original as a camera sees it, 8 bits, straight alpha."""
+    make_current(drawable.positions.device)  # in this thread, which may be one that reads photos ahead
     drawn = draw(drawable, camera)
     alpha = 1 - drawn.transmittance
     rgb = drawn.rgb / alpha.clamp_min(LEAST_ALPHA)[..., None]
-    return Picture(*((values.clamp(0, 1) * 255).round().to(torch.uint8).numpy() for values in (rgb, alpha)))
+    return Picture(*((values.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy() for values in (rgb, alpha)))
 
 
 @torch_on_one_thread()
 def light_of(drawable: Drawable, cameras: Sequence[Camera]) -> Tensor:
     """(N,) the light that each Gaussian sends to a picture, in pixels: the sum of T alpha, mean over cameras."""
-    total = torch.zeros(len(drawable.positions))
+    device = drawable.positions.device
+    total = torch.zeros(len(drawable.positions), device=device)
     settings = RenderSettings()
 
     def light(camera: Camera) -> tuple[Tensor, Tensor]:
@@ -62,7 +65,7 @@ def light_of(drawable: Drawable, cameras: Sequence[Camera]) -> Tensor:
         return index, light
 
     for first in range(0, len(cameras), LIT_AT_ONCE):
-        for index, sent in side_by_side(light, cameras[first : first + LIT_AT_ONCE]):
+        for index, sent in side_by_side(light, cameras[first : first + LIT_AT_ONCE], device):
             total.index_add_(0, index, sent)
     return total / max(1, len(cameras))
 
@@ -82,12 +85,14 @@ class Sample:
     @classmethod
     def of(cls, drawable: Drawable, cameras: Sequence[Camera]) -> Sample:
         """Draw the splats once, however many models are compared with them."""
-        pictures = side_by_side(lambda camera: draw(drawable, camera).rgb.clamp(0, 1), cameras)
+        pictures = side_by_side(
+            lambda camera: draw(drawable, camera).rgb.clamp(0, 1), cameras, drawable.positions.device
+        )
         return cls(list(cameras), pictures)
 
     @torch.no_grad()
     def likeness(self, model: HybridModel) -> list[float]:
-        """PSNR in dB of a model's pictures, over black and cut to [0, 1], against these, by camera."""
+        """PSNR in dB of a model's pictures, over black and cut to [0, 1], against these, by camera; on one device."""
         decoded = model.decode()
 
         @torch.no_grad()  # of this thread
@@ -95,4 +100,4 @@ class Sample:
             shown = render(model, self.cameras[place], decoded=decoded).rgb
             return psnr(shown.clamp(0, 1), self.pictures[place])
 
-        return side_by_side(score, range(len(self.cameras)))
+        return side_by_side(score, range(len(self.cameras)), model.gaussians.positions.device)

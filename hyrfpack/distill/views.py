@@ -27,7 +27,7 @@ ENCLOSED = 0.75  # of all directions from the clearest places: where so many end
 MIDDLE = 0.55  # of the box, along each axis, that views from inside stand in
 PLACES, CLEAREST = 256, 8  # that are looked at to tell
 TRIED = 6  # cameras for each that is wanted
-ENOUGH = 100_000  # splats that tell what a place is like; of more, every n-th
+ENOUGH = 30_000  # splats that tell what a place is like; of more, every n-th
 THUMBNAIL = 24  # pixels a side, to see how much a picture shows
 
 
@@ -115,6 +115,7 @@ def viewpoints(
     """
     rng = np.random.default_rng(seed)
     inside = surrounds(weighted, drawable) if inside is None else inside
+    device = drawable.positions.device
     found: list[Camera] = []
     others: list[tuple[float, Camera]] = []
 
@@ -124,7 +125,7 @@ def viewpoints(
     for _ in range(TRIED):
         ends = [_inside(weighted, rng) if inside else _outside(weighted, rng) for _ in range(count)]
         cameras = [_camera(place, target, size, FIELD_OF_VIEW[inside]) for place, target in ends]
-        for share, camera in zip(side_by_side(covered, cameras), cameras, strict=True):
+        for share, camera in zip(side_by_side(covered, cameras, device), cameras, strict=True):
             if share >= COVERED:
                 found.append(camera)
             else:
@@ -157,7 +158,8 @@ def surrounds(weighted: Weighted, drawable: Drawable) -> bool:
         if clutter[index] <= CLUTTER:
             axes = np.concatenate((np.eye(3), -np.eye(3)))
             cameras = [_camera(places[index], places[index] + axis * weighted.radius, THUMBNAIL, 90.0) for axis in axes]
-            seen.append(np.mean(side_by_side(lambda camera: coverage(drawable, camera), cameras)))
+            device = drawable.positions.device
+            seen.append(np.mean(side_by_side(lambda camera: coverage(drawable, camera), cameras, device)))
     return len(seen) > 0 and float(np.median(seen)) >= ENCLOSED
 
 

@@ -130,13 +130,22 @@ def run_ranges(task: Callable[[int, int], None], length: int, minimum: int = 204
     run_tasks(lambda i: task(edges[i], edges[i + 1]), ranges)
 
 
-def side_by_side(function: Callable[[S], T], items: Sequence[S]) -> list[T]:
+def side_by_side(
+    function: Callable[[S], T],
+    items: Sequence[S],
+    device: torch.device = torch.device("cpu"),  # noqa: B008 - a constant
+) -> list[T]:
     """What a function returns for each item, in their order; an item a core at a time.
+
+    Args:
+        device: where it does its work. Any but the CPU takes one item after the other, which fill it.
 
     Example:
         >>> side_by_side(abs, [-2, 3])
         [2, 3]
     """
+    if device.type != "cpu":
+        return [function(item) for item in items]
     done: dict[int, T] = {}
 
     def run(index: int) -> None:

@@ -38,17 +38,18 @@ class Drawable:
     antialiased: bool
 
     @classmethod
-    def of(cls, splats: Splats, frame: Frame) -> Drawable:
-        """Bring splats to the local units of a frame."""
-        return cls(
-            frame,
-            torch.from_numpy(frame.to_local(splats.positions).astype(np.float32)),
-            torch.from_numpy(splats.scales / np.float32(frame.scale)),
-            torch.from_numpy(splats.quats),
-            torch.from_numpy(splats.opacities),
-            torch.from_numpy(splats.harmonics),
-            splats.antialiased,
-        )
+    def of(
+        cls,
+        splats: Splats,
+        frame: Frame,
+        device: torch.device = torch.device("cpu"),  # noqa: B008 - a constant
+    ) -> Drawable:
+        """Bring splats to the local units of a frame, and to a device."""
+        positions = frame.to_local(splats.positions).astype(np.float32)
+        scales = splats.scales / np.float32(frame.scale)
+        arrays = positions, scales, splats.quats, splats.opacities, splats.harmonics
+        means, sizes, quats, opacities, harmonics = (torch.from_numpy(array).to(device) for array in arrays)
+        return cls(frame, means, sizes, quats, opacities, harmonics, splats.antialiased)
 
     def thinned(self, every: int) -> Drawable:
         """Every n-th of the splats."""
@@ -87,12 +88,13 @@ def draw(
     size = camera.intrinsics, camera.width, camera.height
     index = frustum_cull(drawable.positions, pose, *size, settings.near, settings.cull_tolerance)
     positions = drawable.positions[index]
+    viewpoint = camera_center(pose).to(positions.device, non_blocking=positions.is_cuda)
     return rasterize(
         positions,
         drawable.quats[index],
         drawable.scales[index],
         drawable.opacities[index],
-        torch.zeros_like(positions) if black else drawable.colors_from(camera_center(pose), index).clamp_min(0),
+        torch.zeros_like(positions) if black else drawable.colors_from(viewpoint, index).clamp_min(0),
         pose,
         *size,
         near=settings.near,

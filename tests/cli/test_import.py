@@ -47,6 +47,14 @@ def test_import_learns_what_cameras_see_and_tells_numbers(source: Path, cameras:
     assert f"{numbers['psnr']:.2f} dB against the original" in words
 
 
+def test_a_device_that_is_not_there_is_refused_before_any_work(source: Path, tmp_path: Path) -> None:
+    target = tmp_path / "ball.hyrf"
+    target.write_bytes(b"kept")
+    told = refused("import", source, "-o", target, *QUICK, "--device", "cuda:9", "--overwrite")
+    assert "device 'cuda:9' is not there" in told and "--device cpu" in told
+    assert target.read_bytes() == b"kept"
+
+
 def test_cameras_may_be_those_of_photos(source: Path, tmp_path: Path) -> None:
     photos = write_demo_scene(tmp_path / "photos", views=10, size=24)
     result = succeeded("import", source, "-o", tmp_path / "x.hyrf", *QUICK, "--cameras", photos, "--json")

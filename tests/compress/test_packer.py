@@ -197,7 +197,7 @@ def test_pictures_that_are_off_by_more_or_less_than_was_asked_for_are_mended(off
     tried: list[float] = []
     packer = running.Packer(None, {}, None, None, 0, True, lambda sentence: None)
     monkeypatch.setattr(packer, "attempt", lambda distortion: tried.append(distortion) or running.Trial(distortion, {}))
-    monkeypatch.setattr(running.Packer, "_decoded", lambda packer, trial: trial.data)
+    monkeypatch.setattr(running.Packer, "decoded", lambda packer, trial: trial.data)
 
     trial = packer.settled(1e-3, SimpleNamespace(error=off))
 

@@ -29,7 +29,7 @@ def covariances(scales, quats) -> np.ndarray:
 def test_rotations_are_those_of_scipy() -> None:
     quats = torch.randn(20, 4, generator=torch.Generator().manual_seed(0))
     np.testing.assert_allclose(
-        rotations(quats), Rotation.from_quat(quats.numpy(), scalar_first=True).as_matrix(), atol=1e-6
+        rotations(quats).permute(2, 0, 1), Rotation.from_quat(quats.numpy(), scalar_first=True).as_matrix(), atol=1e-6
     )
 
 

@@ -29,6 +29,12 @@ def test_two_items_are_worked_on_at_once() -> None:
     side_by_side(lambda _: both.wait(), [0, 1])
 
 
+def test_a_gpu_takes_one_item_after_the_other() -> None:
+    threads = []
+    side_by_side(lambda _: threads.append(threading.current_thread()), [0, 1, 2], torch.device("cuda"))
+    assert threads == 3 * [threading.current_thread()]
+
+
 def test_tasks_of_tasks_run_where_they_are_and_wait_for_no_one() -> None:
     """With both threads waiting for a third there would be no end to it."""
 
