@@ -146,7 +146,7 @@ def _fit(
     count = len(model)
     generator = torch.Generator().manual_seed(seed)
     weights = (light / light.mean().clamp_min(1e-30)).clamp(0, MOST_WEIGHT).sqrt()
-    shapes = _Shapes(shapes.sizes, shapes.matrices.T.contiguous().T)
+    shapes = _Shapes(shapes.sizes, shapes.matrices.T.contiguous().T)  # what one takes of it lies together
     typical = (weights * shapes.sizes).sum() / weights.sum().clamp_min(1e-30)
     coords = model.cube_coords(drawable.positions)
     poses = (torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32) for camera in cameras)
