@@ -53,6 +53,14 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def no_warming() -> None:
+    """No test reads a clock, so none waits for the machine to warm up."""
+    from hyrfpack.measure import timing
+
+    timing.WARM_SECONDS = 0
+
+
 @pytest.fixture
 def signals() -> Iterator[None]:
     """Signals do what they do in a terminal, here and in programs started from here.

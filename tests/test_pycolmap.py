@@ -38,7 +38,8 @@ CALLS = {
     "export": "for name in ('a.spz', 'a.ply', 'a.sog', 'a.html'):\n"
     "    hyrfpack.export('model.hyrf', name, data=scene)\n"
     "hyrfpack.export('model.hyrf', 'colmap', data=scene, colmap=True)",
-    "bench": "hyrfpack.bench('model.hyrf', scene, repeats=1, only=['codec'])",
+    "bench": "from hyrfpack.measure import timing\ntiming.WARM_SECONDS = 0\n"
+    "hyrfpack.bench('model.hyrf', scene, repeats=1, only=['codec'])",
     "distill": "hyrfpack.export('model.hyrf', 'a.ply', data=scene, background=False)\n"
     "hyrfpack.distill('a.ply', 'a.hyrf', hyrfpack.DistillConfig(1, 10, 16, 4, 2))",
 }

@@ -1,7 +1,7 @@
 """Runs the Python of the documentation as written: each page from top to bottom, in a fresh interpreter and folder.
 
     python -m tools.safety.run_docs                                docs/python-api.md and the README, all training steps
-    python -m tools.safety.run_docs --steps 20 docs/python-api.md  fewer steps: quick, worse pictures
+    python -m tools.safety.run_docs --steps 20 docs/python-api.md  fewer steps: quick, worse pictures and times
 
 The folder has photos in photos/bonsai: those of --data (default mipnerf360_bonsai among the real sets), or a made-up
 scene where there are none. Pages' Python is what stands in blocks marked so, and in indented ones that import hyrfpack.
@@ -30,6 +30,7 @@ BLOCK = re.compile(r"^```python\n(?P<fenced>.*?)^```$|(?P<indented>(?:^    [^\n]
 FEWER = """
 import runpy, sys
 from hyrfpack.distill import DistillConfig, start
+from hyrfpack.measure import timing
 from hyrfpack.train import TrainConfig
 def cut(settings):
     whole = settings.__post_init__
@@ -40,6 +41,7 @@ def cut(settings):
 cut(TrainConfig)
 cut(DistillConfig)
 start.LEAST_STEPS = start.MOST_STEPS = {steps}
+timing.WARM_SECONDS = 0
 runpy.run_path(sys.argv[1], run_name="__main__")
 """
 
