@@ -20,6 +20,7 @@ from scenes import ball_points, ball_scene, camera_at, small_model
 import hyrfpack
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.distill import DistillConfig, distill_splats
+from hyrfpack.distill.pack import pack
 from hyrfpack.model import HashGridConfig
 from hyrfpack.render import render
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
@@ -173,12 +174,16 @@ def test_gaussians_from_elsewhere_are_learnt_on_a_gpu(gpu, tmp_path, monkeypatch
         "hyrfpack.data.PictureCache.stream", lambda cache, views: ((view, cache.get(view)) for view in views)
     )
     monkeypatch.setattr("hyrfpack.distill.pack.TRIALS", 1)
+    taught = []
+    monkeypatch.setattr("hyrfpack.distill.fit.pack", lambda learnt, *rest: taught.append(learnt) or pack(learnt, *rest))
     cameras = [camera_at(place, width=12, height=12) for place in ((0.0, -3, 0.5), (0.0, 3, 0.5), (3.0, 0, -0.5))]
     quick = DistillConfig(steps=1, test_views=2, psnr=12)
     reports = [
         distill_splats(ball(12), tmp_path / f"{device}.hyrf", quick, cameras=cameras, device=device)
         for device in ("cpu", "cuda")
     ]
+    places = [(t.model.gaussians.positions.device, t.test.pictures[0].device) for t in taught]
+    assert places == [2 * (torch.device("cpu"),), 2 * (gpu,)]
     here, there = (report.psnr_unpacked for report in reports)
     assert there == pytest.approx(here, abs=0.05)
     assert reports[1].bytes_after == pytest.approx(reports[0].bytes_after, rel=0.05)
