@@ -65,8 +65,7 @@ def choose_device(
             say(NO_TRITON)
         elif not torch.version.hip and torch.cuda.get_device_capability(name) < (8, 0):
             say(OLD_GPU)
-        if number:
-            torch.cuda.set_device(int(number))  # kernels are launched on the current device
+        make_current(torch.device(name))
     if kind == "mps":
         if not torch.backends.mps.is_available():
             raise HyrfError("device 'mps' is not there, torch sees no Apple GPU; use --device cpu")

@@ -150,10 +150,14 @@ def test_the_command_line_trains_and_renders_on_a_gpu(gpu, tmp_path):
     assert (tmp_path / "out" / "0000.png").is_file()
 
 
-def test_a_model_is_measured_packed_and_fine_tuned_on_a_gpu(gpu, tmp_path, monkeypatch):
-    monkeypatch.setattr("hyrfpack.compress.calibrate.ROUNDS", 1)
-    monkeypatch.setattr("hyrfpack.compress.calibrate.FEWEST", 2)
-    monkeypatch.setattr("hyrfpack.compress.calibrate.MOST", 2)
+@pytest.fixture
+def few_pictures(monkeypatch):
+    """Calibration that compares as little as it can."""
+    for name, value in (("ROUNDS", 1), ("FEWEST", 2), ("MOST", 2)):
+        monkeypatch.setattr(f"hyrfpack.compress.calibrate.{name}", value)
+
+
+def test_a_model_is_measured_packed_and_fine_tuned_on_a_gpu(gpu, few_pictures, tmp_path):
     scene = ball_scene(views=2, points=12, side=8)
     config = TrainConfig(steps=1, max_gaussians=12, log2_table_size=4, background=False)
     model = hyrfpack.train(scene, tmp_path / "run", config, quiet=True, device="cpu").model
@@ -164,9 +168,7 @@ def test_a_model_is_measured_packed_and_fine_tuned_on_a_gpu(gpu, tmp_path, monke
     assert sizes["cuda"] == pytest.approx(sizes["cpu"], rel=0.02)
 
 
-def test_gaussians_from_elsewhere_are_learnt_on_a_gpu(gpu, tmp_path, monkeypatch):
-    for name, value in (("ROUNDS", 1), ("FEWEST", 2), ("MOST", 2)):
-        monkeypatch.setattr(f"hyrfpack.compress.calibrate.{name}", value)
+def test_gaussians_from_elsewhere_are_learnt_on_a_gpu(gpu, few_pictures, tmp_path, monkeypatch):
     monkeypatch.setattr("hyrfpack.distill.start.LEAST_STEPS", 3)
     monkeypatch.setattr("hyrfpack.distill.start.HashGridConfig", lambda log2, finest: HashGridConfig(log2, levels=2))
     # One thread: the interpreter runs one kernel at a time.

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -91,8 +90,9 @@ def distill(
         check_type("each of the cameras", camera, Camera)
     Outputs(source, overwrite=True).file(target)
     splats = read_splats(source)
-    how: dict[str, Any] = {"cameras": cameras, "device": device, "say": say, "quiet": quiet}
-    report = distill_splats(splats, target, config, name=str(source), **how)
+    report = distill_splats(
+        splats, target, config, name=str(source), cameras=cameras, device=device, say=say, quiet=quiet
+    )
     return dataclasses.replace(report, bytes_source=_bytes_at(Path(source)))
 
 

@@ -113,7 +113,7 @@ def initial_model(
     opacity_logits = logit(drawable.opacities[:, None].clamp_max(OPAQUE))
     colors = (0.5 + BAND_0 * drawable.harmonics[:, 0]).clamp(*COLORS)
     gaussians = Gaussians(drawable.positions, logit(colors), shapes.sizes[:, None], opacity_logits)
-    model = HybridModel(config, gaussians, torch.Generator().manual_seed(seed)).to(drawable.positions.device)
+    model = HybridModel(config, gaussians, torch.Generator().manual_seed(seed)).to(drawable.device)
     with torch.no_grad():
         for values in (model.radiance.weights[-1], model.radiance.biases[-1]):
             values.zero_()

@@ -80,14 +80,13 @@ def teach(
         f"{len(splats):,} Gaussians, harmonics of degree {splats.degree}; {len(train)} viewpoints "
         f"{'made up' if cameras is None else 'given'} to teach with, {len(test)} held out"
     )
-    light = light_of(original, evenly_spaced(train, LIT_FROM)).cpu().numpy()
-    kept = _lit(light)
+    light = light_of(original, evenly_spaced(train, LIT_FROM))
+    kept = torch.from_numpy(_lit(light.cpu().numpy())).to(device)
     if not len(kept):
         raise HyrfDataError(f"{name}: no view shows anything of the Gaussians; give others with --cameras")
     say(f"{len(splats) - len(kept):,} Gaussians are hardly seen and left out; fitting the fields to the others")
     share = min(1.0, max(LEAST_REGRESSED, config.steps / REGRESSED))
-    lit = Drawable.of(splats[kept], weighted.frame, device), torch.from_numpy(light[kept]).to(device)
-    model = initial_model(*lit, train, config.seed, share)
+    model = initial_model(original[kept], light[kept], train, config.seed, share)
     scene, cache = teaching_scene(name, original, train, test), PictureCache()
     _fit_to_pictures(model, scene, config, cache, quiet)
     return Taught(model, train, *(Sample.of(original, cameras) for cameras in (deciding, test)))

@@ -39,7 +39,7 @@ def teaching_scene(name: str, drawable: Drawable, train: Sequence[Camera], test:
 
 def photograph(drawable: Drawable, camera: Camera) -> Picture:
     """The original as a camera sees it, 8 bits, straight alpha."""
-    make_current(drawable.positions.device)  # in this thread, which may be one that reads photos ahead
+    make_current(drawable.device)  # in this thread, which may be one that reads photos ahead
     drawn = draw(drawable, camera)
     alpha = 1 - drawn.transmittance
     rgb = drawn.rgb / alpha.clamp_min(LEAST_ALPHA)[..., None]
@@ -49,8 +49,7 @@ def photograph(drawable: Drawable, camera: Camera) -> Picture:
 @torch_on_one_thread()
 def light_of(drawable: Drawable, cameras: Sequence[Camera]) -> Tensor:
     """(N,) the light that each Gaussian sends to a picture, in pixels: the sum of T alpha, mean over cameras."""
-    device = drawable.positions.device
-    total = torch.zeros(len(drawable.positions), device=device)
+    total = torch.zeros(len(drawable.positions), device=drawable.device)
     settings = RenderSettings()
 
     def light(camera: Camera) -> tuple[Tensor, Tensor]:
@@ -65,7 +64,7 @@ def light_of(drawable: Drawable, cameras: Sequence[Camera]) -> Tensor:
         return index, light
 
     for first in range(0, len(cameras), LIT_AT_ONCE):
-        for index, sent in side_by_side(light, cameras[first : first + LIT_AT_ONCE], device):
+        for index, sent in side_by_side(light, cameras[first : first + LIT_AT_ONCE], drawable.device):
             total.index_add_(0, index, sent)
     return total / max(1, len(cameras))
 
@@ -85,9 +84,7 @@ class Sample:
     @classmethod
     def of(cls, drawable: Drawable, cameras: Sequence[Camera]) -> Sample:
         """Draw the splats once, however many models are compared with them."""
-        pictures = side_by_side(
-            lambda camera: draw(drawable, camera).rgb.clamp(0, 1), cameras, drawable.positions.device
-        )
+        pictures = side_by_side(lambda camera: draw(drawable, camera).rgb.clamp(0, 1), cameras, drawable.device)
         return cls(list(cameras), pictures)
 
     @torch.no_grad()

@@ -115,7 +115,6 @@ def viewpoints(
     """
     rng = np.random.default_rng(seed)
     inside = surrounds(weighted, drawable) if inside is None else inside
-    device = drawable.positions.device
     found: list[Camera] = []
     others: list[tuple[float, Camera]] = []
 
@@ -125,7 +124,7 @@ def viewpoints(
     for _ in range(TRIED):
         ends = [_inside(weighted, rng) if inside else _outside(weighted, rng) for _ in range(count)]
         cameras = [_camera(place, target, size, FIELD_OF_VIEW[inside]) for place, target in ends]
-        for share, camera in zip(side_by_side(covered, cameras, device), cameras, strict=True):
+        for share, camera in zip(side_by_side(covered, cameras, drawable.device), cameras, strict=True):
             if share >= COVERED:
                 found.append(camera)
             else:
@@ -140,7 +139,7 @@ def coverage(drawable: Drawable, camera: Camera) -> float:
     """How much of a camera's picture splats cover, 0 to 1, from a picture of THUMBNAIL pixels."""
     every = _every(len(drawable.positions))
     # Of n times as many, each like these, the n-th power gets through.
-    seen = draw(drawable.thinned(every), small_camera(camera, THUMBNAIL), black=True).transmittance ** every
+    seen = draw(drawable[::every], small_camera(camera, THUMBNAIL), black=True).transmittance ** every
     return 1 - float(seen.mean())
 
 
@@ -158,8 +157,8 @@ def surrounds(weighted: Weighted, drawable: Drawable) -> bool:
         if clutter[index] <= CLUTTER:
             axes = np.concatenate((np.eye(3), -np.eye(3)))
             cameras = [_camera(places[index], places[index] + axis * weighted.radius, THUMBNAIL, 90.0) for axis in axes]
-            device = drawable.positions.device
-            seen.append(np.mean(side_by_side(lambda camera: coverage(drawable, camera), cameras, device)))
+            shares = side_by_side(lambda camera: coverage(drawable, camera), cameras, drawable.device)
+            seen.append(np.mean(shares))
     return len(seen) > 0 and float(np.median(seen)) >= ENCLOSED
 
 

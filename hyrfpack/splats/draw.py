@@ -51,10 +51,15 @@ class Drawable:
         means, sizes, quats, opacities, harmonics = (torch.from_numpy(array).to(device) for array in arrays)
         return cls(frame, means, sizes, quats, opacities, harmonics, splats.antialiased)
 
-    def thinned(self, every: int) -> Drawable:
-        """Every n-th of the splats."""
+    def __getitem__(self, some: Tensor | slice) -> Drawable:
+        """The splats at indices (n,) int64 on their device, or of a slice."""
         names = "positions", "scales", "quats", "opacities", "harmonics"
-        return replace(self, **{name: getattr(self, name)[::every] for name in names})
+        return replace(self, **{name: getattr(self, name)[some] for name in names})
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors are."""
+        return self.positions.device
 
     @property
     def degree(self) -> int:
