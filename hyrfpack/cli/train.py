@@ -56,7 +56,10 @@ BACKGROUND_COLORS = ("black", "white", "random")
     help="What transparent photos are laid over.",
 )
 @click.option(
-    "--exposure/--no-exposure", default=None, help="Learn each photo's exposure.  [default: where photos differ]"
+    "--exposure/--no-exposure",
+    default=False,
+    show_default=True,
+    help="Learn per-image exposure gains; the file then holds the photos' mean exposure.",
 )
 @click.option("--antialiased", is_flag=True, help="Compensate small Gaussians for the pixel filter.")
 @click.option("--log2-table-size", type=click.IntRange(4, 24), metavar="B", help="Hash rows a level, as 2^B.")

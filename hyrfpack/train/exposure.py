@@ -23,7 +23,6 @@ from hyrfpack.ops.adam import adam_step
 from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.train.config import TrainConfig
 
-NEEDED = 0.2  # stops that photos' exposures differ by (standard deviation), from which on gains are learnt
 STOPS = 2.2 / 2 / np.log(2)  # of light that middle grey becomes lighter by, for each unit of a gain's logarithm
 PULL = 1e-4  # towards gains of one: the gradient of a gain's logarithm, for each unit of it
 LONGEST = 500  # tracks of a photo that are looked at, the longest ones
@@ -195,32 +194,26 @@ class Exposures:
 def exposures_for(
     scene: Scene, config: TrainConfig, cache: PictureCache, device: torch.device
 ) -> tuple[Exposures | None, str]:
-    """The gains that a run starts from, None where it learns none, and why.
+    """Estimate the per-image gains that a run starts from.
 
-    Unless asked for or refused, gains are learnt where tracks say that photos differ by NEEDED and more.
+    Gains are learnt only where `config.exposure` asks for them: they lower the plain PSNR of held-out photos.
+
+    Returns:
+        The gains, None where exposure compensation is off, and a sentence for the run's record.
 
     Raises:
-        HyrfTrainingError: they are asked for, and the photos have transparency.
+        HyrfTrainingError: exposure compensation is on and the photos have transparency.
         HyrfDataError: a photo cannot be read.
     """
-    if config.exposure is False:
-        return None, "off: asked for"
+    if not config.exposure:
+        return None, "off"
     if scene.has_alpha:
-        if config.exposure:
-            raise HyrfTrainingError(
-                f"{scene.path}: photos with transparency are laid over a colour of one exposure; leave out --exposure"
-            )
-        return None, "off: photos with transparency"
-    if config.exposure is None and config.steps < len(scene.train):
-        return None, f"off: {config.steps:,} steps are less than the {len(scene.train):,} photos"
+        raise HyrfTrainingError(
+            f"{scene.path}: photos with transparency are laid over a colour of one exposure; leave out --exposure"
+        )
     observed = observe(scene, cache)
     gains = gains_from(observed, len(scene.train))
     known = len(np.unique(observed.photo))
     spread = float(gains.mean(1).std()) * STOPS
     found = f"by their tracks the photos differ by {spread:.2f} stops" if known else "no tracks tell of the photos"
-    on = spread >= NEEDED if config.exposure is None else config.exposure
-    if not on:
-        return None, f"off: {found}"
-    return Exposures(
-        scene.train, gains, device
-    ), f"gains of each photo: {'asked for; ' if config.exposure else ''}{found}"
+    return Exposures(scene.train, gains, device), f"per-image gains: {found}"

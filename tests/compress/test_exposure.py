@@ -35,7 +35,8 @@ def truth() -> list[View]:
 
 @pytest.fixture(scope="module")
 def trained(scene, tmp_path_factory) -> Path:
-    return train(scene, tmp_path_factory.mktemp("run"), TrainConfig(steps=150, max_gaussians=300), quiet=True).model
+    config = TrainConfig(steps=150, max_gaussians=300, exposure=True)
+    return train(scene, tmp_path_factory.mktemp("run"), config, quiet=True).model
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from hyrfpack.train import TrainConfig, Trainer
 from hyrfpack.train.exposure import PULL, USABLE, Exposures, Observations, gains_from, observe
 
 CPU = torch.device("cpu")
-SHORT = TrainConfig(steps=30, seed=3, max_gaussians=160)
+SHORT = TrainConfig(steps=30, seed=3, max_gaussians=160, exposure=True)
 
 
 def centred(gains: np.ndarray) -> np.ndarray:
@@ -163,18 +163,24 @@ def test_gains_that_are_known_are_found_and_the_model_keeps_the_mean():
 
     trainer = trained(scene, dataclasses.replace(SHORT, steps=60))
 
-    assert trainer.choices["exposure"].startswith("gains of each photo: by their tracks the photos differ by 0.5")
+    assert trainer.choices["exposure"].startswith("per-image gains: by their tracks the photos differ by 0.5")
     np.testing.assert_allclose(trainer.exposures.values.detach(), centred(gains), atol=0.05)
 
 
-def test_photos_alike_and_photos_without_tracks_are_trained_as_they_are():
-    alike = exposed_scene(np.ones((6, 1)))
-    for scene, why in ((alike, "0.0"), (dataclasses.replace(alike, tracks={}), "no tracks")):
-        trainer, without = trained(scene), trained(scene, dataclasses.replace(SHORT, exposure=False))
+def test_gains_are_not_learnt_by_default_even_where_photos_differ_by_a_stop():
+    scene = exposed_scene(alternating(6, stops=1.0))
+    default = dataclasses.replace(SHORT, exposure=TrainConfig().exposure)
 
-        assert trainer.exposures is None and why in trainer.choices["exposure"]
-        assert without.choices["exposure"] == "off: asked for"
-        assert parameters(trainer) == parameters(without) and untimed(trainer) == untimed(without)
+    by_default, without = trained(scene, default), trained(dataclasses.replace(scene, tracks={}), default)
+
+    assert by_default.exposures is None and by_default.choices["exposure"] == "off"
+    assert parameters(by_default) == parameters(without) and untimed(by_default) == untimed(without)
+
+
+def test_gains_of_photos_without_tracks_start_at_one():
+    trainer = Trainer(dataclasses.replace(exposed_scene(alternating(6)), tracks={}), SHORT)
+    assert trainer.choices["exposure"] == "per-image gains: no tracks tell of the photos"
+    assert torch.equal(trainer.exposures.values, torch.zeros(6, 3))
 
 
 def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path):
@@ -192,13 +198,9 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path):
         Trainer(scene, dataclasses.replace(SHORT, exposure=False)).load(path)
 
 
-def test_what_exposure_cannot_be_learnt_of():
-    few = Trainer(exposed_scene(alternating(6)), dataclasses.replace(SHORT, steps=5))
-    assert few.exposures is None and few.choices["exposure"] == "off: 5 steps are less than the 6 photos"
-    cut_out = ball_scene(4, alpha=True)
-    assert Trainer(cut_out, SHORT).choices["exposure"] == "off: photos with transparency"
+def test_exposure_of_photos_with_transparency_is_refused():
     with pytest.raises(HyrfTrainingError, match=r"balls: photos with transparency .*leave out --exposure"):
-        Trainer(cut_out, dataclasses.replace(SHORT, exposure=True))
+        Trainer(ball_scene(4, alpha=True), SHORT)
 
 
 def test_exposure_that_drifts_is_predicted_for_photos_held_out():
