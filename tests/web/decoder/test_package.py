@@ -201,3 +201,13 @@ def test_a_file_is_read_in_a_worker():
 
     recorded = np.load(GOLDEN / "v1.1_compact.npz")["gaussians.positions"]
     assert count == len(recorded) and np.array_equal(np.array(positions, np.float32), recorded.ravel())
+
+
+def test_the_documentation_and_the_readme_name_the_package_and_the_three_js_loader():
+    page, readme = ((ROOT / path).read_text() for path in ("docs/web.md", "README.md"))
+
+    for place in ("hyrfpack/web/hyrf", "examples/three"):
+        assert place in page and (ROOT / place / "README.md").exists()
+    assert "npm install ./hyrfpack/web/hyrf" in page and "loadHyrf" in page
+    assert "hyrf.js" in readme and "three.js" in readme and "docs/web.md#in-your-own-javascript" in readme
+    assert "\n## In your own JavaScript\n" in page
