@@ -21,6 +21,7 @@ from hyrfpack.cli.common import (
     overwrite_option,
     print_json,
 )
+from hyrfpack.cli.live import training_view, view_options
 
 if TYPE_CHECKING:
     from hyrfpack.make import MakeResult
@@ -63,6 +64,7 @@ LISTED = 5  # photos that were left out
 @click.option("--work", type=OUTPUT, metavar="DIR", help="Where each stage's product is kept.  [default: FILE's .work]")
 @click.option("--device", metavar="NAME", default="auto", show_default=True, help="Where to train: cpu, cuda, cuda:N.")
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Same seed, same bytes.")
+@view_options
 @overwrite_option
 @json_option
 def make(
@@ -78,6 +80,8 @@ def make(
     work: Path | None,
     device: str,
     seed: int,
+    view: bool,
+    view_port: int | None,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -104,7 +108,10 @@ def make(
 
     place = chosen_device(device)
     try:
-        with Display() as display:
+        with (
+            Display() as display,
+            training_view(output.name, view, view_port, display.say) as observer,
+        ):
             result = run(
                 photos,
                 output,
@@ -121,6 +128,7 @@ def make(
                 overwrite=overwrite,
                 report=display.show,
                 say=display.say,
+                observer=observer,
             )
     except Stopped as stop:
         note(f"stopped in {stop.stage}; the same command goes on")

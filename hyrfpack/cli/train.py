@@ -22,6 +22,7 @@ from hyrfpack.cli.common import (
     read_scene,
     scene_options,
 )
+from hyrfpack.cli.live import training_view, view_options
 from hyrfpack.cli.processes import on_processes
 from hyrfpack.errors import HyrfNoPosesError
 
@@ -72,6 +73,7 @@ BACKGROUND_COLORS = ("black", "white", "random")
     metavar="FILE",
     help="Write progress here as lines of JSON; with tensorboard, scalars beside it.",
 )
+@view_options
 @click.option("--poses", is_flag=True, help="Where DATA has no poses, estimate them first, into RUN/scene.")
 @click.option("--resume", is_flag=True, help="Go on from the run's checkpoint.")
 @click.option("--overwrite", is_flag=True, help="Replace what an earlier run left in the folder.")
@@ -84,6 +86,8 @@ def train(
     reading: dict[str, Any],
     cache_mb: int | None,
     log: Path | None,
+    view: bool,
+    view_port: int | None,
     poses: bool,
     resume: bool,
     overwrite: bool,
@@ -126,7 +130,7 @@ def train(
     from hyrfpack.device import describe_device
     from hyrfpack.train import TrainConfig
     from hyrfpack.train import train as run
-    from hyrfpack.train.run import resuming
+    from hyrfpack.train.run import is_begun, resuming
 
     place = chosen_device(device, ranks)
     try:
@@ -139,9 +143,17 @@ def train(
     note(f"{scene.layout} scene: {len(scene.train)} photos to train on, {len(scene.test)} held out; on {where}")
     cache = None if cache_mb is None else PictureCache(cache_mb * 2**20 // ranks.local_size)
     config = TrainConfig(**settings)
-    result = run(
-        scene, out, config, resume=resume, overwrite=overwrite, cache=cache, device=place, log=log, ranks=ranks
-    )
+    with training_view(out.name, view and ranks.leads, view_port, note) as observer:
+        try:
+            result = run(
+                scene, out, config, resume=resume, overwrite=overwrite, cache=cache, device=place, observer=observer,
+                log=log, ranks=ranks,
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            if not is_begun(out):
+                raise
+            note(f"stopped; {resuming(overwrite)} goes on")
+            click.get_current_context().exit(1)
     detail("seconds: " + ", ".join(f"{part} {t:.1f}" for part, t in result.metrics.get("stage_seconds", {}).items()))
     if not result.complete and result.step == 0:
         note("stopped before the first step; the same command begins anew")
@@ -158,6 +170,8 @@ def train(
         if scores := metrics.get("evaluation"):
             predicted = at_predicted_exposure(scores["psnr_predicted"])
             click.echo(f"held-out views: {scores['psnr']:.2f} dB{predicted}, SSIM {scores['ssim']:.4f}")
+        if view:
+            note(f"'hyrfpack view {result.model}' shows the model again")
     if not result.complete:
         click.get_current_context().exit(1)
 

@@ -6,7 +6,7 @@ import functools
 import os
 import statistics
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -95,6 +95,8 @@ def evaluate(
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     pictures: str | os.PathLike[str] | None = None,
     picture_count: int = PICTURES,
+    report: Callable[[int, int], None] = lambda done, total: None,
+    warn: Callable[[str], None] | None = None,
     ranks: Ranks = ALONE,
 ) -> Evaluation:
     """Render held-out views and score them against their photos.
@@ -109,6 +111,9 @@ def evaluate(
         lpips_weights: see `hyrfpack.evaluate.lpips`; without it lpips is None.
         settings: how to render.
         pictures: folder for photo | render | error pictures of `picture_count` views spread over `views`.
+        report: told how many views are scored and how many there are: at the beginning and after each view. Each of
+            several processes reports its own share.
+        warn: told of each picture that cannot be written, while scoring continues; without it that is an error.
         ranks: processes that share the views, each of which gets all scores.
 
     Raises:
@@ -143,9 +148,13 @@ def evaluate(
             photo, mask = upload(trained[name].load(), solid, device)
             return fitted_gains(render(model, trained[name].camera, settings, decoded=decoded).rgb, photo, mask)
 
+        own = ranks.share(list(enumerate(views)))
+        report(0, len(own))
         render(model, views[0].camera, settings, decoded=decoded)  # compiles kernels and fills caches
         scores: list[tuple[int, ViewScore | None, float]] = []
-        for number, view in ranks.share(list(enumerate(views))):
+        for done, (number, view) in enumerate(own):
+            if done:
+                report(done, len(own))
             photo = view.load()
             reference, mask = upload(photo, solid, device)
             if mask is not None and not mask.any():
@@ -175,7 +184,13 @@ def evaluate(
             scores.append((number, score, seconds))
             if pictures is not None and number in drawn:
                 sheet = comparison(reference, image, mask, _caption(score))
-                save_picture(Path(pictures, drawn[number]), sheet)
+                try:
+                    save_picture(Path(pictures, drawn[number]), sheet)
+                except HyrfError as error:
+                    if warn is None:
+                        raise
+                    warn(str(error))
+        report(len(own), len(own))
         return scores
 
     told = sorted((row for rows in ranks.told(ranks.agree(scored)) for row in rows), key=lambda row: row[0])

@@ -26,6 +26,7 @@ from hyrfpack.make.state import digest_all
 from hyrfpack.make.work import Say, Stopped, Work, interruptible
 from hyrfpack.outputs import StrPath
 from hyrfpack.scene import Scene
+from hyrfpack.train import Trainer
 from hyrfpack.train.config import LARGEST_SEED
 
 __all__ = ["MakeResult", "Stopped", "make"]
@@ -88,6 +89,7 @@ def make(
     overwrite: bool = False,
     report: Callable[[Progress], None] | None = None,
     say: Say = lambda sentence: None,
+    observer: Callable[[Trainer], None] | None = None,
 ) -> MakeResult:
     """Make a scene of photos: poses if there are none, training, compression, scores on held-out photos, export.
 
@@ -111,6 +113,7 @@ def make(
         overwrite: replace an output that is there.
         report: told how far the work is.
         say: told what is going on, in sentences.
+        observer: of the training, as of `hyrfpack.train`.
 
     Raises:
         HyrfError: what is given cannot be used, the output may not or cannot be written, options do not go together
@@ -147,7 +150,7 @@ def make(
             )
             request.check()
             with held(request.work, "make", "another with --work"):
-                return _Making(request, began, report, say).run()
+                return _Making(request, began, report, say, observer).run()
         except Stopped:
             raise
         except KeyboardInterrupt as error:  # before, between and after the stages
@@ -157,8 +160,16 @@ def make(
 class _Making:
     """One call of `make`."""
 
-    def __init__(self, request: Request, began: float, report: Callable[[Progress], None] | None, say: Say) -> None:
+    def __init__(
+        self,
+        request: Request,
+        began: float,
+        report: Callable[[Progress], None] | None,
+        say: Say,
+        observer: Callable[[Trainer], None] | None,
+    ) -> None:
         """Args: began: when the call did, by the monotonic clock."""
+        self.observer = observer
         self.request = request
         self.source = request.source
         self.began = began
@@ -190,7 +201,9 @@ class _Making:
         plan, scene = self._plan(path, reading, scene, cache)
         if request.minutes is None:
             self.reporter.estimates |= forecast_scene(scene, plan, request.device)
-        training = stages.fit(work, scene, self._digest(scene), plan, request.seed, request.device, cache)
+        training = stages.fit(
+            work, scene, self._digest(scene), plan, request.seed, request.device, cache, self.observer
+        )
         stages.pack(work, scene, plan, request.device)
         return self._result(work.folder / stages.PACKED, scene, poses=poses, training=training)
 

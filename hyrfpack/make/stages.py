@@ -28,9 +28,9 @@ from hyrfpack.make.progress import Reporter
 from hyrfpack.make.state import digest, digest_all
 from hyrfpack.make.work import PRODUCTS, Work
 from hyrfpack.scene import Scene
-from hyrfpack.train import train
+from hyrfpack.train import Trainer, train
 from hyrfpack.train.progress import SMOOTHING
-from hyrfpack.train.run import CHECKPOINT, METRICS, MODEL
+from hyrfpack.train.run import CHECKPOINT, METRICS, MODEL, is_begun
 
 SCENE, RUN, PACKED, EXPORTED = (PRODUCTS[stage] for stage in ("poses", "training", "compression", "export"))
 POSES = "poses.json"  # the report of `hyrfpack.estimate_poses`, in the scene's folder
@@ -69,7 +69,14 @@ def pose(work: Work, photos: Path, files: Sequence[Path], matching: str, seed: i
 
 
 def fit(
-    work: Work, scene: Scene, data: str, plan: Plan, seed: int, device: torch.device, cache: PictureCache
+    work: Work,
+    scene: Scene,
+    data: str,
+    plan: Plan,
+    seed: int,
+    device: torch.device,
+    cache: PictureCache,
+    observer: Callable[[Trainer], None] | None,
 ) -> dict[str, Any]:
     """Train into `run/`; returns steps, Gaussians and the choices made."""
     config = plan.config(seed)
@@ -81,17 +88,19 @@ def fit(
                 f"training: {plan.steps:,} steps on {len(scene.train)} photos, {len(scene.test)} held out; "
                 f"on {describe_device(device)}"
             )
-            resume = going_on and (run / CHECKPOINT).is_file()
+            resume = going_on and is_begun(run)
             report = _training_report(work.reporter, plan.steps)
             try:
                 trained = train(
                     scene, run, config, resume=resume, overwrite=True, cache=cache, device=device, quiet=True,
-                    report=report,
+                    report=report, phase=_phase_report(work.reporter), observer=observer,
                 )  # fmt: skip
             except HyrfError as error:  # what it says of going on is about the command `train`
                 raise error.__cause__ if isinstance(error.__cause__, HyrfError) else error from None
             if not trained.complete:
                 raise KeyboardInterrupt
+            if not (run / METRICS).is_file():  # a full disk; the next call completes it
+                raise HyrfError(trained.missing)
         metrics = json.loads((run / METRICS).read_bytes())
         facts = {key: metrics[key] for key in ("gaussians", "bytes", "choices", "device")}
         return {"steps": plan.steps, **facts}, [f"{RUN}/{name}" for name in (MODEL, METRICS)]
@@ -129,6 +138,20 @@ def _training_report(reporter: Reporter, steps: int) -> Callable[[int, float, fl
         reporter.update(step / steps, f"{step:,}/{steps:,}", *quality, f"{gaussians:,} Gaussians")
 
     return report
+
+
+def _phase_report(reporter: Reporter) -> Callable[[str, int, int], None]:
+    """Tells of work before the first and after the last step, each kind of it with a share and a pace of its own."""
+    last = ""
+
+    def phase(what: str, done: int, total: int) -> None:
+        nonlocal last
+        if what != last:
+            last = what
+            reporter.begin("training", what)
+        reporter.update(done / total if total else 0.0, what, *([f"{done:,}/{total:,}"] if total else []))
+
+    return phase
 
 
 # -- packing -------------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from statistics import fmean
 
 import torch
@@ -56,6 +57,7 @@ def measure_budget(
     device: torch.device,
     report: Callable[[int, float, float, int], None] = lambda step, loss, mse, gaussians: None,
     stop: Callable[[], bool] = lambda: False,
+    phase: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> tuple[float, str] | None:
     """Times the usual budget that a scene is worth, one of `FACTORS`, and why; None where it was stopped.
 
@@ -68,12 +70,18 @@ def measure_budget(
         report: told after each of `MOST_STEPS` steps at most its number, the loss and mean squared error of its view,
             and how many Gaussians there are.
         stop: asked after each step.
+        phase: told what is being done, and how many of how many steps, photos or views are done.
 
     Raises:
         HyrfError: as `Trainer.run`; a photo cannot be read.
     """
     near, judges = split(scene.train)
-    judges = [view for view in judges if is_usable(cache.get(view))]
+    usable = []
+    for done, view in enumerate(judges):
+        phase("reading photos to score pilot runs on", done, len(judges))
+        if is_usable(cache.get(view)):
+            usable.append(view)
+    judges = usable
     if not judges:
         return 1.0, "masks leave nothing of the photos to judge by"
     scene = dataclasses.replace(scene, train=near, test=[])
@@ -86,16 +94,20 @@ def measure_budget(
         for budget in (few, usual):
             seed = config.seed ^ len(gains)
             settings = dataclasses.replace(config, steps=PILOT_STEPS, max_gaussians=budget, seed=seed)
+            finished = 2 * len(gains) + len(scores)
+            name, before = f"pilot run {finished + 1} of {2 * len(gains) + 2}", PILOT_STEPS * finished
+            phase(f"{name}: reading photos", 0, 0)
             trainer = Trainer(scene, settings, cache, device)
-            before = PILOT_STEPS * (2 * len(gains) + len(scores))
 
-            def tell(trainer: Trainer, loss: float, mse: float, before: int = before) -> None:
+            def tell(trainer: Trainer, loss: float, mse: float, before: int = before, name: str = name) -> None:
                 report(before + trainer.step, loss, mse, len(trainer.model))
+                phase(f"{name}: training", trainer.step, PILOT_STEPS)
 
             trainer.run(report=tell, stop=stop)
             if stop():
                 return None
-            scores.append(evaluate(trainer.model, judges).psnr_corrected)
+            tell_scored = partial(phase, f"{name}: scoring")
+            scores.append(evaluate(trainer.model, judges, report=tell_scored).psnr_corrected)
         gains.append(scores[1] - scores[0])
     gain = fmean(gains)
     worth = max(gain / EXPECTED, FACTORS[0])

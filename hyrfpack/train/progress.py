@@ -1,4 +1,4 @@
-"""The live line of a training run."""
+"""The live line of a training run, and of what comes before its first and after its last step."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import math
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from threading import Event, Thread
 from time import monotonic
 
-from rich.console import Console, ConsoleOptions, RenderResult
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.live import Live
 from rich.text import Text
 
@@ -16,6 +17,8 @@ from hyrfpack.evaluate.metrics import decibels
 
 SMOOTHING = 0.05  # weight of the newest step in the running means
 LOG_EVERY = 15.0  # seconds between lines when standard error is not a terminal
+FIRST_PHASE_LOG_SECONDS = 2.0  # a phase that takes longer than this gets a line there
+MIN_ETA_SECONDS = 1.0  # a phase shows no remaining time below this, nor before it has taken as long
 COLD_STEPS = 2  # in which kernels are compiled: they say nothing of the speed
 FAIR_STEPS, FAIR_SECONDS = 3, 10.0  # from which on the speed is known well enough to speak of hours
 LONG = 3600.0  # seconds left, from which on it is told what would make them fewer
@@ -60,12 +63,8 @@ class ProgressLine:
         self.mse: float | None = None
         self.quiet = quiet or sys.stderr is None
         self.advice = advice
-        self.line = StatusLine({"steps": f"{done:,}/{steps:,}"}, done / steps)
-        self.live: Live | None = None
-        if not self.quiet and sys.stderr.isatty():
-            console = Console(stderr=True)
-            if not console.is_dumb_terminal:
-                self.live = Live(self.line, console=console, refresh_per_second=4)
+        self.line = StatusLine({"steps": f"{done:,}/{steps:,}", "left": "preparing the first step"}, done / steps)
+        self.live = None if self.quiet else _live_on_terminal(self.line)
 
     def __enter__(self) -> ProgressLine:
         if self.live:
@@ -109,6 +108,8 @@ class ProgressLine:
             "gone": f"{duration(now - self.start)} gone",
             "left": f"{duration(left)} left",
         }
+        if step == self.steps:
+            del parts["left"]
         if self.live:
             self.line.parts, self.line.share = parts, step / self.steps
         else:
@@ -120,6 +121,86 @@ class ProgressLine:
         if self.advice and fair and left > LONG:
             self.note(f"this takes {left / 3600:.1f} more hours; {self.advice} would shorten it")
             self.advice = ""
+
+
+class PhaseLine:
+    """Shows work other than training steps on standard error: what is done, how far it is, and the time gone and left.
+
+    On a terminal one line, which is removed at the end; elsewhere a plain line where a phase takes longer, and then
+    every few seconds. The clock runs on between two updates. Where there is no standard error, nothing.
+    """
+
+    def __init__(self, quiet: bool = False) -> None:
+        """Args: quiet: show nothing."""
+        self.quiet = quiet or sys.stderr is None
+        self.what, self.done, self.total = "", 0, 0
+        self.start = monotonic()
+        self.live = None if self.quiet else _live_on_terminal(self, transient=True)
+        self._over = Event()
+        self._logger = Thread(target=self._log, daemon=True)
+
+    def __enter__(self) -> PhaseLine:
+        if self.live:
+            with suppress(OSError, ValueError):
+                self.live.start()
+        elif not self.quiet:
+            self._logger.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        if self.live:
+            with suppress(OSError, ValueError):
+                self.live.stop()
+        elif not self.quiet:
+            self._logger.join()
+
+    def note(self, sentence: str) -> None:
+        """Tell the person something that stays."""
+        if self.live:
+            with suppress(OSError, ValueError):
+                self.live.console.print(sentence, markup=False, highlight=False)
+        elif not self.quiet:
+            _print(sentence)
+
+    def update(self, what: str, done: int, total: int) -> None:
+        """Take in how far the work is.
+
+        Args:
+            what: is done; a new text begins a new phase.
+            done, total: items of it; a total of 0 says that nobody knows.
+        """
+        if what != self.what:
+            self.start = monotonic()
+        self.what, self.done, self.total = what, done, total
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        if parts := self.parts(monotonic()):
+            yield StatusLine(parts, self.done / self.total if self.total else 0.0, ("gone", "left", "count"))
+
+    def parts(self, now: float) -> dict[str, str]:
+        """What is known at a time of the monotonic clock, by name in the order of reading."""
+        if not self.what:
+            return {}
+        gone = now - self.start
+        parts = {"what": self.what}
+        if self.total:
+            parts["count"] = f"{self.done:,}/{self.total:,}"
+        parts["gone"] = f"{duration(gone)} gone"
+        left = gone * (self.total - self.done) / self.done if self.done else 0.0
+        if min(gone, left) >= MIN_ETA_SECONDS:
+            parts["left"] = f"{duration(left)} left"
+        return parts
+
+    def _log(self) -> None:
+        """Print a line where one is due, until it is over."""
+        printed: tuple[float, float] = (-1.0, 0.0)  # the start of the phase that the last line was about, and when
+        while not self._over.wait(0.25):
+            now, start = monotonic(), self.start
+            due = FIRST_PHASE_LOG_SECONDS <= now - start if printed[0] != start else now - printed[1] >= LOG_EVERY
+            if due and (parts := self.parts(now)):
+                printed = start, now
+                _print("  ".join(parts.values()))
 
 
 def duration(seconds: float) -> str:
@@ -153,6 +234,14 @@ class StatusLine:
             done, mark = round(self.share * room), "-" if options.ascii_only else "\u2501"
             line.append("  ").append(mark * done, "bar.complete").append(mark * (room - done), "bar.back")
         yield line.append("".join(f"  {word}" for word in others))
+
+
+def _live_on_terminal(line: RenderableType, transient: bool = False) -> Live | None:
+    """A display that redraws a line on standard error; None where that is no terminal that can."""
+    if not sys.stderr.isatty():
+        return None
+    console = Console(stderr=True)
+    return None if console.is_dumb_terminal else Live(line, console=console, refresh_per_second=4, transient=transient)
 
 
 def _print(line: str) -> None:

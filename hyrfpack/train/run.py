@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import signal
-import statistics
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -15,33 +13,43 @@ from pathlib import Path
 
 import torch
 
-from hyrfpack import format as hyrf_format
-from hyrfpack.atomic import write_atomic
-from hyrfpack.cameras.capture import provenance_of
 from hyrfpack.checks import check_type
 from hyrfpack.data import PictureCache
 from hyrfpack.data.cache import memory_bytes
-from hyrfpack.device import choose_own_device, describe_device
+from hyrfpack.device import choose_own_device
 from hyrfpack.errors import HyrfError, HyrfTrainingError
-from hyrfpack.evaluate import Evaluation, evaluate, picture_names
-from hyrfpack.evaluate.figures import training_curve
-from hyrfpack.model import HybridModel
+from hyrfpack.evaluate import picture_names
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import ALONE, Ranks
-from hyrfpack.render import render
-from hyrfpack.scene import Scene, View, evenly_spaced
+from hyrfpack.scene import Scene, View
 from hyrfpack.train.checkpoint import saved_budget_factor
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.log import TrainingLog
-from hyrfpack.train.pilots import MOST_STEPS, is_undecided, is_usable, measure_budget, measures_budget
-from hyrfpack.train.progress import ProgressLine
+from hyrfpack.train.pilots import PILOT_STEPS, is_undecided, is_usable, measure_budget, measures_budget
+from hyrfpack.train.progress import PhaseLine, ProgressLine
+from hyrfpack.train.results import (
+    CHECKPOINT,
+    CURVE,
+    METRICS,
+    MODEL,
+    RECORD,
+    VIEWS,
+    Phase,
+    Results,
+    TrainingRecord,
+    changed_settings,
+    read_record,
+    save_model,
+    write_results,
+)
 from hyrfpack.train.trainer import Trainer
 
-MODEL, CHECKPOINT, METRICS, CURVE, VIEWS = "model.hyrf", "checkpoint.pt", "metrics.json", "curve.png", "views"
+__all__ = ["CHECKPOINT", "METRICS", "MODEL", "VIEWS", "TrainResult", "is_begun", "resuming", "train"]
+
 # What ends a run early; Windows has no SIGHUP.
 STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 Report = Callable[[int, float, float, int], None]  # step, loss, mean squared error, Gaussians
-BACKGROUND_SEEN = 1e-3  # a background that gets less than this share of the light is not there
+Observer = Callable[[Trainer], None]
 
 
 @dataclass(frozen=True)
@@ -53,12 +61,15 @@ class TrainResult:
         step: optimiser steps taken.
         model: path of the `.hyrf` file, None when interrupted.
         metrics: what `metrics.json` holds, empty when interrupted.
+        missing: one sentence that names the results which could not be written beside the model, as on a full disk,
+            and why; empty when all are there.
     """
 
     complete: bool
     step: int
     model: Path | None
     metrics: dict
+    missing: str = ""
 
 
 def train(
@@ -72,6 +83,8 @@ def train(
     device: str | torch.device = "auto",
     quiet: bool = False,
     report: Report | None = None,
+    phase: Phase | None = None,
+    observer: Observer | None = None,
     log: Path | str | None = None,
     ranks: Ranks = ALONE,
 ) -> TrainResult:
@@ -82,11 +95,15 @@ def train(
     terminal is closed) saves the checkpoint and returns, unless whoever started the program has it ignored; before the
     first step, while short runs measure the budget, there is nothing to save.
 
+    Results that cannot be written beside the model do not fail the run: a call with the same settings, with `resume` or
+    without, completes them without training again. So does a call after an interruption while they are written.
+
     Args:
         scene: from `hyrfpack.load_scene`.
         out: the run's folder, made if missing.
         config: settings, all defaults measured.
-        resume: go on from the folder's checkpoint; the result is the one an uninterrupted run gives.
+        resume: go on from the folder's checkpoint, or complete the results of a finished model; the result is the one
+            an uninterrupted run gives.
         overwrite: replace what an earlier run left in the folder.
         cache: holds decoded photos; by default a quarter of the memory.
         device: where to train, see `hyrfpack.device.choose_device`. A run may be resumed on another one. On a GPU
@@ -95,6 +112,10 @@ def train(
         report: told after each step its number, the loss and mean squared error of its view (NaN where all of it is
             masked) and how many Gaussians there are, in place of the line that is shown otherwise; 0 for its number
             while pilots run.
+        phase: told of all other work, in place of the line that is shown otherwise: what is being done ("scoring
+            held-out photos"), how many items are done, and how many there are (0 where that is not known).
+        observer: called after each step with the trainer, whose model it may read and must not change. On several
+            processes rank 0's is called. Its time does not count as training time.
         log: a file that gets a line of JSON every few steps, and TensorBoard's files beside it where that is
             installed; see `hyrfpack.train.log.TrainingLog`. A resumed run adds to it.
         ranks: processes that train together, from `hyrfpack.parallel.ranks.joined`: all call this with the same scene
@@ -104,8 +125,8 @@ def train(
     Raises:
         HyrfError: the folder holds another run, training cannot start or go on, no photo has a pixel to train on or to
             score, a held-out photo cannot be read (all of which is found before the first step), or the results would
-            replace photos or other files, or cannot be written (a checkpoint that cannot, while training, is a line on
-            standard error).
+            replace photos or other files, or the model cannot be written (a checkpoint that cannot, while training,
+            is a line on standard error; for other results see `TrainResult.missing`).
         TypeError: `scene` is no Scene or `config` no TrainConfig.
 
     Example:
@@ -121,42 +142,55 @@ def train(
     check_type("config", config, TrainConfig)
     checkpoint = out / CHECKPOINT
     device = choose_own_device(device, ranks)
-    resume = ranks.first(resume or (ranks.restarts > 0 and checkpoint.is_file()))
+    resume = ranks.first(resume or (ranks.restarts > 0 and is_begun(out)))
     cache = cache or PictureCache(memory_bytes() // 4 // ranks.local_size)
 
-    def check() -> None:
-        if not ranks.leads:
-            return
-        _prepare(out, scene, resume, overwrite)
-        if log is not None:
-            Outputs(scene=scene, overwrite=resume or overwrite).file(log)
-        _check_photos(scene, cache)
-
-    ranks.agree(check)
     silent = quiet or report is not None or not ranks.leads
+
+    def check(config: TrainConfig, phase: Phase) -> TrainingRecord | None:
+        if not ranks.leads:
+            return None
+        record = read_record(out) if resume or not overwrite else None
+        _prepare(out, scene, config, record, resume, overwrite)
+        if log is not None:
+            Outputs(scene=scene, overwrite=resume or overwrite or record is not None).file(log)
+        if record is None:
+            _check_photos(scene, cache, phase)
+        return record
+
+    with PhaseLine(silent) as phases:
+        tell_phase = phase or phases.update
+        record = ranks.first(ranks.agree(partial(check, config, tell_phase)))
+    if record is not None:
+        return _complete(record, scene, out, config, device, phase, silent, log, ranks)
+    if overwrite and not resume and ranks.leads:
+        (out / RECORD).unlink(missing_ok=True)  # of the earlier run: this one is not to be taken for it
     why = ""
     if resume and is_undecided(config):
         saved = ranks.agree(lambda: saved_budget_factor(checkpoint) if ranks.leads else None)
         config = dataclasses.replace(config, budget_factor=ranks.first(saved))
     elif not resume and measures_budget(scene, config):
-        with ProgressLine(MOST_STEPS, 0, silent) as line, _stop_requests() as stop:
-            line.note("how many Gaussians is the scene worth? Short runs tell")
-            tell: Report = line.update if report is None else partial(_as_step_nought, report)
+        with PhaseLine(silent) as phases, _stop_requests() as stop:
+            phases.note(f"estimating the Gaussian budget from pilot runs of {PILOT_STEPS} steps")
+            tell: Report = _ignore_step if report is None else partial(_as_step_nought, report)
             # Each does it for itself: none waits for another.
-            pilots = partial(measure_budget, scene, config, cache, device, tell, stop)
+            pilots = partial(measure_budget, scene, config, cache, device, tell, stop, phase or phases.update)
             answers = ranks.told(ranks.agree(pilots))
             measured = None if None in answers else answers[0]
             if measured is None:
                 return TrainResult(False, 0, None, {})
             config, why = dataclasses.replace(config, budget_factor=measured[0]), f": {measured[1]}"
-    trainer = ranks.agree(lambda: Trainer(scene, config, cache, device, ranks=ranks))
+    with PhaseLine(silent) as phases:
+        (phase or phases.update)("reading photos and setting up the model", 0, 0)
+        trainer = ranks.agree(lambda: Trainer(scene, config, cache, device, ranks=ranks))
     trainer.choices["max_gaussians"] += why
     if resume:
         trainer.load(checkpoint)
     elif ranks.leads and not ranks.alone:  # one of an earlier run is not what to go on from, should we be started anew
         checkpoint.unlink(missing_ok=True)
-    with _naming_the_checkpoint(trainer, overwrite), ExitStack() as stack:
+    with ExitStack() as stack:
         with (
+            _naming_the_checkpoint(trainer, overwrite),
             ProgressLine(trainer.steps, trainer.step, silent, _shorter(device)) as line,
             _stop_requests() as stop,
         ):
@@ -170,74 +204,80 @@ def train(
             def tell_all(trainer: Trainer, loss: float, mse: float) -> None:
                 for tell in told:
                     tell(trainer.step, loss, mse, len(trainer.model))
+                if observer is not None and ranks.leads:
+                    observer(trainer)
 
             complete = trainer.run(checkpoint=checkpoint, report=tell_all, stop=stop, warn=line.note)
-        metrics = _finish(trainer, out) if complete and ranks.leads else {}
+        if not complete or not ranks.leads:
+            if written:
+                written.end(complete=complete, step=trainer.step)
+            return TrainResult(complete, trainer.step, out / MODEL if complete else None, {})
+        with PhaseLine(silent) as phases:
+            tell_phase = phase or phases.update
+            with _naming_the_checkpoint(trainer, overwrite):
+                record = save_model(trainer, out, tell_phase)
+            results = write_results(record, scene, out, config, device, tell_phase)
+            missing = _tell_missing(results, overwrite, phases)
         if written:
-            facts = {name: metrics[name] for name in ("gaussians", "bytes") if complete}
-            scores = metrics.get("evaluation", {})
-            facts |= {name: scores[name] for name in ("psnr", "ssim") if name in scores}
-            written.end(complete=complete, step=trainer.step, **facts)
-    if not complete:
-        return TrainResult(False, trainer.step, None, {})
-    if ranks.leads:
-        checkpoint.unlink(missing_ok=True)
-    return TrainResult(True, trainer.step, out / MODEL, metrics)
+            _log_end(written, record.step, results)
+    return TrainResult(True, trainer.step, out / MODEL, results.metrics, missing)
+
+
+def is_begun(out: Path) -> bool:
+    """Whether a run's folder has something that `resume` continues from: a checkpoint, or a model to be scored."""
+    return (out / CHECKPOINT).is_file() or read_record(out) is not None
+
+
+def _complete(
+    record: TrainingRecord,
+    scene: Scene,
+    out: Path,
+    config: TrainConfig,
+    device: torch.device,
+    phase: Phase | None,
+    silent: bool,
+    log: Path | str | None,
+    ranks: Ranks,
+) -> TrainResult:
+    """Compute and write what is missing beside a finished model; rank 0 does."""
+    if not ranks.leads:
+        return TrainResult(True, record.step, out / MODEL, {})
+    with PhaseLine(silent) as phases, ExitStack() as stack:
+        phases.note("the model is trained already; its scores and pictures are computed now")
+        written = None
+        if log is not None:
+            written = stack.enter_context(TrainingLog(Path(log), record.step, record.step, device, phases.note))
+        results = write_results(record, scene, out, config, device, phase or phases.update)
+        if written:
+            _log_end(written, record.step, results)
+        missing = _tell_missing(results, overwrite=False, line=phases)
+    return TrainResult(True, record.step, out / MODEL, results.metrics, missing)
+
+
+def _tell_missing(results: Results, overwrite: bool, line: PhaseLine) -> str:
+    """Say which results are missing, if any, and return the sentence."""
+    if not results.missing:
+        return ""
+    names = " and ".join(filter(None, [", ".join(results.missing[:-1]), results.missing[-1]]))
+    verb = "are" if len(results.missing) > 1 else "is"
+    sentence = f"{results.reasons[0]}; the model is finished, but {names} {verb} missing"
+    line.note(f"{sentence}; {resuming(overwrite)} writes what is missing")
+    return sentence
+
+
+def _log_end(log: TrainingLog, step: int, results: Results) -> None:
+    facts = {name: results.metrics[name] for name in ("gaussians", "bytes")}
+    scores = results.metrics.get("evaluation", {})
+    facts |= {name: scores[name] for name in ("psnr", "ssim") if name in scores}
+    log.end(complete=True, step=step, **facts)
+
+
+def _ignore_step(step: int, loss: float, mse: float, gaussians: int) -> None:
+    """Pilot runs tell how far they are as phases."""
 
 
 def _as_step_nought(report: Report, step: int, loss: float, mse: float, gaussians: int) -> None:
     report(0, loss, mse, gaussians)
-
-
-def _finish(trainer: Trainer, out: Path) -> dict:
-    """Write what a finished run leaves, the model first; returns the metrics."""
-    scene, config = trainer.scene, trainer.config
-    if not trainer.records:
-        raise HyrfTrainingError(
-            f"{scene.path}: masks leave no pixel of the photos that the {trainer.steps:,} steps came to; "
-            "take more steps than there are photos"
-        )
-
-    model = _drop_unseen_background(trainer)
-    path = out / MODEL
-    provenance = {
-        "steps": config.steps,
-        "seed": config.seed,
-        "choices": trainer.choices,
-        **provenance_of(scene, mean_exposure=trainer.exposures is not None),
-        "psnr": statistics.median(record["psnr"] for record in trainer.records[-len(trainer.records) // 10 :]),
-    }
-    report = hyrf_format.save(model, path, profile="raw", provenance=provenance)
-    metrics = {
-        "settings": config.to_dict(),
-        "device": describe_device(trainer.device),
-        "processes": trainer.ranks.size,
-        "scene": {
-            "path": scene.path,
-            "layout": scene.layout,
-            "train": len(scene.train),
-            "test": len(scene.test),
-            "max_size": scene.max_size,
-            "reading": dict(scene.reading),
-        },
-        "choices": trainer.choices,
-        "notes": scene.notes,
-        "gaussians": len(model),
-        "bytes": report.bytes_after,
-        "seconds": trainer.elapsed,
-        "steps_per_second": trainer.steps / max(trainer.elapsed, 1e-9),
-        "stage_seconds": {name: round(value, 3) for name, value in sorted(trainer.seconds.items())},
-        "curve": trainer.records,
-    }
-    if scene.test:
-        # Scored on the file as it was written, not on what is in memory.
-        written = hyrf_format.load(path, trainer.device)
-        written.precision = config.precision
-        scores: Evaluation = evaluate(written, scene.test, training=scene.train, pictures=out / VIEWS)
-        metrics["evaluation"] = scores.to_dict()
-    training_curve(trainer.records, out / CURVE)
-    write_atomic(out / METRICS, json.dumps(metrics, indent=1).encode())
-    return metrics
 
 
 def resuming(overwrite: bool) -> str:
@@ -266,24 +306,37 @@ def _naming_the_checkpoint(trainer: Trainer, overwrite: bool) -> Iterator[None]:
         ) from error
 
 
-def _prepare(out: Path, scene: Scene, resume: bool, overwrite: bool) -> None:
-    if resume and not (out / CHECKPOINT).is_file():
+def _prepare(
+    out: Path, scene: Scene, config: TrainConfig, record: TrainingRecord | None, resume: bool, overwrite: bool
+) -> None:
+    """Refuse what may not be written or continued; `record` is that of a finished model to be completed."""
+    if record is not None:
+        if different := changed_settings(record, scene, config):
+            raise HyrfTrainingError(
+                f"{out}: the folder holds a model that was trained with other settings ({', '.join(different)}); "
+                "use the same ones to complete its results, or replace it with --overwrite"
+            )
+    elif resume and not (out / CHECKPOINT).is_file():
         raise HyrfError(f"{out}: there is no checkpoint to resume; leave out --resume to start a run")
     left = [name for name in (MODEL, CHECKPOINT) if (out / name).exists()]
-    if left and not (resume or overwrite):
+    if left and not (resume or overwrite or record is not None):
         hint = "--resume goes on with it, " if CHECKPOINT in left else ""
         raise HyrfError(f"{out}: the folder holds an earlier run ({left[-1]}); {hint}--overwrite replaces it")
     views = [f"{VIEWS}/{name}" for name in picture_names(scene.test).values()]
-    outputs = Outputs(scene=scene, overwrite=resume or overwrite)
-    outputs.folder(out, [MODEL, CHECKPOINT, METRICS, CURVE, *views])
+    outputs = Outputs(scene=scene, overwrite=resume or overwrite or record is not None)
+    outputs.folder(out, [MODEL, CHECKPOINT, METRICS, CURVE, RECORD, *views])
 
 
-def _check_photos(scene: Scene, cache: PictureCache) -> None:
+def _check_photos(scene: Scene, cache: PictureCache, phase: Phase) -> None:
     """Refuse now what would else end the run after its last step: held-out photos that cannot be read, and masks that
     leave nothing. Photos to train on are read in the first steps anyway, so that one that can be used is enough."""
-    held_out = [is_usable(view.load()) for view in scene.test]
+    held_out = []
+    for done, view in enumerate(scene.test):
+        phase("reading held-out photos", done, len(scene.test))
+        held_out.append(is_usable(view.load()))
     if held_out and not any(held_out):
         raise _nothing_left(scene, scene.test, "to score")
+    phase("reading photos", 0, 0)
     if scene.train and not any(is_usable(cache.get(view)) for view in scene.train):
         raise _nothing_left(scene, scene.train, "to train on")
 
@@ -293,22 +346,6 @@ def _nothing_left(scene: Scene, views: list[View], purpose: str) -> HyrfTraining
         f"{scene.path}: the masks of all {len(views)} photos {purpose} leave no pixel, {views[0].name} for one; check "
         "that white means 'use this pixel'"
     )
-
-
-@torch.no_grad()
-def _drop_unseen_background(trainer: Trainer) -> HybridModel:
-    """The model without its background sphere if hardly any light reaches the training cameras from there."""
-    model = trainer.model
-    if not model.config.background:
-        return model
-    views = evenly_spaced(trainer.scene.train, 16)
-    seen = max(float((1 - render(model, view.camera, background=False).alpha).mean()) for view in views)
-    if seen >= BACKGROUND_SEEN:
-        trainer.choices["background"] += f"; up to {seen:.1%} of a view's light comes from it"
-        return model
-    trainer.choices["background"] = f"none: no training view gets more than {BACKGROUND_SEEN:.1%} of its light from it"
-    model.config = dataclasses.replace(model.config, background=False)
-    return model
 
 
 @contextmanager

@@ -31,6 +31,7 @@ def encode_player(
     description: str = "A player of 3D scenes",
     fetches: str = ANYWHERE,
     stages: Mapping[str, dict] | None = None,
+    updates: str | None = None,
 ) -> bytes:
     """The page that plays a file beside it or one that its address names, as `?content=URL`; or that is dropped on it.
 
@@ -41,11 +42,16 @@ def encode_player(
         description: for those who share the page.
         fetches: what it may fetch, as a content security policy has it.
         stages: from where to look at `.hyrf` files beside the page, by their address relative to it; see `html.stage`.
+        updates: address of a JSON file that says which snapshot of a training `content` is: {"snapshot": number from 1,
+            0 while there is none, "step", "steps"}. The page asks for it again and again and shows newer snapshots from
+            where the viewer stands. None for a file that stays.
 
     Returns:
         The file, UTF-8. The same arguments give the same bytes.
     """
-    beside = {"content": content, "title": title, "stages": stages or {}}
+    beside: dict = {"content": content, "title": title, "stages": stages or {}}
+    if updates is not None:
+        beside["updates"] = updates
     texts = [json_text("content", beside)] if content is not None or stages else []
     if poster is not None:
         texts.append(f'<img id="poster" alt="" src="{html.escape(poster)}">')

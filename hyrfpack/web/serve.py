@@ -1,16 +1,17 @@
-"""A page and the file that it plays, served to browsers of this machine."""
+"""A page and the files that it plays, from disk or from memory, served to browsers of this machine."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import os
 import re
 import socket
 import sys
 import threading
 import webbrowser
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -21,12 +22,32 @@ from hyrfpack.errors import HyrfError
 LOCAL = "127.0.0.1"
 BINARY = "application/octet-stream"
 PIECE = 1 << 18  # bytes of a file that are held at once
+POLL_SECONDS = 0.1  # that a server in a thread takes to end, at most
 _RANGE = re.compile(r"bytes=(\d*)-(\d*)", re.ASCII)
+
+
+class MemoryFile:
+    """A file that is served from memory and may be replaced meanwhile; each request gets one whole version of it."""
+
+    def __init__(self, data: bytes) -> None:
+        self._version = 0, data
+
+    def replace(self, data: bytes) -> None:
+        """Give it another content: its ETag changes, too."""
+        self._version = self._version[0] + 1, data
+
+    def open(self) -> tuple[BinaryIO, int, str]:
+        """The present version to be read, its length in bytes and its ETag."""
+        number, data = self._version
+        return io.BytesIO(data), len(data), f'"{number:x}-{len(data):x}"'
+
+
+Files = Mapping[str, str | os.PathLike[str] | MemoryFile]
 
 
 def serve(
     page: bytes,
-    files: Mapping[str, str | os.PathLike[str]] | None = None,
+    files: Files | None = None,
     *,
     host: str = LOCAL,
     port: int = 0,
@@ -35,7 +56,7 @@ def serve(
 ) -> None:
     """Serve a page, and files beside it, until interrupted (Ctrl-C), which is how it ends without an error.
 
-    Files are read from disk in pieces as they are asked for, whole or in ranges of bytes (RFC 9110, one range a
+    Files on disk are read in pieces as they are asked for, whole or in ranges of bytes (RFC 9110, one range a
     request); one that has changed meanwhile has another ETag, and one that has gone is not found.
 
     Args:
@@ -49,10 +70,8 @@ def serve(
     Raises:
         HyrfError: nothing can listen there.
     """
-    with _server(host, port) as server:
-        server.page, server.files = page, {f"/{name}": Path(path) for name, path in (files or {}).items()}
-        name = f"[{host}]" if ":" in host else host
-        address = f"http://{name}:{server.server_port}/"
+    with _server(host, port, page, files or {}) as server:
+        address = _address(host, server)
         say(address)
         if open_browser:  # beside us: some browsers do not return before they are closed
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
@@ -60,9 +79,35 @@ def serve(
             server.serve_forever()
 
 
+@contextlib.contextmanager
+def serving(page: bytes, files: Files, *, port: int = 0) -> Iterator[str]:
+    """Serve a page and files to this machine in a thread, while the block runs; gives the page's address.
+
+    Args:
+        page, files, port: as of `serve`.
+
+    Raises:
+        HyrfError: nothing can listen at this port.
+    """
+    with _server(LOCAL, port, page, files) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(POLL_SECONDS,), daemon=True)
+        thread.start()
+        try:
+            yield _address(LOCAL, server)
+        finally:
+            server.shutdown()
+            thread.join()
+            server.page, server.files = b"", {}  # for connections that browsers keep open
+
+
+def _address(host: str, server: _Server) -> str:
+    name = f"[{host}]" if ":" in host else host
+    return f"http://{name}:{server.server_port}/"
+
+
 class _Server(ThreadingHTTPServer):
     page = b""
-    files: Mapping[str, Path] = {}
+    files: Mapping[str, Path | MemoryFile] = {}
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):  # the browser went away
@@ -87,17 +132,13 @@ class _Handler(BaseHTTPRequestHandler):
 
     do_HEAD = do_GET
 
-    def _file(self, path: Path) -> None:
+    def _file(self, served: Path | MemoryFile) -> None:
         try:
-            if not path.is_file():  # asked before opening: opening a pipe would wait for a writer
-                raise FileNotFoundError(path)
-            file = path.open("rb")
+            file, size, tag = served.open() if isinstance(served, MemoryFile) else _open_on_disk(served)
         except OSError:
             self.send_error(HTTPStatus.NOT_FOUND, explain="The file that was served here is gone or cannot be read.")
             return
         with file:
-            status = os.fstat(file.fileno())
-            size, tag = status.st_size, f'"{status.st_ino:x}-{status.st_mtime_ns:x}-{status.st_size:x}"'
             shared = {"Accept-Ranges": "bytes", "ETag": tag}
             part = self._asked(size, tag)
             if part is None:
@@ -148,14 +189,25 @@ class _Handler(BaseHTTPRequestHandler):
         """Requests are nobody's news."""
 
 
-def _server(host: str, port: int) -> _Server:
+def _open_on_disk(path: Path) -> tuple[BinaryIO, int, str]:
+    """A file to be read, its length in bytes and its ETag. Raises OSError."""
+    if not path.is_file():  # asked before opening: opening a pipe would wait for a writer
+        raise FileNotFoundError(path)
+    file = path.open("rb")
+    status = os.fstat(file.fileno())
+    return file, status.st_size, f'"{status.st_ino:x}-{status.st_mtime_ns:x}-{status.st_size:x}"'
+
+
+def _server(host: str, port: int, page: bytes, files: Files) -> _Server:
+    """A server that listens and does not answer yet."""
+
     class Server(_Server):
         address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
 
     if not host.strip():  # to the socket, this is every address
         raise HyrfError(f"'{host}' is not an address to listen at; name {LOCAL}, or 0.0.0.0 to let others look")
     try:
-        return Server((host, port), _Handler)
+        server = Server((host, port), _Handler)
     except (OSError, UnicodeError) as error:  # the latter of a name that can be none
         if getattr(error, "errno", None) == errno.EADDRINUSE:
             raise HyrfError(
@@ -163,3 +215,6 @@ def _server(host: str, port: int) -> _Server:
             ) from error
         reason = getattr(error, "strerror", None) or error
         raise HyrfError(f"nothing can listen at port {port} of {host} ({reason}); name another port or host") from error
+    server.page = page
+    server.files = {f"/{name}": file if isinstance(file, MemoryFile) else Path(file) for name, file in files.items()}
+    return server

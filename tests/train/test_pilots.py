@@ -50,7 +50,7 @@ def scores(monkeypatch) -> dict[int, float]:
             pass
 
     monkeypatch.setattr(pilots, "Trainer", Untrained)
-    monkeypatch.setattr(pilots, "evaluate", lambda model, views: SimpleNamespace(psnr_corrected=table[model]))
+    monkeypatch.setattr(pilots, "evaluate", lambda model, views, report: SimpleNamespace(psnr_corrected=table[model]))
     return table
 
 
@@ -76,7 +76,7 @@ def test_what_would_make_the_model_smaller_is_asked_twice(monkeypatch, scores, f
             seeds.append(config.seed)
 
     monkeypatch.setattr(pilots, "Trainer", Seeded)
-    monkeypatch.setattr(pilots, "evaluate", lambda model, views: SimpleNamespace(psnr_corrected=model))
+    monkeypatch.setattr(pilots, "evaluate", lambda model, views, report: SimpleNamespace(psnr_corrected=model))
     assert measured(a_scene())[0] == factor
     assert seeds == ([0, 0] if first >= 1 else [0, 0, 1, 1])
 
@@ -129,7 +129,7 @@ def test_photos_that_masks_leave_nothing_of_do_not_judge(left, monkeypatch):
     monkeypatch.setattr(
         pilots,
         "evaluate",
-        lambda _, views: judged.append([view.name for view in views]) or SimpleNamespace(psnr_corrected=20.0),
+        lambda _, views, report: judged.append([view.name for view in views]) or SimpleNamespace(psnr_corrected=20.0),
     )
     scene = a_scene()
     judges = [view.name for view in pilots.split(scene.train)[1]]
@@ -200,3 +200,15 @@ def test_the_report_hears_of_pilots_as_step_nought(tmp_path):
     steps: list[int] = []
     train(a_scene(), tmp_path, TrainConfig(steps=10), report=lambda step, *_: steps.append(step))
     assert steps[-10:] == list(range(1, 11)) and steps[:-10] in ([0] * 12, [0] * 24)
+
+
+@pytest.mark.usefixtures("short")
+def test_pilot_runs_tell_each_step_and_each_view_that_is_scored():
+    told: list[tuple[str, int, int]] = []
+    measured(a_scene(), phase=lambda *progress: told.append(progress))
+    assert [row for row in told if row[0] == "pilot run 1 of 2: training"] == [
+        ("pilot run 1 of 2: training", step, 6) for step in range(1, 7)
+    ]
+    assert [row for row in told if row[0] == "pilot run 2 of 2: scoring"] == [
+        ("pilot run 2 of 2: scoring", done, 2) for done in range(3)
+    ]

@@ -4,12 +4,13 @@ import io
 import math
 import re
 import sys
+import time
 
 import pytest
 from rich.console import Console
 
 from hyrfpack.train import progress
-from hyrfpack.train.progress import ProgressLine, duration
+from hyrfpack.train.progress import PhaseLine, ProgressLine, duration
 
 
 def test_a_log_file_gets_plain_lines_with_all_that_matters(capsys, monkeypatch):
@@ -21,8 +22,9 @@ def test_a_log_file_gets_plain_lines_with_all_that_matters(capsys, monkeypatch):
     assert out == ""
     assert len(err.splitlines()) == 20
     last = err.splitlines()[-1]
-    for part in ("step 20/20  ", "loss 0.2500", "PSNR 20.00", "1,234 Gaussians", "steps/s", "0 s left"):
+    for part in ("step 20/20  ", "loss 0.2500", "PSNR 20.00", "1,234 Gaussians", "steps/s", "0 s gone"):
         assert part in last
+    assert "left" in err.splitlines()[-2] and "left" not in last
 
 
 def test_the_last_step_is_always_said(capsys):
@@ -243,3 +245,59 @@ def test_standard_error_that_goes_away_does_not_end_the_training(terminal, monke
         gone.close()
         line.note("a sentence")
         line.update(3, 1.0, 0.1, 5)
+
+
+# -- what comes before and after the steps ---------------------------------------------------------------------------
+
+
+def test_a_phase_says_what_is_done_how_far_it_is_and_how_long_it_takes():
+    line = PhaseLine(quiet=True)
+    line.update("scoring held-out photos", 0, 20)
+    line.update("scoring held-out photos", 5, 20)
+    assert line.parts(line.start + 10) == {
+        "what": "scoring held-out photos",
+        "count": "5/20",
+        "gone": "10 s gone",
+        "left": "30 s left",
+    }
+
+
+@pytest.mark.parametrize(("done", "total"), [(0, 20), (20, 20), (0, 0)])
+def test_a_phase_never_says_that_no_time_is_left(done, total):
+    line = PhaseLine(quiet=True)
+    line.update("scoring held-out photos", done, total)
+    assert "left" not in line.parts(line.start + 10)
+
+
+def test_the_clock_of_a_phase_begins_with_the_phase():
+    line = PhaseLine(quiet=True)
+    line.start -= 100
+    line.update("reading photos", 0, 0)
+    first = line.start
+    line.update("reading photos", 0, 0)
+    assert line.start == first and line.parts(first + 3)["gone"] == "3 s gone"
+
+
+def test_a_log_file_gets_a_line_for_a_phase_that_is_long_and_none_for_a_short_one(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "FIRST_PHASE_LOG_SECONDS", 0.0)
+    with PhaseLine() as line:
+        line.update("scoring held-out photos", 5, 20)
+        time.sleep(0.6)
+    assert capsys.readouterr().err == "scoring held-out photos  5/20  0 s gone\n"
+    monkeypatch.setattr(progress, "FIRST_PHASE_LOG_SECONDS", 1e9)
+    with PhaseLine() as line:
+        line.update("scoring held-out photos", 5, 20)
+        time.sleep(0.6)
+    assert capsys.readouterr().err == ""
+
+
+def test_a_terminal_shows_a_phase_and_removes_it_at_the_end(monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    with PhaseLine() as line:
+        line.update("scoring held-out photos", 5, 20)
+        time.sleep(0.6)
+    shown = terminal.getvalue()
+    assert "scoring held-out photos" in shown and "5/20" in shown
+    assert "\x1b[2K" in shown[shown.rindex("photos") :]  # the line is erased

@@ -18,7 +18,7 @@ import pytest
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.web import serve as serving
-from hyrfpack.web.serve import PIECE, serve
+from hyrfpack.web.serve import PIECE, MemoryFile, serve
 
 PAGE = b"<!DOCTYPE html><title>served</title>"
 DATA = np.random.default_rng(0).bytes(3 * PIECE + 17)
@@ -34,8 +34,7 @@ def scene(tmp_path: Path) -> Path:
 @pytest.fixture
 def port(scene: Path) -> Iterator[int]:
     """Of a server with a page and a file."""
-    with serving._server("127.0.0.1", 0) as server:
-        server.page, server.files = PAGE, {"/scene.hyrf": scene}
+    with serving._server("127.0.0.1", 0, PAGE, {"scene.hyrf": scene}) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.02,))
         thread.start()
         yield server.server_port
@@ -149,8 +148,7 @@ def test_a_large_file_is_not_held_in_memory(tmp_path):
 import resource, socket, sys, threading
 from hyrfpack.web import serve
 from pathlib import Path
-with serve._server("127.0.0.1", 0) as server:
-    server.files = {"/scene.hyrf": Path(sys.argv[1])}
+with serve._server("127.0.0.1", 0, b"", {"scene.hyrf": Path(sys.argv[1])}) as server:
     threading.Thread(target=server.serve_forever, daemon=True).start()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with socket.create_connection(("127.0.0.1", server.server_port)) as client:
@@ -220,3 +218,39 @@ def test_a_browser_that_goes_away_is_nobodys_news(capsys: pytest.CaptureFixture,
     )
     serve(bytes(20_000_000), open_browser=True, say=lambda address: None)
     assert capsys.readouterr().err == ""
+
+
+# -- from memory -----------------------------------------------------------------------------------------------------
+
+
+def port_of(address: str) -> int:
+    return int(address.rstrip("/").rpartition(":")[2])
+
+
+def test_a_file_in_memory_is_served_whole_and_in_ranges():
+    with serving.serving(PAGE, {"scene.hyrf": MemoryFile(DATA)}) as address:
+        port = port_of(address)
+        assert ask(port, "/")[2] == PAGE and ask(port)[2] == DATA
+        status, headers, body = ask(port, Range="bytes=5-9")
+        assert (status, headers["Content-Range"], body) == (206, f"bytes 5-9/{len(DATA)}", DATA[5:10])
+
+
+def test_a_file_in_memory_that_is_replaced_has_another_tag_and_none_gets_parts_of_both():
+    file = MemoryFile(DATA)
+    with serving.serving(PAGE, {"scene.hyrf": file}) as address:
+        tag = ask(port_of(address))[1]["ETag"]
+        file.replace(DATA[::-1])
+        status, headers, body = ask(port_of(address), Range="bytes=5-9", If_Range=tag)
+        assert status == 200 and body == DATA[::-1] and headers["ETag"] != tag
+
+
+def test_serving_in_a_thread_ends_with_the_block():
+    with serving.serving(PAGE, {"scene.hyrf": MemoryFile(DATA)}) as address:
+        kept = http.client.HTTPConnection("127.0.0.1", port_of(address), timeout=20)
+        kept.request("GET", "/scene.hyrf")
+        assert kept.getresponse().read() == DATA
+    with pytest.raises(OSError):
+        ask(port_of(address), "/")
+    kept.request("GET", "/scene.hyrf")  # on a connection of before
+    assert kept.getresponse().status == 404
+    kept.close()

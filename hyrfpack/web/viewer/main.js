@@ -11,8 +11,11 @@ import { payload } from "./payload.js";
 import { Player } from "./player.js";
 import { savePicture, shareCamera } from "./share.js";
 import { chosenFile, fetchedFile } from "./source.js";
+import { followTraining, trainingTitle } from "./training.js";
 
 const FADE = 600; // ms, see style.css
+const NOT_BEGUN = "The training has not taken its first step yet.";
+const ENDED = "The training does not answer any more; this is its last snapshot.";
 const IGNORED = { wheel: "Click the scene, then the wheel zooms.", finger: "Tap the scene, then fingers move it." };
 
 // A page around this one that has put it into a <hyrf-viewer> is told of loads and errors.
@@ -175,6 +178,26 @@ function start() {
     return stages.find(([name]) => new URL(encodeURI(name), document.baseURI).href === address)?.[1] ?? null;
   };
 
+  // Show a model that is being trained, and each newer snapshot of it from where one stands.
+  const watchTraining = (address, updates) => new Promise((shown, failed) => {
+    let mine = null; // number of what was opened, once that is the first snapshot
+    const show = async (progress) => {
+      const called = trainingTitle(beside.title, progress);
+      if (mine === null) {
+        remark("");
+        await open(() => fetchedFile(address), called);
+        mine = number;
+        return shown();
+      }
+      await player.open({ ...(await fetchedFile(address)), update: true });
+      if (mine !== number) return;
+      title = next = called;
+      panel.entitle(player.scene, title);
+    };
+    const wanted = () => mine === null || mine === number;
+    followTraining(updates, { show, waiting: () => remark(NOT_BEGUN), wanted }).then(() => wanted() && remark(ENDED), failed);
+  });
+
   const first = async () => {
     if (inside) {
       panel.describe(inside, title);
@@ -184,6 +207,8 @@ function start() {
       return;
     }
     const address = asked.content ?? (beside?.content ? webAddress(beside.content, "content") : null);
+    const updates = asked.content || !beside?.updates ? null : webAddress(beside.updates, "content");
+    if (updates) return watchTraining(address, updates);
     if (address) return open(async () => ({ ...(await fetchedFile(address)), stage: stageOf(address) }), asked.title ?? (asked.content ? null : beside.title));
     element("loading").hidden = true;
     document.body.classList.add("empty");

@@ -26,11 +26,16 @@ export class Panel {
     player.addEventListener("stood", ({ detail }) => (element("cameras").selectedIndex = detail));
   }
 
-  // The scene's name and facts.
-  describe({ kind, count, cameras }, title) {
+  // The scene's name and how much there is of it.
+  entitle({ kind, count }, title) {
     element("title").textContent = element("title").title = document.title = title;
     element("count").textContent = KINDS[kind](count.toLocaleString("en"));
     element("view").setAttribute("aria-label", `${title}, a 3D scene`);
+  }
+
+  // These, and its cameras.
+  describe({ kind, count, cameras }, title) {
+    this.entitle({ kind, count }, title);
     const options = cameras.map((_, number) => new Option(`Camera ${number + 1} of ${cameras.length}`));
     element("cameras").replaceChildren(...options);
     for (const name of ["previous", "next", "cameras"]) element(name).disabled = cameras.length < 2;

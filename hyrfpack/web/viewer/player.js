@@ -94,16 +94,17 @@ export class Player extends EventTarget {
     }
   }
 
-  // Any file: {name, stream}, and `stage` where it is known from where to look: {cameras, up, target}.
-  async open({ name, stream, stage = null }) {
+  // Any file: {name, stream}, and `stage` where it is known from where to look: {cameras, up, target}. `update`: it is
+  // the scene that is shown, as it is now; the eye stays where it is, and nothing is told of it but what is wrong.
+  async open({ name, stream, stage = null, update = false }) {
     try {
-      await this.receive({ name, stream, stage, picture: null });
+      await this.receive({ name, stream, stage, picture: null, update });
     } catch ({ message }) {
       throw new Error(`${name} cannot be opened: ${message}`);
     }
   }
 
-  async receive({ name = "", scene = null, stage = null, stream, picture }) {
+  async receive({ name = "", scene = null, stage = null, stream, picture, update = false }) {
     // What the page came with is shown after all if this cannot be.
     if (this.loader || this.earlier) this.next?.dispose();
     else this.earlier = this.next;
@@ -111,7 +112,7 @@ export class Player extends EventTarget {
       content: (content) => this.take(loader, content),
       progress: ({ what, part }) => this.progress(loader, what, part),
     });
-    Object.assign(loader, { picture, part: 0, scene, remark: "" });
+    Object.assign(loader, { picture, part: 0, scene, remark: "", update });
     this.next = loader;
     try {
       await loader.read({ name, scene, stage, plain: scene?.plain ?? false, stream });
@@ -140,7 +141,7 @@ export class Player extends EventTarget {
   progress(loader, what, part) {
     const [first, last] = SHARES[what];
     loader.part = Math.max(loader.part, first + (last - first) * part);
-    if (loader === (this.next ?? this.loader)) this.tell("progress", { what, part: loader.part });
+    if (loader === (this.next ?? this.loader) && !loader.update) this.tell("progress", { what, part: loader.part });
   }
 
   wanted(loader) {
@@ -167,7 +168,7 @@ export class Player extends EventTarget {
           if (!this.wanted(loader)) throw new Superseded();
           this.progress(loader, "preparing", part);
         });
-        const view = this.view(begins?.eye);
+        const view = this.view(loader.update && sameAxes(this.scene, scene) ? this.eye : begins?.eye);
         await content.coloured(view, scene.tolerance, { goOn: () => this.wanted(loader) });
       } else {
         content = new Splats(gl, splats);
@@ -189,7 +190,9 @@ export class Player extends EventTarget {
       loader.again(true);
       return false;
     }
-    if (begins) this.enter(begins);
+    const stays = loader.update && sameAxes(this.scene, scene);
+    if (stays) Object.assign(this, { scene, cameras: begins?.cameras ?? this.cameras });
+    else if (begins) this.enter(begins);
     this.renderer.show(staged);
     loader.use(number);
     if (loader === this.next) {
@@ -203,12 +206,12 @@ export class Player extends EventTarget {
     this.loaded = true;
     this.moves++;
     this.stale = this.unsorted = true;
-    if (begins) this.tell("opened", scene);
-    else if (scene.count !== loader.scene.count) this.tell("counted", scene);
+    if (begins && !stays) this.tell("opened", scene);
+    else if (!begins && scene.count !== loader.scene.count) this.tell("counted", scene);
     loader.scene = scene;
     this.tell("said", loader.remark);
     this.progress(loader, "preparing", 1);
-    this.tell("loaded");
+    if (!stays) this.tell("loaded");
     this.fit();
     this.resort();
     return true;
@@ -433,6 +436,11 @@ export class Player extends EventTarget {
     if (!picture) throw new Error(TAKEN);
     return picture;
   }
+}
+
+// Whether two scenes have the same origin and unit, so that an eye of one can look at the other.
+function sameAxes(before, after) {
+  return before?.unit === after.unit && before.center.every((value, axis) => value === after.center[axis]);
 }
 
 // How one first stands before a scene. Throws where a camera makes no sense.

@@ -1,0 +1,56 @@
+"""The options --view and --view-port of commands that train."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+if TYPE_CHECKING:
+    from hyrfpack.train import Trainer
+
+Command = TypeVar("Command", bound=Callable)
+
+
+def view_options(command: Command) -> Command:
+    """Options that show the training in a browser: --view, --view-port."""
+    with_options: Any = command
+    for option in (
+        click.option(
+            "--view-port",
+            type=click.IntRange(0, 65535),
+            metavar="PORT",
+            help="Port that --view serves at.  [default: a free one]",
+        ),
+        click.option("--view", is_flag=True, help="Serve a page that shows the model while it is trained."),
+    ):
+        with_options = option(with_options)
+    return with_options
+
+
+@contextmanager
+def training_view(
+    title: str, view: bool, view_port: int | None, say: Callable[[str], None]
+) -> Iterator[Callable[[Trainer], None] | None]:
+    """The observer of a training that --view asks for; None without it.
+
+    Args:
+        title: of the page.
+        view, view_port: the options.
+        say: told the page's address in a sentence.
+
+    Raises:
+        UsageError: --view-port is given alone.
+        HyrfError: nothing can listen at this port.
+    """
+    if view_port is not None and not view:
+        raise click.UsageError("--view-port is the port of --view; give both of them")
+    if not view:
+        yield None
+        return
+    from hyrfpack.live import live_view
+
+    with live_view(title, port=view_port or 0, say=say) as live:
+        yield live.observe

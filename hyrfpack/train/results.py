@@ -1,0 +1,263 @@
+"""What a finished run leaves: the model, then scores, pictures, the training curve and `metrics.json`.
+
+The model is written first. Everything else can be computed again from the model and the training record, a small file
+beside it that is removed when all results are there. So a full disk or an interruption after the last step costs no
+training.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import statistics
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from hyrfpack import format as hyrf_format
+from hyrfpack.atomic import write_atomic
+from hyrfpack.cameras.capture import provenance_of
+from hyrfpack.device import describe_device
+from hyrfpack.errors import HyrfError, HyrfTrainingError
+from hyrfpack.evaluate import evaluate, picture_names
+from hyrfpack.evaluate.figures import training_curve
+from hyrfpack.format.codec import write_model
+from hyrfpack.model import HybridModel
+from hyrfpack.render import render
+from hyrfpack.scene import Scene, evenly_spaced
+from hyrfpack.train.config import TrainConfig
+from hyrfpack.train.pilots import is_undecided
+from hyrfpack.train.trainer import Trainer
+
+MODEL, CHECKPOINT, METRICS, CURVE, VIEWS = "model.hyrf", "checkpoint.pt", "metrics.json", "curve.png", "views"
+RECORD = "training.json"  # the training record
+RECORD_VERSION = 1
+BACKGROUND_SEEN = 1e-3  # a background that gets less than this share of the light is not there
+BACKGROUND_VIEWS = 16  # training views, at most, that decide whether the background is seen
+
+Phase = Callable[[str, int, int], None]  # what is being done, items done, items in all (0: not known)
+
+
+@dataclass(frozen=True)
+class TrainingRecord:
+    """Everything that `metrics.json` needs and the model's file does not hold.
+
+    Attributes:
+        model_sha256: digest of the model's file, in hexadecimal digits.
+        step: optimiser steps taken.
+        settings: plain values that decide the model, see `_settings_of`.
+        metrics: what `metrics.json` will hold, except the scores.
+    """
+
+    model_sha256: str
+    step: int
+    settings: dict[str, Any]
+    metrics: dict[str, Any]
+
+    def encode(self) -> bytes:
+        """The record as JSON."""
+        return json.dumps({"version": RECORD_VERSION, **dataclasses.asdict(self)}).encode()
+
+
+@dataclass(frozen=True)
+class Results:
+    """What was written after the training.
+
+    Attributes:
+        metrics: what `metrics.json` holds; without scores where these could not be computed.
+        missing: files and folders that could not be written, relative to the run's folder.
+        reasons: one sentence for each failure, the first one first.
+    """
+
+    metrics: dict[str, Any]
+    missing: tuple[str, ...] = ()
+    reasons: tuple[str, ...] = ()
+
+
+def read_record(out: Path) -> TrainingRecord | None:
+    """The training record of a finished model whose results are not all written yet.
+
+    Returns:
+        The record, or None where there is none, or it is damaged, or it belongs to another model.
+    """
+    try:
+        content = json.loads((out / RECORD).read_bytes())
+        if content.pop("version") != RECORD_VERSION:
+            return None
+        record = TrainingRecord(**content)
+        digest = hashlib.sha256((out / MODEL).read_bytes()).hexdigest()
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
+    return record if record.model_sha256 == digest and isinstance(record.metrics, dict) else None
+
+
+def changed_settings(record: TrainingRecord, scene: Scene, config: TrainConfig) -> list[str]:
+    """Names of the settings that differ from those of the finished run; a measured budget is no difference."""
+    asked = json.loads(json.dumps(_settings_of(scene, config)))
+    if is_undecided(config):
+        asked["budget_factor"] = record.settings.get("budget_factor")
+    keys = asked.keys() | record.settings.keys()
+    return sorted(key for key in keys if asked.get(key) != record.settings.get(key))
+
+
+def save_model(trainer: Trainer, out: Path, phase: Phase) -> TrainingRecord:
+    """Write the model of a finished run and its training record, and remove what belongs to an earlier model.
+
+    The record is written before the model: a model on a full disk then has its record. Where only the record cannot be
+    written, the checkpoint stays in its place.
+
+    Raises:
+        HyrfTrainingError: no step had a pixel to train on.
+        HyrfError: the model cannot be written; the checkpoint stays.
+    """
+    scene, config = trainer.scene, trainer.config
+    if not trainer.records:
+        raise HyrfTrainingError(
+            f"{scene.path}: masks leave no pixel of the photos that the {trainer.steps:,} steps came to; "
+            "take more steps than there are photos"
+        )
+    model = _drop_unseen_background(trainer, phase)
+    phase("writing the model", 0, 0)
+    provenance = {
+        "steps": config.steps,
+        "seed": config.seed,
+        "choices": trainer.choices,
+        **provenance_of(scene, mean_exposure=trainer.exposures is not None),
+        "psnr": statistics.median(record["psnr"] for record in trainer.records[-len(trainer.records) // 10 :]),
+    }
+    data = hyrf_format.encode_model(model, "raw", provenance)
+    metrics = {
+        "settings": config.to_dict(),
+        "device": describe_device(trainer.device),
+        "processes": trainer.ranks.size,
+        "scene": {
+            "path": scene.path,
+            "layout": scene.layout,
+            "train": len(scene.train),
+            "test": len(scene.test),
+            "max_size": scene.max_size,
+            "reading": dict(scene.reading),
+        },
+        "choices": trainer.choices,
+        "notes": scene.notes,
+        "gaussians": len(model),
+        "bytes": len(data),
+        "seconds": trainer.elapsed,
+        "steps_per_second": trainer.steps / max(trainer.elapsed, 1e-9),
+        "stage_seconds": {name: round(value, 3) for name, value in sorted(trainer.seconds.items())},
+        "curve": trainer.records,
+    }
+    record = TrainingRecord(hashlib.sha256(data).hexdigest(), trainer.step, _settings_of(scene, config), metrics)
+    is_recorded = True
+    try:
+        write_atomic(out / RECORD, record.encode())
+    except HyrfError:
+        is_recorded = False
+    try:
+        write_model(data, out / MODEL)
+    except HyrfError:
+        _remove(out / RECORD)
+        raise
+    for name in (METRICS, CURVE, *_picture_files(scene)):  # they would be taken for results of this model
+        _remove(out / name)
+    if is_recorded:
+        _remove(out / CHECKPOINT)  # which also frees space for the results
+    return record
+
+
+def write_results(
+    record: TrainingRecord, scene: Scene, out: Path, config: TrainConfig, device: torch.device, phase: Phase
+) -> Results:
+    """Score the model's file, and write pictures, curve and `metrics.json`; nothing of it fails the run.
+
+    The training record and the checkpoint are removed once they are not needed any more.
+
+    Args:
+        record: of the model in the folder.
+        scene: with the held-out photos.
+        out: the run's folder.
+        config: of the run.
+        device: where to render.
+        phase: told how far it is.
+    """
+    metrics, missing, reasons = dict(record.metrics), [], []
+    is_scored = True
+    if scene.test:
+        unwritten: list[str] = []
+        try:
+            # Scored on the file as it was written, not on what is in memory.
+            model = hyrf_format.load(out / MODEL, device)
+            model.precision = config.precision
+            scores = evaluate(
+                model,
+                scene.test,
+                training=scene.train,
+                pictures=out / VIEWS,
+                report=lambda done, total: phase("scoring held-out photos", done, total),
+                warn=unwritten.append,
+            )
+            metrics["evaluation"] = scores.to_dict()
+        except HyrfError as error:
+            is_scored = False
+            reasons.append(str(error))
+        if unwritten or not is_scored:
+            missing.append(VIEWS)
+            reasons += unwritten
+    phase(f"drawing {CURVE}", 0, 0)
+    try:
+        training_curve(metrics["curve"], out / CURVE)
+    except HyrfError as error:
+        missing.append(CURVE)
+        reasons.append(str(error))
+    try:
+        if is_scored:
+            write_atomic(out / METRICS, json.dumps(metrics, indent=1).encode())
+            _remove(out / CHECKPOINT)
+        else:
+            missing.append(METRICS)
+    except HyrfError as error:
+        missing.append(METRICS)
+        reasons.append(str(error))
+    if not missing:
+        _remove(out / RECORD)
+    return Results(metrics, tuple(missing), tuple(reasons))
+
+
+def _settings_of(scene: Scene, config: TrainConfig) -> dict[str, Any]:
+    """Plain values that must be the same for results to be completed."""
+    views = [[view.name, view.camera.width, view.camera.height] for view in scene.train]
+    return {**config.to_dict(), "views": views, "held-out views": [view.name for view in scene.test]}
+
+
+def _picture_files(scene: Scene) -> list[str]:
+    """The pictures of held-out views, by their paths in the run's folder."""
+    return [f"{VIEWS}/{name}" for name in picture_names(scene.test).values()]
+
+
+def _remove(path: Path) -> None:
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
+
+
+@torch.no_grad()
+def _drop_unseen_background(trainer: Trainer, phase: Phase) -> HybridModel:
+    """The model without its background sphere if hardly any light reaches the training cameras from there."""
+    model = trainer.model
+    if not model.config.background:
+        return model
+    views = evenly_spaced(trainer.scene.train, BACKGROUND_VIEWS)
+    seen = 0.0
+    for done, view in enumerate(views):
+        phase("measuring the light from the background", done, len(views))
+        seen = max(seen, float((1 - render(model, view.camera, background=False).alpha).mean()))
+    if seen >= BACKGROUND_SEEN:
+        trainer.choices["background"] += f"; up to {seen:.1%} of a view's light comes from it"
+        return model
+    trainer.choices["background"] = f"none: no training view gets more than {BACKGROUND_SEEN:.1%} of its light from it"
+    model.config = dataclasses.replace(model.config, background=False)
+    return model

@@ -1,0 +1,204 @@
+"""A view of a training: what it shows, what it costs, and that it changes nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import socket
+import urllib.error
+import urllib.request
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from commands import refused, succeeded
+from scenes import ball_scene
+
+from hyrfpack.format import decode_model, describe
+from hyrfpack.live import LiveView, live_view
+from hyrfpack.live.view import MIN_INTERVAL_RATIO, MIN_INTERVAL_SECONDS
+from hyrfpack.train import DensityConfig, TrainConfig, Trainer, train
+
+CONFIG = TrainConfig(
+    steps=40,
+    seed=1,
+    max_gaussians=120,
+    background_color="random",
+    density=DensityConfig(start=0.05, stop=0.7, rounds=8, gradient=1e-5, resets=1),
+)
+
+
+def a_scene():
+    scene = ball_scene(views=8, points=60, side=24)
+    return dataclasses.replace(scene, train=scene.train[2:], test=scene.train[:2])
+
+
+def content(file) -> bytes:
+    with file.open()[0] as opened:
+        return opened.read()
+
+
+def progress(view: LiveView) -> dict:
+    return json.loads(content(view.updates))
+
+
+class Clock:
+    """Seconds that tests let go by; each look at the clock takes `look` of them."""
+
+    def __init__(self, look: float = 0.0) -> None:
+        self.now, self.look = 1000.0, look
+
+    def __call__(self) -> float:
+        self.now += self.look
+        return self.now
+
+
+@pytest.mark.parametrize("exposure", [False, True])
+@pytest.mark.parametrize("background", [False, True])
+def test_a_training_with_a_view_gives_the_same_model_bit_by_bit(exposure, background, tmp_path):
+    config = dataclasses.replace(CONFIG, exposure=exposure, background=background)
+    plain = train(a_scene(), tmp_path / "plain", config, quiet=True)
+    clock = Clock(look=MIN_INTERVAL_SECONDS * MIN_INTERVAL_RATIO)
+    view = LiveView(clock)
+
+    def observe(trainer: Trainer) -> None:
+        clock.now += 1e9  # a snapshot is due after each step
+        view.observe(trainer)
+
+    viewed = train(a_scene(), tmp_path / "viewed", config, quiet=True, observer=observe)
+    assert progress(view)["snapshot"] == config.steps
+    assert plain.model.read_bytes() == viewed.model.read_bytes()
+    curves = [[{**record, "seconds": 0} for record in run.metrics["curve"]] for run in (plain, viewed)]
+    assert curves[0] == curves[1]
+
+
+def test_a_snapshot_is_the_model_of_its_step_seen_from_the_cameras_of_the_photos():
+    trainer, view = Trainer(a_scene(), CONFIG), LiveView(Clock())
+    for wanted in (1, 40):
+        trainer.run(report=lambda trainer, *_: view.observe(trainer), stop=lambda wanted=wanted: trainer.step == wanted)
+        assert progress(view) == {"snapshot": 1 if wanted == 1 else 2, "step": wanted, "steps": 40}
+        shown = dict(decode_model(content(view.scene)).named_parameters())
+        assert shown.keys() == dict(trainer.model.named_parameters()).keys()
+        for name, parameter in trainer.model.named_parameters():
+            np.testing.assert_array_equal(shown[name].detach(), parameter.detach(), err_msg=name)
+
+
+def test_a_snapshot_keeps_the_cameras_for_the_page_to_start_from(tmp_path):
+    trainer, view = Trainer(a_scene(), dataclasses.replace(CONFIG, steps=1)), LiveView()
+    trainer.run(report=lambda trainer, *_: view.observe(trainer))
+    file = tmp_path / "snapshot.hyrf"
+    file.write_bytes(content(view.scene))
+    kept = describe(file)["provenance"]
+    assert len(kept["cameras"]) == 6 and kept["viewpoint"] and kept["steps"] == 1
+
+
+def made_up_trainer(step: int, steps: int = 10_000) -> SimpleNamespace:
+    return SimpleNamespace(step=step, steps=steps, model=None, scene=None, exposures=None)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "interval"),
+    [(0.01, MIN_INTERVAL_SECONDS), (2.0, 80.0), (30.0, 1200.0)],
+    ids=["a small model", "a large one", "a very large one"],
+)
+def test_snapshots_take_less_than_3_percent_of_the_time_however_large_the_model_is(seconds, interval, monkeypatch):
+    clock, taken = Clock(), []
+
+    def encode(*_) -> bytes:
+        taken.append(clock.now)
+        clock.now += seconds
+        return b"snapshot"
+
+    monkeypatch.setattr("hyrfpack.live.view.encode_model", encode)
+    monkeypatch.setattr("hyrfpack.live.view.provenance_of", lambda *_, **__: {})
+    view, began = LiveView(clock), clock.now
+    for step in range(1, 10_000):
+        clock.now += 0.5
+        view.observe(made_up_trainer(step))
+    assert np.diff(taken).min() >= interval and len(taken) > 2
+    assert (len(taken) - 1) * seconds <= 0.03 * (clock.now - began)
+
+
+def test_the_first_step_and_the_last_one_are_always_shown(monkeypatch):
+    monkeypatch.setattr("hyrfpack.live.view.encode_model", lambda *_: b"snapshot")
+    monkeypatch.setattr("hyrfpack.live.view.provenance_of", lambda *_, **__: {})
+    view, shown = LiveView(Clock()), []
+    for step in range(1, 6):
+        view.observe(made_up_trainer(step, steps=5))
+        shown.append(progress(view)["step"])
+    assert shown == [1, 1, 1, 1, 5]
+
+
+def test_a_model_that_is_not_finite_leaves_the_snapshot_before():
+    trainer, view = Trainer(a_scene(), CONFIG), LiveView(lambda: 0.0)
+    trainer.run(report=lambda trainer, *_: view.observe(trainer), stop=lambda: trainer.step == 1)
+    before = content(view.scene)
+    with torch.no_grad():
+        trainer.model.gaussians.positions[0] = float("nan")
+    trainer.step = trainer.steps
+    view.observe(trainer)
+    assert content(view.scene) == before and progress(view)["step"] == 1
+
+
+def test_the_page_and_its_files_are_served_while_the_block_runs_and_not_after():
+    said: list[str] = []
+    with live_view("a <scene>", say=said.append) as view:
+        (address,) = [word for word in said[0].split() if word.startswith("http://127.0.0.1:")]
+
+        def fetched(name: str) -> bytes:
+            with urllib.request.urlopen(address + name, timeout=20) as answer:
+                return answer.read()
+
+        assert b"<title>a &lt;scene&gt;</title>" in fetched("")
+        assert json.loads(fetched("training.json")) == {"snapshot": 0, "step": 0, "steps": 0}
+        trainer = Trainer(a_scene(), dataclasses.replace(CONFIG, steps=2))
+        trainer.run(report=lambda trainer, *_: view.observe(trainer))
+        assert json.loads(fetched("training.json")) == {"snapshot": 2, "step": 2, "steps": 2}
+        assert len(decode_model(fetched("scene.hyrf"))) == len(trainer.model)
+    with pytest.raises(urllib.error.URLError):
+        fetched("")
+
+
+# -- commands --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def observed(monkeypatch) -> list[int]:
+    """Steps that views are told of."""
+    steps: list[int] = []
+    monkeypatch.setattr(LiveView, "observe", lambda self, trainer: steps.append(trainer.step))
+    return steps
+
+
+def test_train_shows_its_training_where_it_is_asked_to(data, observed, tmp_path):
+    command = ("train", data, "-o", tmp_path / "run", "--steps", 3, "--max-gaussians", 100)
+    result = succeeded(*command, "--view")
+    assert observed == [1, 2, 3]
+    assert "the training can be seen at http://127.0.0.1:" in result.stderr and "http" not in result.stdout
+    assert f"'hyrfpack view {tmp_path / 'run' / 'model.hyrf'}'" in result.stderr
+    observed.clear()
+    result = succeeded(*command, "--overwrite")
+    assert observed == [] and "http" not in result.stderr
+
+
+def test_make_shows_its_training_where_it_is_asked_to(data, observed, monkeypatch, tmp_path):
+    from hyrfpack.make import plan
+
+    quality = dataclasses.replace(plan.QUALITIES["draft"], steps=3, finetune_steps=0)
+    monkeypatch.setitem(plan.QUALITIES, "draft", quality)
+    result = succeeded("make", data, "-o", tmp_path / "scene.hyrf", "--quality", "draft", "--view")
+    assert observed == [1, 2, 3] and "the training can be seen at http://127.0.0.1:" in result.stderr
+
+
+def test_a_port_that_is_taken_is_one_sentence_before_any_work(data, tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        sentence = refused("train", data, "-o", tmp_path / "run", "--view", "--view-port", port)
+    assert f"port {port} of 127.0.0.1 is taken by another program" in sentence
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_port_without_a_view_is_refused(data, tmp_path):
+    for command in (("train", data, "-o", tmp_path / "run"), ("make", data, "-o", tmp_path / "scene.hyrf")):
+        assert "give both of them" in refused(*command, "--view-port", 8000)

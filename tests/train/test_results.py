@@ -1,0 +1,235 @@
+"""Results beside the model: a full disk or an interruption after the last step costs no training."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import hashlib
+import json
+import os
+from pathlib import Path
+
+import pytest
+from scenes import ball_scene
+
+from hyrfpack.errors import HyrfDataError, HyrfError, HyrfTrainingError
+from hyrfpack.scene import Scene
+from hyrfpack.train import TrainConfig, Trainer, train
+from hyrfpack.train import run as runs
+
+CONFIG = TrainConfig(steps=20, seed=1, max_gaussians=120)
+COMPLETE = {"model.hyrf", "metrics.json", "curve.png", "views"}
+TIMED = ("seconds", "steps_per_second", "stage_seconds")
+
+
+def a_scene() -> Scene:
+    """Six photos to train on and two held out."""
+    scene = ball_scene(views=8, points=60, side=24)
+    return dataclasses.replace(scene, train=scene.train[2:], test=scene.train[:2])
+
+
+def names(out: Path) -> set[str]:
+    return {path.name for path in out.iterdir()}
+
+
+def metrics_of(out: Path) -> dict:
+    return json.loads((out / "metrics.json").read_bytes())
+
+
+@pytest.fixture
+def full(monkeypatch) -> set[str]:
+    """Endings of paths that there is no space for on the disk; a test fills and clears it."""
+    endings: set[str] = set()
+    replace = os.replace
+
+    def checked(source, target) -> None:
+        if str(target).endswith(tuple(endings)):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        replace(source, target)
+
+    monkeypatch.setattr("hyrfpack.atomic.os.replace", checked)
+    return endings
+
+
+@pytest.fixture
+def no_training(monkeypatch):
+    """Returns a function after whose call nothing may be trained."""
+    return lambda: monkeypatch.setattr(Trainer, "run", lambda *_, **__: pytest.fail("it was trained again"))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "undisturbed"
+    train(a_scene(), out, CONFIG, quiet=True)
+    return out
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_metrics_that_did_not_fit_are_completed_without_training(full, no_training, undisturbed, tmp_path, resume):
+    full.add("metrics.json")
+    result = train(a_scene(), tmp_path, CONFIG, quiet=True)
+    assert result.complete and result.model.is_file() and result.metrics["evaluation"]["psnr"] > 0
+    assert "metrics.json: the disk is full" in result.missing
+    assert names(tmp_path) == {"model.hyrf", "curve.png", "views", "training.json"}
+    times = {name: result.metrics[name] for name in TIMED}
+
+    full.clear()
+    no_training()
+    completed = train(a_scene(), tmp_path, CONFIG, resume=resume, quiet=True)
+
+    assert completed.complete and completed.step == 20 and completed.missing == ""
+    assert names(tmp_path) == COMPLETE
+    metrics, expected = metrics_of(tmp_path), metrics_of(undisturbed)
+    assert metrics == json.loads(json.dumps(completed.metrics)) and metrics.keys() == expected.keys()
+    assert {name: metrics[name] for name in TIMED} == times
+    for key in ("settings", "choices", "scene", "gaussians", "bytes", "device", "processes", "notes"):
+        assert metrics[key] == expected[key], key
+    curves = [[{**r, "seconds": 0} for r in m["curve"]] for m in (metrics, expected)]
+    assert curves[0] == curves[1]
+    scores = [{**m["evaluation"], "seconds_per_frame": 0} for m in (metrics, expected)]
+    assert scores[0] == scores[1]
+
+
+@pytest.mark.parametrize(("ending", "missing"), [("curve.png", "curve.png"), (".png", "views and curve.png")])
+def test_pictures_that_do_not_fit_do_not_fail_the_run(full, no_training, tmp_path, capsys, ending, missing):
+    full.add(ending)
+    result = train(a_scene(), tmp_path, CONFIG)
+    assert result.complete and metrics_of(tmp_path) == json.loads(json.dumps(result.metrics))
+    verb = "is" if ending == "curve.png" else "are"
+    told = capsys.readouterr().err
+    assert f"the model is finished, but {missing} {verb} missing" in told
+    assert "the same command with --resume writes what is missing" in told
+
+    full.clear()
+    no_training()
+    train(a_scene(), tmp_path, CONFIG, quiet=True)
+    assert names(tmp_path) == COMPLETE and len(list((tmp_path / "views").iterdir())) == 2
+
+
+def test_a_held_out_photo_that_is_gone_after_the_last_step_does_not_fail_the_run(no_training, tmp_path):
+    scene, reads = a_scene(), [0]
+
+    def vanishing():
+        reads[0] += 1
+        if reads[0] == 2:  # the first time is before the first step
+            raise HyrfDataError("photos/0000.png: the file is gone; copy it again")
+        return scene.train[0].load()
+
+    test = [dataclasses.replace(scene.test[0], load=vanishing), scene.test[1]]
+    result = train(dataclasses.replace(scene, test=test), tmp_path, CONFIG, quiet=True)
+    assert result.complete and "photos/0000.png: the file is gone" in result.missing
+    assert not (tmp_path / "metrics.json").exists()
+
+    no_training()
+    train(a_scene(), tmp_path, CONFIG, quiet=True)
+    assert names(tmp_path) == COMPLETE
+
+
+def test_an_interruption_while_scoring_is_completed_without_training(no_training, monkeypatch, tmp_path):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("hyrfpack.train.results.evaluate", interrupted)
+        train(a_scene(), tmp_path, CONFIG, quiet=True)
+    assert names(tmp_path) == {"model.hyrf", "training.json"} and runs.is_begun(tmp_path)
+
+    no_training()
+    train(a_scene(), tmp_path, CONFIG, quiet=True)
+    assert names(tmp_path) == COMPLETE and not runs.is_begun(tmp_path)
+
+
+def test_a_model_that_does_not_fit_leaves_the_checkpoint_and_resuming_completes_the_run(full, undisturbed, tmp_path):
+    full.add("model.hyrf")
+    with pytest.raises(
+        HyrfError, match=r"model.hyrf: the disk is full.*checkpoint of step 19 is kept.*--resume goes on"
+    ):
+        train(a_scene(), tmp_path, CONFIG, quiet=True)
+    assert names(tmp_path) == {"checkpoint.pt"}
+
+    full.clear()
+    train(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
+    assert names(tmp_path) == COMPLETE
+    assert (tmp_path / "model.hyrf").read_bytes() == (undisturbed / "model.hyrf").read_bytes()
+
+
+def test_where_the_training_record_does_not_fit_the_checkpoint_stays_until_the_metrics_are_there(full, tmp_path):
+    full |= {"training.json", "metrics.json"}
+    result = train(a_scene(), tmp_path, CONFIG, quiet=True)
+    assert result.complete and names(tmp_path) == {"model.hyrf", "checkpoint.pt", "curve.png", "views"}
+
+    full.clear()
+    train(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
+    assert names(tmp_path) == COMPLETE and len(metrics_of(tmp_path)["curve"]) == 20
+
+
+def test_results_are_completed_with_the_settings_of_the_model_only(full, tmp_path):
+    full.add("metrics.json")
+    train(a_scene(), tmp_path, CONFIG, quiet=True)
+    before = hashlib.sha256((tmp_path / "model.hyrf").read_bytes()).digest()
+    full.clear()
+    other = dataclasses.replace(CONFIG, steps=30, seed=2)
+    for resume in (False, True):
+        with pytest.raises(HyrfTrainingError, match=r"other settings \(seed, steps\).*--overwrite"):
+            train(a_scene(), tmp_path, other, resume=resume, quiet=True)
+    fewer = dataclasses.replace(a_scene(), test=a_scene().test[:1])
+    with pytest.raises(HyrfTrainingError, match="other settings .held-out views."):
+        train(fewer, tmp_path, CONFIG, quiet=True)
+    assert hashlib.sha256((tmp_path / "model.hyrf").read_bytes()).digest() == before
+
+    train(a_scene(), tmp_path, other, overwrite=True, quiet=True)
+    assert metrics_of(tmp_path)["settings"]["steps"] == 30 and names(tmp_path) == COMPLETE
+
+
+def test_metrics_of_an_earlier_model_do_not_stay_beside_a_new_one(full, tmp_path):
+    train(a_scene(), tmp_path, CONFIG, quiet=True)
+    full |= {"metrics.json", ".png"}
+    result = train(a_scene(), tmp_path, dataclasses.replace(CONFIG, seed=5), overwrite=True, quiet=True)
+    assert "views, curve.png and metrics.json are missing" in result.missing
+    assert names(tmp_path) == {"model.hyrf", "training.json", "views"} and not list((tmp_path / "views").iterdir())
+
+
+@pytest.mark.parametrize("damage", [b"", b"[]", b"{}", b'{"version": 1}', None])
+def test_a_record_that_is_damaged_or_of_another_model_counts_for_nothing(full, tmp_path, damage):
+    full.add("metrics.json")
+    train(a_scene(), tmp_path, CONFIG, quiet=True)
+    full.clear()
+    if damage is None:
+        (tmp_path / "model.hyrf").write_bytes(b"another")
+    else:
+        (tmp_path / "training.json").write_bytes(damage)
+    with pytest.raises(HyrfError, match="holds an earlier run"):
+        train(a_scene(), tmp_path, CONFIG, quiet=True)
+    with pytest.raises(HyrfError, match="no checkpoint to resume"):
+        train(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
+
+
+def test_the_log_of_a_completed_run_ends_with_its_scores(full, tmp_path):
+    full.add("metrics.json")
+    train(a_scene(), tmp_path / "run", CONFIG, quiet=True)
+    full.clear()
+    result = train(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "log.jsonl")
+    (end,) = map(json.loads, (tmp_path / "log.jsonl").read_text().splitlines())
+    assert end["event"] == "end" and end["complete"] is True and end["step"] == 20
+    assert end["psnr"] == pytest.approx(result.metrics["evaluation"]["psnr"], rel=1e-5)
+
+
+# -- progress --------------------------------------------------------------------------------------------------------
+
+
+def test_all_work_around_the_steps_is_told_with_its_share(tmp_path):
+    told: list[tuple[str, int, int]] = []
+    train(a_scene(), tmp_path, CONFIG, quiet=True, phase=lambda *progress: told.append(progress))
+    assert list(dict.fromkeys(what for what, _, _ in told)) == [
+        "reading held-out photos",
+        "reading photos",
+        "reading photos and setting up the model",
+        "measuring the light from the background",
+        "writing the model",
+        "scoring held-out photos",
+        "drawing curve.png",
+    ]
+    assert [row for row in told if row[0].startswith("scoring")] == [
+        ("scoring held-out photos", done, 2) for done in range(3)
+    ]
+    assert all(0 <= done <= total for _, done, total in told)
