@@ -14,7 +14,7 @@ from hyrfpack.data.archive import is_archive, unpacked
 from hyrfpack.data.equirectangular import FACES
 from hyrfpack.data.folder import list_photos, list_pictures
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.lock import held
+from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import PICTURES, StrPath
 from hyrfpack.poses import diagnosis
 from hyrfpack.poses.frames import FrameReport, choose_frames
@@ -137,7 +137,7 @@ class _Estimation:
         if is_archive(self.photos):
             self.photos = unpacked(self.photos)
         self.output.check_place(self.photos)
-        with held(self.out, "poses", "another folder"):
+        with exclusive_folder(self.out):
             self.output.check(self.photos, overwrite)
             try:
                 return self._run()

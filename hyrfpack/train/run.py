@@ -25,6 +25,7 @@ from hyrfpack.device import choose_own_device, describe_device
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate import Evaluation, evaluate, picture_names
 from hyrfpack.evaluate.figures import training_curve
+from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import ALONE, Ranks
@@ -87,7 +88,8 @@ def train(
         out: the run's folder, made if missing.
         config: settings, all defaults measured.
         resume: go on from the folder's checkpoint; the result is the one an uninterrupted run gives.
-        overwrite: replace what an earlier run left in the folder.
+        overwrite: replace what an earlier run left in the folder. Without it, nothing is replaced, not even what
+            appears while training: a result gets a free name beside it, which `TrainResult.model` tells of the model.
         cache: holds decoded photos; by default a quarter of the memory.
         device: where to train, see `hyrfpack.device.choose_device`. A run may be resumed on another one. On a GPU
             sums of gradients vary in their last bits from run to run, which may tip the measured budget.
@@ -102,10 +104,10 @@ def train(
             as torchrun does after one has ended, they go on from the checkpoint if there is one.
 
     Raises:
-        HyrfError: the folder holds another run, training cannot start or go on, no photo has a pixel to train on or to
-            score, a held-out photo cannot be read (all of which is found before the first step), or the results would
-            replace photos or other files, or cannot be written (a checkpoint that cannot, while training, is a line on
-            standard error).
+        HyrfError: another call is at work in the folder, the folder holds another run, training cannot start or go on,
+            no photo has a pixel to train on or to score, a held-out photo cannot be read (all of which is found before
+            the first step), or the results would replace photos or other files, or cannot be written (a checkpoint
+            that cannot, while training, is a line on standard error).
         TypeError: `scene` is no Scene or `config` no TrainConfig.
 
     Example:
@@ -119,9 +121,34 @@ def train(
     out = Path(out)
     config = TrainConfig() if config is None else config
     check_type("config", config, TrainConfig)
+    # Whatever lies there: no folder is created where nothing may be written.
+    ranks.agree(lambda: _check_outputs(out, scene, overwrite=True) if ranks.leads else None)
+    with exclusive_folder(out, "another folder with -o", ranks):
+        return _train_in_folder(
+            scene, out, config, resume=resume, overwrite=overwrite, cache=cache, device=device, quiet=quiet,
+            report=report, log=log, ranks=ranks,
+        )  # fmt: skip
+
+
+def _train_in_folder(
+    scene: Scene,
+    out: Path,
+    config: TrainConfig,
+    *,
+    resume: bool,
+    overwrite: bool,
+    cache: PictureCache | None,
+    device: str | torch.device,
+    quiet: bool,
+    report: Report | None,
+    log: Path | str | None,
+    ranks: Ranks,
+) -> TrainResult:
+    """As `train`, in a folder that this call holds."""
     checkpoint = out / CHECKPOINT
     device = choose_own_device(device, ranks)
     resume = ranks.first(resume or (ranks.restarts > 0 and checkpoint.is_file()))
+    replace = resume or overwrite
     cache = cache or PictureCache(memory_bytes() // 4 // ranks.local_size)
 
     def check() -> None:
@@ -129,7 +156,7 @@ def train(
             return
         _prepare(out, scene, resume, overwrite)
         if log is not None:
-            Outputs(scene=scene, overwrite=resume or overwrite).file(log)
+            Outputs(scene=scene, overwrite=replace).file(log)
         _check_photos(scene, cache)
 
     ranks.agree(check)
@@ -164,15 +191,17 @@ def train(
                 line.note(f"Gaussians at most: {trainer.choices['max_gaussians']}")
             written = None
             if log is not None and ranks.leads:
-                written = stack.enter_context(TrainingLog(Path(log), trainer.steps, trainer.step, device, line.note))
+                written = stack.enter_context(
+                    TrainingLog(Path(log), trainer.steps, trainer.step, device, line.note, replace)
+                )
             told = [report or line.update, *([written.step] if written else [])]
 
             def tell_all(trainer: Trainer, loss: float, mse: float) -> None:
                 for tell in told:
                     tell(trainer.step, loss, mse, len(trainer.model))
 
-            complete = trainer.run(checkpoint=checkpoint, report=tell_all, stop=stop, warn=line.note)
-        metrics = _finish(trainer, out) if complete and ranks.leads else {}
+            complete = trainer.run(checkpoint=checkpoint, report=tell_all, stop=stop, warn=line.note, overwrite=replace)
+        model, metrics = _finish(trainer, out, replace) if complete and ranks.leads else (out / MODEL, {})
         if written:
             facts = {name: metrics[name] for name in ("gaussians", "bytes") if complete}
             scores = metrics.get("evaluation", {})
@@ -180,17 +209,17 @@ def train(
             written.end(complete=complete, step=trainer.step, **facts)
     if not complete:
         return TrainResult(False, trainer.step, None, {})
-    if ranks.leads:
+    if ranks.leads and (replace or trainer.saved is not None):  # else one that is there is not of this run
         checkpoint.unlink(missing_ok=True)
-    return TrainResult(True, trainer.step, out / MODEL, metrics)
+    return TrainResult(True, trainer.step, model, metrics)
 
 
 def _as_step_nought(report: Report, step: int, loss: float, mse: float, gaussians: int) -> None:
     report(0, loss, mse, gaussians)
 
 
-def _finish(trainer: Trainer, out: Path) -> dict:
-    """Write what a finished run leaves, the model first; returns the metrics."""
+def _finish(trainer: Trainer, out: Path, overwrite: bool) -> tuple[Path, dict]:
+    """Write what a finished run leaves, the model first; returns the path of the model, and the metrics."""
     scene, config = trainer.scene, trainer.config
     if not trainer.records:
         raise HyrfTrainingError(
@@ -199,7 +228,6 @@ def _finish(trainer: Trainer, out: Path) -> dict:
         )
 
     model = _drop_unseen_background(trainer)
-    path = out / MODEL
     provenance = {
         "steps": config.steps,
         "seed": config.seed,
@@ -207,7 +235,8 @@ def _finish(trainer: Trainer, out: Path) -> dict:
         **provenance_of(scene, mean_exposure=trainer.exposures is not None),
         "psnr": statistics.median(record["psnr"] for record in trainer.records[-len(trainer.records) // 10 :]),
     }
-    report = hyrf_format.save(model, path, profile="raw", provenance=provenance)
+    report = hyrf_format.save(model, out / MODEL, profile="raw", provenance=provenance, overwrite=overwrite)
+    path = Path(report.file)
     metrics = {
         "settings": config.to_dict(),
         "device": describe_device(trainer.device),
@@ -233,11 +262,13 @@ def _finish(trainer: Trainer, out: Path) -> dict:
         # Scored on the file as it was written, not on what is in memory.
         written = hyrf_format.load(path, trainer.device)
         written.precision = config.precision
-        scores: Evaluation = evaluate(written, scene.test, training=scene.train, pictures=out / VIEWS)
+        scores: Evaluation = evaluate(
+            written, scene.test, training=scene.train, pictures=out / VIEWS, overwrite=overwrite
+        )
         metrics["evaluation"] = scores.to_dict()
-    training_curve(trainer.records, out / CURVE)
-    write_atomic(out / METRICS, json.dumps(metrics, indent=1).encode())
-    return metrics
+    training_curve(trainer.records, out / CURVE, overwrite=overwrite)
+    write_atomic(out / METRICS, json.dumps(metrics, indent=1).encode(), overwrite=overwrite)
+    return path, metrics
 
 
 def resuming(overwrite: bool) -> str:
@@ -273,9 +304,12 @@ def _prepare(out: Path, scene: Scene, resume: bool, overwrite: bool) -> None:
     if left and not (resume or overwrite):
         hint = "--resume goes on with it, " if CHECKPOINT in left else ""
         raise HyrfError(f"{out}: the folder holds an earlier run ({left[-1]}); {hint}--overwrite replaces it")
+    _check_outputs(out, scene, overwrite=resume or overwrite)
+
+
+def _check_outputs(out: Path, scene: Scene, *, overwrite: bool) -> None:
     views = [f"{VIEWS}/{name}" for name in picture_names(scene.test).values()]
-    outputs = Outputs(scene=scene, overwrite=resume or overwrite)
-    outputs.folder(out, [MODEL, CHECKPOINT, METRICS, CURVE, *views])
+    Outputs(scene=scene, overwrite=overwrite).folder(out, [MODEL, CHECKPOINT, METRICS, CURVE, *views])
 
 
 def _check_photos(scene: Scene, cache: PictureCache) -> None:

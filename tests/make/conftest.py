@@ -37,7 +37,7 @@ def hurry(patch: pytest.MonkeyPatch) -> None:
         patch.setitem(QUALITIES, name, quality)
     patch.setattr(stages, "DistillConfig", partial(DistillConfig, size=24, train_views=6, test_views=2))
     patch.setattr(sensitivity, "MOST", 12)
-    patch.setattr("hyrfpack.train.run.training_curve", lambda _, path: path.touch())  # as long as all steps
+    patch.setattr("hyrfpack.train.run.training_curve", lambda _, path, **options: path.touch())  # as long as all steps
 
 
 @pytest.fixture(scope="session")
