@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import monotonic
@@ -147,7 +148,10 @@ def make(
                 overwrite=overwrite,
             )
             request.check()
-            with exclusive_folder(request.work, "another folder with --work"):
+            with (
+                exclusive_folder(request.work, "another folder with --work"),
+                exclusive_folder(request.output, "another folder with -o") if request.makes_folder else nullcontext(),
+            ):
                 return _Making(request, began, report, say).run()
         except Stopped:
             raise

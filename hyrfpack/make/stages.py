@@ -24,7 +24,6 @@ from hyrfpack.evaluate import evaluate
 from hyrfpack.evaluate.metrics import decibels
 from hyrfpack.export import export
 from hyrfpack.format import describe, load
-from hyrfpack.lock import exclusive_folder
 from hyrfpack.make.plan import Plan
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.state import digest, digest_all
@@ -222,7 +221,7 @@ def score(work: Work, scene: Scene, device: torch.device) -> dict[str, Any]:
 
 
 def deliver(product: Path, output: Path, *, overwrite: bool) -> Path:
-    """Copy what was made, a file or the files of a folder, to where it is wanted.
+    """Copy what was made, a file or the files of a folder that this call holds, to where it is wanted.
 
     Args:
         overwrite: replace files that are there. Without it, a file gets a free name beside one that is there; of a
@@ -236,12 +235,11 @@ def deliver(product: Path, output: Path, *, overwrite: bool) -> Path:
     """
     if not product.is_dir():
         return copy(product, output, overwrite=overwrite)
-    with exclusive_folder(output, "another folder with -o"):
-        files = {path: output / path.relative_to(product) for path in sorted(product.rglob("*")) if path.is_file()}
-        different = [target for path, target in files.items() if digest(path) != digest(target)]
-        Outputs(overwrite=overwrite).folder(output, [os.path.relpath(target, output) for target in different])
-        for path, target in files.items():
-            copy(path, target, overwrite=overwrite, rename=False)
+    files = {path: output / path.relative_to(product) for path in sorted(product.rglob("*")) if path.is_file()}
+    different = [target for path, target in files.items() if digest(path) != digest(target)]
+    Outputs(overwrite=overwrite).folder(output, [os.path.relpath(target, output) for target in different])
+    for path, target in files.items():
+        copy(path, target, overwrite=overwrite, rename=False)
     return output
 
 

@@ -181,6 +181,22 @@ def test_two_calls_for_one_scene_are_kept_apart(tmp_path):
     begin(tmp_path / "photos", scene)
 
 
+def test_poses_that_another_program_puts_there_meanwhile_are_kept_and_the_work_too(tmp_path):
+    scene = tmp_path / "scene"
+
+    def appear(doing: str, share: float) -> None:
+        (scene / "sparse" / "0").mkdir(parents=True, exist_ok=True)
+        (scene / "sparse" / "0" / "cameras.bin").write_bytes(b"of another program")
+
+    with pytest.raises(hyrfpack.HyrfError, match="poses of another program, which are kept"):
+        finished(photos(tmp_path / "photos"), scene, report=appear)
+    assert (scene / "sparse" / "0" / "cameras.bin").read_bytes() == b"of another program"
+    shutil.rmtree(scene / "sparse")
+    said = []
+    finished(tmp_path / "photos", scene, say=said.append)
+    assert said[0] == "an interrupted estimation goes on" and (scene / "sparse" / "0").is_dir()
+
+
 def test_masks_that_lie_there_are_not_taken_for_those_that_were_named(tmp_path):
     photos(tmp_path / "photos")
     for folder, level in (("named", 255), ("scene/masks", 0)):
