@@ -9,7 +9,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 PEERS := tests/node/node_modules/.ready
 
-.PHONY: help demo test test-browsers test-newest test-oldest docs player bench gpu speed sets choices ablations precision kill fuzz fuzz-browser lint format clean
+.PHONY: help demo test test-browsers test-newest test-oldest docs player bench gpu speed sets choices ablations precision kill races fuzz fuzz-browser lint format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -76,6 +76,9 @@ precision: $(READY) ## the same training in float32 and in float64, whole and in
 
 kill: $(READY) ## kill the commands at random moments and check what is left (ten minutes)
 	$(BIN)/python -m tools.safety.kill
+
+races: $(READY) ## run commands at the same time and check that no result is lost (half an hour)
+	$(BIN)/python -m tools.safety.races
 
 fuzz: $(READY) ## feed the .hyrf reader a million hostile files (ten minutes)
 	$(BIN)/python -m tools.safety.fuzz

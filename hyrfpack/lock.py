@@ -1,4 +1,4 @@
-"""A folder that one call works in at a time."""
+"""Folder locks: one call at a time writes into a folder."""
 
 from __future__ import annotations
 
@@ -6,9 +6,13 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hyrfpack.atomic import make_folder
 from hyrfpack.errors import HyrfError
+
+if TYPE_CHECKING:
+    from hyrfpack.parallel.ranks import Ranks
 
 try:
     import fcntl
@@ -17,47 +21,70 @@ except ImportError:  # Windows
 
 
 @contextmanager
-def held(folder: Path, command: str, other: str) -> Iterator[None]:
-    """Make a folder and keep other calls out of it, where the system can: Windows and some network folders cannot.
+def exclusive_folder(
+    folder: str | os.PathLike[str], remedy: str = "another folder", ranks: Ranks | None = None
+) -> Iterator[None]:
+    """Create a folder and lock it, so that no other call of hyrfpack writes into it at the same time.
 
-    Folders that are made for it and are empty at the end are removed again.
+    The lock is an `flock` on the folder itself. The kernel releases it when the process ends, also when the process is
+    killed, so that no lock is ever left behind. Every call opens the folder for itself: calls in two threads of one
+    process exclude each other as two processes do. A call must therefore not lock a folder that it holds already.
+    Where the system knows no such locks (Windows, some network file systems), nothing is locked.
+
+    Folders that are created here and are still empty at the end are removed.
 
     Args:
-        folder: to work in.
-        command: what works there, for the message.
-        other: what else the person can name, for the message: "another with --work".
+        folder: to write into.
+        remedy: what the user can name instead, for the message: "another folder with --work".
+        ranks: processes that work together, all of which call this. The main process holds the lock; when it is
+            refused, all of them are.
 
     Raises:
-        HyrfError: another call is at work there, or the folder cannot be made.
+        HyrfError: another call is at work in the folder, or the folder cannot be created.
     """
-    new = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]  # the deepest first
-    handle = _lock(folder, f"{folder}: another '{command}' is at work in this folder; wait for it, or name {other}")
+    folder = Path(folder)
+    if ranks is not None and not ranks.leads:
+        ranks.agree(lambda: None)
+        yield
+        return
+    created = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]  # the deepest first
+    handle = _lock(folder, remedy) if ranks is None else ranks.agree(lambda: _lock(folder, remedy))
     try:
         yield
     finally:
-        with suppress(OSError):  # something is in it
-            for path in new:
+        with suppress(OSError):  # a folder that is not empty stays
+            for path in created:
                 path.rmdir()
         if handle is not None:
+            with suppress(OSError):  # locks are not supported there
+                # Closing alone would leave the lock with a process that was forked meanwhile.
+                fcntl.flock(handle, fcntl.LOCK_UN)
             os.close(handle)
 
 
-def _lock(folder: Path, busy: str) -> int | None:
-    """The descriptor that holds a folder's lock; None where there are no locks."""
+def _lock(folder: Path, remedy: str) -> int | None:
+    """The descriptor that holds a folder's lock; None where a folder cannot be locked."""
     while True:
         make_folder(folder)
         if fcntl is None:
             return None
-        with suppress(FileNotFoundError):  # another call has ended and removed it, here or before it is locked
+        try:
             handle = os.open(folder, os.O_RDONLY)
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                os.close(handle)
-                raise HyrfError(busy) from None
-            except OSError:  # locks are unknown there
-                return handle
-            with suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(handle), os.stat(folder)):
-                    return handle
+        except FileNotFoundError:  # another call has ended and removed it
+            continue
+        except OSError:  # a folder may be writable and not readable
+            return None
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
             os.close(handle)
+            raise HyrfError(
+                f"{folder}: another hyrfpack command is at work in this folder; wait until it has ended, or name "
+                f"{remedy}"
+            ) from None
+        except OSError:  # locks are not supported there
+            return handle
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(handle), os.stat(folder)):
+                return handle
+        os.close(handle)  # another call removed the folder between opening and locking

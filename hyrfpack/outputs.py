@@ -3,7 +3,9 @@
 1. What is read is never replaced, and nothing is put into a folder that photos or poses are read from.
 2. Nothing is put among other photos or poses, and no file that is there is replaced, unless `overwrite` says so.
 
-It is asked before any work, so that nothing is found out after minutes that was known at once.
+It is asked before any work, so that nothing is found out after minutes that was known at once. What appears during
+the work is kept, too: `atomic` checks again in the step that gives a finished file its name, and `lock` keeps a second
+call of hyrfpack out of a folder that a first one writes into.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hyrfpack.atomic import check_writable
+from hyrfpack.atomic import MAX_NAME_BYTES, check_writable
 from hyrfpack.errors import HyrfError
 
 if TYPE_CHECKING:
@@ -30,7 +32,7 @@ POSES = (
     *("poses_bounds.npy", "bundle.out", "cameras.xml", "metadata", "keyframes"),
 )
 MODELS = ("sparse", "colmap/sparse")  # folders of COLMAP models
-LONGEST_NAME, LONGEST_PATH = 255, 4095  # bytes, of common systems
+LONGEST_PATH = 4095  # bytes, of common systems
 
 StrPath = str | os.PathLike[str]
 
@@ -168,8 +170,8 @@ def _check_names(paths: Iterable[StrPath]) -> None:
     """Refuse names that cannot be."""
     for path in map(os.path.abspath, paths):
         for part in Path(path).parts:
-            if len(os.fsencode(part)) > LONGEST_NAME:
-                raise HyrfError(f"{part[:40]}...: the name is longer than {LONGEST_NAME} bytes; shorten it")
+            if len(os.fsencode(part)) > MAX_NAME_BYTES:
+                raise HyrfError(f"{part[:40]}...: the name is longer than {MAX_NAME_BYTES} bytes; shorten it")
         if len(os.fsencode(path)) > LONGEST_PATH:
             raise HyrfError(f"{path[:40]}...: the path is longer than {LONGEST_PATH} bytes; shorten it")
 

@@ -9,12 +9,14 @@ import re
 import stat
 import subprocess
 import sys
+from itertools import islice
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
 
 from hyrfpack import atomic
-from hyrfpack.atomic import replacing, write_atomic
+from hyrfpack.atomic import numbered_names, replacing, write_atomic
 from hyrfpack.errors import HyrfError
 
 
@@ -222,6 +224,166 @@ def test_writers_of_one_file_at_once_never_mix(tmp_path):
     assert [writer.communicate()[1].decode() for writer in writers] == [""] * 4
     assert [writer.returncode for writer in writers] == [0] * 4
     assert len(seen) > 1 and files_in(tmp_path).keys() == {"model.hyrf"}
+
+
+# -- nothing is replaced without being asked ---------------------------------------------------------------------------
+
+ROUNDS = 50
+
+
+@pytest.fixture(params=["hard links", "no hard links"])
+def file_system(request, monkeypatch) -> None:
+    """With hard links and without, as on FAT."""
+
+    def unsupported(*_, **__):
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    if request.param == "no hard links":
+        monkeypatch.setattr(os, "link", unsupported)
+
+
+@pytest.mark.usefixtures("file_system")
+def test_without_overwrite_a_new_file_gets_its_name(tmp_path):
+    assert write_atomic(tmp_path / "model.hyrf", b"new", overwrite=False) == tmp_path / "model.hyrf"
+
+    assert files_in(tmp_path) == {"model.hyrf": b"new"}
+
+
+@pytest.mark.usefixtures("file_system")
+def test_without_overwrite_a_file_that_is_there_is_kept_and_the_first_free_name_is_taken(tmp_path):
+    (tmp_path / "model.hyrf").write_bytes(b"old")
+    (tmp_path / "model-2.hyrf").write_bytes(b"older")
+
+    assert write_atomic(tmp_path / "model.hyrf", b"new", overwrite=False) == tmp_path / "model-3.hyrf"
+
+    assert files_in(tmp_path) == {"model.hyrf": b"old", "model-2.hyrf": b"older", "model-3.hyrf": b"new"}
+
+
+@pytest.mark.usefixtures("file_system")
+def test_without_overwrite_a_file_created_while_writing_is_kept(tmp_path):
+    with atomic.pending_file(tmp_path / "model.hyrf", overwrite=False) as pending:
+        pending.temporary.write_bytes(b"new")
+        (tmp_path / "model.hyrf").write_bytes(b"of another program")
+
+    assert pending.path == tmp_path / "model-2.hyrf"
+    assert files_in(tmp_path) == {"model.hyrf": b"of another program", "model-2.hyrf": b"new"}
+
+
+@pytest.mark.usefixtures("file_system")
+def test_without_overwrite_and_rename_a_file_created_while_writing_is_an_error(tmp_path):
+    with (
+        pytest.raises(HyrfError, match="index.html: another program created this file in the meantime.* --overwrite"),
+        atomic.pending_file(tmp_path / "index.html", overwrite=False, rename=False) as pending,
+    ):
+        pending.temporary.write_bytes(b"new")
+        (tmp_path / "index.html").write_bytes(b"of another program")
+
+    assert files_in(tmp_path) == {"index.html": b"of another program"}
+
+
+@pytest.mark.usefixtures("file_system")
+@pytest.mark.parametrize("kind", ["folder", "dangling link", "link to a file"])
+def test_without_overwrite_whatever_has_the_name_is_kept(kind, tmp_path):
+    (tmp_path / "other").write_bytes(b"old")
+    path = tmp_path / "model.hyrf"
+    if kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to("nowhere" if kind == "dangling link" else "other")
+
+    assert write_atomic(path, b"new", overwrite=False) == tmp_path / "model-2.hyrf"
+
+    assert (tmp_path / "other").read_bytes() == b"old" and (tmp_path / "model-2.hyrf").read_bytes() == b"new"
+    assert path.is_dir() if kind == "folder" else path.is_symlink()
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_without_overwrite_the_path_that_is_returned_is_written_as_it_was_asked_for(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "model.hyrf").write_bytes(b"old")
+
+    assert str(write_atomic("model.hyrf", b"new", overwrite=False)) == "model-2.hyrf"
+
+
+@pytest.mark.parametrize(
+    ("name", "second"),
+    [
+        ("scene.hyrf", "scene-2.hyrf"),
+        ("scene.points.ply", "scene-2.points.ply"),
+        ("scene.points.glb", "scene-2.points.glb"),
+        ("drone 2024.05.01.hyrf", "drone 2024.05.01-2.hyrf"),
+        ("no suffix", "no suffix-2"),
+        (".hidden", ".hidden-2"),
+        (".hidden.hyrf", ".hidden-2.hyrf"),
+        ("\u00fc" * 125 + ".hyrf", "\u00fc" * 124 + "-2.hyrf"),  # 255 bytes, of two for each letter
+    ],
+)
+def test_a_free_name_keeps_the_whole_suffix_and_fits_into_a_folder(name, second, tmp_path):
+    first, found = islice(numbered_names(tmp_path / name), 2)
+    assert (first, found) == (tmp_path / name, tmp_path / second)
+    (tmp_path / name).write_bytes(b"old")
+
+    assert write_atomic(tmp_path / name, b"new", overwrite=False) == tmp_path / second
+
+
+def test_a_claimed_name_is_given_up_when_the_file_cannot_take_it(tmp_path, monkeypatch):
+    """On file systems without hard links."""
+
+    def fail(*_):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "link", fail)
+    monkeypatch.setattr(os, "replace", fail)
+
+    with pytest.raises(HyrfError, match="model.hyrf: the file cannot be written"):
+        write_atomic(tmp_path / "model.hyrf", b"new", overwrite=False)
+
+    assert files_in(tmp_path) == {}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs SIGKILL")
+@pytest.mark.parametrize(("step", "whole"), [("fsync", False), ("link", False), ("after link", True)])
+def test_process_killed_while_it_names_a_file_leaves_a_whole_file_or_none(tmp_path, step, whole):
+    script = (
+        "import os, signal, sys\n"
+        "from hyrfpack.atomic import write_atomic\n"
+        "kill, link = lambda *_: os.kill(os.getpid(), signal.SIGKILL), os.link\n"
+        f"step = '{step}'\n"
+        "if step == 'after link': os.link = lambda *names: (link(*names), kill())\n"
+        "else: setattr(os, step, kill)\n"
+        "write_atomic(sys.argv[1], b'new' * 999, overwrite=False)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+
+    done = subprocess.run([sys.executable, "-c", script, tmp_path / "model.hyrf"], env=environment, check=False)
+
+    assert done.returncode == -9
+    write_atomic(tmp_path / "another", b"next")  # the next one to write into the folder removes the temporary file
+    assert files_in(tmp_path) == {"another": b"next", **({"model.hyrf": b"new" * 999} if whole else {})}
+
+
+def race(folder: Path, letter: bytes, start, answers) -> None:
+    """One of the processes that all write the same names, round by round."""
+    for number in range(ROUNDS):
+        start.wait()
+        answers.put((number, write_atomic(folder / f"{number}.hyrf", letter * 1000, overwrite=False).name))
+
+
+def test_of_two_processes_that_write_one_name_without_overwrite_neither_result_is_lost_50_times(tmp_path):
+    spawn = get_context("spawn")
+    start, answers = spawn.Barrier(2), spawn.Queue()
+    racers = [spawn.Process(target=race, args=(tmp_path, letter, start, answers)) for letter in (b"a", b"b")]
+    for racer in racers:
+        racer.start()
+    told = sorted(answers.get() for _ in range(2 * ROUNDS))
+    for racer in racers:
+        racer.join()
+
+    assert told == sorted((number, f"{number}{end}.hyrf") for number in range(ROUNDS) for end in ("", "-2"))
+    files = files_in(tmp_path)
+    assert files.keys() == {name for _, name in told}
+    for number in range(ROUNDS):
+        assert {files[f"{number}.hyrf"], files[f"{number}-2.hyrf"]} == {b"a" * 1000, b"b" * 1000}
 
 
 # -- places that take no file ----------------------------------------------------------------------------------------

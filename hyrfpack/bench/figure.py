@@ -36,7 +36,7 @@ class Panel:
     across: Callable[[Row], float]
 
 
-def plot(rows: Sequence[Row], path: str | os.PathLike[str]) -> None:
+def plot(rows: Sequence[Row], path: str | os.PathLike[str], *, overwrite: bool = True) -> Path:
     """Draw the rms error of each row against its time over the reference's, both axes logarithmic.
 
     A panel for each group; in "render" one for each setting with a curve, in "codec" one for the profiles and one for
@@ -45,6 +45,10 @@ def plot(rows: Sequence[Row], path: str | os.PathLike[str]) -> None:
 
     Args:
         path: the picture to write, in the format of its extension, one out of FORMATS.
+        overwrite: as of `hyrfpack.atomic.pending_file`.
+
+    Returns:
+        The path that was written.
 
     Raises:
         HyrfError: the file cannot be written, or its extension names no such format.
@@ -61,7 +65,7 @@ def plot(rows: Sequence[Row], path: str | os.PathLike[str]) -> None:
     figure.set_layout_engine("none")
     for axes, labels in zip(places, marked, strict=False):
         _label(axes, labels)
-    save_figure(path, figure, format=picture_format(path))
+    return save_figure(path, figure, overwrite=overwrite, format=picture_format(path))
 
 
 def picture_format(path: str | os.PathLike[str]) -> str:

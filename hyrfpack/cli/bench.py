@@ -9,7 +9,17 @@ from typing import Any
 
 import click
 
-from hyrfpack.cli.common import OUTPUT, PATH, note, overwrite_option, print_json, read_scene, scene_options, table
+from hyrfpack.cli.common import (
+    OUTPUT,
+    PATH,
+    note,
+    note_rename,
+    overwrite_option,
+    print_json,
+    read_scene,
+    scene_options,
+    table,
+)
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 
@@ -83,12 +93,14 @@ def bench(
         for sentence in result.notes:
             click.echo(f"\nnote: {sentence}")
     if json_file not in (None, "-"):
-        write_atomic(json_file, json.dumps(result.to_dict(), indent=1, allow_nan=False).encode())
+        numbers = json.dumps(result.to_dict(), indent=1, allow_nan=False).encode()
+        note_rename(Path(json_file), write_atomic(json_file, numbers, overwrite=overwrite))
+    note(f"{note_rename(output, plot(result.rows, output, overwrite=overwrite))}: time against error")
     if markdown is not None:
         blocks = words.markdown(result)
-        write_atomic(markdown, words.fill(page or words.empty_page(blocks), blocks, str(markdown)).encode())
-    plot(result.rows, output)
-    note(f"{output}: time against error")
+        page = page and _read_page(markdown)  # again: it may have been edited while this command measured
+        filled = words.fill(page or words.empty_page(blocks), blocks, str(markdown)).encode()
+        note_rename(markdown, write_atomic(markdown, filled, overwrite=overwrite or bool(page)))
 
 
 def _read_page(path: Path | None) -> str:

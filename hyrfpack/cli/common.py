@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from hyrfpack.atomic import describe_rename
 from hyrfpack.choices import LAYOUTS, PRECISIONS
 from hyrfpack.cli.manners import detail, note
 from hyrfpack.errors import HyrfError
@@ -176,6 +177,13 @@ def read_scene(path: Path, reading: dict[str, Any], model: dict | None = None) -
     for sentence in scene.notes:
         note(sentence)
     return scene
+
+
+def note_rename(asked: Path, written: Path | str) -> Path:
+    """The path that was written, with a note where it is not the one that was asked for."""
+    if Path(written) != asked:
+        note(describe_rename(asked, written))
+    return Path(written)
 
 
 def split_views(scene: Scene, split: str) -> list[View]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from hyrfpack.cli.common import OUTPUT, PATH, json_option, note, overwrite_option, print_json
+from hyrfpack.cli.common import OUTPUT, PATH, json_option, note, note_rename, overwrite_option, print_json
 
 
 @click.command(short_help="Show training runs side by side.")
@@ -31,8 +31,9 @@ def compare(runs: tuple[Path, ...], output: Path, overwrite: bool, as_json: bool
     report = run(runs, output, overwrite=overwrite)
     for sentence in report.doubts:
         note(sentence)
+    written = note_rename(output, report.file)
     if as_json:
         print_json(asdict(report))
         return
     views = f"{len(report.views)} held-out view{'' if len(report.views) == 1 else 's'}"
-    click.echo(f"{output}: {len(report.runs)} runs, {views}, {report.bytes:,} bytes; open it in a browser")
+    click.echo(f"{written}: {len(report.runs)} runs, {views}, {report.bytes:,} bytes; open it in a browser")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from hyrfpack.cli.common import OUTPUT, json_option, note, overwrite_option, print_json
+from hyrfpack.cli.common import OUTPUT, json_option, note, note_rename, overwrite_option, print_json
 from hyrfpack.outputs import Outputs
 
 
@@ -22,10 +22,12 @@ def demo(output: Path, steps: int, overwrite: bool, as_json: bool) -> None:
     Example:
       hyrfpack demo -o demo
     """
-    from hyrfpack.demo.run import FILES, run_demo
+    from hyrfpack.demo.run import FILES, PAGE, PICTURE, run_demo
 
     Outputs(overwrite=overwrite).folder(output, FILES)
-    result = run_demo(output, steps=steps, say=note)
+    result = run_demo(output, steps=steps, overwrite=overwrite, say=note)
+    note_rename(output / PICTURE, result.picture)
+    note_rename(output / PAGE, result.page.file)
     if as_json:
         print_json(result.to_dict())
         return

@@ -14,6 +14,7 @@ from hyrfpack.cli.common import (
     PATH,
     json_option,
     note,
+    note_rename,
     overwrite_option,
     print_json,
     read_scene,
@@ -156,7 +157,11 @@ def export(
     else:
         check_place(output, Outputs(*models, scene=scenes[0] if scenes else None, overwrite=overwrite), colmap)
     if len(models) != 1:
-        report = gallery(models, output, data=scenes, say=note) if models else player(None, output)
+        report = (
+            gallery(models, output, data=scenes, overwrite=overwrite, say=note)
+            if models
+            else player(None, output, overwrite=overwrite)
+        )
     else:
         report = write(
             *models,
@@ -169,8 +174,10 @@ def export(
             spz_version=int(spz_version),
             baked=baked,
             colmap=colmap,
+            overwrite=overwrite,
             say=note,
         )
+    note_rename(output, report.file)
     if as_json:
         print_json(asdict(report))
         return

@@ -18,6 +18,7 @@ from hyrfpack.cli.common import (
     device_option,
     json_option,
     note,
+    note_rename,
     number,
     overwrite_option,
     print_json,
@@ -141,19 +142,21 @@ def compress(
         prune=prune,
         target_bytes=target_size,
         max_psnr_drop=max_psnr_drop,
+        overwrite=overwrite,
         device=place,
         say=note,
         ranks=ranks,
     )
     if not ranks.leads:
         return
-    scores = _scores(model, output, scene)
+    written = note_rename(output, result.file)
+    scores = _scores(model, written, scene)
     if report is not None:
         from hyrfpack.compress.report import write_report
 
         command = _typed(click.get_current_context())
-        write_report(report, model, output, result, scene, command=command, say=note)
-    _print_report(output, result, scores, as_json)
+        write_report(report, model, written, result, scene, command=command, overwrite=overwrite, say=note)
+    _print_report(result, scores, as_json)
 
 
 @click.command(short_help="Unpack a file to exact float32.")
@@ -182,7 +185,9 @@ def decompress(file: Path, output: Path, fraction: float | None, overwrite: bool
     Outputs(file, overwrite=overwrite).file(output, ".hyrf")
     from hyrfpack.format import repack
 
-    _print_report(output, repack(file, output, fraction=fraction), {}, as_json)
+    result = repack(file, output, fraction=fraction, overwrite=overwrite)
+    note_rename(output, result.file)
+    _print_report(result, {}, as_json)
 
 
 @click.command(short_help="Show what a file holds, or what photos are like.")
@@ -305,15 +310,15 @@ def _scores(before: Path, after: Path, scene: Scene | None) -> dict[str, float]:
     return scores
 
 
-def _print_report(path: Path, report: CompressionReport, scores: dict[str, float], as_json: bool) -> None:
+def _print_report(report: CompressionReport, scores: dict[str, float], as_json: bool) -> None:
     if as_json:
-        print_json({"file": str(path), **report.to_dict(), **scores})
+        print_json({**report.to_dict(), **scores})
         return
     sections = [asdict(part) for part in report.sections]
     click.echo(_section_table(sections, report.bytes_after, report.gaussians, report.shares))
     ratio = report.bytes_before / report.bytes_after
     outcome = "every number as float32" if report.profile == "raw" else f"{ratio:.2f} times smaller than as float32"
-    click.echo(f"{path}: {report.bytes_after:,} bytes, {report.gaussians:,} Gaussians, {outcome}")
+    click.echo(f"{report.file}: {report.bytes_after:,} bytes, {report.gaussians:,} Gaussians, {outcome}")
     if report.found:
         click.echo(report.found)
     if report.error is not None:

@@ -15,6 +15,7 @@ from hyrfpack.cli.common import (
     device_option,
     json_option,
     note,
+    note_rename,
     number,
     overwrite_option,
     print_json,
@@ -91,14 +92,15 @@ def import_(
     given = None if cameras is None else _cameras(cameras)
     place = chosen_device(device)
     config = DistillConfig(steps=steps, psnr=psnr, size=size, seed=seed)
-    report = distill(source, output, config, cameras=given, device=place, say=note, quiet=False)
+    report = distill(source, output, config, cameras=given, overwrite=overwrite, device=place, say=note, quiet=False)
+    written = note_rename(output, report.file)
     if as_json:
         print_json(report.to_dict())
         return
     rows = [
         [source.name, f"{report.gaussians_before:,}", f"{report.bytes_source:,}", _times(report, report.bytes_source)],
         ["as PLY", f"{report.gaussians_before:,}", f"{report.bytes_ply:,}", _times(report, report.bytes_ply)],
-        [output.name, f"{report.gaussians_after:,}", f"{report.bytes_after:,}", ""],
+        [written.name, f"{report.gaussians_after:,}", f"{report.bytes_after:,}", ""],
     ]
     click.echo(table(["file", "Gaussians", "bytes", "smaller by"], rows))
     click.echo(

@@ -17,6 +17,7 @@ from hyrfpack.cli.common import (
     chosen_device,
     json_option,
     note,
+    note_rename,
     number,
     overwrite_option,
     print_json,
@@ -133,6 +134,7 @@ def make(
     except Stopped as stop:
         note(f"stopped in {stop.stage}; the same command goes on")
         click.get_current_context().exit(1)
+    note_rename(output, result.output)
     if as_json:
         print_json(result.to_dict())
         return

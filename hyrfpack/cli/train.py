@@ -18,6 +18,7 @@ from hyrfpack.cli.common import (
     device_options,
     json_option,
     note,
+    note_rename,
     print_json,
     read_scene,
     scene_options,
@@ -130,7 +131,7 @@ def train(
     from hyrfpack.device import describe_device
     from hyrfpack.train import TrainConfig
     from hyrfpack.train import train as run
-    from hyrfpack.train.run import is_begun, resuming
+    from hyrfpack.train.run import MODEL, is_begun, resuming
 
     place = chosen_device(device, ranks)
     try:
@@ -159,6 +160,8 @@ def train(
         note("stopped before the first step; the same command begins anew")
     elif not result.complete:
         note(f"stopped after step {result.step:,}; {resuming(overwrite)} goes on from there")
+    if result.model is not None:
+        note_rename(out / MODEL, result.model)
     if as_json:
         print_json({"complete": result.complete, "step": result.step, **result.metrics})
     elif result.complete and ranks.leads:

@@ -16,6 +16,7 @@ from hyrfpack.cli.common import (
     json_option,
     largest_picture,
     note,
+    note_rename,
     overwrite_option,
     print_json,
     read_scene,
@@ -88,7 +89,8 @@ def render(
     from hyrfpack.cameras.files import cameras_from_json
     from hyrfpack.cameras.paths import orbit as orbit_around
     from hyrfpack.format import describe, load
-    from hyrfpack.render.files import render_files, rendered_names
+    from hyrfpack.lock import exclusive_folder
+    from hyrfpack.render.files import render_files_unlocked, rendered_names
     from hyrfpack.render.video import has_ffmpeg, write_video
 
     place = chosen_device(device, ranks)
@@ -104,28 +106,36 @@ def render(
         named = [(f"{number:04d}", camera) for number, camera in enumerate(cameras_around)]
     film = output / "video.mp4" if video and has_ffmpeg() else None
     names = rendered_names([name for name, _ in named], depth)
-    outputs = Outputs(model, cameras, scene=scene, overwrite=overwrite)
-    ranks.agree(lambda: outputs.folder(output, [*names, *([film.name] if film else [])]))
+    names += [film.name] if film else []
+
+    def check(replace: bool) -> None:
+        if ranks.leads:
+            Outputs(model, cameras, scene=scene, overwrite=replace).folder(output, names)
 
     def write() -> list[Path]:
         loaded = load(model, place, part)
         loaded.precision = precision
-        pictures = render_files(loaded, named, output, depth=depth, ranks=ranks)
+        pictures = render_files_unlocked(loaded, named, output, depth=depth, overwrite=overwrite, ranks=ranks)
         return list(counted(pictures, len(ranks.share(named)), "rendering"))
 
-    parts = ranks.told(ranks.agree(write))
-    if not ranks.leads:
-        return
-    written = [parts[place % ranks.size][place // ranks.size] for place in range(len(named))]
-    if film:
-        write_video(written, film)
-    elif video:
+    ranks.agree(lambda: check(replace=True))  # whatever lies there: no folder is created where nothing may be written
+    with exclusive_folder(output, "another folder with -o", ranks):  # until the video is written, too
+        ranks.agree(lambda: check(replace=overwrite))
+        parts = ranks.told(ranks.agree(write))
+        if not ranks.leads:
+            return
+        written = [parts[place % ranks.size][place // ranks.size] for place in range(len(named))]
+        if film:
+            film = note_rename(film, write_video(written, film, overwrite=overwrite))
+    for name, path in zip(rendered_names([name for name, _ in named]), written, strict=True):
+        note_rename(output / name, path)
+    if video and not film:
         note("there is no ffmpeg program, so no video was made; the pictures are in place")
     if as_json:
         print_json({"pictures": [str(path) for path in written], "video": str(film) if film else None})
     else:
         width, height = largest_picture(camera for _, camera in named)
-        click.echo(f"{output}: {len(written)} pictures{' and video.mp4' if film else ''}, {width} x {height} pixels")
+        click.echo(f"{output}: {len(written)} pictures{f' and {film.name}' if film else ''}, {width} x {height} pixels")
 
 
 @click.command(short_help="Score a model against photos.")
@@ -186,7 +196,15 @@ def evaluate(
         return loaded, scene, views
 
     loaded, scene, views = ranks.agree(read)
-    scores = score(loaded, views, training=scene.train, lpips_weights=lpips_weights, pictures=pictures, ranks=ranks)
+    scores = score(
+        loaded,
+        views,
+        training=scene.train,
+        lpips_weights=lpips_weights,
+        pictures=pictures,
+        overwrite=overwrite,
+        ranks=ranks,
+    )
     if not ranks.leads:
         return
     size = os.path.getsize(model)

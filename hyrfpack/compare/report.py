@@ -46,7 +46,8 @@ def compare(runs: Sequence[StrPath], out: StrPath, *, overwrite: bool = False) -
     Args:
         runs: folders that `hyrfpack.train` wrote to, two or more.
         out: the page, an .html file.
-        overwrite: replace the file if it is there.
+        overwrite: replace the file if it is there. Without it, a file that appears in the meantime is kept, too:
+            the page gets a free name beside it, which the report tells.
 
     Raises:
         TypeError: `runs` is one path.
@@ -73,5 +74,5 @@ def compare(runs: Sequence[StrPath], out: StrPath, *, overwrite: bool = False) -
     said = doubts(found, names, [view.name for view in views if not view.same])
     views = [view for view in views if view.same]
     page = encode_comparison(found, names, views, said)
-    write_atomic(out, page)
-    return ComparisonReport(str(out), len(page), names, [view.name for view in views], said)
+    written = write_atomic(out, page, overwrite=overwrite)
+    return ComparisonReport(str(written), len(page), names, [view.name for view in views], said)

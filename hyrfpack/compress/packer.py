@@ -73,6 +73,7 @@ def compress(
     target_bytes: int | None = None,
     max_psnr_drop: float | None = None,
     distortion: float | None = None,
+    overwrite: bool = True,
     device: str | torch.device = "auto",
     say: Callable[[str], None] = lambda sentence: None,
     ranks: Ranks = ALONE,
@@ -95,6 +96,8 @@ def compress(
         max_psnr_drop: make the file as small as can be for so many dB of mean PSNR on the held-out photos of `data`;
             of `psnr_predicted` (`hyrfpack.Evaluation`) where photos' exposures were learnt beside the model.
         distortion: mean squared error that pictures may get, by estimate; instead of a search.
+        overwrite: replace a file at `target`. Without it, one that is there is an error, and one that appears in the
+            meantime is kept: the result gets a free name beside it, which the report tells.
         device: where pictures are drawn, see `hyrfpack.device.choose_device`. On the CPU the same input gives the same
             bytes; on a GPU sums of gradients vary in their last bits, and bytes with them.
         say: told what is going on.
@@ -117,11 +120,15 @@ def compress(
         distortion = settings.pop("noise")
     if data is not None:
         check_type("data", data, Scene)
-    Outputs(source, scene=data, overwrite=True).file(target)
+    # The main process alone looks, and the others wait for it: what it has written is no reason to refuse.
+    outputs = Outputs(source, scene=data, overwrite=overwrite)
+    ranks.agree(lambda: outputs.file(target) if ranks.leads else None)
     if profile != "compact":
         if data is not None or finetune_steps or target_bytes or max_psnr_drop is not None or distortion:
             raise HyrfError(f"profile '{profile}' has no settings to fit to photos, sizes or losses; use 'compact'")
-        repacked = ranks.agree(lambda: repack(source, target, profile, **settings) if ranks.leads else None)
+        repacked = ranks.agree(
+            lambda: repack(source, target, profile, overwrite=overwrite, **settings) if ranks.leads else None
+        )
         return cast(CompressionReport, ranks.first(repacked))
     if settings:
         raise HyrfError(f"profile 'compact' has no setting '{next(iter(settings))}'")
@@ -151,7 +158,7 @@ def compress(
         trial, found = packer.within_drop(max_psnr_drop, start)
     else:
         trial, found = packer.attempt(start) if finetune_steps else packer.settled(start, originals), ""
-    written = ranks.agree(lambda: write_model(trial.data, target) if ranks.leads else None)
+    written = ranks.agree(lambda: write_model(trial.data, target, overwrite=overwrite) if ranks.leads else None)
     report = cast(CompressionReport, ranks.first(written))
     total = sum(trial.errors.values())
     shares = {part: error / (total or 1.0) for part, error in trial.errors.items()}

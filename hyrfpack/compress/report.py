@@ -31,6 +31,7 @@ from hyrfpack.format.codec import (
     load_with_provenance,
 )
 from hyrfpack.format.info import describe
+from hyrfpack.lock import exclusive_folder
 from hyrfpack.measure.machine import machine, machine_line
 from hyrfpack.measure.timing import take_turns
 from hyrfpack.model import HybridModel
@@ -56,6 +57,7 @@ def write_report(
     scene: Scene | None = None,
     *,
     command: str = "",
+    overwrite: bool = True,
     say: Callable[[str], None] = lambda sentence: None,
 ) -> Path:
     """Write `folder/index.html` about a compressed file, and its pictures beside it.
@@ -64,22 +66,39 @@ def write_report(
     held out, and without photos against the uncompressed model's own renders.
 
     Args:
-        folder: made if missing; files of an earlier page are replaced.
+        folder: made if missing.
         source: the file that was compressed.
         packed: the file it became.
         report: what `hyrfpack.compress` returned.
         scene: photos.
         command: what was run, for people to run it again.
+        overwrite: replace files of an earlier page; without it, they are an error.
         say: told what is going on.
 
     Returns:
         The page, written last: where it is, all that it shows is there.
 
     Raises:
-        HyrfError: a file cannot be read, or the folder cannot be written.
+        HyrfError: a file cannot be read, the folder cannot be written, or another call is at work in it.
     """
     folder, source, packed = Path(folder), Path(source), Path(packed)
     Outputs(source, packed, scene=scene, overwrite=True).folder(folder, FILES)
+    with exclusive_folder(folder, "another folder with --report"):
+        Outputs(source, packed, scene=scene, overwrite=overwrite).folder(folder, FILES)
+        return _write_report(folder, source, packed, report, scene, command, overwrite, say)
+
+
+def _write_report(
+    folder: Path,
+    source: Path,
+    packed: Path,
+    report: CompressionReport,
+    scene: Scene | None,
+    command: str,
+    overwrite: bool,
+    say: Callable[[str], None],
+) -> Path:
+    """As `write_report`, into a folder that this call holds."""
     model, provenance = load_with_provenance(source)
     views, words = _views(model, source, scene)
     say(f"comparing pictures with {words}, for the page")
@@ -101,7 +120,7 @@ def write_report(
     files = {CHOSEN: data, **profiles, **{name: other for name, other in curve.items() if name not in same}}
     points, decoded = _measured(files, scored)
 
-    shown, amplified = _write_pictures(folder, model, decoded[CHOSEN], scored, before, points[CHOSEN].scores)
+    shown, amplified = _write_pictures(folder, model, decoded[CHOSEN], scored, before, points[CHOSEN].scores, overwrite)
     findings = Findings(
         views=words,
         has_photos=scene is not None,
@@ -115,10 +134,10 @@ def write_report(
         machine=machine_line(machine()),
         writer=facts["writer"],
     )
-    draw(findings, folder / PLOT)
+    draw(findings, folder / PLOT, overwrite=overwrite)
     path = folder / PAGE
-    write_atomic(path, page(source, packed, report, findings, command).encode())
-    return path
+    text = page(source, packed, report, findings, command).encode()
+    return write_atomic(path, text, overwrite=overwrite, rename=False)
 
 
 def _views(model: HybridModel, source: Path, scene: Scene | None) -> tuple[list[View], str]:
@@ -190,6 +209,7 @@ def _write_pictures(
     views: Sequence[View],
     before: Evaluation,
     after: Evaluation,
+    overwrite: bool,
 ) -> tuple[list[ShownView], int]:
     """Renders of both models and their difference, from the view that loses most to the one that loses least.
 
@@ -212,7 +232,7 @@ def _write_pictures(
     for number, ((view, old, new), pair, distance) in enumerate(zip(chosen, pairs, between, strict=True), 1):
         names = picture_names(number)
         for name, picture in zip(names, (*pair, amplified * (pair[1] - pair[0]).abs()), strict=True):
-            save_picture(folder / name, to_image(picture))
+            save_picture(folder / name, to_image(picture), overwrite=overwrite, rename=False)
         shown.append(ShownView(view.name, old.psnr, new.psnr, distance, names))
     return shown, amplified
 

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 BLUE, RED, GREY = "#1a73e8", "#d93025", "#5f6368"
 
 
-def draw(findings: Findings, path: str | os.PathLike[str]) -> None:
+def draw(findings: Findings, path: str | os.PathLike[str], *, overwrite: bool = True) -> None:
     """Plot bytes against loss, and below that against the time to decode; "compact" is joined, the file itself ringed.
 
     Raises:
-        HyrfError: the file cannot be written.
+        HyrfError: the file cannot be written, or not without `overwrite`.
     """
     figure = blank_figure(9, 6.5)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
@@ -39,7 +39,7 @@ def draw(findings: Findings, path: str | os.PathLike[str]) -> None:
     ticks = _round_sizes(*below.get_xlim())
     below.set_xticks(ticks, [size_in_words(tick) for tick in ticks])
     below.set_xticks([], minor=True)
-    save_figure(path, figure, format="png", metadata={"Software": None})
+    save_figure(path, figure, overwrite=overwrite, rename=False, format="png", metadata={"Software": None})
 
 
 def _scatter(axes: Axes, findings: Findings, points: Sequence[Point], height: Callable[[Point], float]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import time
 from collections.abc import Callable
@@ -20,8 +21,10 @@ from hyrfpack.evaluate import evaluate
 from hyrfpack.evaluate.figures import comparison, contact_sheet
 from hyrfpack.evaluate.metrics import psnr, to_8bit
 from hyrfpack.export import ExportReport, export
-from hyrfpack.format import load, repack
+from hyrfpack.format import CompressionReport, load, repack
+from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
+from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
 from hyrfpack.render.files import render_files, save_picture
 from hyrfpack.scene import Scene, evenly_spaced
@@ -106,50 +109,66 @@ def run_demo(
     steps: int = 3000,
     views: int = 60,
     size: int = 200,
+    overwrite: bool = True,
     say: Callable[[str], None] = lambda sentence: None,
 ) -> DemoResult:
     """Make a scene, train on it, compress, decompress, render, score, export, and draw one picture of it.
 
     Leaves in `folder`: `scene/` (photos and poses), `run/` (the training), `paper.hyrf`, `compact.hyrf`, `back.hyrf`
     (compact.hyrf decompressed), `renders/` (held-out views from compact.hyrf), `demo.html` (compact.hyrf in a page that
-    plays it) and `demo.png`. Earlier results are replaced.
+    plays it) and `demo.png`.
 
     Args:
         folder: made if missing.
         steps: of the training.
         views, size: how many photos, and their width and height in pixels.
+        overwrite: replace files that are there; without it, they are an error.
         say: told what is going on, a sentence before each part.
 
     Raises:
-        HyrfError: something cannot be written.
+        HyrfError: something cannot be written, or another call is at work in the folder.
     """
     folder = Path(folder)
+    Outputs(overwrite=True).folder(folder, FILES)
+    with exclusive_folder(folder, "another folder with -o"):
+        Outputs(overwrite=overwrite).folder(folder, FILES)
+        return _run_demo(folder, steps, views, size, overwrite, say)
+
+
+def _run_demo(
+    folder: Path, steps: int, views: int, size: int, overwrite: bool, say: Callable[[str], None]
+) -> DemoResult:
+    """As `run_demo`, in a folder that this call holds."""
     say(f"making a scene of {views} photos")
-    write_demo_scene(folder / SCENE, views=views, size=size)
+    write_demo_scene(folder / SCENE, views=views, size=size, overwrite=overwrite)
     scene = load_scene(folder / SCENE)
     say(f"training {steps:,} steps on {len(scene.train)} photos, {len(scene.test)} held out")
-    trained = train(scene, folder / RUN, TrainConfig(steps=steps), overwrite=True)
+    trained = train(scene, folder / RUN, TrainConfig(steps=steps), overwrite=overwrite)
     if trained.model is None:
         raise KeyboardInterrupt
 
     say("compressing, decompressing and scoring")
-    back, profiles = folder / BACK, []
+    back, profiles, replace = folder / BACK, [], overwrite
     for profile in ("raw", *PACKED):
         path, compress_seconds = trained.model, None
         if profile != "raw":
-            path = folder / PACKED[profile]
-            compress_seconds = _seconds(partial(compress, trained.model, path, profile))
-        decompress_seconds = _seconds(partial(repack, path, back))
+            packed, compress_seconds = _timed(
+                partial(compress, trained.model, folder / PACKED[profile], profile, overwrite=overwrite)
+            )
+            path = Path(packed.file)
+        unpacked, decompress_seconds = _timed(partial(repack, path, back, overwrite=replace))
+        back, replace = Path(unpacked.file), True  # from now on it is of this call
         scores = evaluate(load(back), scene.test)
         stored = path.stat().st_size
         profiles.append(ProfileResult(profile, scores.psnr, scores.ssim, stored, compress_seconds, decompress_seconds))
 
     say("rendering held-out views")
     model = load(path)
-    for _ in render_files(model, [(view.name, view.camera) for view in scene.test], folder / RENDERS):
+    held_out = [(view.name, view.camera) for view in scene.test]
+    for _ in render_files(model, held_out, folder / RENDERS, overwrite=overwrite):
         pass
     say("making a page for the browser")
-    page = export(path, folder / PAGE, data=scene)
+    page = export(path, folder / PAGE, data=scene, overwrite=overwrite)
     result = DemoResult(
         steps=steps,
         gaussians=len(model),
@@ -159,8 +178,8 @@ def run_demo(
         picture=folder / PICTURE,
         page=page,
     )
-    save_picture(result.picture, _draw(model, scene, result))
-    return result
+    picture = save_picture(result.picture, _draw(model, scene, result), overwrite=overwrite)
+    return dataclasses.replace(result, picture=picture)
 
 
 @torch.no_grad()
@@ -177,7 +196,8 @@ def _draw(model: HybridModel, scene: Scene, result: DemoResult) -> Image.Image:
     return contact_sheet(rows, title, result.table())
 
 
-def _seconds(action: Callable[[], object]) -> float:
+def _timed(action: Callable[[], CompressionReport]) -> tuple[CompressionReport, float]:
+    """What an action returns, and the seconds that it took."""
     start = time.perf_counter()
-    action()
-    return time.perf_counter() - start
+    report = action()
+    return report, time.perf_counter() - start

@@ -52,14 +52,17 @@ class _Solid:
         return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
 
 
-def write_demo_scene(folder: str | os.PathLike[str], *, views: int = 60, size: int = 200, seed: int = 0) -> Path:
+def write_demo_scene(
+    folder: str | os.PathLike[str], *, views: int = 60, size: int = 200, seed: int = 0, overwrite: bool = True
+) -> Path:
     """Write a procedural scene that `load_scene` reads: pictures, transforms.json and a sparse point cloud.
 
     Args:
-        folder: where to; made if absent, files of the same names are replaced.
+        folder: where to; made if absent.
         views: pictures, on a dome around the objects.
         size: width and height of a picture in pixels.
         seed: of textures, cameras and points; the same seed writes the same bytes.
+        overwrite: replace files that are there; without it, they are an error.
 
     Returns:
         The folder.
@@ -83,7 +86,8 @@ def write_demo_scene(folder: str | os.PathLike[str], *, views: int = 60, size: i
         picture, surface = _render(world_from_camera, focal, size, noise)
         photo = io.BytesIO()
         Image.fromarray(picture).save(photo, format="png")
-        write_atomic(folder / "images" / f"{index:04d}.png", photo.getbuffer())
+        path = folder / "images" / f"{index:04d}.png"
+        write_atomic(path, photo.getbuffer(), overwrite=overwrite, rename=False)
         frames.append(
             {
                 "file_path": f"images/{index:04d}.png",
@@ -103,9 +107,10 @@ def write_demo_scene(folder: str | os.PathLike[str], *, views: int = 60, size: i
         exact = surface[:, rows, columns].T[near]
         points.append(exact + rng.normal(size=exact.shape) * 0.002 * depth[near, None])
         colors.append(picture[rows, columns][near])
-    _write_ply(folder / "sparse_pc.ply", np.concatenate(points), np.concatenate(colors))
+    _write_ply(folder / "sparse_pc.ply", np.concatenate(points), np.concatenate(colors), overwrite)
     content = {"camera_model": "PINHOLE", "ply_file_path": "sparse_pc.ply", "frames": frames}
-    write_atomic(folder / "transforms.json", json.dumps(content, indent=1).encode())
+    poses = json.dumps(content, indent=1).encode()
+    write_atomic(folder / "transforms.json", poses, overwrite=overwrite, rename=False)
     return folder
 
 
@@ -349,9 +354,9 @@ _SOLIDS = (
 )
 
 
-def _write_ply(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
+def _write_ply(path: Path, points: np.ndarray, colors: np.ndarray, overwrite: bool) -> None:
     vertices = np.empty(len(points), [("position", "<f4", 3), ("color", "u1", 3)])
     vertices["position"], vertices["color"] = points, colors
     fields = [f"property float {axis}" for axis in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *fields, "end_header", ""]
-    write_atomic(path, "\n".join(header).encode() + vertices.tobytes())
+    write_atomic(path, "\n".join(header).encode() + vertices.tobytes(), overwrite=overwrite, rename=False)

@@ -41,6 +41,7 @@ class DistillReport:
         bytes_ply: of the original as PLY in INRIA's layout, without the header: 4 (17 + 3 (K - 1)) for each Gaussian.
         bytes_after: of the `.hyrf` file.
         seconds: that it took.
+        file: the path that was written.
     """
 
     gaussians_before: int
@@ -55,6 +56,7 @@ class DistillReport:
     bytes_ply: int
     bytes_after: int
     seconds: float
+    file: str
 
     def to_dict(self) -> dict:
         """Plain numbers, ready for JSON."""
@@ -67,6 +69,7 @@ def distill(
     config: DistillConfig = DistillConfig(),  # noqa: B008 - frozen
     *,
     cameras: Sequence[Camera] | None = None,
+    overwrite: bool = True,
     device: str | torch.device = "auto",
     say: Callable[[str], None] = lambda sentence: None,
     quiet: bool = True,
@@ -88,11 +91,12 @@ def distill(
     check_type("config", config, DistillConfig)
     for camera in cameras or ():
         check_type("each of the cameras", camera, Camera)
-    Outputs(source, overwrite=True).file(target)
+    Outputs(source, overwrite=overwrite).file(target)
     splats = read_splats(source)
     report = distill_splats(
-        splats, target, config, name=str(source), cameras=cameras, device=device, say=say, quiet=quiet
-    )
+        splats, target, config, name=str(source), cameras=cameras, overwrite=overwrite, device=device, say=say,
+        quiet=quiet,
+    )  # fmt: skip
     return dataclasses.replace(report, bytes_source=_bytes_at(Path(source)))
 
 
@@ -103,6 +107,7 @@ def distill_splats(
     *,
     name: str = "the splats",
     cameras: Sequence[Camera] | None = None,
+    overwrite: bool = True,
     device: str | torch.device = "auto",
     say: Callable[[str], None] = lambda sentence: None,
     quiet: bool = True,
@@ -119,6 +124,8 @@ def distill_splats(
         name: what messages call the splats.
         cameras: that pictures shall hold at, made smaller where larger than `config.size`; one in TEST_EVERY is held
             out.
+        overwrite: replace a file at `target`. Without it, one that is there is an error, and one that appears in the
+            meantime is kept: the result gets a free name beside it, which the report tells.
         device: where pictures are drawn and the model learns, see `hyrfpack.device.choose_device`.
         say: told what is going on.
         quiet: show no progress line.
@@ -128,7 +135,7 @@ def distill_splats(
         HyrfError: the file cannot be written, or there is no such device.
     """
     started = time.perf_counter()
-    Outputs(overwrite=True).file(target)
+    Outputs(overwrite=overwrite).file(target)
     place = choose_device(device, say)
     taught = teach(splats, config, name=name, cameras=cameras, device=place, say=say, quiet=quiet)
     unpacked = float(np.mean(taught.test.likeness(taught.model)))
@@ -136,8 +143,8 @@ def distill_splats(
     imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
     provenance = {"steps": config.steps, "seed": config.seed, "psnr": unpacked, "choices": {"imported": imported}}
     data = pack(taught, config.psnr, provenance, say)
-    write_atomic(target, data)  # only now: an interrupt leaves what was there before
-    decoded = hyrf_format.load(target).to(place)
+    written = write_atomic(target, data, overwrite=overwrite)  # only now: an interrupt leaves what was there before
+    decoded = hyrf_format.load(written).to(place)
     decoded.precision = taught.model.precision
     scores = taught.test.likeness(decoded)
     reached = float(np.mean(scores))
@@ -156,6 +163,7 @@ def distill_splats(
         bytes_ply=4 * len(splats) * (17 + 3 * (splats.harmonics.shape[1] - 1)),
         bytes_after=len(data),
         seconds=time.perf_counter() - started,
+        file=str(written),
     )
 
 

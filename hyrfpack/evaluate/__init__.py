@@ -7,6 +7,7 @@ import os
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from hyrfpack.evaluate.exposure import corrected, expose, fitted_gains, predicte
 from hyrfpack.evaluate.figures import comparison
 from hyrfpack.evaluate.lpips import LPIPS
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
+from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.parallel.ranks import ALONE, Ranks
 from hyrfpack.render import RenderSettings, render
@@ -95,6 +97,7 @@ def evaluate(
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     pictures: str | os.PathLike[str] | None = None,
     picture_count: int = PICTURES,
+    overwrite: bool = True,
     report: Callable[[int, int], None] = lambda done, total: None,
     warn: Callable[[str], None] | None = None,
     ranks: Ranks = ALONE,
@@ -111,13 +114,15 @@ def evaluate(
         lpips_weights: see `hyrfpack.evaluate.lpips`; without it lpips is None.
         settings: how to render.
         pictures: folder for photo | render | error pictures of `picture_count` views spread over `views`.
+        overwrite: replace files in `pictures`; without it, one that is there is an error.
         report: told how many views are scored and how many there are: at the beginning and after each view. Each of
             several processes reports its own share.
         warn: told of each picture that cannot be written, while scoring continues; without it that is an error.
         ranks: processes that share the views, each of which gets all scores.
 
     Raises:
-        HyrfError: there is no view to score, or a file cannot be read or written.
+        HyrfError: there is no view to score, a file cannot be read or written, or another call is at work in the
+            folder `pictures`.
         TypeError: the model, a view or the settings are something else.
 
     Example:
@@ -185,7 +190,7 @@ def evaluate(
             if pictures is not None and number in drawn:
                 sheet = comparison(reference, image, mask, _caption(score))
                 try:
-                    save_picture(Path(pictures, drawn[number]), sheet)
+                    save_picture(Path(pictures, drawn[number]), sheet, overwrite=overwrite, rename=False)
                 except HyrfError as error:
                     if warn is None:
                         raise
@@ -193,7 +198,8 @@ def evaluate(
         report(len(own), len(own))
         return scores
 
-    told = sorted((row for rows in ranks.told(ranks.agree(scored)) for row in rows), key=lambda row: row[0])
+    with nullcontext() if pictures is None else exclusive_folder(pictures, ranks=ranks):
+        told = sorted((row for rows in ranks.told(ranks.agree(scored)) for row in rows), key=lambda row: row[0])
     scores = [score for _, score, _ in told if score is not None]
     if not scores:
         raise HyrfError("the masks of all views leave no pixel to score; check that white means 'use this pixel'")

@@ -100,12 +100,16 @@ def contact_sheet(rows: Sequence[Image.Image], title: str, lines: Sequence[str])
     return sheet
 
 
-def training_curve(records: Sequence[dict], path: str | os.PathLike[str]) -> None:
+def training_curve(records: Sequence[dict], path: str | os.PathLike[str], *, overwrite: bool = True) -> Path:
     """Draw how a training went: PSNR and loss of the views trained on, faint with their mean, and the Gaussians.
 
     Args:
         records: each with "step", "psnr" (dB), "loss" and "gaussians".
         path: the PNG to write.
+        overwrite: as of `hyrfpack.atomic.pending_file`.
+
+    Returns:
+        The path that was written.
 
     Raises:
         HyrfError: the file cannot be written.
@@ -132,7 +136,7 @@ def training_curve(records: Sequence[dict], path: str | os.PathLike[str]) -> Non
     axes[1].set_yscale("log")
     axes[2].set_ylim(bottom=0)
     axes[2].set_xlabel("step")
-    save_figure(path, figure, format="png", metadata={"Software": None})
+    return save_figure(path, figure, overwrite=overwrite, format="png", metadata={"Software": None})
 
 
 @contextmanager
@@ -159,15 +163,19 @@ def blank_figure(width: float, height: float, layout: Literal["constrained"] | N
     return figure
 
 
-def save_figure(path: str | os.PathLike[str], figure: Figure, **options: Any) -> None:
-    """Write a figure in one step, making its folder; `options` as matplotlib's `savefig` takes them.
+def save_figure(
+    path: str | os.PathLike[str], figure: Figure, *, overwrite: bool = True, rename: bool = True, **options: Any
+) -> Path:
+    """Write a figure in one step, making its folder, and return the path that was written.
+
+    `overwrite` and `rename` are those of `hyrfpack.atomic.pending_file`, `options` those of matplotlib's `savefig`.
 
     Raises:
         HyrfError: the folder or the file cannot be written.
     """
     data = io.BytesIO()
     figure.savefig(data, dpi=120, **options)
-    write_atomic(path, data.getbuffer())
+    return write_atomic(path, data.getbuffer(), overwrite=overwrite, rename=rename)
 
 
 def svg_of(figure: Figure) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hyrfpack.atomic import replacing
+from hyrfpack.atomic import pending_file
 from hyrfpack.errors import needs_package
 from hyrfpack.scene import Camera, evenly_spaced
 from hyrfpack.splats.splats import Splats
@@ -26,6 +26,8 @@ def write_colmap(
     folder: str | os.PathLike[str],
     points: Splats | None,
     max_points: int = MAX_POINTS,
+    *,
+    overwrite: bool = True,
 ) -> None:
     """Write `folder`/sparse/0, a binary COLMAP model. The photos belong into `folder`/images.
 
@@ -38,9 +40,10 @@ def write_colmap(
         folder: where; made when it is missing.
         points: whose centres become points, or None for no points.
         max_points: at most so many points.
+        overwrite: replace tables that are there.
 
     Raises:
-        HyrfError: pycolmap is missing, or a file cannot be written.
+        HyrfError: pycolmap is missing, or a file cannot be written, or not without `overwrite`.
     """
     with needs_package("pycolmap", f"{folder}: writing a COLMAP model"):
         import pycolmap
@@ -70,7 +73,8 @@ def write_colmap(
         for table in sorted(Path(temporary).iterdir()):
             data = table.read_bytes()
             # They take their names when the block ends.
-            tables.enter_context(replacing(target / table.name, len(data))).write_bytes(data)
+            pending = pending_file(target / table.name, len(data), overwrite=overwrite, rename=False)
+            tables.enter_context(pending).temporary.write_bytes(data)
 
 
 def encode_transforms(cameras: Sequence[tuple[str, Camera]]) -> bytes:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from hyrfpack.atomic import replacing, write_atomic
+from hyrfpack.atomic import pending_file, write_atomic
 from hyrfpack.checks import check_type
 from hyrfpack.evaluate import evaluate
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
@@ -21,6 +21,7 @@ from hyrfpack.export.poster import encode_poster, model_poster, splats_poster
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
 from hyrfpack.format import describe
+from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.scene import Scene
@@ -42,6 +43,7 @@ def player(
     folder: StrPath,
     *,
     data: Scene | None = None,
+    overwrite: bool = True,
     say: Say = lambda sentence: None,
 ) -> ExportReport:
     """Write a folder of static files that plays a scene on any web server: a page, the file itself and its picture.
@@ -52,12 +54,13 @@ def player(
     Args:
         source: a `.hyrf` file, or one of splats (.ply, .spz, .splat, .sog), copied as it is; None for a player without
             a scene.
-        folder: where; made when it is missing. Files of these names are replaced, others stay.
+        folder: where; made when it is missing. Files of other names stay.
         data: photos of the scene, from where the picture is taken; else it is from where the file says.
+        overwrite: replace files that are there; without it, they are an error.
         say: told what is going on.
 
     Raises:
-        HyrfError: the file cannot be read, or a file cannot be written.
+        HyrfError: the file cannot be read, a file cannot be written, or another call is at work in the folder.
         TypeError: `data` is no Scene.
 
     Example:
@@ -70,7 +73,14 @@ def player(
         check_type("data", data, Scene)
     sources = [] if source is None else [source]
     check_folder(folder, sources, [data], overwrite=True, listed=False)
-    title, into = _title(folder), _Folder(Path(folder))
+    with exclusive_folder(folder, "another folder with -o"):
+        check_folder(folder, sources, [data], overwrite=overwrite, listed=False)
+        return _write_player(source, _Folder(Path(folder), overwrite), data, say)
+
+
+def _write_player(source: StrPath | None, into: _Folder, data: Scene | None, say: Say) -> ExportReport:
+    """As `player`, into a folder that this call holds."""
+    title = _title(into.path)
     content = poster = None
     stages = {}
     description, count = "A player of 3D scenes", 0
@@ -88,7 +98,7 @@ def player(
     into.write(ELEMENT, element_script())
     into.write(README, encode_readme(title, INDEX, INDEX, element=content or "URL"))
     into.write(INDEX, encode_player(title, content=content, poster=poster, description=description, stages=stages))
-    return ExportReport(str(folder), into.bytes, count, native=source is not None)
+    return ExportReport(str(into.path), into.bytes, count, native=source is not None)
 
 
 def gallery(
@@ -96,19 +106,21 @@ def gallery(
     folder: StrPath,
     *,
     data: Sequence[Scene | None] = (),
+    overwrite: bool = True,
     say: Say = lambda sentence: None,
 ) -> ExportReport:
     """Write a folder of static files that shows several scenes: a page that lists them, a player, and the files.
 
     Args:
         sources: as of `player`, at least one.
-        folder: where; made when it is missing. Files of these names are replaced, others stay.
+        folder: where; made when it is missing. Files of other names stay.
         data: photos of each scene, or None; held-out ones score it, and the list tells so. Without them it tells how
             well a model fits the photos it was trained on, where its file says.
+        overwrite: replace files that are there; without it, they are an error.
         say: told what is going on.
 
     Raises:
-        HyrfError: a file cannot be read or written.
+        HyrfError: a file cannot be read or written, or another call is at work in the folder.
         ValueError: there are not as many `data` as `sources`.
 
     Example:
@@ -124,24 +136,31 @@ def gallery(
         if scene is not None:
             check_type("data", scene, Scene)
     check_folder(folder, sources, scenes, overwrite=True, listed=True)
+    with exclusive_folder(folder, "another folder with -o"):
+        check_folder(folder, sources, scenes, overwrite=overwrite, listed=True)
+        return _write_gallery(sources, _Folder(Path(folder), overwrite), scenes, say)
+
+
+def _write_gallery(sources: Sequence[StrPath], into: _Folder, scenes: Sequence[Scene | None], say: Say) -> ExportReport:
+    """As `gallery`, into a folder that this call holds."""
     contents = []
     for source, scene in zip(sources, scenes, strict=True):  # all, before anything is written
         say(f"reading {source}")
         contents.append(_Content.read(source, scene, say, scored=True))
-    into, cards = _Folder(Path(folder)), []
+    cards = []
     for source, shown, (content, poster) in zip(sources, contents, _names(sources, listed=True), strict=True):
         into.copy(content, source)
         if shown.poster is not None:
             into.write(poster, encode_poster(shown.poster, "JPEG", POSTER_BYTES))
         picture = None if shown.poster is None else poster
         cards.append(Card(Path(source).stem, content, picture, shown.count, shown.length, shown.quality))
-    title = _title(folder)
+    title = _title(into.path)
     pairs = zip(cards, contents, strict=True)
     stages = {card.content: shown.stage for card, shown in pairs if shown.stage}
     into.write(LIST_PLAYER, encode_player(title, stages=stages))
     into.write(README, encode_readme(title, LIST_PLAYER, INDEX))
     into.write(INDEX, encode_gallery(title, cards, LIST_PLAYER))
-    return ExportReport(str(folder), into.bytes, sum(card.count for card in cards), native=True)
+    return ExportReport(str(into.path), into.bytes, sum(card.count for card in cards), native=True)
 
 
 def check_folder(
@@ -218,18 +237,22 @@ def _quality(path: StrPath, model: HybridModel, data: Scene | None, say: Say) ->
 
 
 class _Folder:
-    """A folder to write into, each file whole or not at all, and the bytes that have been."""
+    """A folder to write into, each file whole or not at all, and the bytes that have been.
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.bytes = path, 0
+    Its files name each other, so that none of them can take another name where its own is taken: that is an error.
+    """
+
+    def __init__(self, path: Path, overwrite: bool) -> None:
+        self.path, self.overwrite, self.bytes = path, overwrite, 0
 
     def write(self, name: str, data: bytes) -> None:
-        write_atomic(self.path / name, data)
+        write_atomic(self.path / name, data, overwrite=self.overwrite, rename=False)
         self.bytes += len(data)
 
     def copy(self, name: str, source: StrPath) -> None:
-        with replacing(self.path / name, os.path.getsize(source)) as temporary:
-            shutil.copyfile(source, temporary)
+        length = os.path.getsize(source)
+        with pending_file(self.path / name, length, overwrite=self.overwrite, rename=False) as pending:
+            shutil.copyfile(source, pending.temporary)
         self.bytes += os.path.getsize(self.path / name)
 
 

@@ -57,9 +57,13 @@ def native_page(read: Source, data: bytes, title: str) -> bytes:
 
 
 def write_native_page(
-    read: Source, source: str | os.PathLike[str], target: str | os.PathLike[str], say: Callable[[str], None]
+    read: Source,
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    say: Callable[[str], None],
+    overwrite: bool = True,
 ) -> ExportReport:
-    """Write the page that holds a model file itself.
+    """Write the page that holds a model file itself. `overwrite` as of `hyrfpack.atomic.pending_file`.
 
     Raises:
         HyrfError: it cannot be written.
@@ -67,8 +71,8 @@ def write_native_page(
     data = Path(source).read_bytes()
     tell_of_size(source, len(data), say)
     page = native_page(read, data, Path(target).stem)
-    write_atomic(target, page)
-    return ExportReport(str(target), len(page), len(read.model), native=True)
+    written = write_atomic(target, page, overwrite=overwrite)
+    return ExportReport(str(written), len(page), len(read.model), native=True)
 
 
 def tell_of_size(source: str | os.PathLike[str], length: int, say: Callable[[str], None]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,6 +36,7 @@ from hyrfpack.export.pages import baked_page, write_native_page
 from hyrfpack.export.points import encode_points
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
+from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
 from hyrfpack.scene import Scene
 from hyrfpack.splats.formats.hints import Hints
@@ -59,6 +61,7 @@ def export(
     spz_version: int = 3,
     baked: bool = False,
     colmap: bool = False,
+    overwrite: bool = True,
     say: Say = lambda sentence: None,
 ) -> ExportReport:
     """Write a `.hyrf` model as what other programs read, in its own axes and units, and measure what was lost.
@@ -87,10 +90,13 @@ def export(
         spz_version: of ".spz", 3 (which all programs read) or 4.
         baked: a page holds splats instead of the model.
         colmap: write cameras and points into a folder, as a COLMAP model.
+        overwrite: replace files that are there. Without it, they are an error. One that appears in the meantime is
+            kept, too: a single file gets a free name beside it, which the report tells; in a folder it is an error.
         say: told what is going on.
 
     Raises:
-        HyrfError: a file cannot be read or written, or the options do not go together.
+        HyrfError: a file cannot be read or written, the options do not go together, or another call is at work in the
+            folder.
         TypeError: `data` is no Scene.
 
     Example:
@@ -104,16 +110,41 @@ def export(
     kind = kind_of(target, colmap)
     check_request(kind, target, degree, crop, min_opacity, background, baked)
     if kind is PLAYER:
-        return player(source, target, data=data, say=say)
-    check_place(target, Outputs(source, scene=data, overwrite=True), colmap)
+        return player(source, target, data=data, overwrite=overwrite, say=say)
+    if kind is COLMAP:
+        check_place(target, Outputs(source, scene=data, overwrite=True), colmap)
+    with exclusive_folder(target, "another folder with -o") if kind is COLMAP else nullcontext():
+        check_place(target, Outputs(source, scene=data, overwrite=overwrite), colmap)
+        return _export(
+            source, target, kind, degree=degree, data=data, crop=crop, min_opacity=min_opacity, background=background,
+            spz_version=spz_version, baked=baked, overwrite=overwrite, say=say,
+        )  # fmt: skip
+
+
+def _export(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    kind: Kind,
+    *,
+    degree: int | None,
+    data: Scene | None,
+    crop: Sequence[float] | None,
+    min_opacity: float,
+    background: bool,
+    spz_version: int,
+    baked: bool,
+    overwrite: bool,
+    say: Say,
+) -> ExportReport:
+    """As `export`, of what has been checked; into a folder that this call holds, where the kind is one of folders."""
     read = Source.read(source, data)
     if kind is PAGE and not baked:
-        return write_native_page(read, source, target, say)
+        return write_native_page(read, source, target, say, overwrite)
     if kind in (TRANSFORMS, COLMAP) and (read.coarse or not read.cameras):
         kept = "only coarse cameras" if read.coarse else "no cameras"
         raise HyrfError(f"{source}: it keeps {kept}; export them from the file that training wrote, or name --data")
     if kind is TRANSFORMS:
-        return _export_cameras(read, target)
+        return _export_cameras(read, target, overwrite)
     points = kind in (COLMAP, *POINTS)
     sphere = background and crop is None and read.model.config.background and not points
     check_model(read, kind, crop, min_opacity, sphere)
@@ -134,7 +165,7 @@ def export(
     sights = sights or sights_of(read.model, read.fitted)
     splats = chosen(bake(read.model, read.fitted, (degree,), sights)[degree], crop, min_opacity)
     if points:
-        return _export_points(read, kind, target, splats)
+        return _export_points(read, kind, target, splats, overwrite)
     say(f"writing {len(splats):,} Gaussians{' and the background' if sphere else ''}")
     count = 0
     if isinstance(kind, Format):
@@ -145,9 +176,9 @@ def export(
         packed, shown = _pack_splats(read, splats, Path(target), kind, spz_version)
     else:
         packed, shown = _pack_page(read, splats, sphere, Path(target))
-    write_atomic(target, packed)
+    written = write_atomic(target, packed, overwrite=overwrite)
     report = ExportReport(
-        str(target),
+        str(written),
         len(packed),
         len(splats),
         background=count,
@@ -226,23 +257,25 @@ def _cost(before: Likeness, after: Likeness, error: float) -> float:
     return 10 * math.log10((error + 10 ** (-after.model / 10)) / (error + 10 ** (-before.model / 10)))
 
 
-def _export_cameras(read: Source, target: str | os.PathLike[str]) -> ExportReport:
+def _export_cameras(read: Source, target: str | os.PathLike[str], overwrite: bool) -> ExportReport:
     data = encode_transforms(read.cameras)
-    write_atomic(target, data)
-    return ExportReport(str(target), len(data), cameras=len(read.cameras))
+    written = write_atomic(target, data, overwrite=overwrite)
+    return ExportReport(str(written), len(data), cameras=len(read.cameras))
 
 
-def _export_points(read: Source, kind: Kind, target: str | os.PathLike[str], splats: Splats) -> ExportReport:
+def _export_points(
+    read: Source, kind: Kind, target: str | os.PathLike[str], splats: Splats, overwrite: bool
+) -> ExportReport:
     """Centres of splats, and cameras."""
     if kind is COLMAP:
-        write_colmap(read.cameras, target, splats)
+        write_colmap(read.cameras, target, splats, overwrite=overwrite)
         size = sum(table.stat().st_size for table in Path(target, "sparse", "0").glob("*.bin"))
         return ExportReport(str(target), size, cameras=len(read.cameras))
     data = encode_points(
         splats, [camera for _, camera in read.cameras], "glb" if kind.ending.endswith("glb") else "ply", read.up
     )
-    write_atomic(target, data)
-    return ExportReport(str(target), len(data), len(splats), cameras=len(read.cameras))
+    written = write_atomic(target, data, overwrite=overwrite)
+    return ExportReport(str(written), len(data), len(splats), cameras=len(read.cameras))
 
 
 def _listed(scores: dict[int, float]) -> str:

@@ -55,6 +55,7 @@ class CompressionReport:
         finetuned: of "compact": whether its numbers were fitted to photos.
         sensitivity: of "compact": what each number does to pictures (`hyrfpack.compress.sensitivity.Sensitivity`), by
             which it was packed; kept so that a page about the file need not measure it again.
+        file: the path that was written.
     """
 
     profile: str
@@ -67,6 +68,7 @@ class CompressionReport:
     found: str = ""
     finetuned: bool = False
     sensitivity: Any = field(default=None, repr=False, compare=False)
+    file: str = ""
 
     def to_dict(self) -> dict:
         """All but the sensitivity, as plain numbers, strings, lists and dictionaries, ready for JSON."""
@@ -141,9 +143,14 @@ def save(
     path: str | os.PathLike[str],
     profile: str = "raw",
     provenance: dict | None = None,
+    *,
+    overwrite: bool = True,
     **settings: Any,
 ) -> CompressionReport:
     """Write a model to a `.hyrf` file, whole or not at all. Arguments and errors as `encode_model`.
+
+    Args:
+        overwrite: replace a file at `path`. Without it, the file gets a free name beside, which the report tells.
 
     Raises:
         HyrfError: also when the file cannot be written.
@@ -155,20 +162,20 @@ def save(
         >>> report.profile, report.gaussians == len(model)
         ('raw', True)
     """
-    return write_model(encode_model(model, profile, provenance, **settings), path)
+    return write_model(encode_model(model, profile, provenance, **settings), path, overwrite=overwrite)
 
 
-def write_model(data: bytes, path: str | os.PathLike[str]) -> CompressionReport:
-    """Write what `encode_model` made to a file, whole or not at all.
+def write_model(data: bytes, path: str | os.PathLike[str], *, overwrite: bool = True) -> CompressionReport:
+    """Write what `encode_model` made to a file, whole or not at all. `overwrite` as of `save`.
 
     Raises:
         HyrfError: the file cannot be written.
     """
-    write_atomic(path, data)
+    written = write_atomic(path, data, overwrite=overwrite)
     container = read_container(data, SECTIONS)
     metadata, sizes = read_metadata(container), section_sizes(container)
     before = sum(size.before for size in sizes if size.type != METADATA)
-    return CompressionReport(metadata.profile, metadata.gaussians, before, len(data), sizes)
+    return CompressionReport(metadata.profile, metadata.gaussians, before, len(data), sizes, file=str(written))
 
 
 def load(
@@ -192,16 +199,22 @@ def repack(
     target: str | os.PathLike[str],
     profile: str = "raw",
     fraction: float | None = None,
+    *,
+    overwrite: bool = True,
     **settings: Any,
 ) -> CompressionReport:
     """Rewrite a `.hyrf` file with profile "raw" or "paper"; its provenance goes along, see `coarse`.
 
     Arguments and errors as `encode_model`, `load` and `save`.
+
+    Args:
+        overwrite: replace a file at `target`. Without it, one that is there is an error, and one that appears in the
+            meantime is kept: the result gets a free name beside it, which the report tells.
     """
-    Outputs(source, overwrite=True).file(target)
+    Outputs(source, overwrite=overwrite).file(target)
     model, provenance = load_with_provenance(source, fraction)
     kept = provenance if profile == "raw" else coarse(provenance, model.config.frame.scale)
-    return save(model, target, profile, kept, **settings)
+    return save(model, target, profile, kept, overwrite=overwrite, **settings)
 
 
 def load_with_provenance(path: str | os.PathLike[str], fraction: float | None = None) -> tuple[HybridModel, dict]:

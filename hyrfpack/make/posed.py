@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hyrfpack.errors import HyrfError
+from hyrfpack.lock import exclusive_folder
 from hyrfpack.make.progress import Progress, Reporter
 from hyrfpack.make.source import Reading, Source
 from hyrfpack.make.stages import SCENE, is_posed
@@ -36,23 +37,35 @@ def posed(
         say: told what is going on.
 
     Raises:
-        HyrfError: nothing may or can be written there, a run is there, or poses cannot be estimated.
+        HyrfError: nothing may or can be written there, another call is at work there, a run is there, or poses cannot
+            be estimated.
         KeyboardInterrupt: it was interrupted; the same call goes on.
     """
-    from hyrfpack.poses import estimate_poses
-
     scene, source = run / SCENE, Source.of(photos, Reading(images))
-    for outputs in source.outputs(overwrite or resume):
-        outputs.folder(run, [MODEL, CHECKPOINT, METRICS])
+    _check(source, run, overwrite=True)
     if Path(os.path.realpath(run)).is_relative_to(os.path.realpath(source.path)):
         raise HyrfError(f"{run}: the run would lie among the photos; name another folder")
+    with exclusive_folder(run, "another folder with -o"):
+        _check(source, run, overwrite=overwrite or resume)
+        _estimate(source.path, scene, overwrite, report, say)
+    return scene
+
+
+def _check(source: Source, run: Path, *, overwrite: bool) -> None:
+    for outputs in source.outputs(overwrite):
+        outputs.folder(run, [MODEL, CHECKPOINT, METRICS])
+
+
+def _estimate(photos: Path, scene: Path, overwrite: bool, report: Callable[[Progress], None] | None, say: Say) -> None:
+    """Estimate poses into the folder of a scene, unless they are there."""
+    from hyrfpack.poses import estimate_poses
+
     if is_posed(scene) and not overwrite:
         say(f"poses are taken from {scene}, where they were estimated before; --overwrite estimates them anew")
-        return scene
+        return
     reporter = Reporter(["poses"], report)
     reporter.begin("poses")
     with interruptible():
         estimate_poses(
-            source.path, scene, overwrite=overwrite, report=lambda doing, share: reporter.update(share, doing), say=say
+            photos, scene, overwrite=overwrite, report=lambda doing, share: reporter.update(share, doing), say=say
         )
-    return scene

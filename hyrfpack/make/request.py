@@ -53,6 +53,11 @@ class Request:
             names.insert(names.index("training"), "measurement")
         return names
 
+    @property
+    def makes_folder(self) -> bool:
+        """Whether the output is a folder."""
+        return not self._is_model and kind_of(self.output) is PLAYER
+
     def check(self) -> None:
         """Raises HyrfError: what is asked for cannot be, or may or can not be written."""
         self._check_options()
@@ -107,7 +112,7 @@ class Request:
     def _check_output(self, outputs: Outputs, *, overwrite: bool) -> None:
         if self._is_model:
             outputs.file(self.output, ".hyrf")
-        elif kind_of(self.output) is PLAYER:
+        elif self.makes_folder:
             outputs.folder(self.output, [])
             check_folder(self.output, [self.source.path], [self.source.scene], overwrite=overwrite, listed=False)
         else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import monotonic
@@ -15,7 +16,7 @@ from hyrfpack.data import PictureCache
 from hyrfpack.data.folder import list_photos, photo_facts
 from hyrfpack.device import choose_device
 from hyrfpack.format import describe
-from hyrfpack.lock import held
+from hyrfpack.lock import exclusive_folder
 from hyrfpack.make import stages
 from hyrfpack.make.minutes import measure
 from hyrfpack.make.plan import QUALITIES, Plan, forecast_photos, forecast_scene
@@ -37,7 +38,7 @@ class MakeResult:
     """What was made.
 
     Attributes:
-        output: the file or folder.
+        output: the file or folder that was written.
         bytes: of it.
         gaussians: that the scene has.
         model: the packed model, in the work folder; what was given where that was a model.
@@ -110,7 +111,8 @@ def make(
         target_bytes: pack the model into so many bytes.
         seed: of all that is random, 0 to 2^64 - 1.
         device: where to train and to pack, see `hyrfpack.device.choose_device`.
-        overwrite: replace an output that is there.
+        overwrite: replace an output that is there. Without it, one that appears in the meantime is kept, too: a file
+            gets a free name beside it, which the result tells; a folder is an error.
         report: told how far the work is.
         say: told what is going on, in sentences.
         observer: of the training, as of `hyrfpack.train`.
@@ -149,7 +151,10 @@ def make(
                 overwrite=overwrite,
             )
             request.check()
-            with held(request.work, "make", "another with --work"):
+            with (
+                exclusive_folder(request.work, "another folder with --work"),
+                exclusive_folder(request.output, "another folder with -o") if request.makes_folder else nullcontext(),
+            ):
                 return _Making(request, began, report, say, observer).run()
         except Stopped:
             raise
@@ -268,9 +273,9 @@ class _Making:
         request, work = self.request, self.work
         scores = {"views": 0} if scene is None else stages.score(work, scene, request.device)
         exported, product = stages.write(work, model, request.output.name, scene)
-        stages.deliver(product, request.output)  # last: where it is, all is done
+        output = stages.deliver(product, request.output, overwrite=request.overwrite)  # last: where it is, all is done
         return MakeResult(
-            output=request.output,
+            output=output,
             bytes=exported["bytes"],
             gaussians=describe(model)["gaussians"],
             model=model,
@@ -281,7 +286,7 @@ class _Making:
             ssim=scores.get("ssim"),
             poses=poses or {},
             training=training or {},
-            export={**exported, "file": str(request.output), **({"import": imported} if imported else {})},
+            export={**exported, "file": str(output), **({"import": imported} if imported else {})},
             seconds={name: round(seconds, 1) for name, seconds in work.seconds.items()},
             kept=tuple(work.kept),
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -12,7 +13,7 @@ from typing import Any
 
 import torch
 
-from hyrfpack.atomic import replacing
+from hyrfpack.atomic import pending_file
 from hyrfpack.cameras.capture import has_mean_exposure
 from hyrfpack.compress import compress
 from hyrfpack.data import PictureCache
@@ -27,6 +28,7 @@ from hyrfpack.make.plan import Plan
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.state import digest, digest_all
 from hyrfpack.make.work import PRODUCTS, Work
+from hyrfpack.outputs import Outputs
 from hyrfpack.scene import Scene
 from hyrfpack.train import Trainer, train
 from hyrfpack.train.progress import SMOOTHING
@@ -241,18 +243,33 @@ def score(work: Work, scene: Scene, device: torch.device) -> dict[str, Any]:
     return work.stage("scoring", inputs, act)
 
 
-def deliver(product: Path, output: Path) -> None:
-    """Copy what was made, a file or the files of a folder, to where it is wanted."""
+def deliver(product: Path, output: Path, *, overwrite: bool) -> Path:
+    """Copy what was made, a file or the files of a folder that this call holds, to where it is wanted.
+
+    Args:
+        overwrite: replace files that are there. Without it, a file gets a free name beside one that is there; of a
+            folder, whose files name each other, one that is there is an error.
+
+    Returns:
+        Where it is.
+
+    Raises:
+        HyrfError: it cannot be copied; it stays in the work folder.
+    """
     if not product.is_dir():
-        copy(product, output)
-        return
-    for path in sorted(product.rglob("*")):
-        if path.is_file():
-            copy(path, output / path.relative_to(product))
+        return copy(product, output, overwrite=overwrite)
+    files = {path: output / path.relative_to(product) for path in sorted(product.rglob("*")) if path.is_file()}
+    different = [target for path, target in files.items() if digest(path) != digest(target)]
+    Outputs(overwrite=overwrite).folder(output, [os.path.relpath(target, output) for target in different])
+    for path, target in files.items():
+        copy(path, target, overwrite=overwrite, rename=False)
+    return output
 
 
-def copy(source: Path, target: Path) -> None:
-    """Copy a file; it is there whole or not at all."""
-    if digest(source) != digest(target):
-        with replacing(target, source.stat().st_size) as temporary:
-            shutil.copyfile(source, temporary)
+def copy(source: Path, target: Path, *, overwrite: bool = True, rename: bool = True) -> Path:
+    """Copy a file, whole or not at all, unless it is there; as `hyrfpack.atomic.pending_file`. Returns where it is."""
+    if digest(source) == digest(target):
+        return target
+    with pending_file(target, source.stat().st_size, overwrite=overwrite, rename=rename) as pending:
+        shutil.copyfile(source, pending.temporary)
+    return pending.path

@@ -14,7 +14,7 @@ from hyrfpack.data.archive import is_archive, unpacked
 from hyrfpack.data.equirectangular import FACES
 from hyrfpack.data.folder import list_photos, list_pictures
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.lock import held
+from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import PICTURES, StrPath
 from hyrfpack.poses import diagnosis
 from hyrfpack.poses.frames import FrameReport, choose_frames
@@ -96,7 +96,8 @@ def estimate_poses(
 
     Raises:
         HyrfDataError: there are too few photos, or they do not overlap, or show the scene from one place only.
-        HyrfError: the folder cannot be written, has poses already, or the library failed.
+        HyrfError: the folder cannot be written, has poses already, another call is at work in it, or the library
+            failed.
         ValueError: `matching` or `seed` is none.
 
     Example:
@@ -108,7 +109,7 @@ def estimate_poses(
     check_choice("matching", matching, MATCHING)
     check_int("seed", seed, 0, 2**64 - 1)
     with disk_errors(Path(out)):
-        return _Estimation(Path(photos), Path(out), matching, masks, seed, report, say).run(overwrite)
+        return _Estimation(Path(photos), Path(out), matching, masks, seed, overwrite, report, say).run()
 
 
 @dataclass
@@ -120,6 +121,7 @@ class _Estimation:
     matching: str
     masks: StrPath | None
     seed: int
+    overwrite: bool
     report: Report | None
     say: Say | None
     count: int = 0
@@ -132,13 +134,13 @@ class _Estimation:
     def __post_init__(self) -> None:
         self.output = Output(self.out)
 
-    def run(self, overwrite: bool) -> PosesReport:
+    def run(self) -> PosesReport:
         """All stages; of an estimation that finishes none nothing is left, unless it was interrupted."""
         if is_archive(self.photos):
             self.photos = unpacked(self.photos)
         self.output.check_place(self.photos)
-        with held(self.out, "poses", "another folder"):
-            self.output.check(self.photos, overwrite)
+        with exclusive_folder(self.out):
+            self.output.check(self.photos, self.overwrite)
             try:
                 return self._run()
             except HyrfDataError:
@@ -320,6 +322,7 @@ class _Estimation:
             {stage: round(seconds, 1) for stage, seconds in self.seconds.items()},
         )
         unsure = sorted(registered.difference(found["sure"]))
+        self.output.check(self.photos, self.overwrite)  # again: another program may have put poses there meanwhile
         self.output.put(job.model("chosen"), asdict(report) | {"scene": str(self.out), "unsure": unsure})
         return report
 

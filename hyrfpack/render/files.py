@@ -12,6 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from hyrfpack.atomic import write_atomic
+from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import PICTURES
 from hyrfpack.parallel.ranks import ALONE, Ranks
@@ -26,9 +27,12 @@ def render_files(
     *,
     depth: bool = False,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    overwrite: bool = True,
     ranks: Ranks = ALONE,
 ) -> Iterator[Path]:
     """Render named cameras to `folder/<name>.png`, sub-folders kept; yields each path once it is written.
+
+    The folder is locked until the last picture is written or the iterator is closed.
 
     Args:
         model: what to render.
@@ -37,11 +41,30 @@ def render_files(
         depth: also write `<name>.depth.tiff`: one float32 channel, depth along the view axis in world units, 0 where
             no Gaussian is hit.
         settings: how to render.
+        overwrite: replace files that are there; without it, a picture gets a free name beside one that is there, and
+            depth that is there is an error.
         ranks: processes that share the cameras; each yields what it has written.
 
     Raises:
-        HyrfError: a picture cannot be written.
+        HyrfError: a picture cannot be written, or another call is at work in the folder.
     """
+    with exclusive_folder(folder, "another folder with -o", ranks):
+        yield from render_files_unlocked(
+            model, cameras, folder, depth=depth, settings=settings, overwrite=overwrite, ranks=ranks
+        )
+
+
+def render_files_unlocked(
+    model: HybridModel,
+    cameras: Sequence[tuple[str, Camera]],
+    folder: str | os.PathLike[str],
+    *,
+    depth: bool = False,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    overwrite: bool = True,
+    ranks: Ranks = ALONE,
+) -> Iterator[Path]:
+    """As `render_files`, into a folder that the caller has locked."""
     with torch.no_grad():
         decoded = model.decode()
     named = list(zip(file_names([name for name, _ in cameras]), cameras, strict=True))
@@ -49,10 +72,11 @@ def render_files(
         with torch.no_grad():
             rendering = render(model, camera, settings, decoded=decoded, depth=depth)
         path = Path(folder) / f"{name}.png"
-        save_picture(path, to_image(rendering.rgb))
+        written = save_picture(path, to_image(rendering.rgb), overwrite=overwrite)
         if rendering.depth is not None:
-            save_picture(path.with_suffix(".depth.tiff"), Image.fromarray(rendering.depth.float().cpu().numpy()))
-        yield path
+            depths = Image.fromarray(rendering.depth.float().cpu().numpy())
+            save_picture(path.with_suffix(".depth.tiff"), depths, overwrite=overwrite, rename=False)
+        yield written
 
 
 def rendered_names(names: Sequence[str], depth: bool = False) -> list[str]:
@@ -88,12 +112,16 @@ def _safe(name: str) -> str:
     return "".join(c if c.isprintable() and c not in ':*?"<>|' else "_" for c in kept) or "view"
 
 
-def save_picture(path: str | os.PathLike[str], image: Image.Image) -> None:
-    """Write a picture in one step, in the format of its extension, making its folder.
+def save_picture(
+    path: str | os.PathLike[str], image: Image.Image, *, overwrite: bool = True, rename: bool = True
+) -> Path:
+    """Write a picture in one step, in the format of its extension, making its folder; returns the path written.
+
+    `overwrite` and `rename` are those of `hyrfpack.atomic.pending_file`.
 
     Raises:
         HyrfError: the folder or the file cannot be written.
     """
     data = io.BytesIO()
     image.save(data, format=Image.registered_extensions()[Path(path).suffix.lower()])
-    write_atomic(path, data.getbuffer())
+    return write_atomic(path, data.getbuffer(), overwrite=overwrite, rename=rename)

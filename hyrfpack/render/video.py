@@ -8,7 +8,7 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
-from hyrfpack.atomic import replacing
+from hyrfpack.atomic import pending_file
 from hyrfpack.errors import HyrfError
 
 # Chroma is stored at half resolution, so both sides must be even; a black row or column is added when they are not.
@@ -20,13 +20,19 @@ def has_ffmpeg() -> bool:
     return shutil.which("ffmpeg") is not None
 
 
-def write_video(frames: Sequence[Path], path: str | os.PathLike[str], frames_per_second: int = 30) -> None:
+def write_video(
+    frames: Sequence[Path], path: str | os.PathLike[str], frames_per_second: int = 30, *, overwrite: bool = True
+) -> Path:
     """Put PNG files together as an MP4, whole or not at all.
 
     Args:
         frames: pictures in order; those of another size than the first are scaled to it.
         path: the .mp4 to write, in a folder that exists.
         frames_per_second: how fast it plays.
+        overwrite: replace a file at `path`; without it, the video gets a free name beside.
+
+    Returns:
+        The path that was written.
 
     Raises:
         HyrfError: there is no ffmpeg program, or it fails; its last line is in the message.
@@ -36,9 +42,9 @@ def write_video(frames: Sequence[Path], path: str | os.PathLike[str], frames_per
         raise HyrfError(f"{path}: no video was made because there is no ffmpeg program; install ffmpeg and try again")
     command = [program, "-hide_banner", "-loglevel", "error", "-y", "-f", "image2pipe", "-c:v", "png"]
     command += ["-framerate", str(frames_per_second), "-i", "-", "-vf", _EVEN, "-movflags", "+faststart", "-f", "mp4"]
-    with replacing(path) as partial:
+    with pending_file(path, overwrite=overwrite) as pending:
         with subprocess.Popen(
-            [*command, str(partial)], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+            [*command, str(pending.temporary)], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
         ) as process:  # which waits for the program, also when a frame cannot be read
             assert process.stdin is not None  # a pipe was asked for
             try:
@@ -50,3 +56,4 @@ def write_video(frames: Sequence[Path], path: str | os.PathLike[str], frames_per
         if process.returncode:
             lines = complaint.decode(errors="replace").strip().splitlines() or ["it gave no reason"]
             raise HyrfError(f"{path}: ffmpeg could not make the video ({lines[-1]}); the pictures are in place")
+    return pending.path

@@ -21,13 +21,16 @@ VERSION = 2
 DIGEST_BYTES = 32  # SHA-256 of all that goes before, at the end of the file
 
 
-def save_checkpoint(path: Path, *, settings: dict, tensors: dict[str, torch.Tensor], progress: dict) -> None:
+def save_checkpoint(
+    path: Path, *, settings: dict, tensors: dict[str, torch.Tensor], progress: dict, overwrite: bool = True
+) -> None:
     """Write a checkpoint in one step.
 
     Args:
         settings: plain values that must be the same on resuming.
         tensors: by name.
         progress: plain values (step, records).
+        overwrite: replace a file that is there.
 
     Raises:
         HyrfError: the file cannot be written; one that was there before stays.
@@ -36,7 +39,7 @@ def save_checkpoint(path: Path, *, settings: dict, tensors: dict[str, torch.Tens
     texts = {"version": VERSION, "settings": json.dumps(settings, sort_keys=True), "progress": json.dumps(progress)}
     torch.save({**texts, "tensors": tensors}, buffer)
     buffer.write(hashlib.sha256(buffer.getbuffer()).digest())
-    write_atomic(path, buffer.getbuffer())
+    write_atomic(path, buffer.getbuffer(), overwrite=overwrite, rename=False)
 
 
 def saved_budget_factor(path: Path) -> float | None:

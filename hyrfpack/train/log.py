@@ -11,10 +11,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import torch
 
+from hyrfpack.atomic import describe_rename, numbered_names
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import decibels
 from hyrfpack.train.progress import Pace
@@ -42,24 +43,38 @@ class TrainingLog:
     """
 
     def __init__(
-        self, path: Path, steps: int, done: int, device: torch.device, warn: Callable[[str], None] = warnings.warn
+        self,
+        path: Path,
+        steps: int,
+        done: int,
+        device: torch.device,
+        warn: Callable[[str], None] = warnings.warn,
+        overwrite: bool = True,
     ) -> None:
         """Begin a log, or go on with one where steps are done already; TensorBoard's files go to a folder of its name.
+
+        Without `overwrite`, a file that is there when a log begins is kept, and the log takes a free name beside it.
 
         Raises:
             HyrfError: the file cannot be written.
         """
-        self.path, self.steps, self.device, self.warn = path, steps, device, warn
+        self.steps, self.device, self.warn = steps, device, warn
         self.pace = Pace(steps, done)
         self.start = self.last = time.monotonic()
         self.losses: list[float] = []
         self.errors: list[float] = []
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self.file = open(path, "a" if done else "w", encoding="utf-8")
+            if done or overwrite:
+                self.file: TextIO = open(path, "a" if done else "w", encoding="utf-8")
+            else:
+                self.file = _open_new(path)
         except OSError as error:
             raise HyrfError(f"{path}: the log cannot be written ({error.strerror}); name another file") from error
-        self.scalars = _summary_writer(path)
+        self.path = Path(self.file.name)
+        if self.path != path:
+            warn(describe_rename(path, self.path))
+        self.scalars = _summary_writer(self.path)
 
     def step(self, step: int, loss: float, mse: float, gaussians: int) -> None:
         """Take in one finished step."""
@@ -123,6 +138,14 @@ class TrainingLog:
             self.warn(f"{self.path}: the log cannot be written ({error.strerror}); training goes on without it")
             with suppress(OSError):  # it tries once more to write what is left
                 self.file.close()
+
+
+def _open_new(path: Path) -> TextIO:
+    """Open a new file, under the first free one of `numbered_names`."""
+    for name in numbered_names(path):
+        with suppress(FileExistsError):
+            return open(name, "x", encoding="utf-8")
+    raise AssertionError("numbers never end")
 
 
 def peak_memory() -> int | None:

@@ -48,12 +48,14 @@ class TrainingRecord:
     """Everything that `metrics.json` needs and the model's file does not hold.
 
     Attributes:
-        model_sha256: digest of the model's file, in hexadecimal digits.
+        model: name of the model's file in the run's folder.
+        model_sha256: digest of that file, in hexadecimal digits.
         step: optimiser steps taken.
         settings: plain values that decide the model, see `_settings_of`.
         metrics: what `metrics.json` will hold, except the scores.
     """
 
+    model: str
     model_sha256: str
     step: int
     settings: dict[str, Any]
@@ -90,7 +92,7 @@ def read_record(out: Path) -> TrainingRecord | None:
         if content.pop("version") != RECORD_VERSION:
             return None
         record = TrainingRecord(**content)
-        digest = hashlib.sha256((out / MODEL).read_bytes()).hexdigest()
+        digest = hashlib.sha256((out / Path(record.model).name).read_bytes()).hexdigest()
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
     return record if record.model_sha256 == digest and isinstance(record.metrics, dict) else None
@@ -105,11 +107,18 @@ def changed_settings(record: TrainingRecord, scene: Scene, config: TrainConfig) 
     return sorted(key for key in keys if asked.get(key) != record.settings.get(key))
 
 
-def save_model(trainer: Trainer, out: Path, phase: Phase) -> TrainingRecord:
+def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) -> TrainingRecord:
     """Write the model of a finished run and its training record, and remove what belongs to an earlier model.
 
     The record is written before the model: a model on a full disk then has its record. Where only the record cannot be
     written, the checkpoint stays in its place.
+
+    Args:
+        trainer: of the finished run.
+        out: the run's folder.
+        phase: told how far it is.
+        overwrite: replace and remove files of an earlier run. Without it, a file that appeared at the model's name
+            during the run is kept: the model gets a free name beside it.
 
     Raises:
         HyrfTrainingError: no step had a pixel to train on.
@@ -152,30 +161,43 @@ def save_model(trainer: Trainer, out: Path, phase: Phase) -> TrainingRecord:
         "stage_seconds": {name: round(value, 3) for name, value in sorted(trainer.seconds.items())},
         "curve": trainer.records,
     }
-    record = TrainingRecord(hashlib.sha256(data).hexdigest(), trainer.step, _settings_of(scene, config), metrics)
+    digest = hashlib.sha256(data).hexdigest()
+    record = TrainingRecord(MODEL, digest, trainer.step, _settings_of(scene, config), metrics)
     is_recorded = True
     try:
         write_atomic(out / RECORD, record.encode())
     except HyrfError:
         is_recorded = False
     try:
-        write_model(data, out / MODEL)
+        name = Path(write_model(data, out / MODEL, overwrite=overwrite).file).name
     except HyrfError:
         _remove(out / RECORD)
         raise
-    for name in (METRICS, CURVE, *_picture_files(scene)):  # they would be taken for results of this model
-        _remove(out / name)
-    if is_recorded:
+    if name != record.model:
+        record = dataclasses.replace(record, model=name)
+        with suppress(HyrfError):
+            write_atomic(out / RECORD, record.encode())
+    if overwrite:
+        for result in (METRICS, CURVE, *_picture_files(scene)):  # they would be taken for results of this model
+            _remove(out / result)
+    if is_recorded and (overwrite or trainer.saved is not None):
         _remove(out / CHECKPOINT)  # which also frees space for the results
     return record
 
 
 def write_results(
-    record: TrainingRecord, scene: Scene, out: Path, config: TrainConfig, device: torch.device, phase: Phase
+    record: TrainingRecord,
+    scene: Scene,
+    out: Path,
+    config: TrainConfig,
+    device: torch.device,
+    phase: Phase,
+    *,
+    overwrite: bool,
 ) -> Results:
     """Score the model's file, and write pictures, curve and `metrics.json`; nothing of it fails the run.
 
-    The training record and the checkpoint are removed once they are not needed any more.
+    The training record is removed once it is not needed any more.
 
     Args:
         record: of the model in the folder.
@@ -184,6 +206,7 @@ def write_results(
         config: of the run.
         device: where to render.
         phase: told how far it is.
+        overwrite: replace files at the results' names; without it they are kept.
     """
     metrics, missing, reasons = dict(record.metrics), [], []
     is_scored = True
@@ -191,13 +214,14 @@ def write_results(
         unwritten: list[str] = []
         try:
             # Scored on the file as it was written, not on what is in memory.
-            model = hyrf_format.load(out / MODEL, device)
+            model = hyrf_format.load(out / record.model, device)
             model.precision = config.precision
             scores = evaluate(
                 model,
                 scene.test,
                 training=scene.train,
                 pictures=out / VIEWS,
+                overwrite=overwrite,
                 report=lambda done, total: phase("scoring held-out photos", done, total),
                 warn=unwritten.append,
             )
@@ -210,14 +234,13 @@ def write_results(
             reasons += unwritten
     phase(f"drawing {CURVE}", 0, 0)
     try:
-        training_curve(metrics["curve"], out / CURVE)
+        training_curve(metrics["curve"], out / CURVE, overwrite=overwrite)
     except HyrfError as error:
         missing.append(CURVE)
         reasons.append(str(error))
     try:
         if is_scored:
-            write_atomic(out / METRICS, json.dumps(metrics, indent=1).encode())
-            _remove(out / CHECKPOINT)
+            write_atomic(out / METRICS, json.dumps(metrics, indent=1).encode(), overwrite=overwrite)
         else:
             missing.append(METRICS)
     except HyrfError as error:

@@ -19,6 +19,7 @@ from hyrfpack.data.cache import memory_bytes
 from hyrfpack.device import choose_own_device
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate import picture_names
+from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import ALONE, Ranks
 from hyrfpack.scene import Scene, View
@@ -104,7 +105,8 @@ def train(
         config: settings, all defaults measured.
         resume: go on from the folder's checkpoint, or complete the results of a finished model; the result is the one
             an uninterrupted run gives.
-        overwrite: replace what an earlier run left in the folder.
+        overwrite: replace what an earlier run left in the folder. Without it, nothing is replaced, not even what
+            appears while training: a result gets a free name beside it, which `TrainResult.model` tells of the model.
         cache: holds decoded photos; by default a quarter of the memory.
         device: where to train, see `hyrfpack.device.choose_device`. A run may be resumed on another one. On a GPU
             sums of gradients vary in their last bits from run to run, which may tip the measured budget.
@@ -123,10 +125,11 @@ def train(
             as torchrun does after one has ended, they go on from the checkpoint if there is one.
 
     Raises:
-        HyrfError: the folder holds another run, training cannot start or go on, no photo has a pixel to train on or to
-            score, a held-out photo cannot be read (all of which is found before the first step), or the results would
-            replace photos or other files, or the model cannot be written (a checkpoint that cannot, while training,
-            is a line on standard error; for other results see `TrainResult.missing`).
+        HyrfError: another call is at work in the folder, the folder holds another run, training cannot start or go on,
+            no photo has a pixel to train on or to score, a held-out photo cannot be read (all of which is found before
+            the first step), or the results would replace photos or other files, or the model cannot be written (a
+            checkpoint that cannot, while training, is a line on standard error; for other results see
+            `TrainResult.missing`).
         TypeError: `scene` is no Scene or `config` no TrainConfig.
 
     Example:
@@ -140,11 +143,37 @@ def train(
     out = Path(out)
     config = TrainConfig() if config is None else config
     check_type("config", config, TrainConfig)
+    # Whatever lies there: no folder is created where nothing may be written.
+    ranks.agree(lambda: _check_outputs(out, scene, overwrite=True) if ranks.leads else None)
+    with exclusive_folder(out, "another folder with -o", ranks):
+        return _train_in_folder(
+            scene, out, config, resume=resume, overwrite=overwrite, cache=cache, device=device, quiet=quiet,
+            report=report, phase=phase, observer=observer, log=log, ranks=ranks,
+        )  # fmt: skip
+
+
+def _train_in_folder(
+    scene: Scene,
+    out: Path,
+    config: TrainConfig,
+    *,
+    resume: bool,
+    overwrite: bool,
+    cache: PictureCache | None,
+    device: str | torch.device,
+    quiet: bool,
+    report: Report | None,
+    phase: Phase | None,
+    observer: Observer | None,
+    log: Path | str | None,
+    ranks: Ranks,
+) -> TrainResult:
+    """As `train`, in a folder that this call holds."""
     checkpoint = out / CHECKPOINT
     device = choose_own_device(device, ranks)
     resume = ranks.first(resume or (ranks.restarts > 0 and is_begun(out)))
+    replace = resume or overwrite
     cache = cache or PictureCache(memory_bytes() // 4 // ranks.local_size)
-
     silent = quiet or report is not None or not ranks.leads
 
     def check(config: TrainConfig, phase: Phase) -> TrainingRecord | None:
@@ -153,7 +182,7 @@ def train(
         record = read_record(out) if resume or not overwrite else None
         _prepare(out, scene, config, record, resume, overwrite)
         if log is not None:
-            Outputs(scene=scene, overwrite=resume or overwrite or record is not None).file(log)
+            Outputs(scene=scene, overwrite=replace or record is not None).file(log)
         if record is None:
             _check_photos(scene, cache, phase)
         return record
@@ -198,7 +227,9 @@ def train(
                 line.note(f"Gaussians at most: {trainer.choices['max_gaussians']}")
             written = None
             if log is not None and ranks.leads:
-                written = stack.enter_context(TrainingLog(Path(log), trainer.steps, trainer.step, device, line.note))
+                written = stack.enter_context(
+                    TrainingLog(Path(log), trainer.steps, trainer.step, device, line.note, replace)
+                )
             told = [report or line.update, *([written.step] if written else [])]
 
             def tell_all(trainer: Trainer, loss: float, mse: float) -> None:
@@ -207,7 +238,7 @@ def train(
                 if observer is not None and ranks.leads:
                     observer(trainer)
 
-            complete = trainer.run(checkpoint=checkpoint, report=tell_all, stop=stop, warn=line.note)
+            complete = trainer.run(checkpoint=checkpoint, report=tell_all, stop=stop, warn=line.note, overwrite=replace)
         if not complete or not ranks.leads:
             if written:
                 written.end(complete=complete, step=trainer.step)
@@ -215,12 +246,14 @@ def train(
         with PhaseLine(silent) as phases:
             tell_phase = phase or phases.update
             with _naming_the_checkpoint(trainer, overwrite):
-                record = save_model(trainer, out, tell_phase)
-            results = write_results(record, scene, out, config, device, tell_phase)
+                record = save_model(trainer, out, tell_phase, overwrite=replace)
+            results = write_results(record, scene, out, config, device, tell_phase, overwrite=replace)
             missing = _tell_missing(results, overwrite, phases)
+        if METRICS not in results.missing and (replace or trainer.saved is not None):
+            checkpoint.unlink(missing_ok=True)
         if written:
             _log_end(written, record.step, results)
-    return TrainResult(True, trainer.step, out / MODEL, results.metrics, missing)
+    return TrainResult(True, trainer.step, out / record.model, results.metrics, missing)
 
 
 def is_begun(out: Path) -> bool:
@@ -246,12 +279,14 @@ def _complete(
         phases.note("the model is trained already; its scores and pictures are computed now")
         written = None
         if log is not None:
-            written = stack.enter_context(TrainingLog(Path(log), record.step, record.step, device, phases.note))
-        results = write_results(record, scene, out, config, device, phase or phases.update)
+            written = stack.enter_context(TrainingLog(Path(log), record.step, record.step, device, phases.note, True))
+        results = write_results(record, scene, out, config, device, phase or phases.update, overwrite=True)
         if written:
             _log_end(written, record.step, results)
         missing = _tell_missing(results, overwrite=False, line=phases)
-    return TrainResult(True, record.step, out / MODEL, results.metrics, missing)
+    if METRICS not in results.missing:
+        (out / CHECKPOINT).unlink(missing_ok=True)
+    return TrainResult(True, record.step, out / record.model, results.metrics, missing)
 
 
 def _tell_missing(results: Results, overwrite: bool, line: PhaseLine) -> str:
@@ -322,9 +357,12 @@ def _prepare(
     if left and not (resume or overwrite or record is not None):
         hint = "--resume goes on with it, " if CHECKPOINT in left else ""
         raise HyrfError(f"{out}: the folder holds an earlier run ({left[-1]}); {hint}--overwrite replaces it")
+    _check_outputs(out, scene, overwrite=resume or overwrite or record is not None)
+
+
+def _check_outputs(out: Path, scene: Scene, *, overwrite: bool) -> None:
     views = [f"{VIEWS}/{name}" for name in picture_names(scene.test).values()]
-    outputs = Outputs(scene=scene, overwrite=resume or overwrite or record is not None)
-    outputs.folder(out, [MODEL, CHECKPOINT, METRICS, CURVE, RECORD, *views])
+    Outputs(scene=scene, overwrite=overwrite).folder(out, [MODEL, CHECKPOINT, METRICS, CURVE, RECORD, *views])
 
 
 def _check_photos(scene: Scene, cache: PictureCache, phase: Phase) -> None:

@@ -126,6 +126,7 @@ class Trainer:
         report: Callable[[Trainer, float, float], None] = lambda trainer, loss, mse: None,
         stop: Callable[[], bool] = lambda: False,
         warn: Callable[[str], None] = warnings.warn,
+        overwrite: bool = True,
     ) -> bool:
         """Train until the last step, or until `stop()` says so.
 
@@ -136,6 +137,7 @@ class Trainer:
             stop: asked after each step; by several processes during each, to be the last.
             warn: told when a checkpoint cannot be written, as on a full disk. Training goes on and tries again at the
                 next one, for hours of work are worth more than a checkpoint.
+            overwrite: replace a file at `checkpoint` that is of another run.
 
         Returns:
             Whether the run is complete.
@@ -160,7 +162,7 @@ class Trainer:
                 stopped = (stop() if self.ranks.alone else stopped) and not complete
                 if checkpoint and (stopped or (self.step % every == 0 and not complete)):
                     try:
-                        self.save(checkpoint)
+                        self.save(checkpoint, overwrite=overwrite or self.saved is not None)
                     except HyrfError as error:
                         if stopped:
                             raise
@@ -321,8 +323,12 @@ class Trainer:
         if self.exposures is not None:
             self.exposures.load_state_dict(_under("exposure.", tensors))
 
-    def save(self, path: Path) -> None:
-        """Write the run's state to `path`; rank 0 does, and all have to call it."""
+    def save(self, path: Path, *, overwrite: bool = True) -> None:
+        """Write the run's state to `path`; rank 0 does, and all have to call it.
+
+        Raises:
+            HyrfError: the file cannot be written, or not without `overwrite`.
+        """
         collected = self.ranks.told(_on_cpu(self.strategy.state_dict()))
         if not self.ranks.leads:
             self.saved = self.step
@@ -337,7 +343,7 @@ class Trainer:
             "elapsed": self.elapsed,
             "choices": self.choices,
         }
-        save_checkpoint(path, settings=self._settings(), tensors=tensors, progress=progress)
+        save_checkpoint(path, settings=self._settings(), tensors=tensors, progress=progress, overwrite=overwrite)
         self.saved = self.step
 
     def load(self, path: Path) -> None:

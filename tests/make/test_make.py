@@ -16,7 +16,7 @@ from PIL import Image
 
 from hyrfpack import evaluate, load, load_scene, save
 from hyrfpack.errors import HyrfError
-from hyrfpack.lock import held
+from hyrfpack.lock import exclusive_folder
 from hyrfpack.make import make, stages
 from hyrfpack.make.progress import Progress, Reporter
 from hyrfpack.splats.formats import ply
@@ -284,7 +284,7 @@ def test_a_record_that_is_damaged_is_refused(record, reason, posed, tmp_path):
 def test_two_calls_in_one_work_folder_are_kept_apart(made, posed, tmp_path):
     pytest.importorskip("fcntl", reason="locks are of Unix")
     work = copy_of(made, tmp_path)
-    with held(work, "make", "another with --work"), pytest.raises(HyrfError, match="another 'make' is at work.*--work"):
+    with exclusive_folder(work), pytest.raises(HyrfError, match="another hyrfpack command is at work.*--work"):
         make(posed, tmp_path / "scene.hyrf", work=work)
     assert len(make(posed, tmp_path / "scene.hyrf", work=work).kept) == 4
 

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 import hyrfpack
-from hyrfpack.lock import held
+from hyrfpack.lock import exclusive_folder
 from hyrfpack.poses.job import Job
 from hyrfpack.poses.made import still_there
 
@@ -172,13 +172,29 @@ def test_what_is_refused_or_fails_before_anything_is_done_leaves_nothing(tmp_pat
 def test_two_calls_for_one_scene_are_kept_apart(tmp_path):
     pytest.importorskip("fcntl", reason="locks are of Unix")
     scene = tmp_path / "scene"
-    with held(scene, "poses", "another folder"), pytest.raises(hyrfpack.HyrfError) as refusal:
+    with exclusive_folder(scene), pytest.raises(hyrfpack.HyrfError) as refusal:
         hyrfpack.estimate_poses(photos(tmp_path / "photos"), scene)
     assert str(refusal.value) == (
-        f"{scene}: another 'poses' is at work in this folder; wait for it, or name another folder"
+        f"{scene}: another hyrfpack command is at work in this folder; wait until it has ended, or name another folder"
     )
     assert not scene.exists()
     begin(tmp_path / "photos", scene)
+
+
+def test_poses_that_another_program_puts_there_meanwhile_are_kept_and_the_work_too(tmp_path):
+    scene = tmp_path / "scene"
+
+    def appear(doing: str, share: float) -> None:
+        (scene / "sparse" / "0").mkdir(parents=True, exist_ok=True)
+        (scene / "sparse" / "0" / "cameras.bin").write_bytes(b"of another program")
+
+    with pytest.raises(hyrfpack.HyrfError, match="poses of another program, which are kept"):
+        finished(photos(tmp_path / "photos"), scene, report=appear)
+    assert (scene / "sparse" / "0" / "cameras.bin").read_bytes() == b"of another program"
+    shutil.rmtree(scene / "sparse")
+    said = []
+    finished(tmp_path / "photos", scene, say=said.append)
+    assert said[0] == "an interrupted estimation goes on" and (scene / "sparse" / "0").is_dir()
 
 
 def test_masks_that_lie_there_are_not_taken_for_those_that_were_named(tmp_path):

@@ -7,12 +7,14 @@ import errno
 import hashlib
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from scenes import ball_scene
 
 from hyrfpack.errors import HyrfDataError, HyrfError, HyrfTrainingError
+from hyrfpack.outputs import StrPath
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, Trainer, train
 from hyrfpack.train import run as runs
@@ -40,14 +42,17 @@ def metrics_of(out: Path) -> dict:
 def full(monkeypatch) -> set[str]:
     """Endings of paths that there is no space for on the disk; a test fills and clears it."""
     endings: set[str] = set()
-    replace = os.replace
 
-    def checked(source, target) -> None:
-        if str(target).endswith(tuple(endings)):
-            raise OSError(errno.ENOSPC, "No space left on device")
-        replace(source, target)
+    def checked(move: Callable[[StrPath, StrPath], None]) -> Callable[[StrPath, StrPath], None]:
+        def checked_move(source: StrPath, target: StrPath) -> None:
+            if str(target).endswith(tuple(endings)):
+                raise OSError(errno.ENOSPC, "No space left on device")
+            move(source, target)
 
-    monkeypatch.setattr("hyrfpack.atomic.os.replace", checked)
+        return checked_move
+
+    for name in ("replace", "link"):
+        monkeypatch.setattr(f"hyrfpack.atomic.os.{name}", checked(getattr(os, name)))
     return endings
 
 

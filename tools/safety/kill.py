@@ -215,9 +215,9 @@ def prepare(work: Path, names: Sequence[str]) -> list[Case]:
             model, packed = work / f"train-{seed}" / MODEL, work / f"compress-{seed}" / "out.hyrf"
             return {
                 "train": ["train", str(scene), "-o", str(out), "--overwrite", "--seed", str(seed), *TRAINING],
-                "compress": ["compress", str(model), "-o", str(out / "out.hyrf")],
-                "decompress": ["decompress", str(packed), "-o", str(out / "out.hyrf")],
-                "render": ["render", str(packed), "-o", str(out), "--orbit", str(FRAMES)],
+                "compress": ["compress", str(model), "-o", str(out / "out.hyrf"), "--overwrite"],
+                "decompress": ["decompress", str(packed), "-o", str(out / "out.hyrf"), "--overwrite"],
+                "render": ["render", str(packed), "-o", str(out), "--orbit", str(FRAMES), "--overwrite"],
                 "make": ["make", str(scene), "-o", str(out / "out.hyrf"), "--overwrite", "--seed", str(seed), *DRAFT],
             }[name]
 
