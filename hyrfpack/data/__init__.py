@@ -13,9 +13,9 @@ from hyrfpack.data.cache import PictureCache
 from hyrfpack.data.folder import list_photos, list_raw_photos
 from hyrfpack.data.layouts import LAYOUTS
 from hyrfpack.data.places import find_set
-from hyrfpack.data.unusable import explain_no_photos, refuse_raw_file
+from hyrfpack.data.unusable import explain_no_photos, refuse_one_photo
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
-from hyrfpack.outputs import PICTURES, VIDEOS
+from hyrfpack.outputs import VIDEOS
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 
 __all__ = ["LAYOUTS", "PictureCache", "load_scene", "pose_commands"]
@@ -117,9 +117,7 @@ def _folder_of(given: Path, notes: list[str]) -> Path:
     if not os.path.isdir(given):
         if given.suffix.lower() in VIDEOS:
             raise HyrfNoPosesError(f"{given}: a video has no poses; {pose_commands(given)}")
-        refuse_raw_file(given)
-        if given.suffix.lower() in PICTURES:
-            raise HyrfDataError(f"{given}: one photo, not a folder of photos; give the folder that it is in")
+        refuse_one_photo(given)
         raise HyrfDataError(f"{given}: a file, not a folder; give the folder that holds photos and poses, or its .zip")
     return given
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from hyrfpack.data.folder import list_raw_photos
 from hyrfpack.data.pictures import HEIC_NEEDS, HEIC_REMEDY, RAW_REMEDY
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.outputs import RAW_PHOTOS, VIDEOS
+from hyrfpack.outputs import RAW_PHOTOS, READABLE, VIDEOS
 
 MAX_NAMED_FILES = 3  # in one sentence; the others are counted
 
@@ -30,10 +30,13 @@ def count_photos(count: int) -> str:
     return "1 photo" if count == 1 else f"{count:,} photos"
 
 
-def refuse_raw_file(path: Path) -> None:
-    """Raises HyrfDataError: a path that was given as photos is one raw file."""
-    if path.suffix.lower() in RAW_PHOTOS and path.is_file():
+def refuse_one_photo(path: Path) -> None:
+    """Raises HyrfDataError: a path that was given as photos is one photo, raw or not."""
+    ending = path.suffix.lower()
+    if ending in RAW_PHOTOS and path.is_file():
         raise HyrfDataError(f"{path}: raw files are not supported; {RAW_REMEDY}")
+    if ending in READABLE and path.is_file():
+        raise HyrfDataError(f"{path}: this is one photo, not a folder of photos; name the folder of all photos")
 
 
 def raw_photos_note(raw_photos: Sequence[Path]) -> list[str]:

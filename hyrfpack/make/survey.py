@@ -22,7 +22,7 @@ from hyrfpack.data.unusable import (
     explain_no_photos,
     name_files,
     raw_photos_note,
-    refuse_raw_file,
+    refuse_one_photo,
     unreadable_sentences,
 )
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError, without_path
@@ -39,6 +39,7 @@ _DARK, _DARKER = 0.02, 3.0  # mean luminance of a dark set; stops below the medi
 _CLIPPED = 0.25  # of the pixels
 _SAME_ZOOM = 0.03  # relative difference of focal lengths that EXIF rounds to
 _SAME_PICTURE = 1.0  # mean difference in levels of 255 of two thumbnails
+_HEADERS_SHARE, _LOOKS_SHARE = 0.2, 0.95  # of the work, that is done once headers are read, and pixels looked at
 _THUMBNAIL = 24  # pixels a side
 
 
@@ -119,9 +120,10 @@ def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | Non
     tell = report or (lambda text, share: None)
     if path.is_file() and path.suffix.lower() in VIDEOS:
         return _describe_video(path, tell)
-    refuse_raw_file(path)
+    refuse_one_photo(path)
     folder = unpacked(path) if is_archive(path) else path
     photos = list_photos(folder)
+    tell("reading poses", 0.0)
     scene, problems = _scene(path, folder)
     posed = _posed_files(scene)
     photos = sorted({*photos, *posed})
@@ -138,7 +140,7 @@ def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | Non
 
     problems += _count_problems(len(photos), scene, len(posed), path)
     problems += unreadable_sentences(unreadable, len(photos))
-    problems += _copies(photos, looks, folder)
+    problems += _copies(photos, looks, folder, tell)
     problems += _blur_problems(looks, blurred, folder)
     problems += _light_problems(looks, light, stops, folder, scene)
     if scene is None:
@@ -226,7 +228,8 @@ def _headers(
             facts.append(photo_facts(photo))
         except HyrfDataError as error:
             unreadable[_below(photo, folder)] = _reason(error, photo)
-        tell("reading headers", 0.2 * (done + 1) / len(chosen))
+        read = f"reading the headers of photos, {done + 1:,} of {len(chosen):,}"
+        tell(read, _HEADERS_SHARE * (done + 1) / len(chosen))
     return facts, unreadable
 
 
@@ -240,7 +243,8 @@ def _looks(photos: list[Path], folder: Path, tell: Callable[[str, float], None])
                 looks.append(found)
             else:
                 undecodable[_below(chosen[done], folder)] = found
-            tell("looking at the photos", 0.2 + 0.8 * (done + 1) / len(chosen))
+            looked = f"looking at the photos, {done + 1:,} of {len(chosen):,}"
+            tell(looked, _HEADERS_SHARE + (_LOOKS_SHARE - _HEADERS_SHARE) * (done + 1) / len(chosen))
     return looks, undecodable
 
 
@@ -277,7 +281,7 @@ def _count_problems(count: int, scene: Scene | None, posed: int, path: Path) -> 
     return found
 
 
-def _copies(photos: list[Path], looks: list[_Look], folder: Path) -> list[str]:
+def _copies(photos: list[Path], looks: list[_Look], folder: Path, tell: Callable[[str, float], None]) -> list[str]:
     thumbnails = np.stack([look.thumbnail for look in looks])
     if len(looks) > 2 and np.abs(thumbnails - thumbnails[0]).mean(axis=(1, 2)).max() < _SAME_PICTURE:
         return ["all photos show the same picture; walk around and take photos from many places"]
@@ -286,7 +290,10 @@ def _copies(photos: list[Path], looks: list[_Look], folder: Path) -> list[str]:
         sizes.setdefault(photo.stat().st_size, []).append(photo)
     seen: dict[bytes, Path] = {}
     copies = []
-    for photo in (item for group in sizes.values() if len(group) > 1 for item in group):
+    suspects = [item for group in sizes.values() if len(group) > 1 for item in group]
+    for done, photo in enumerate(suspects):
+        compared = f"looking for copies, {done + 1:,} of {len(suspects):,}"
+        tell(compared, _LOOKS_SHARE + (1 - _LOOKS_SHARE) * done / len(suspects))
         digest = hashlib.sha256(photo.read_bytes()).digest()
         if digest in seen:
             copies.append((photo, seen[digest]))

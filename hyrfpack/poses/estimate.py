@@ -13,10 +13,10 @@ from hyrfpack.choices import MATCHING
 from hyrfpack.data.archive import is_archive, naming_archives, unpacked
 from hyrfpack.data.equirectangular import FACES
 from hyrfpack.data.folder import list_photos, list_pictures, list_raw_photos
-from hyrfpack.data.unusable import raw_photos_note, refuse_raw_file, unreadable_sentences
+from hyrfpack.data.unusable import raw_photos_note, refuse_one_photo, unreadable_sentences
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.lock import held
-from hyrfpack.outputs import PICTURES, StrPath
+from hyrfpack.outputs import StrPath
 from hyrfpack.poses import diagnosis
 from hyrfpack.poses.frames import FrameReport, choose_frames, frame_times
 from hyrfpack.poses.job import Job
@@ -183,10 +183,8 @@ class _Estimation:
 
     def _prepare(self) -> Job:
         """Photos and masks where they are read from, and the job."""
-        refuse_raw_file(self.photos)
+        refuse_one_photo(self.photos)
         video = self.is_video = self.photos.is_file()
-        if video and self.photos.suffix.lower() in PICTURES:
-            raise HyrfDataError(f"{self.photos}: one photo has no poses; name the folder of all photos, or a video")
         images = self.out / "images"
         here = not video and self._in_images(images)
         mask_folder = self._mask_folder(here)

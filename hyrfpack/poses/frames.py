@@ -214,8 +214,8 @@ def _choose(path: Path, measured: _Measured, most: int, tell: Report) -> tuple[d
         )
     if len(picked) < _LEAST_TAKEN:
         raise HyrfDataError(
-            f"{path}: only {len(picked)} of {measured.of} frames differ, for the camera hardly moves; "
-            "walk around what you film"
+            f"{path}: the camera hardly moves, so that {len(picked)} of {measured.of} frames can serve as photos, and "
+            f"{_LEAST_TAKEN} is the least; walk around what you film"
         )
     steps = np.array([distances(places, a, slice(b, b + 1))[0] for a, b in zip(picked, picked[1:], strict=False)])
     notes = list(measured.notes)
