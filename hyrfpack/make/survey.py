@@ -146,7 +146,7 @@ def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | Non
     if scene is None:
         problems += _zoom_problems(facts) + _mask_problems(folder, photos)
     notes = list(scene.notes) if scene is not None else _header_notes(facts) + raw_photos_note(list_raw_photos(folder))
-    if len(looks) < len(photos):
+    if len(looks) + len(unreadable) < len(photos):
         notes.append(f"the pixels of {len(looks)} of {len(photos)} photos were looked at, evenly spread")
     preset = ": ".join(detect_preset(scene)) if scene is not None and scene.train else ""
     tell("described", 1.0)

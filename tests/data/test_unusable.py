@@ -109,6 +109,7 @@ def test_a_heic_photo_without_the_package_does_not_stop_a_survey(tmp_path, monke
         (folder / name).write_bytes(HEIC_HEADER)
     survey = hyrfpack.describe_photos(folder)
     assert (survey.photos, survey.decoded) == (9, 5)
+    assert not any("evenly spread" in note for note in survey.notes)  # all were looked at
     (problem,) = [sentence for sentence in survey.problems if "HEIC" in sentence]
     assert problem == (
         "4 of 9 photos cannot be read: a/x.heic, b/x.heic, y.HEIC and 1 more (reading HEIC photos needs pillow-heif); "
