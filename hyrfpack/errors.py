@@ -41,6 +41,11 @@ class HyrfTrainingError(HyrfError):
     """Training cannot start or cannot go on (a loss that is not finite, a checkpoint that does not fit)."""
 
 
+def without_path(error: HyrfError, path: object) -> str:
+    """The sentence of an error without the path that it starts with, for a sentence that names the file otherwise."""
+    return str(error).removeprefix(f"{printable(str(path))}: ")
+
+
 def reason_of(error: Exception, longest: int = 120) -> str:
     """What another library says of an error, for a place in a sentence of ours: its first line, or else its kind."""
     return str(error).splitlines()[0][:longest] if str(error) else type(error).__name__

@@ -23,7 +23,12 @@ if TYPE_CHECKING:
 
 # Pictures that are taken for photos; where a name has no ending, the first of these that is there is meant.
 READABLE = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".avif", ".jp2", ".heic", ".heif", ".hif")
-PICTURES = (*READABLE, ".dng")  # and those that people keep photos as, too
+# Raw photos of cameras: they are never read, so that they are counted and named to the user where they lie.
+RAW_PHOTOS = (
+    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".gpr", ".iiq", ".kdc", ".mos", ".mrw"),
+    *(".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
+)
+PICTURES = (*READABLE, *RAW_PHOTOS)  # all that people keep photos as
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv")
 ARCHIVES = (".zip", ".r3d")  # sets that are one file
 TABLES = tuple(f"{table}{kind}" for table in ("cameras", "images", "points3D") for kind in (".bin", ".txt"))

@@ -19,6 +19,11 @@ ORBIT = 48  # cameras around a model that kept none
 COARSE = 14  # cameras that a small file keeps
 FINE = 500  # of the parts of the scene's box that they are right to, about
 
+# A kept camera is found among others within this part of the scene's box and this angle. Two sets of photos may share a
+# few cameras by chance: the first of many sets stands at the origin.
+_SAME_PLACE_SCALE, _SAME_DIRECTION_DEGREES = 5 / FINE, 3.0
+_MIN_FOUND_SHARE = 0.25  # of the kept cameras; with fewer, the photos are not those of training
+
 
 def kept_cameras(cameras: Sequence[Camera]) -> list[list[float]]:
     """Up to KEPT of the cameras, evenly spread, as the "cameras" of a provenance: see `camera_to_numbers`."""
@@ -130,6 +135,42 @@ class Capture:
             raise HyrfDataError(
                 f"the model's viewpoint cannot be used ({error}); render with --data or --cameras instead"
             ) from error
+
+    @property
+    def mismatch(self) -> str:
+        """One sentence if the cameras of the photos are not those that the file keeps of its training: another scene,
+        or another coordinate frame. "" where they are, and where there are no photos or the file keeps no cameras.
+
+        Names of photos are not compared: files keep none, and photos whose poses were estimated anew keep theirs.
+        """
+        if self.scene is None:
+            return ""
+        views = self.scene.views
+        try:
+            kept = [camera_from_numbers(numbers) for numbers in self._kept or self._coarse or ()]
+            limit = _SAME_PLACE_SCALE * float(self.facts["config"]["frame"]["scale"])
+        except (TypeError, ValueError, ArithmeticError, KeyError):
+            return ""
+        if not (views and kept):
+            return ""
+        places = np.array([view.camera.position for view in views])
+        directions = np.array([view.camera.forward for view in views])
+        least_cosine = np.cos(np.radians(_SAME_DIRECTION_DEGREES))
+        found = sum(
+            bool(
+                np.any(
+                    (np.linalg.norm(places - c.position, axis=1) <= limit) & (directions @ c.forward >= least_cosine)
+                )
+            )
+            for c in kept
+        )
+        if found >= _MIN_FOUND_SHARE * len(kept):
+            return ""
+        return (
+            f"{self.scene.path}: of the {len(kept)} cameras that the model keeps of its training, {found or 'none'} "
+            f"{'are' if found > 1 else 'is'} among those of these photos, which may show another scene or have poses "
+            "in another coordinate frame; name the photos and poses that it was trained on"
+        )
 
     @property
     def max_size(self) -> int:

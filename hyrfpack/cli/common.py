@@ -159,7 +159,7 @@ def chosen_device(name: str, ranks: Ranks | None = None) -> torch.device:
 
 
 def read_scene(path: Path, reading: dict[str, Any], model: dict | None = None) -> Scene:
-    """Read a data folder and tell what the reader has to say about it.
+    """Read a data folder and tell what the reader has to say about it, and whether a model is of other photos.
 
     Args:
         path: the folder.
@@ -176,6 +176,8 @@ def read_scene(path: Path, reading: dict[str, Any], model: dict | None = None) -
     scene = load_scene(path, **reading)
     for sentence in scene.notes:
         note(sentence)
+    if model is not None and (mismatch := Capture(model, scene).mismatch):
+        note(mismatch)
     return scene
 
 

@@ -38,7 +38,7 @@ def poses(
 ) -> None:
     """Find the poses of PHOTOS, a folder of photos, its .zip, or a video, and make a scene that `hyrfpack train` reads.
 
-    SCENE gets images/ (links to the photos), sparse/0 (a COLMAP model) and poses.json (what came out). PHOTOS may be
+    SCENE gets images/ (copies of the photos), sparse/0 (a COLMAP model) and poses.json (what came out). PHOTOS may be
     SCENE itself if its photos are in images/. Ctrl-C keeps what is done, and the same command goes on with it.
 
     \b

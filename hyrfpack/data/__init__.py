@@ -6,14 +6,16 @@ import os
 import shlex
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from hyrfpack.data.archive import is_archive, unpacked
+from hyrfpack.data.archive import is_archive, naming_archives, unpacked
 from hyrfpack.data.cache import PictureCache
-from hyrfpack.data.folder import list_photos
+from hyrfpack.data.folder import list_photos, list_raw_photos
 from hyrfpack.data.layouts import LAYOUTS
 from hyrfpack.data.places import find_set
+from hyrfpack.data.unusable import explain_no_photos, refuse_one_photo
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
-from hyrfpack.outputs import PICTURES, VIDEOS
+from hyrfpack.outputs import VIDEOS
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 
 __all__ = ["LAYOUTS", "PictureCache", "load_scene", "pose_commands"]
@@ -70,7 +72,23 @@ def load_scene(
         raise ValueError(f"no layout '{layout}'; there are {', '.join(LAYOUTS)}")
     given = Path(path)
     notes: list[str] = []
-    folder, found = _find_set(_folder_of(given, notes), layout, notes)
+    top = _folder_of(given, notes)
+    reading = {"test_every": test_every, "images": images, "layout": layout, "model": model, "max_size": max_size}
+    with naming_archives():
+        return _read(given, top, notes, reading)
+
+
+def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any]) -> Scene:
+    """`load_scene` of a folder.
+
+    Args:
+        given: the folder or archive that the user named.
+        top: the folder.
+        notes: sentences for the user so far.
+        reading: the other arguments of `load_scene`.
+    """
+    layout, images, model = reading["layout"], reading["images"], reading["model"]
+    folder, found = _find_set(top, layout, notes)
     if not found or layout not in (None, *found):
         raise _no_poses(given, folder, layout, other=bool(found))
     chosen = layout or found[0]
@@ -80,13 +98,12 @@ def load_scene(
     if model is not None and "model" not in reader.options:
         raise HyrfDataError(f"{folder}: the {chosen} layout has no COLMAP models to choose from; leave out '{model}'")
     wanted = {name: options[name] for name in reader.options}
-    scene = reader.read(folder, test_every=test_every, max_size=max_size, **wanted)
+    scene = reader.read(folder, test_every=reading["test_every"], max_size=reading["max_size"], **wanted)
     if len(found) > 1:
         notes.append(f"poses are there as {' and '.join(found)}; {chosen} was taken")
     scene.notes[:0] = notes
     files = (*scene.files, str(given)) if is_archive(given) else scene.files
-    reading = {"test_every": test_every, "images": images, "layout": chosen, "model": model, "max_size": max_size}
-    return replace(scene, files=files, reading={"path": os.path.abspath(given), **reading})
+    return replace(scene, files=files, reading={"path": os.path.abspath(given), **reading, "layout": chosen})
 
 
 def _folder_of(given: Path, notes: list[str]) -> Path:
@@ -100,8 +117,7 @@ def _folder_of(given: Path, notes: list[str]) -> Path:
     if not os.path.isdir(given):
         if given.suffix.lower() in VIDEOS:
             raise HyrfNoPosesError(f"{given}: a video has no poses; {pose_commands(given)}")
-        if given.suffix.lower() in PICTURES:
-            raise HyrfDataError(f"{given}: one photo, not a folder of photos; give the folder that it is in")
+        refuse_one_photo(given)
         raise HyrfDataError(f"{given}: a file, not a folder; give the folder that holds photos and poses, or its .zip")
     return given
 
@@ -132,6 +148,8 @@ def _no_poses(given: Path, folder: Path, layout: str | None, other: bool) -> Hyr
     photos = [] if other or layout else list_photos(folder)
     if photos:
         return HyrfNoPosesError(f"{given}: no poses found for the {len(photos)} photos; {pose_commands(given)}")
+    if not (other or layout) and list_raw_photos(folder):
+        return HyrfDataError(explain_no_photos(given, folder))
     marks = [LAYOUTS[layout].mark] if layout else [reader.mark for reader in LAYOUTS.values()]
     kind = f"{layout} " if layout else ""
     return HyrfDataError(

@@ -13,11 +13,11 @@ import sys
 import tempfile
 import time
 import zipfile
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from hyrfpack.errors import HyrfDataError, reason_of
+from hyrfpack.errors import HyrfDataError, HyrfError, reason_of
 from hyrfpack.outputs import ARCHIVES
 
 _MOST_FILES = 200_000
@@ -25,6 +25,7 @@ _MOST_RATIO, _SLACK_BYTES = 100, 1 << 26  # photos hardly shrink in an archive; 
 _CHUNK = 1 << 20
 _PARTIAL = ".partial-"  # of folders that are being unpacked into
 _STALE_SECONDS = 24 * 3600
+_archive_of: dict[Path, Path] = {}  # by the folder that it was unpacked into, in this process
 _ENCRYPTED, _UTF8 = 0x1, 0x800  # flags of entries
 
 
@@ -48,6 +49,7 @@ def unpacked(archive: Path) -> Path:
             folder = _cache() / f"{archive.stem[:60]}-{_identity(archive)}"
             if not _is_whole(folder, entries):
                 _unpack(archive, content, entries, folder)
+            _archive_of[folder] = archive
             return folder / _common_folder(entries)
     except HyrfDataError:
         raise
@@ -63,6 +65,33 @@ def unpacked(archive: Path) -> Path:
         ) from error
     except Exception as error:  # zipfile and its decompressors raise whatever they meet
         raise HyrfDataError(f"{archive}: the archive is damaged ({reason_of(error)}); copy or make it again") from error
+
+
+def given_path(path: Path) -> Path:
+    """The path of a file as the user knows it: one that was unpacked is named by its place in the archive.
+
+    Example:
+        >>> given_path(Path("photos/bonsai/images/0000.png")).as_posix()
+        'photos/bonsai/images/0000.png'
+    """
+    for folder, archive in _archive_of.items():
+        if path.is_relative_to(folder):
+            return archive / path.relative_to(folder)
+    return path
+
+
+@contextmanager
+def naming_archives() -> Iterator[None]:
+    """Make errors that are raised inside name files by their places in archives, as `given_path` does."""
+    try:
+        yield
+    except HyrfError as error:
+        sentence = str(error)
+        for folder, archive in _archive_of.items():
+            sentence = sentence.replace(str(folder), str(archive))
+        if sentence == str(error):
+            raise
+        raise type(error)(sentence) from error
 
 
 def _common_folder(paths: Iterable[str]) -> Path:

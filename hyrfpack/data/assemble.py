@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from hyrfpack.data.equirectangular import FACES, Face, FaceFile, face_lens, face_size
-from hyrfpack.data.folder import list_pictures
+from hyrfpack.data.folder import is_raw_name, list_pictures
 from hyrfpack.data.masks import find_masks
 from hyrfpack.data.names import nearest
 from hyrfpack.data.pictures import (
@@ -23,6 +24,7 @@ from hyrfpack.data.pictures import (
     shrunk_size,
 )
 from hyrfpack.data.undistort import Lens
+from hyrfpack.data.unusable import raw_photos_note
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced, rigid_pose
 
@@ -108,7 +110,7 @@ def make_scene(
             f"{path}: all {len(test)} photos are held out for testing and none is left to train on; "
             "add photos or hold out fewer (0 holds out none)"
         )
-    notes += [*_same_poses(views), *_told(photos, max_size, mask_notes)]
+    notes += [*_same_poses(views), *_told(photos, max_size, mask_notes), *raw_photos_note(_raw_photos_beside(photos))]
     points, point_colors, tracks = _finite_points(points, point_colors, photos, notes)
     read = [file for photo in photos for file in (photo.path, photo.mask) if file is not None]
     files = tuple(str(file) for file in (*tables, *read))
@@ -128,6 +130,12 @@ def _cut(photos: list[Photo], held_out: Set[str]) -> tuple[list[Photo], set[str]
     parts = {photo.name: _faces(photo) if photo.lens.model == "equirectangular" else [photo] for photo in photos}
     names = {part.name for name in held_out for part in parts.get(name, ())}
     return [part for cut in parts.values() for part in cut], names
+
+
+def _raw_photos_beside(photos: list[Photo]) -> list[Path]:
+    """Raw files in the folders that photos lie in."""
+    folders = sorted({photo.path.parent for photo in photos})
+    return [folder / name for folder in folders for name in os.listdir(folder) if is_raw_name(name)]
 
 
 def _told(photos: list[Photo], max_size: int, about_masks: list[str]) -> list[str]:

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from hyrfpack.atomic import replacing
+from hyrfpack.data.archive import given_path
 from hyrfpack.data.pictures import Header, read_header, read_mask, read_pixels, same_aspect, says_panorama
 from hyrfpack.data.undistort import Lens
 from hyrfpack.errors import HyrfDataError
@@ -79,7 +80,8 @@ class FaceFile:
     def __call__(self) -> Picture:
         rgb, alpha = read_pixels(self.path)
         if rgb.shape[1::-1] != self.stored:
-            raise HyrfDataError(f"{self.path}: the picture changed its size since the scene was read; read it again")
+            shown = given_path(self.path)
+            raise HyrfDataError(f"{shown}: the picture changed its size since the scene was read; read it again")
         mask = None
         if self.mask is not None:
             whole = read_mask(self.mask, *rgb.shape[:2])

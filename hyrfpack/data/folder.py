@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -14,7 +14,7 @@ from typing import Any
 
 from hyrfpack.data.pictures import is_picture_name, opened, read_header, read_orientation
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.outputs import StrPath
+from hyrfpack.outputs import RAW_PHOTOS, StrPath
 
 # Folders of pictures that are no photos: masks, previews, what depth sensors and other programs leave.
 _NO_PHOTOS = re.compile(r"masks?(_.*)?|thumb(nail)?s?|depths?(_maps?)?|normals?|confidence", re.IGNORECASE)
@@ -68,7 +68,19 @@ def list_photos(folder: StrPath) -> list[Path]:
         >>> [path.name for path in list_photos("photos/bonsai")][:2]
         ['0000.png', '0001.png']
     """
-    return _listed(Path(folder), photos=True)
+    return _listed(Path(folder), is_picture_name, photos=True)
+
+
+def list_raw_photos(folder: StrPath) -> list[Path]:
+    """The raw files of cameras (.CR3, .NEF and so on) where `list_photos` looks for photos; they are never read.
+
+    Args, order and errors are those of `list_photos`.
+
+    Example:
+        >>> list_raw_photos("photos/bonsai")
+        []
+    """
+    return _listed(Path(folder), is_raw_name, photos=True)
 
 
 def list_pictures(folder: StrPath) -> list[Path]:
@@ -80,7 +92,12 @@ def list_pictures(folder: StrPath) -> list[Path]:
         >>> [path.name for path in list_pictures("photos/bonsai/images")][:2]
         ['0000.png', '0001.png']
     """
-    return _listed(Path(folder), photos=False)
+    return _listed(Path(folder), is_picture_name, photos=False)
+
+
+def is_raw_name(name: str) -> bool:
+    """Whether a file is called like a camera's raw photo, and is not hidden."""
+    return name.lower().endswith(RAW_PHOTOS) and not name.startswith(".")
 
 
 def may_hold_photos(name: str) -> bool:
@@ -94,19 +111,23 @@ def times_smaller(name: str) -> int:
     return int(copy[1]) if copy else 0
 
 
-def _listed(root: Path, photos: bool) -> list[Path]:
+def _listed(root: Path, is_wanted: Callable[[str], bool], photos: bool) -> list[Path]:
     if not os.path.isdir(root):  # Path.is_dir raises where a name is too long
         what = "is a file, not a folder of photos" if os.path.exists(root) else "there is no such folder"
         raise HyrfDataError(f"{root}: {what}; name the folder that holds the photos")
     try:
-        found = list(_pictures_below(root, set(), photos))
+        found = list(_pictures_below(root, set(), is_wanted, photos))
     except OSError as error:
         raise HyrfDataError(f"{root}: the folder cannot be read ({error.strerror}); check its permissions") from error
     return sorted(found, key=lambda path: path.relative_to(root).as_posix())
 
 
-def _pictures_below(folder: Path, seen: set[str], photos: bool) -> Iterator[Path]:
-    """Pictures, or photos alone, in no order; `seen` are the folders that were looked into, which none is twice."""
+def _pictures_below(folder: Path, seen: set[str], is_wanted: Callable[[str], bool], photos: bool) -> Iterator[Path]:
+    """Files by their names, in no order; `seen` are the folders that were looked into, which none is twice.
+
+    Args:
+        photos: leave out folders that hold no photos.
+    """
     place = os.path.realpath(folder)
     with os.scandir(folder) as listing:
         entries = list(listing)
@@ -118,14 +139,27 @@ def _pictures_below(folder: Path, seen: set[str], photos: bool) -> Iterator[Path
     for entry in entries:
         if entry.is_dir():
             folders.append(entry)
-        elif is_picture_name(entry.name) and entry.is_file():
+        elif is_wanted(entry.name) and entry.is_file():
             yield folder / entry.name
     for entry in sorted(folders, key=lambda entry: (entry.is_symlink(), entry.name)):  # by their own names first
         copies = times_smaller(entry.name) and "images" in names
         if _HIDDEN.fullmatch(entry.name) or (photos and (copies or not may_hold_photos(entry.name))):
             continue
         with suppress(PermissionError):
-            yield from _pictures_below(folder / entry.name, seen, photos)
+            yield from _pictures_below(folder / entry.name, seen, is_wanted, photos)
+
+
+def first_readable(photos: Iterable[StrPath]) -> PhotoFacts | None:
+    """The facts of the first photo whose header can be read; None where none can.
+
+    Example:
+        >>> first_readable(["missing.jpg", "photos/bonsai/images/0000.png"]).size
+        (48, 48)
+    """
+    for photo in photos:
+        with suppress(HyrfDataError):
+            return photo_facts(photo)
+    return None
 
 
 def photo_facts(path: StrPath) -> PhotoFacts:

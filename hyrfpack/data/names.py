@@ -15,7 +15,7 @@ from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 
-from hyrfpack.data.folder import list_photos, list_pictures
+from hyrfpack.data.folder import is_raw_name, list_photos, list_pictures
 from hyrfpack.outputs import PICTURES, READABLE
 
 _ENDING = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,4}$")  # what may be left out of a listed name; ".0001" is no ending
@@ -121,6 +121,8 @@ class PictureIndex:
 
     def _exact(self, name: str) -> Path | None:
         path = self.folder / name.replace("\\", "/")
+        if is_raw_name(path.name):  # a picture of another ending may be there that was exported from it
+            return None
         candidates = [path] if path.name.lower().endswith(PICTURES) else [path, *_with_endings(path)]
         return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
 

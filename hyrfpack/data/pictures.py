@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hyrfpack.data.archive import given_path
 from hyrfpack.data.undistort import Lens, undistort
 from hyrfpack.errors import HyrfDataError, HyrfError, needs_package, reason_of
-from hyrfpack.outputs import READABLE
+from hyrfpack.outputs import RAW_PHOTOS, READABLE
 from hyrfpack.scene import Picture
 
 if TYPE_CHECKING:
@@ -25,6 +26,10 @@ _SIXTEEN_BIT = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 _ORIENTATION = 0x0112  # EXIF's tag
 _TURNS = {2: 0, 3: 3, 4: 1, 5: 5, 6: 4, 7: 6, 8: 2}  # its values -> Pillow's transpositions
 _UNDONE = {6: 8, 8: 6}  # the others undo themselves
+HEIC_NEEDS = "reading HEIC photos needs pillow-heif"
+HEIC_REMEDY = "run 'pip install \"hyrfpack[heic]\"', or convert them to JPEG"
+RAW_REMEDY = "export them as JPEG and name the folder that holds the exported photos"
+
 _HEIC = (".heic", ".heif", ".hif")
 _HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 _DRAFT = 2  # times the size asked for that a JPEG is decoded at, at least: 49 dB and more from decoding all of it
@@ -82,7 +87,9 @@ class PhotoFile:
         return undistort(picture, self.lens) if self.lens.distorted else picture
 
     def _changed(self) -> HyrfDataError:
-        return HyrfDataError(f"{self.path}: the picture changed its size since the scene was read; read it again")
+        return HyrfDataError(
+            f"{given_path(self.path)}: the picture changed its size since the scene was read; read it again"
+        )
 
 
 def is_picture_name(name: str) -> bool:
@@ -109,29 +116,37 @@ def opened(path: Path) -> ImageFile:
     Sizes and pixels are to be had by `read_header` and `read_pixels`: Pillow turns TIFF files without being asked.
 
     Raises:
-        HyrfDataError: the file is missing, empty, or no picture.
-        HyrfError: a package that reads it is missing.
+        HyrfDataError: the file is missing, empty, raw, or no picture, or it is HEIC and pillow-heif is not installed.
     """
-    with needs_package("pillow", f"{path}: reading pictures"):
-        from PIL import Image
+    shown = given_path(path)
+    with needs_package("pillow", f"{shown}: reading pictures"):
+        from PIL import Image, UnidentifiedImageError
 
     try:
+        if path.suffix.lower() in RAW_PHOTOS:  # many are TIFF files, and Pillow would read their previews
+            raise HyrfDataError(f"{shown}: raw files are not supported; {RAW_REMEDY}")
         if os.path.getsize(path) == 0:
-            raise HyrfDataError(f"{path}: the picture file is empty (0 bytes); copy it again")
+            raise HyrfDataError(f"{shown}: the picture file is empty (0 bytes); copy it again")
         _know_heic(path)
         image = Image.open(path)
         if image.format == "EPS":  # a program, which Pillow would have Ghostscript run
-            raise HyrfDataError(f"{path}: PostScript is not a photo; save it as PNG or JPEG")
+            raise HyrfDataError(f"{shown}: PostScript is not a photo; save it as PNG or JPEG")
     except HyrfError:
         raise
     except FileNotFoundError as error:
-        raise HyrfDataError(f"{path}: the picture is missing; restore it or read the scene again") from error
+        raise HyrfDataError(f"{shown}: the picture is missing; restore it or read the scene again") from error
     except PermissionError as error:
-        raise HyrfDataError(f"{path}: the picture may not be read; check its permissions") from error
+        raise HyrfDataError(f"{shown}: the picture may not be read; check its permissions") from error
+    except UnidentifiedImageError as error:  # whose text is the path
+        raise HyrfDataError(
+            f"{shown}: not a picture that can be read, its format is unknown; replace the file"
+        ) from error
     except Exception as error:  # Pillow's header parsers raise whatever they meet.
-        raise HyrfDataError(f"{path}: not a picture that can be read ({reason_of(error)}); replace the file") from error
+        raise HyrfDataError(
+            f"{shown}: not a picture that can be read ({reason_of(error)}); replace the file"
+        ) from error
     if min(image.size) < 1:
-        raise HyrfDataError(f"{path}: the picture has no pixels ({image.size[0]} x {image.size[1]}); replace the file")
+        raise HyrfDataError(f"{shown}: the picture has no pixels ({image.size[0]} x {image.size[1]}); replace the file")
     return image
 
 
@@ -192,7 +207,9 @@ def read_pixels(
         from PIL import Image
 
         if image.mode == "F":
-            raise HyrfDataError(f"{path}: floating-point pictures have no display values; save it as 8-bit PNG")
+            raise HyrfDataError(
+                f"{given_path(path)}: floating-point pictures have no display values; save it as 8-bit PNG"
+            )
         try:
             # What a draft covers is its whole size, but for a fraction of a pixel at the right and at the bottom.
             stored = size[::-1] if size is not None and orientation >= 5 else size
@@ -213,7 +230,8 @@ def read_pixels(
                 picture = picture.transpose(Image.Transpose(_TURNS[orientation]))
             pixels = np.array(picture)
         except Exception as error:  # Pillow's decoders raise whatever they meet.
-            raise HyrfDataError(f"{path}: cannot decode the picture ({reason_of(error)}); replace the file") from error
+            shown = given_path(path)
+            raise HyrfDataError(f"{shown}: cannot decode the picture ({reason_of(error)}); replace the file") from error
     if pixels.ndim == 2:
         return np.repeat(pixels[..., None], 3, axis=2), None
     if pixels.shape[2] == 4:
@@ -271,6 +289,8 @@ def _know_heic(path: Path) -> None:
     with path.open("rb") as stream:
         start = stream.read(12)
     if path.suffix.lower() in _HEIC or (start[4:8] == b"ftyp" and start[8:] in _HEIC_BRANDS):
-        with needs_package("pillow-heif", f"{path}: reading HEIC photos"):
+        try:
             import pillow_heif
+        except ModuleNotFoundError as error:
+            raise HyrfDataError(f"{given_path(path)}: {HEIC_NEEDS}; {HEIC_REMEDY}") from error
         pillow_heif.register_heif_opener()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +14,18 @@ import numpy as np
 from PIL import Image
 
 from hyrfpack.data import load_scene, pose_commands
-from hyrfpack.data.archive import is_archive, unpacked
-from hyrfpack.data.folder import PhotoFacts, list_photos, photo_facts
+from hyrfpack.data.archive import given_path, is_archive, unpacked
+from hyrfpack.data.folder import PhotoFacts, list_photos, list_raw_photos, photo_facts
 from hyrfpack.data.quality import TOO_SOFT, Exposure, exposure, is_blurred, read_gray, sharpness
-from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
+from hyrfpack.data.unusable import (
+    count_photos,
+    explain_no_photos,
+    name_files,
+    raw_photos_note,
+    refuse_one_photo,
+    unreadable_sentences,
+)
+from hyrfpack.errors import HyrfDataError, HyrfNoPosesError, without_path
 from hyrfpack.outputs import PICTURES, VIDEOS, StrPath
 from hyrfpack.parallel.pool import thread_count
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene, evenly_spaced
@@ -31,8 +39,8 @@ _DARK, _DARKER = 0.02, 3.0  # mean luminance of a dark set; stops below the medi
 _CLIPPED = 0.25  # of the pixels
 _SAME_ZOOM = 0.03  # relative difference of focal lengths that EXIF rounds to
 _SAME_PICTURE = 1.0  # mean difference in levels of 255 of two thumbnails
+_HEADERS_SHARE, _LOOKS_SHARE = 0.2, 0.95  # of the work, that is done once headers are read, and pixels looked at
 _THUMBNAIL = 24  # pixels a side
-_NAMED = 3  # photos named in a sentence
 
 
 @dataclass(frozen=True)
@@ -112,34 +120,33 @@ def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | Non
     tell = report or (lambda text, share: None)
     if path.is_file() and path.suffix.lower() in VIDEOS:
         return _describe_video(path, tell)
+    refuse_one_photo(path)
     folder = unpacked(path) if is_archive(path) else path
     photos = list_photos(folder)
+    tell("reading poses", 0.0)
     scene, problems = _scene(path, folder)
     posed = _posed_files(scene)
     photos = sorted({*photos, *posed})
     if not photos:
-        raise HyrfDataError(_nothing_there(path, folder))
-    facts, unreadable = _headers(photos, tell)
-    looks, undecodable = _looks([fact.path for fact in facts], tell)
+        raise HyrfDataError(explain_no_photos(path, folder))
+    facts, unreadable = _headers(photos, folder, tell)
+    looks, undecodable = _looks([fact.path for fact in facts], folder, tell)
+    unreadable |= undecodable
     if not looks:
-        name, reason = next(iter({**unreadable, **undecodable}.items()))
-        raise HyrfDataError(f"{path}: of {_photos(len(photos))} none can be read ({name}: {reason}); copy them again")
+        raise HyrfDataError(f"{path}: {'; '.join(unreadable_sentences(unreadable, len(photos)))}")
     blurred = [look.path for look, bad in zip(looks, is_blurred([x.sharpness for x in looks]), strict=True) if bad]
     light = np.log2([max(look.exposure.luminance, 1e-6) for look in looks])
     stops = float(np.ptp(np.quantile(light, (0.05, 0.95))))
 
     problems += _count_problems(len(photos), scene, len(posed), path)
-    if unreadable or undecodable:
-        bad = {**unreadable, **undecodable}
-        name, reason = next(iter(bad.items()))
-        problems.append(f"{_photos(len(bad))} cannot be read ({name}: {reason}); copy or remove them")
-    problems += _copies(photos, looks, folder)
+    problems += unreadable_sentences(unreadable, len(photos))
+    problems += _copies(photos, looks, folder, tell)
     problems += _blur_problems(looks, blurred, folder)
     problems += _light_problems(looks, light, stops, folder, scene)
     if scene is None:
         problems += _zoom_problems(facts) + _mask_problems(folder, photos)
-    notes = list(scene.notes) if scene is not None else _header_notes(facts)
-    if len(looks) < len(photos):
+    notes = list(scene.notes) if scene is not None else _header_notes(facts) + raw_photos_note(list_raw_photos(folder))
+    if len(looks) + len(unreadable) < len(photos):
         notes.append(f"the pixels of {len(looks)} of {len(photos)} photos were looked at, evenly spread")
     preset = ": ".join(detect_preset(scene)) if scene is not None and scene.train else ""
     tell("described", 1.0)
@@ -210,17 +217,9 @@ def _posed_files(scene: Scene | None) -> set[Path]:
     return {Path(file) for file in files if file is not None}
 
 
-def _nothing_there(path: Path, folder: Path) -> str:
-    videos = sorted(entry.name for entry in folder.iterdir() if entry.suffix.lower() in VIDEOS)
-    if videos:
-        return f"{path}: there are no photos in this folder, but {videos[0]}; name the video"
-    raw = any(entry.suffix.lower() == ".dng" for entry in folder.rglob("*"))
-    if raw:
-        return f"{path}: there are only raw photos, which are not read; save them as JPEG"
-    return f"{path}: there are no photos here (JPEG, PNG, WebP, TIFF or HEIC); name the folder that holds them"
-
-
-def _headers(photos: list[Path], tell: Callable[[str, float], None]) -> tuple[list[PhotoFacts], dict[str, str]]:
+def _headers(
+    photos: list[Path], folder: Path, tell: Callable[[str, float], None]
+) -> tuple[list[PhotoFacts], dict[str, str]]:
     """What the headers of photos say, and why some say nothing."""
     facts, unreadable = [], {}
     chosen = evenly_spaced(photos, MOST_OPENED)
@@ -228,12 +227,13 @@ def _headers(photos: list[Path], tell: Callable[[str, float], None]) -> tuple[li
         try:
             facts.append(photo_facts(photo))
         except HyrfDataError as error:
-            unreadable[photo.name] = _reason(error, photo)
-        tell("reading headers", 0.2 * (done + 1) / len(chosen))
+            unreadable[_below(photo, folder)] = _reason(error, photo)
+        read = f"reading the headers of photos, {done + 1:,} of {len(chosen):,}"
+        tell(read, _HEADERS_SHARE * (done + 1) / len(chosen))
     return facts, unreadable
 
 
-def _looks(photos: list[Path], tell: Callable[[str, float], None]) -> tuple[list[_Look], dict[str, str]]:
+def _looks(photos: list[Path], folder: Path, tell: Callable[[str, float], None]) -> tuple[list[_Look], dict[str, str]]:
     """What the pixels of photos say, and why some say nothing."""
     chosen = evenly_spaced(photos, MOST_DECODED)
     looks, undecodable = [], {}
@@ -242,8 +242,9 @@ def _looks(photos: list[Path], tell: Callable[[str, float], None]) -> tuple[list
             if isinstance(found, _Look):
                 looks.append(found)
             else:
-                undecodable[chosen[done].name] = found
-            tell("looking at the photos", 0.2 + 0.8 * (done + 1) / len(chosen))
+                undecodable[_below(chosen[done], folder)] = found
+            looked = f"looking at the photos, {done + 1:,} of {len(chosen):,}"
+            tell(looked, _HEADERS_SHARE + (_LOOKS_SHARE - _HEADERS_SHARE) * (done + 1) / len(chosen))
     return looks, undecodable
 
 
@@ -257,15 +258,15 @@ def _look(path: Path) -> _Look | str:
 
 
 def _reason(error: HyrfDataError, path: Path) -> str:
-    return str(error).removeprefix(f"{path}: ").partition(";")[0]
+    return without_path(error, given_path(path)).partition(";")[0]
 
 
 def _count_problems(count: int, scene: Scene | None, posed: int, path: Path) -> list[str]:
     found = []
     if count < _FEW:
         found.append(
-            f"there {'is' if count == 1 else 'are'} only {_photos(count)}; take {_FEW} or more, from all around and "
-            "with much overlap"
+            f"there {'is' if count == 1 else 'are'} only {count_photos(count)}; take {_FEW} or more, from all around "
+            "and with much overlap"
         )
     if scene is None or scene.layout == "blender":  # whose splits are used in part
         return found
@@ -280,7 +281,7 @@ def _count_problems(count: int, scene: Scene | None, posed: int, path: Path) -> 
     return found
 
 
-def _copies(photos: list[Path], looks: list[_Look], folder: Path) -> list[str]:
+def _copies(photos: list[Path], looks: list[_Look], folder: Path, tell: Callable[[str, float], None]) -> list[str]:
     thumbnails = np.stack([look.thumbnail for look in looks])
     if len(looks) > 2 and np.abs(thumbnails - thumbnails[0]).mean(axis=(1, 2)).max() < _SAME_PICTURE:
         return ["all photos show the same picture; walk around and take photos from many places"]
@@ -289,7 +290,10 @@ def _copies(photos: list[Path], looks: list[_Look], folder: Path) -> list[str]:
         sizes.setdefault(photo.stat().st_size, []).append(photo)
     seen: dict[bytes, Path] = {}
     copies = []
-    for photo in (item for group in sizes.values() if len(group) > 1 for item in group):
+    suspects = [item for group in sizes.values() if len(group) > 1 for item in group]
+    for done, photo in enumerate(suspects):
+        compared = f"looking for copies, {done + 1:,} of {len(suspects):,}"
+        tell(compared, _LOOKS_SHARE + (1 - _LOOKS_SHARE) * done / len(suspects))
         digest = hashlib.sha256(photo.read_bytes()).digest()
         if digest in seen:
             copies.append((photo, seen[digest]))
@@ -297,7 +301,9 @@ def _copies(photos: list[Path], looks: list[_Look], folder: Path) -> list[str]:
     if not copies:
         return []
     first, of = (_below(item, folder) for item in copies[0])
-    return [f"{_photos(len(copies))} {_is(len(copies))} a copy of another, {first} of {of} for one; remove the copies"]
+    return [
+        f"{count_photos(len(copies))} {_is(len(copies))} a copy of another, {first} of {of} for one; remove the copies"
+    ]
 
 
 def _blur_problems(looks: list[_Look], blurred: list[Path], folder: Path) -> list[str]:
@@ -309,8 +315,8 @@ def _blur_problems(looks: list[_Look], blurred: list[Path], folder: Path) -> lis
         ]
     if not blurred:
         return []
-    names = _named([_below(item, folder) for item in blurred])
-    return [f"{_photos(len(blurred))} {_is(len(blurred))} blurred ({names}); leave out or retake what is blurred"]
+    names = name_files([_below(item, folder) for item in blurred])
+    return [f"{count_photos(len(blurred))} {_is(len(blurred))} blurred ({names}); leave out or retake what is blurred"]
 
 
 def _light_problems(
@@ -325,13 +331,14 @@ def _light_problems(
     dark = [_below(look.path, folder) for look, value in zip(looks, light, strict=True) if value < middle - _DARKER]
     if dark:
         found.append(
-            f"{_photos(len(dark))} {_is(len(dark))} far darker than the others ({_named(dark)}); leave out what is dark"
+            f"{count_photos(len(dark))} {_is(len(dark))} far darker than the others ({name_files(dark)}); leave out "
+            "what is dark"
         )
     bright = [_below(look.path, folder) for look in looks if look.exposure.bright > _CLIPPED]
     if len(bright) > len(looks) / 4:
         found.append(
-            f"{_photos(len(bright))} {_is(len(bright))} white over a quarter or more ({_named(bright)}); expose less, "
-            "and lock it"
+            f"{count_photos(len(bright))} {_is(len(bright))} white over a quarter or more ({name_files(bright)}); "
+            "expose less, and lock it"
         )
     if stops > _UNEVEN:
         found.append(
@@ -367,14 +374,14 @@ def _mask_problems(folder: Path, photos: list[Path]) -> list[str]:
     stray = sorted(file.name for file in there if file.stem not in names)
     if not stray:
         return []
-    return [f"{len(stray)} of {len(there)} masks are of no photo ({_named(stray)}); name each as its photo is"]
+    return [f"{len(stray)} of {len(there)} masks are of no photo ({name_files(stray)}); name each as its photo is"]
 
 
 def _header_notes(facts: list[PhotoFacts]) -> list[str]:
     notes = []
     turned = sum(fact.orientation != 1 for fact in facts)
     if turned:
-        notes.append(f"{_photos(turned)} {_is(turned)} stored on the side; 'hyrfpack poses' makes upright copies")
+        notes.append(f"{count_photos(turned)} {_is(turned)} stored on the side; 'hyrfpack poses' makes upright copies")
     large = sum(max(fact.size) > DEFAULT_MAX_SIZE for fact in facts)
     if large:
         notes.append(
@@ -383,7 +390,7 @@ def _header_notes(facts: list[PhotoFacts]) -> list[str]:
         )
     round_ = sum(fact.size[0] == 2 * fact.size[1] for fact in facts)
     if round_:
-        notes.append(f"{_photos(round_)} {_is(round_)} twice as wide as high, as those of 360-degree cameras are")
+        notes.append(f"{count_photos(round_)} {_is(round_)} twice as wide as high, as those of 360-degree cameras are")
     return notes
 
 
@@ -398,14 +405,6 @@ def _counted(items: Iterable[str]) -> dict[str, int]:
 
 def _below(path: Path, folder: Path) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
-
-
-def _named(names: Sequence[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
-
-
-def _photos(count: int) -> str:
-    return "1 photo" if count == 1 else f"{count} photos"
 
 
 def _is(count: int) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +30,9 @@ class Pair:
     pixels2: np.ndarray
 
 
-def search_focal(pairs: Sequence[Pair], camera: pycolmap.Camera, seed: int) -> float:
+def search_focal(
+    pairs: Sequence[Pair], camera: pycolmap.Camera, seed: int, progress: Callable[[float], None] = lambda share: None
+) -> float:
     """The focal length with which calibrated geometry explains most matches, in longer sides of the picture.
 
     Where pairs do not tell (flat ground from above, motion straight ahead) it is near the guess.
@@ -39,12 +41,14 @@ def search_focal(pairs: Sequence[Pair], camera: pycolmap.Camera, seed: int) -> f
         pairs: of the camera's own photos.
         camera: its size and model; its focal length does not matter.
         seed: of RANSAC.
+        progress: called with the share of the search that is done.
     """
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = _CLOSE, seed % 2**31
     options.min_num_trials, options.max_num_trials = _TRIALS // 3, _TRIALS
     scores = []
-    for focal in FOCALS:
+    for place, focal in enumerate(FOCALS):
+        progress(place / len(FOCALS))
         tried = with_focal(camera, focal)
         found = [pycolmap.estimate_essential_matrix(p.pixels1, p.pixels2, tried, tried, options) for p in pairs]
         shares = [0.0 if f is None else f["num_inliers"] / len(p.pixels1) for f, p in zip(found, pairs, strict=True)]

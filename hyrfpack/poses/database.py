@@ -12,6 +12,8 @@ import pycolmap
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.poses.job import Job
+from hyrfpack.poses.process import Tell
+from hyrfpack.poses.watch import count_rows, watching_rows
 
 pycolmap.logging.minloglevel = 1  # warnings and errors, into the stage's log
 Cameras = dict[int, pycolmap.Camera]  # by number
@@ -78,7 +80,7 @@ def read_cameras(database: pycolmap.Database) -> Cameras:
     return {camera.camera_id: camera for camera in database.read_all_cameras()}
 
 
-def recalibrate(job: Job, name: str, decide: Callable[[Cameras], Cameras]) -> bool:
+def recalibrate(job: Job, name: str, decide: Callable[[Cameras], Cameras], tell: Tell) -> bool:
     """Give the database better cameras, and check all its pairs by their geometry with these.
 
     What was decided is kept before anything is changed, so that an interrupted call does the same when it is repeated.
@@ -86,6 +88,7 @@ def recalibrate(job: Job, name: str, decide: Callable[[Cameras], Cameras]) -> bo
     Args:
         name: of this step, for what is kept.
         decide: cameras as they are -> those to be replaced, by number.
+        tell: called with what is going on and the share of this step that is done, from 0.5 on.
 
     Returns:
         Whether there was a camera to replace.
@@ -104,7 +107,14 @@ def recalibrate(job: Job, name: str, decide: Callable[[Cameras], Cameras]) -> bo
                 camera.params, camera.has_prior_focal_length = parameters, True
                 database.update_camera(camera)
             database.clear_two_view_geometries()
-        pycolmap.geometric_verification(job.database, two_view_geometry_options=verification(job.seed))
+        count = count_rows(job, "matches")
+
+        def tell_done(done: int) -> None:
+            share = min(done / max(count, 1), 1.0)
+            tell(f"verifying pairs with better focal lengths, {min(done, count):,} of {count:,}", 0.5 + 0.5 * share)
+
+        with watching_rows(job, "two_view_geometries", tell_done):
+            pycolmap.geometric_verification(job.database, two_view_geometry_options=verification(job.seed))
         done.touch()
     return bool(kept)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from hyrfpack.data.quality import is_blurred
+from hyrfpack.data.unusable import explain_no_photos, unreadable_sentences
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.outputs import VIDEOS
+from hyrfpack.poses.prepare import COPY, only_unreadable
 
 LEAST = 3  # photos that poses can be found for
 _FEATURELESS = 60  # features of a typical photo, below which there is nothing to match
@@ -19,47 +19,47 @@ _BLANK = 0.1  # sharpness: what is blurred and shows something has more
 _TURNED = 0.8  # of all pairs: a panorama
 
 
-def check_count(folder: Path, usable: int, left_out: Mapping[str, str]) -> None:
+def check_count(given: Path, folder: Path, usable: int, left_out: Mapping[str, str]) -> None:
     """Raises HyrfDataError: there are too few photos.
 
     Args:
-        folder: of the photos.
+        given: what the user named.
+        folder: of the photos; the same, or where an archive was unpacked.
         usable: how many of them can be read and are no copies.
         left_out: the reason for each other one.
     """
     if usable >= LEAST:
         return
     count = usable + len(left_out)
-    copies = [reason for reason in left_out.values() if reason.startswith("a copy of")]
+    copies = [reason for reason in left_out.values() if reason.startswith(COPY)]
     if not count:
-        videos = [name for name in os.listdir(folder) if name.lower().endswith(VIDEOS)]
-        hint = f"; name the video itself: {videos[0]}" if videos else "; name the folder that holds them"
-        raise HyrfDataError(f"{folder}: there are no photos here (JPEG, PNG, WebP, TIFF or HEIC){hint}")
+        raise HyrfDataError(explain_no_photos(given, folder))
     if copies and usable + len(copies) >= LEAST:
         raise HyrfDataError(
-            f"{folder}: {len(copies)} of {count} files are copies of another, and {usable} different "
+            f"{given}: {len(copies)} of {count} files are copies of another, and {usable} different "
             f"{'photo is' if usable == 1 else 'photos are'} too few; take photos from many places"
         )
-    if left_out and not copies:
-        name, reason = next(iter(left_out.items()))
-        raise HyrfDataError(
-            f"{folder}: {len(left_out)} of {count} photos cannot be read ({name}: {reason}), and {usable or 'none'} is "
-            "too few; replace the files"
-        )
+    if unreadable := only_unreadable(left_out):
+        left = f"; the {usable} that can be read {'is' if usable == 1 else 'are'} too few" if usable else ""
+        raise HyrfDataError(f"{given}: {'; '.join(unreadable_sentences(unreadable, count))}{left}")
     raise HyrfDataError(
-        f"{folder}: {usable} {'photo is' if usable == 1 else 'photos are'} too few to find poses; take 20 or more from "
+        f"{given}: {usable} {'photo is' if usable == 1 else 'photos are'} too few to find poses; take 20 or more from "
         "different places, each sharing two thirds of its view with the next"
     )
 
 
-def check_features(folder: Path, count: int, features: Mapping[str, Any]) -> None:
-    """Raises HyrfDataError: too few photos can be decoded, or they show too little (`features.find_features`)."""
+def check_features(folder: Path, count: int, features: Mapping[str, Any], unreadable: Mapping[str, str]) -> None:
+    """Raises HyrfDataError: too few photos can be decoded, or they show too little.
+
+    Args:
+        folder: what the user named.
+        count: photos in all.
+        features: the answer of `features.find_features`.
+        unreadable: the reason for each photo that cannot be read, by its name for the user.
+    """
     counts = list(features["keypoints"].values())
     if len(counts) < LEAST:
-        name, reason = next(iter(features["unreadable"].items()))
-        raise HyrfDataError(
-            f"{folder}: {len(counts)} of {count} photos can be decoded ({name}: {reason}); replace the files"
-        )
+        raise HyrfDataError(f"{folder}: {'; '.join(unreadable_sentences(unreadable, count))}")
     if np.median(counts) < _FEATURELESS:
         raise HyrfDataError(
             f"{folder}: there is hardly anything in these photos that can be recognised in another (a typical one has "
@@ -88,11 +88,6 @@ def check_found(folder: Path, count: int, found: Mapping[str, Any]) -> None:
             f"{folder}: no poses could be found, for these {count} photos share too little with each other; take more "
             "between them, each sharing two thirds of its view with the next"
         )
-
-
-def undecodable(features: Mapping[str, Any]) -> dict[str, str]:
-    """The reason for each photo whose header alone can be read."""
-    return {name: f"cannot be decoded ({reason})" for name, reason in features["unreadable"].items()}
 
 
 def blurred(features: Mapping[str, Any]) -> frozenset[str]:

@@ -3,28 +3,40 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hyrfpack.checks import check_choice, check_int
 from hyrfpack.choices import MATCHING
-from hyrfpack.data.archive import is_archive, unpacked
+from hyrfpack.data.archive import is_archive, naming_archives, unpacked
 from hyrfpack.data.equirectangular import FACES
-from hyrfpack.data.folder import list_photos, list_pictures
+from hyrfpack.data.folder import list_photos, list_pictures, list_raw_photos
+from hyrfpack.data.unusable import raw_photos_note, refuse_one_photo, unreadable_sentences
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.lock import exclusive_folder
-from hyrfpack.outputs import PICTURES, StrPath
+from hyrfpack.outputs import StrPath
 from hyrfpack.poses import diagnosis
-from hyrfpack.poses.frames import FrameReport, choose_frames
+from hyrfpack.poses.frames import FrameReport, choose_frames, frame_times
 from hyrfpack.poses.job import Job
 from hyrfpack.poses.output import Output, disk_errors, same
 from hyrfpack.poses.pairs import EXHAUSTIVE_UP_TO, choose_matching
-from hyrfpack.poses.prepare import Photo, devices_of, find_masks, in_order, look_at, make_images, make_masks
+from hyrfpack.poses.prepare import (
+    Photo,
+    devices_of,
+    find_masks,
+    in_order,
+    look_at,
+    make_images,
+    make_masks,
+    only_unreadable,
+)
 from hyrfpack.poses.process import Crashed, run_stage
 
-_SHARES = {"photos": 0.05, "features": 0.15, "matches": 0.45, "global": 0.1, "incremental": 0.2, "finish": 0.05}
+# Share of each stage in the whole time, between what sets of small photos and of large ones take.
+_SHARES = {"photos": 0.03, "features": 0.15, "matches": 0.35, "global": 0.25, "incremental": 0.12, "finish": 0.1}
+_VIDEO_FRAMES_SHARE = 0.3  # of the time, in which the frames of a video are chosen; the other stages share the rest
 _FLAT = 2.0  # degrees between rays: less says that the camera hardly moved
 
 Say = Callable[[str], None]
@@ -40,7 +52,8 @@ class PosesReport:
         photos: how many there were.
         registered: how many have a pose.
         sure: how many of these both mappers pose the same, within 2 % of the scene's extent and 5 degrees.
-        left_out: the reason for each photo without a pose.
+        left_out: the reason for each photo without a pose, by its path below the folder that was given; frames of a
+            video and faces of panoramas by their names in images/.
         mapper: whose result was taken, "incremental" or "global".
         why: it was, in a sentence with the figures of both.
         notes: sentences on what is in doubt and what was done with the photos.
@@ -77,7 +90,7 @@ def estimate_poses(
 
     Args:
         photos: a folder of photos (sub-folders are cameras of their own), a .zip of one, or a video.
-        out: the scene's folder. It gets images/ (links to the photos, upright copies of those that a camera stored on
+        out: the scene's folder. It gets images/ (copies of the photos, upright ones of those that a camera stored on
             their side), sparse/0 and poses.json. A folder whose photos are in images/ may be `photos` and `out` at
             once; its photos stay as they are.
         matching: "exhaustive" (all pairs), "sequential" (photos follow each other, and loops are looked for),
@@ -108,7 +121,7 @@ def estimate_poses(
     """
     check_choice("matching", matching, MATCHING)
     check_int("seed", seed, 0, 2**64 - 1)
-    with disk_errors(Path(out)):
+    with disk_errors(Path(out)), naming_archives():
         return _Estimation(Path(photos), Path(out), matching, masks, seed, overwrite, report, say).run()
 
 
@@ -128,11 +141,15 @@ class _Estimation:
     left_out: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
+    names: dict[str, str] = field(default_factory=dict)  # that the user knows photos by, if these are others
+    is_video: bool = False
+    share: float = 0.0  # of all the work that was told to be done
     claimed: bool = False  # the folder of products
     finished: bool = False  # a stage, or work that this call goes on with
 
     def __post_init__(self) -> None:
         self.output = Output(self.out)
+        self.given = self.photos  # an archive, whose files are unpacked elsewhere
 
     def run(self) -> PosesReport:
         """All stages; of an estimation that finishes none nothing is left, unless it was interrupted."""
@@ -156,19 +173,20 @@ class _Estimation:
         job = self._prepare()
         self.seconds["photos"] = time.monotonic() - began
         features = self._stage("features")
-        self.left_out |= diagnosis.undecodable(features)
-        diagnosis.check_features(self.photos, self.count, features)
+        unreadable = {self._name(name): reason for name, reason in features["unreadable"].items()}
+        self.left_out |= unreadable
+        diagnosis.check_features(self.given, self.count, features, unreadable)
+        self._note_all(unreadable_sentences(unreadable, self.count))
         matches = self._stage("matches")
-        diagnosis.check_matches(self.photos, self.count, matches)
+        diagnosis.check_matches(self.given, self.count, matches)
         found = self._stage("finish", *self._map())
-        diagnosis.check_found(self.photos, len(job.names), found)
+        diagnosis.check_found(self.given, len(job.names), found)
         return self._conclude(job, features, matches, found)
 
     def _prepare(self) -> Job:
         """Photos and masks where they are read from, and the job."""
-        video = self.photos.is_file()
-        if video and self.photos.suffix.lower() in PICTURES:
-            raise HyrfDataError(f"{self.photos}: one photo has no poses; name the folder of all photos, or a video")
+        refuse_one_photo(self.photos)
+        video = self.is_video = self.photos.is_file()
         images = self.out / "images"
         here = not video and self._in_images(images)
         mask_folder = self._mask_folder(here)
@@ -181,9 +199,14 @@ class _Estimation:
             self._claim()
             root = self._take_frames()
             sources = list_photos(root)
-        photos, self.left_out = look_at(root, sources, in_place=here or video)
+        copied = not (here or video)
+        looking = self._counter(
+            "reading the headers of photos", len(sources), 0.9 if video else 0.0, 0.5 if copied else 1
+        )
+        photos, self.left_out = look_at(root, sources, in_place=not copied, progress=looking)
         self.count = len(photos) + len(self.left_out)
-        diagnosis.check_count(self.photos, len(photos), self.left_out)
+        diagnosis.check_count(self.given, root, len(photos), self.left_out)
+        self.names = self._names(photos)
         masks = find_masks(photos, mask_folder) if mask_folder else {}
         if self.masks is not None and not masks:
             raise HyrfDataError(f"{self.masks}: no mask is named as a photo is ({photos[0].source}.png); rename them")
@@ -192,13 +215,16 @@ class _Estimation:
             self.output.check_free("masks")
         if not video:
             self._claim()  # not before: nothing is removed for photos that are refused
-        if not (here or video):
-            root = self.output.make("images", lambda folder: make_images(photos, folder))
+        if copied:
+            copying = self._counter("copying photos", len(photos), 0.5, 1.0)
+            root = self.output.make("images", lambda folder: make_images(photos, folder, copying))
         if put_masks:
             folder = self.output.make("masks", lambda folder: make_masks(photos, masks, folder))
             masks = {name: folder / f"{name}.png" for name in masks}
-        self._note_photos(photos, masks, turned=not here)
-        devices, of = devices_of(photos, in_place=here or video)
+        self._note_photos(photos, masks, copied, turned=not here)
+        if not video:
+            self._note_all(raw_photos_note(self._list(root if here else self.photos, list_raw_photos)))
+        devices, of = devices_of(photos, in_place=not copied)
         if len(devices) > 1:
             self._note(f"{len(devices)} cameras or zooms are told apart by folder, device, size and focal length")
         ordered = video or (len(photos) > EXHAUSTIVE_UP_TO and in_order(photos))
@@ -215,9 +241,9 @@ class _Estimation:
         job.save(self.output.work / "job.json")
         return job
 
-    def _list(self, folder: Path) -> list[Path]:
+    def _list(self, folder: Path, list_files: Callable[[Path], list[Path]] = list_photos) -> list[Path]:
         """The photos in a folder, but for what was put into a scene in it."""
-        files = list_photos(folder)
+        files = list_files(folder)
         scene = (self.out / "images" if same(folder, self.out) else self.out).resolve()
         if folder.resolve() in scene.parents:
             files = [path for path in files if scene not in path.resolve().parents]
@@ -252,7 +278,7 @@ class _Estimation:
         """The folder of the frames that are taken of the video."""
 
         def tell(doing: str, share: float) -> None:
-            self._tell("photos", doing, share)
+            self._tell("photos", doing, 0.9 * share)
 
         def take(folder: Path) -> FrameReport:
             return choose_frames(self.photos, folder, report=tell)
@@ -260,12 +286,42 @@ class _Estimation:
         folder = self.output.make("images", take, keep=True)
         frames = take(folder)  # which finds them there
         self._note(f"{frames.taken} of {frames.of} frames were taken")
-        for sentence in frames.notes:
-            self._note(sentence)
+        self._note_all(frames.notes)
         return folder
 
-    def _note_photos(self, photos: list[Photo], masks: dict[str, Path], turned: bool) -> None:
-        """Say what was done with the photos; `turned`: those that are stored on their side are upright now."""
+    def _names(self, photos: list[Photo]) -> dict[str, str]:
+        """What the user calls photos that are called otherwise in images/: the photo that one was written from, or when
+        a frame is shown."""
+        if self.is_video:
+            times = frame_times(self.output.work / "images")
+            return {name: f"{name} (at {seconds:.1f} s)" for name, seconds in times.items()}
+        return {photo.name: photo.source for photo in photos if photo.face is None}
+
+    def _name(self, name: str) -> str:
+        return self.names.get(name, name)
+
+    def _counter(self, doing: str, count: int, first: float, last: float) -> Callable[[int], None]:
+        """What tells how many of the photos are done, as shares of the first stage from `first` to `last`."""
+
+        def progress(done: int) -> None:
+            self._tell("photos", f"{doing}, {done:,} of {count:,}", first + (last - first) * done / max(count, 1))
+
+        return progress
+
+    def _note_photos(self, photos: list[Photo], masks: dict[str, Path], copied: bool, turned: bool) -> None:
+        """Say what was done with the photos.
+
+        Args:
+            photos: all that are used.
+            masks: of them.
+            copied: they were put into images/.
+            turned: those that are stored on their side are upright now.
+        """
+        self._note_all(unreadable_sentences(only_unreadable(self.left_out), self.count))
+        if copied:
+            size = sum(path.stat().st_size for path in {photo.facts.path for photo in photos})
+            where = self.out / "images"
+            self._note(f"the photos ({size / 1e6:,.1f} MB) are copied into {where}; edits there do not change yours")
         if masks:
             self._note(f"{len(masks)} of {len(photos)} photos have a mask")
         if faces := sum(photo.face is not None for photo in photos):
@@ -302,8 +358,9 @@ class _Estimation:
         self, job: Job, features: dict[str, Any], matches: dict[str, Any], found: dict[str, Any]
     ) -> PosesReport:
         registered = set(found["registered"])
-        decoded = [name for name in job.names if name not in self.left_out]
-        self.left_out |= diagnosis.unposed(decoded, features, matches, found)
+        decoded = [name for name in job.names if name not in features["unreadable"]]
+        unposed = diagnosis.unposed(decoded, features, matches, found)
+        self.left_out |= {self._name(name): reason for name, reason in unposed.items()}
         if found["doubt"]:
             self._note(found["doubt"])
         if found["angle"] < _FLAT:
@@ -326,6 +383,10 @@ class _Estimation:
         self.output.put(job.model("chosen"), asdict(report) | {"scene": str(self.out), "unsure": unsure})
         return report
 
+    def _note_all(self, sentences: Iterable[str]) -> None:
+        for sentence in sentences:
+            self._note(sentence)
+
     def _note(self, sentence: str) -> None:
         self.notes.append(sentence)
         if self.say is not None:
@@ -333,6 +394,11 @@ class _Estimation:
 
     def _tell(self, stage: str, doing: str, share: float) -> None:
         if self.report is not None:
-            stages = list(_SHARES)
-            before = sum(_SHARES[earlier] for earlier in stages[: stages.index(stage)])
-            self.report(doing, min(before + _SHARES[stage] * share, 1.0))
+            shares = dict(_SHARES)
+            if self.is_video:
+                rest = (1 - _VIDEO_FRAMES_SHARE) / (1 - _SHARES["photos"])
+                shares = {name: rest * value for name, value in _SHARES.items()} | {"photos": _VIDEO_FRAMES_SHARE}
+            stages = list(shares)
+            before = sum(shares[earlier] for earlier in stages[: stages.index(stage)])
+            self.share = max(self.share, min(before + shares[stage] * share, 1.0))
+            self.report(doing, self.share)

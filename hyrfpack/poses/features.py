@@ -17,10 +17,11 @@ from PIL import Image
 from hyrfpack.atomic import write_atomic
 from hyrfpack.data.pictures import read_mask, read_pixels
 from hyrfpack.data.quality import sharpness
-from hyrfpack.errors import HyrfDataError
+from hyrfpack.errors import HyrfDataError, without_path
 from hyrfpack.poses.database import make_database, opened
 from hyrfpack.poses.job import Job, chunks
 from hyrfpack.poses.process import Tell
+from hyrfpack.poses.watch import watching_rows
 
 _MOST = 8192  # features of a photo
 _SMALL = 1000  # pixels of the longer side up to which features are also found between pixels (twice the resolution)
@@ -41,12 +42,17 @@ def find_features(job: Job, tell: Tell) -> dict[str, Any]:
     numbers = {name: number for number, name in enumerate(job.names, start=1)}
     known = {*facts["sharpness"], *facts["unreadable"]}
     done = len(known)
+
+    def tell_done(done: int) -> None:
+        number = min(done + 1, len(job.names))
+        tell(f"features of photo {number:,} of {len(job.names):,}", done / len(job.names))
+
     for camera, device in enumerate(job.devices, start=1):
         mine = [
             name for name, of in zip(job.names, job.device_of, strict=True) if of + 1 == camera and name not in known
         ]
         for names in chunks(mine, _CHUNK):
-            tell(f"features of photo {done + 1:,} of {len(job.names):,}", done / len(job.names))
+            tell_done(done)
             folder = job.work / "working"
             shutil.rmtree(folder, ignore_errors=True)
             with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -58,7 +64,9 @@ def find_features(job: Job, tell: Tell) -> dict[str, Any]:
                 else:
                     facts["sharpness"][name] = sharp
             readable = [numbers[name] for name, (_, reason) in zip(names, copies, strict=True) if not reason]
-            _extract(job, folder, readable, camera)
+            first = done + len(names) - len(readable)
+            with watching_rows(job, "keypoints", lambda found, first=first: tell_done(first + found)):  # type: ignore[misc]
+                _extract(job, folder, readable, camera)
             write_atomic(kept, json.dumps(facts).encode())
             done += len(names)
     shutil.rmtree(job.work / "working", ignore_errors=True)
@@ -74,7 +82,7 @@ def _make_copy(job: Job, folder: Path, size: tuple[int, int], name: str, number:
     try:
         rgb, alpha = read_pixels(job.images / name, size)
     except HyrfDataError as error:
-        return 0.0, str(error)
+        return 0.0, without_path(error, job.images / name).partition(";")[0]
     grey = rgb.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
     if alpha is not None:
         grey *= alpha.astype(np.float32) / 255

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections import Counter
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -53,16 +54,20 @@ def finish(job: Job, models: list[str], tell: Tell) -> dict[str, Any]:
     chosen, why = choose(list(best.values()), _count_matches(job))
     other = next((candidate for candidate in best.values() if candidate is not chosen), None)
     model, poses, explained = found[chosen], chosen.poses, chosen.explained
-    tell("completing the better one", 0.2)
-    for refine, least in ((partial(go_on, job), 1.0), (partial(add_points, job), 1.0), (_with_fitting_lens, _AS_GOOD)):
+    steps: list[tuple[str, float, Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction], float]] = [
+        ("looking for poses of the other photos", 0.1, partial(go_on, job), 1.0),
+        ("adding points that two photos see", 0.4, partial(add_points, job), 1.0),
+        ("finding the lens distortion", 0.5, partial(_with_fitting_lens, tell=tell), _AS_GOOD),
+    ]
+    for doing, share, refine, least in steps:
+        tell(doing, share)
         refined = refine(model)
         its_poses = _poses(job, refined)
         its_explained = evidence(its_poses, _matches(job, refined))
         if len(its_poses) >= len(poses) and its_explained >= least * explained:
             model, poses, explained = refined, its_poses, its_explained
-    tell("colouring points", 0.8)
     _enlarge(job, model)
-    _color(job, model)
+    _color(job, model, tell)
     _save(job, model)
     apart = {name for candidate in best.values() for piece in candidate.apart for name in piece}
     return {
@@ -122,7 +127,7 @@ def _matches(job: Job, model: pycolmap.Reconstruction) -> list[Matches]:
         ]
 
 
-def _with_fitting_lens(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+def _with_fitting_lens(model: pycolmap.Reconstruction, tell: Tell) -> pycolmap.Reconstruction:
     """A copy refined with the lens that its photos need.
 
     Where four coefficients of distortion (COLMAP's OPENCV) fit clearly better than the one so far, they are taken, if
@@ -131,10 +136,12 @@ def _with_fitting_lens(model: pycolmap.Reconstruction) -> pycolmap.Reconstructio
     """
     error = _with_lens(model, "SIMPLE_RADIAL").compute_mean_reprojection_error()
     photos = Counter(image.camera_id for image in model.images.values() if image.has_pose)
+    tell("finding the lens distortion, 1 of 3 models tried", 0.6)
     if min(photos.values()) >= _MANY:
         bent = _with_lens(model, "OPENCV")
         if bent.compute_mean_reprojection_error() < _BENT * error:
             return bent
+    tell("finding the lens distortion, 2 of 3 models tried", 0.7)
     straight = _with_lens(model, "SIMPLE_PINHOLE")
     return straight if straight.compute_mean_reprojection_error() <= _STRAIGHT * error else model
 
@@ -171,10 +178,11 @@ def _enlarge(job: Job, model: pycolmap.Reconstruction) -> None:
             point.xy = point.xy * scale
 
 
-def _color(job: Job, model: pycolmap.Reconstruction) -> None:
+def _color(job: Job, model: pycolmap.Reconstruction, tell: Tell) -> None:
     """Give each point the mean colour of the pixels that see it."""
     sums: dict[int, np.ndarray] = {}
-    for image in model.images.values():
+    for number, image in enumerate(model.images.values(), start=1):
+        tell(f"colouring points, photo {number:,} of {len(model.images):,}", 0.8 + 0.2 * number / len(model.images))
         seen = [(point.point3D_id, point.xy) for point in image.points2D if point.has_point3D()]
         if not (image.has_pose and seen):
             continue
@@ -182,12 +190,12 @@ def _color(job: Job, model: pycolmap.Reconstruction) -> None:
         width, height = size = shrunk_size(device.size[0], device.size[1], _COLORED)
         rgb, _ = read_pixels(job.images / image.name, size)
         scale = np.array(size) / np.array(device.size)
-        for number, xy in seen:
+        for point_id, xy in seen:
             column, row = (xy * scale).astype(int)
             color = rgb[min(max(row, 0), height - 1), min(max(column, 0), width - 1)].astype(np.float64)
-            sums[number] = sums.get(number, 0) + np.array([*color, 1.0])
-    for number, (*color, count) in sums.items():
-        model.points3D[number].color = np.round(np.array(color) / count).astype(np.uint8)
+            sums[point_id] = sums.get(point_id, 0) + np.array([*color, 1.0])
+    for point_id, (*color, count) in sums.items():
+        model.points3D[point_id].color = np.round(np.array(color) / count).astype(np.uint8)
 
 
 def _save(job: Job, model: pycolmap.Reconstruction) -> None:

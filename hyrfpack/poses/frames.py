@@ -33,6 +33,7 @@ _LEAST_DECODED, _LEAST_TAKEN = 10, 5  # frames
 _SHARPNESS_AT = 640  # pixels of the longer side
 _MEASURED_RATE, _MEASURED = 30.5, 6000  # frames a second and in all: more are as one sees them no better
 _SAME = 0.4  # mean difference in levels of 255: a repeated frame, whatever the coder made of it
+_LOOKING_SHARE, _TRACKING_SHARE = 0.6, 0.7  # of the work, that is done once all frames were looked at, and followed
 _WHOLE = 0.95  # of the length that the header says
 
 
@@ -63,6 +64,7 @@ class _Measured:
     """What one pass over a video says of the frames looked at that are no repetitions, and of all."""
 
     numbers: np.ndarray  # (N,) places in the video
+    times: np.ndarray  # (N,) seconds from its start
     sharp: np.ndarray  # (N,)
     small: list[np.ndarray]  # N of (h, w) uint8
     of: int
@@ -108,10 +110,11 @@ def choose_frames(video: StrPath, folder: StrPath, *, most: int = 150, report: R
         record = _read_record(folder)
         if record is None or record["key"] != key:
             measured = _measure(video, source, tell)
-            chosen, found = _choose(video, measured, most)
+            chosen, found = _choose(video, measured, most, tell)
             _remove_frames(folder, record)
             make_folder(folder)
-            record = {"key": key, "frames": chosen, "report": asdict(found)}
+            times = {_name(number): seconds for number, seconds in chosen.items()}
+            record = {"key": key, "frames": list(chosen), "times": times, "report": asdict(found)}
             write_atomic(folder / RECORD, json.dumps(record).encode())
         _write_frames(source, folder, record["frames"], tell)
     tell("frames written", 1.0)
@@ -137,13 +140,15 @@ def survey_frames(
     """
     video = Path(video)
     with opened(video) as source:
-        measured = _measure(video, source, report or (lambda text, share: None))
-        return _choose(video, measured, most)[1], source.size, len(measured.numbers) + measured.repeated
+        tell = report or (lambda text, share: None)
+        measured = _measure(video, source, tell)
+        return _choose(video, measured, most, tell)[1], source.size, len(measured.numbers) + measured.repeated
 
 
 def _measure(path: Path, video: Video, tell: Report) -> _Measured:
     step = max(1 / _MEASURED_RATE, video.seconds / _MEASURED)
     numbers: list[int] = []
+    times: list[float] = []
     sharp: list[float] = []
     small: list[np.ndarray] = []
     notes: list[str] = []
@@ -167,7 +172,10 @@ def _measure(path: Path, video: Video, tell: Report) -> _Measured:
             sharp.append(sharpness(gray.astype(np.float32) / 255))
             small.append(thumbnail)
             numbers.append(number)
-        tell("looking at the frames", 0.7 * min(1.0, time / video.seconds) if video.seconds else 0.0)
+            times.append(time)
+        length = f" of {video.seconds:.0f} s" if video.seconds else ""
+        share = min(1.0, time / video.seconds) if video.seconds else 0.0
+        tell(f"looking at frame {of:,}, {time:.0f} s{length}", _LOOKING_SHARE * share)
     if of < _LEAST_DECODED:
         cut = " that can be decoded; copy it again in full, or film" if video.damaged else "; film"
         raise HyrfDataError(f"{path}: the video has only {of} frames{cut} for at least ten seconds")
@@ -178,16 +186,21 @@ def _measure(path: Path, video: Video, tell: Report) -> _Measured:
         )
     if interlaced:
         notes.append("the video is interlaced, which combs what moves; film progressively (p, not i) if you can")
-    return _Measured(np.array(numbers), np.array(sharp), small, of, repeated, time, tuple(notes))
+    return _Measured(np.array(numbers), np.array(times), np.array(sharp), small, of, repeated, time, tuple(notes))
 
 
-def _choose(path: Path, measured: _Measured, most: int) -> tuple[list[int], FrameReport]:
-    """Numbers of the frames to take, and what there is to say about them."""
+def _choose(path: Path, measured: _Measured, most: int, tell: Report) -> tuple[dict[int, float], FrameReport]:
+    """Number and time of each frame to take, and what there is to say about them."""
     blurred = is_blurred(measured.sharp)
     if blurred.all():
         raise HyrfDataError(f"{path}: all frames of the video are blurred; film again, slower and with more light")
     sharp = np.flatnonzero(~blurred)
-    places = track([measured.small[place] for place in sharp])
+
+    def progress(done: int) -> None:
+        share = _LOOKING_SHARE + (_TRACKING_SHARE - _LOOKING_SHARE) * done / len(sharp)
+        tell(f"following the motion, frame {done:,} of {len(sharp):,}", share)
+
+    places = track([measured.small[place] for place in sharp], progress)
     values = measured.sharp[sharp]
     spacing = _SPACING
     picked = _spread(places, values, spacing)
@@ -201,8 +214,8 @@ def _choose(path: Path, measured: _Measured, most: int) -> tuple[list[int], Fram
         )
     if len(picked) < _LEAST_TAKEN:
         raise HyrfDataError(
-            f"{path}: only {len(picked)} of {measured.of} frames differ, for the camera hardly moves; "
-            "walk around what you film"
+            f"{path}: the camera hardly moves, so that {len(picked)} of {measured.of} frames can serve as photos, and "
+            f"{_LEAST_TAKEN} is the least; walk around what you film"
         )
     steps = np.array([distances(places, a, slice(b, b + 1))[0] for a, b in zip(picked, picked[1:], strict=False)])
     notes = list(measured.notes)
@@ -211,7 +224,9 @@ def _choose(path: Path, measured: _Measured, most: int) -> tuple[list[int], Fram
             f"the taken frames are {np.median(steps):.0%} of the picture apart, so far that matching may fail; "
             "take more frames, film slower, or cut the video into pieces"
         )
-    return measured.numbers[sharp[picked]].tolist(), FrameReport(
+    taken = sharp[picked]
+    seconds = [round(time, 3) for time in measured.times[taken].tolist()]
+    return dict(zip(measured.numbers[taken].tolist(), seconds, strict=True)), FrameReport(
         taken=len(picked),
         of=measured.of,
         blurred=int(blurred.sum()),
@@ -260,15 +275,23 @@ def _write_frames(video: Video, folder: Path, numbers: list[int], tell: Report) 
     if not missing:
         return
     left = len(missing)
+    last = max(missing)
     for number, _, frame in video.frames():
         if number in missing:
             data = io.BytesIO()
             upright_picture(frame, video.aspect).save(data, "JPEG", quality=95, subsampling=0)
             write_atomic(folder / _name(number), data.getvalue())
             missing.remove(number)
-        tell("writing the frames", 0.7 + 0.3 * (left - len(missing)) / left)
+        written = f"writing frames, {left - len(missing):,} of {left:,}"
+        tell(written, _TRACKING_SHARE + (1 - _TRACKING_SHARE) * min((number + 1) / (last + 1), 1.0))
         if not missing:
             break
+
+
+def frame_times(folder: Path) -> dict[str, float]:
+    """The time in seconds, from the start of the video, of each frame that `choose_frames` wrote into a folder."""
+    record = _read_record(folder)
+    return {} if record is None else dict(record["times"])
 
 
 def _name(number: int) -> str:
@@ -279,7 +302,7 @@ def _read_record(folder: Path) -> dict | None:
     """What an earlier call wrote beside its frames, if any."""
     with suppress(OSError, ValueError, TypeError):
         record = json.loads((folder / RECORD).read_text())
-        if isinstance(record, dict) and {"key", "frames", "report"} <= record.keys():
+        if isinstance(record, dict) and {"key", "frames", "times", "report"} <= record.keys():
             return record
     return None
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ import pycolmap
 from hyrfpack.poses.database import FOUND, Cameras, recalibrate
 from hyrfpack.poses.job import Job
 from hyrfpack.poses.process import Tell
+from hyrfpack.poses.watch import watching_global_mapper
 
 _ROUNDS = (
     3  # of posing all photos at once, each from another start and with the focal lengths that the one before found
@@ -35,19 +38,38 @@ def map_globally(job: Job, tell: Tell) -> dict[str, Any]:
     for turn in range(_ROUNDS):
         name = f"global-{turn}"
         if not job.model(name).exists():
-            tell(f"posing all photos at once, {turn + 1} of {_ROUNDS}", turn / _ROUNDS)
+            doing = f"posing all photos at once, run {turn + 1} of {_ROUNDS}"
+            tell(doing, turn / _ROUNDS)
             seed, options = (job.seed + turn) % 2**31, pycolmap.GlobalPipelineOptions()
             options.random_seed = options.mapper.random_seed = seed
             options.num_threads = options.mapper.num_threads = THREADS
             options.mapper.global_positioning.random_seed = options.mapper.rotation_averaging.random_seed = seed
             options.min_num_matches, options.min_model_size = FOUND, SMALLEST
-            _keep(job, name, pycolmap.global_mapping(job.database, job.images, _scratch(job), options))
+            log, told = job.work / "global.log", _within(tell, turn, 0.0, 0.8)
+            with _logging_info(), watching_global_mapper(log, doing, told):
+                found = pycolmap.global_mapping(job.database, job.images, _scratch(job), options)
+            _keep(job, name, found)
         names.append(name)
         pieces = read_pieces(job.model(name))
         if pieces and turn < _ROUNDS - 1:
-            tell("verifying pairs with better focal lengths", (turn + 0.8) / _ROUNDS)
-            recalibrate(job, f"{name}.focal", partial(_better_cameras, pieces[0]))
+            recalibrate(job, f"{name}.focal", partial(_better_cameras, pieces[0]), _within(tell, turn, 0.6, 1.0))
     return {"models": names}
+
+
+def _within(tell: Tell, turn: int, first: float, last: float) -> Tell:
+    """Progress of a part of one run, which begins and ends at these shares of that run, as progress of all runs."""
+    return lambda doing, share: tell(doing, (turn + first + (last - first) * share) / _ROUNDS)
+
+
+@contextmanager
+def _logging_info() -> Iterator[None]:
+    """Have the library write the phases of its work into the log."""
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = 0
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
 
 
 def map_incrementally(job: Job, tell: Tell) -> dict[str, Any]:
@@ -66,19 +88,26 @@ def map_incrementally(job: Job, tell: Tell) -> dict[str, Any]:
         if any(read_pieces(folder) for folder in job.work.glob("global-?")):
             options.ba_refine_focal_length = options.ba_refine_extra_params = False
             options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
-        posed, count = 0, len(job.names)
-
-        def next_photo() -> None:
-            nonlocal posed
-            posed += 1
-            tell(f"posing photos one by one, {min(posed, count):,} of {count:,}", min(posed / count, 1.0))
-
-        tell(f"posing photos one by one, of {count:,}", 0.0)
+        count = len(job.names)
+        tell(f"posing photos one by one, choosing the first 2 of {count:,}", 0.0)
         pieces = pycolmap.incremental_mapping(
-            job.database, job.images, _scratch(job), options, next_image_callback=next_photo
+            job.database, job.images, _scratch(job), options, next_image_callback=_photo_counter(count, tell)
         )
         _keep(job, name, pieces)
     return {"models": [name]}
+
+
+def _photo_counter(count: int, tell: Tell) -> Callable[[], None]:
+    """What the incremental mapper calls after each photo. Its end is not known: photos may stay without a pose, and
+    what it gives up is begun anew, so that the share stays below 1."""
+    posed = 2  # that it begins with
+
+    def next_photo() -> None:
+        nonlocal posed
+        posed += 1
+        tell(f"posing photos one by one, {min(posed, count):,} of {count:,} posed", 0.95 * min(posed / count, 1.0))
+
+    return next_photo
 
 
 def go_on(job: Job, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:

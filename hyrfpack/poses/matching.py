@@ -15,12 +15,14 @@ from hyrfpack.poses.calibrate import FOCALS, Pair, search_focal, turned_only, wi
 from hyrfpack.poses.database import FOUND, opened, read_cameras, recalibrate, verification, verified_pairs
 from hyrfpack.poses.job import Job
 from hyrfpack.poses.process import Tell
+from hyrfpack.poses.watch import watching_rows
 
-_STEP = 5.0  # seconds of matching between two lines of progress, about
+_STEP = 2.0  # seconds of matching between two lines of progress, about
 _FIRST, _LARGEST = 100, 2000  # pairs that are matched at a time, at first and at most
 _STRONG = 2 * FOUND  # matches of the pairs that focal lengths are read from
 _LOOKED_AT = 40  # of them
 _ENOUGH = 5  # of them, without which they say nothing
+_FOCALS = "estimating focal lengths from matches"
 _CHANGED = 0.05  # of a focal length: beyond, pairs are verified anew
 
 
@@ -35,16 +37,20 @@ def match(job: Job, tell: Tell) -> dict[str, Any]:
     if marker.exists():
         return json.loads(marker.read_text())
     if not (job.work / "focal.json").exists():  # which is decided on all matches
-        _match_pairs(job, _choose_pairs(job), tell)
-    tell("reading focal lengths from matches", 0.9)
-    recalibrate(job, "focal", lambda cameras: _better_focals(job, cameras))
-    tell("checking panoramas", 0.97)
+        _match_pairs(job, _choose_pairs(job, tell), tell)
+
+    def told(doing: str, share: float) -> None:
+        tell(doing, 0.82 + 0.13 * share)
+
+    told(_FOCALS, 0.0)
+    recalibrate(job, "focal", lambda cameras: _better_focals(job, cameras, told), told)
+    tell("checking that the camera moved", 0.95)
     answer = _sum_up(job)
     write_atomic(marker, json.dumps(answer).encode())
     return answer
 
 
-def _choose_pairs(job: Job) -> pairing.Pairs:
+def _choose_pairs(job: Job, tell: Tell) -> pairing.Pairs:
     count = len(job.names)
     if job.matching == "exhaustive":
         return pairing.exhaustive(count)
@@ -53,7 +59,11 @@ def _choose_pairs(job: Job) -> pairing.Pairs:
         for number in range(1, count + 1):
             there = database.exists_descriptors(number)
             found.append(database.read_descriptors(number).data if there else np.zeros((0, 128), np.uint8))
-    similarity = pairing.similarities(found, job.seed)
+
+    def progress(done: int) -> None:
+        tell(f"choosing which photos to match, {done:,} of {count:,}", 0.02 * done / count)
+
+    similarity = pairing.similarities(found, job.seed, progress)
     choose = pairing.sequential if job.matching == "sequential" else pairing.retrieval
     return choose(count, similarity)
 
@@ -75,18 +85,26 @@ def _match_pairs(job: Job, pairs: pairing.Pairs, tell: Tell) -> None:
     portion = job.work / "pairs.txt"
     options = pycolmap.ImportedPairingOptions()
     options.match_list_path = portion
+
+    def tell_done(done: int) -> None:
+        number, share = min(done + 1, len(wanted)), min(done / len(wanted), 1.0)
+        tell(f"matching pair {number:,} of {len(wanted):,}", 0.02 + 0.8 * share)
+
     while left:
-        tell(f"matching pair {done + 1:,} of {len(wanted):,}", 0.9 * done / len(wanted))
+        tell_done(done)
         now, left = left[:size], left[size:]
         portion.write_text("".join(f"{names[first]} {names[second]}\n" for first, second in now), encoding="utf-8")
         began = time.monotonic()
-        pycolmap.match_image_pairs(job.database, pairing_options=options, verification_options=verification(job.seed))
+        with watching_rows(job, "two_view_geometries", lambda found, done=done: tell_done(done + found)):  # type: ignore[misc]
+            pycolmap.match_image_pairs(
+                job.database, pairing_options=options, verification_options=verification(job.seed)
+            )
         pace = len(now) / max(time.monotonic() - began, 1e-3)
         done, size = done + len(now), int(np.clip(pace * _STEP, _FIRST // 4, _LARGEST))
     portion.unlink(missing_ok=True)
 
 
-def _better_focals(job: Job, cameras: dict[int, pycolmap.Camera]) -> dict[int, pycolmap.Camera]:
+def _better_focals(job: Job, cameras: dict[int, pycolmap.Camera], tell: Tell) -> dict[int, pycolmap.Camera]:
     """The cameras whose focal length EXIF does not tell and that is another than was guessed."""
     with opened(job) as database:
         strong = _strong_pairs(job, database)
@@ -94,7 +112,12 @@ def _better_focals(job: Job, cameras: dict[int, pycolmap.Camera]) -> dict[int, p
     for number, device in enumerate(job.devices, start=1):
         own = strong.get(number, [])
         if device.focal is None and len(own) >= _ENOUGH:
-            found[number] = search_focal(own, cameras[number], job.seed)
+
+            def progress(share: float, number: int = number) -> None:
+                camera = f", camera {number} of {len(job.devices)}" if len(job.devices) > 1 else ""
+                tell(f"{_FOCALS}{camera}", 0.5 * (number - 1 + share) / len(job.devices))
+
+            found[number] = search_focal(own, cameras[number], job.seed, progress)
     typical = float(np.median(list(found.values()))) if found else None
     better = {}
     for number, device in enumerate(job.devices, start=1):

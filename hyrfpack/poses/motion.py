@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy import fft
@@ -18,7 +18,7 @@ _LOST = 24.0  # pixels that count for frames that cannot be compared: a cut, or 
 _NEAR_QUANTILE = 0.75  # of the windows: what is near moves more, and it is what has to be seen from all sides
 
 
-def track(frames: Sequence[np.ndarray]) -> np.ndarray:
+def track(frames: Sequence[np.ndarray], progress: Callable[[int], None] = lambda done: None) -> np.ndarray:
     """Follow the parts of the picture from the first frame on.
 
     Windows spread over the frame are compared with those of an earlier frame by phase correlation, not with the last
@@ -26,6 +26,7 @@ def track(frames: Sequence[np.ndarray]) -> np.ndarray:
 
     Args:
         frames: (H, W) uint8, WIDE pixels on the longer side.
+        progress: called with the number of frames that were followed so far.
 
     Returns:
         (N, windows, 2) float32: where each window has gone since the first frame, in shares of the longer side.
@@ -34,6 +35,7 @@ def track(frames: Sequence[np.ndarray]) -> np.ndarray:
     track = np.zeros((len(frames), windows, 2), np.float32)
     reference, spectra, last = 0, _spectra(frames[0]), _spectra(frames[0])
     for number in range(1, len(frames)):
+        progress(number)
         here = _spectra(frames[number])
         moved = _shift(spectra, here)
         if moved is None and reference != number - 1:

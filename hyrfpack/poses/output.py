@@ -17,7 +17,7 @@ from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.outputs import MODELS, PICTURES, POSES, TABLES
 from hyrfpack.poses.made import FOLDERS, REPORT, Made, are_all, files_of, read_report, remove, still_there
 
-_VERSION = 3  # of what is kept on the way; older products are made anew
+_VERSION = 4  # of what is kept on the way; older products are made anew
 _FINGERPRINT = "fingerprint"  # of what is made from which photos
 
 
@@ -107,7 +107,12 @@ class Output:
             if not keep:
                 shutil.rmtree(unfinished, ignore_errors=True)
             unfinished.mkdir(exist_ok=True)
-            fill(unfinished)
+            try:
+                fill(unfinished)
+            except OSError:  # such as a full disk, which copies of many photos would keep full
+                if not keep:
+                    shutil.rmtree(unfinished, ignore_errors=True)
+                raise
             os.replace(unfinished, folder)
         return folder
 

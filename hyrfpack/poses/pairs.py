@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 EXHAUSTIVE_UP_TO = 200  # photos of an unordered set: beyond, only those that look alike are matched
@@ -56,7 +58,9 @@ def _most_alike(similarity: np.ndarray, most: int) -> set[tuple[int, int]]:
     return pairs
 
 
-def similarities(descriptors: list[np.ndarray], seed: int) -> np.ndarray:
+def similarities(
+    descriptors: list[np.ndarray], seed: int, progress: Callable[[int], None] = lambda done: None
+) -> np.ndarray:
     """How alike photos are, by what their features look like (VLAD, Jegou et al. 2010).
 
     A vocabulary is made from the set itself; each photo is the sum of what its descriptors differ by from their nearest
@@ -65,6 +69,7 @@ def similarities(descriptors: list[np.ndarray], seed: int) -> np.ndarray:
     Args:
         descriptors: (N, 128) uint8 of each photo; N may be 0.
         seed: of the sample and of where k-means starts.
+        progress: called with the number of photos that are done.
 
     Returns:
         (photos, photos) cosines in [-1, 1]; 0 for photos without features.
@@ -79,6 +84,7 @@ def similarities(descriptors: list[np.ndarray], seed: int) -> np.ndarray:
             values = found.astype(np.float32)
             nearest = _nearest(values, words)
             np.add.at(sums[photo], nearest, values - words[nearest])
+        progress(photo + 1)
     sums /= np.maximum(np.linalg.norm(sums, axis=2, keepdims=True), 1e-6)
     flat = sums.reshape(len(sums), -1)
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-6)

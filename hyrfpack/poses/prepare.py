@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
-import os
 import re
-import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
 import numpy as np
 from PIL import Image, ImageOps
 
 from hyrfpack.data import masks as mask_files
+from hyrfpack.data.archive import given_path
 from hyrfpack.data.equirectangular import FACES, Face, FaceFile, cut_panorama, face_lens, face_size, is_panorama
 from hyrfpack.data.folder import PhotoFacts, photo_facts
 from hyrfpack.data.pictures import opened, read_header
-from hyrfpack.errors import HyrfDataError, reason_of
+from hyrfpack.errors import HyrfDataError, reason_of, without_path
+from hyrfpack.poses.copying import copy_file
 from hyrfpack.poses.job import Device
 
 _AS_IS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")  # what other programs that read scenes know, too
@@ -29,6 +29,12 @@ _QUALITY = {"quality": 95, "subsampling": 0}
 _PNG_MODES = ("1", "L", "LA", "I", "I;16", "I;16B", "P", "RGB", "RGBA")
 _ORIENTATION = 0x0112
 _BURST = 2.0  # seconds between photos that follow each other
+
+_FACE_TAKEN = "another picture has the name of one of its faces"
+COPY = "a copy of"  # what the reason begins with for which a photo is left out
+
+Item = TypeVar("Item")
+Progress = Callable[[int], None]  # told how many photos are done
 
 
 @dataclass(frozen=True)
@@ -53,13 +59,16 @@ class Photo:
         return self.face is None and self.facts.orientation == 1 and self.facts.path.suffix.lower() in _AS_IS
 
 
-def look_at(root: Path, files: Sequence[Path], in_place: bool) -> tuple[list[Photo], dict[str, str]]:
+def look_at(
+    root: Path, files: Sequence[Path], in_place: bool, progress: Progress = lambda done: None
+) -> tuple[list[Photo], dict[str, str]]:
     """Read all headers. A panorama of the whole sphere becomes six photos, its faces.
 
     Args:
         root: the folder that names are relative to.
         files: in it.
         in_place: they stay where they are, as they are.
+        progress: called with the number of files that were read so far.
 
     Returns:
         Photos that can be used, sorted by name, and the reason for each other one.
@@ -73,7 +82,7 @@ def look_at(root: Path, files: Sequence[Path], in_place: bool) -> tuple[list[Pho
     first_with: dict[tuple[int, str], str] = {}
     sizes = Counter(path.stat().st_size for path in files)
     with ThreadPoolExecutor() as pool:
-        found = list(pool.map(_facts_or_reason, files))
+        found = list(_counted(pool.map(_facts_or_reason, files), progress))
     for path, facts in zip(files, found, strict=True):
         source = path.relative_to(root).as_posix()
         if isinstance(facts, str):
@@ -83,9 +92,13 @@ def look_at(root: Path, files: Sequence[Path], in_place: bool) -> tuple[list[Pho
         if sizes[size] > 1:
             original = first_with.setdefault((size, _digest(path)), source)
             if original != source:
-                left_out[source] = f"a copy of {original}"
+                left_out[source] = f"{COPY} {original}"
                 continue
-        if is_panorama(path):
+        panorama = _is_panorama_or_reason(path)
+        if isinstance(panorama, str):
+            left_out[source] = panorama
+            continue
+        if panorama:
             if in_place:
                 raise HyrfDataError(
                     f"{path}: this picture shows all around and cannot be cut into photos where it is; put such "
@@ -96,7 +109,7 @@ def look_at(root: Path, files: Sequence[Path], in_place: bool) -> tuple[list[Pho
                 taken.update(face.name for face in faces)
                 photos += faces
             else:
-                left_out[source] = "another picture has the name of one of its faces"
+                left_out[source] = _FACE_TAKEN
             continue
         photo = Photo(source, facts, source)
         if not (in_place or photo.kept):
@@ -104,6 +117,11 @@ def look_at(root: Path, files: Sequence[Path], in_place: bool) -> tuple[list[Pho
             taken.add(photo.name)
         photos.append(photo)
     return sorted(photos, key=lambda photo: photo.name), left_out
+
+
+def only_unreadable(left_out: Mapping[str, str]) -> dict[str, str]:
+    """Of the photos that `look_at` leaves out, those that cannot be read."""
+    return {name: reason for name, reason in left_out.items() if not reason.startswith((COPY, _FACE_TAKEN))}
 
 
 def devices_of(photos: Sequence[Photo], in_place: bool) -> tuple[tuple[Device, ...], tuple[int, ...]]:
@@ -144,16 +162,24 @@ def in_order(photos: Sequence[Photo]) -> bool:
     return len(stems) == 1 and len(set(numbers)) == len(numbers)
 
 
-def make_images(photos: Sequence[Photo], folder: Path) -> None:
-    """Put the photos into a new folder: links to files that can be used as they are, upright copies of others, faces of
-    panoramas."""
+def make_images(photos: Sequence[Photo], folder: Path, progress: Progress = lambda done: None) -> None:
+    """Put the photos into a new folder: copies of files that can be used as they are, upright pictures of others, faces
+    of panoramas.
+
+    Args:
+        photos: to put there, by their names.
+        folder: the new folder.
+        progress: called with the number of photos that are there so far.
+    """
     for parent in {(folder / photo.name).parent for photo in photos}:
         parent.mkdir(parents=True, exist_ok=True)
     whole = [photo for photo in photos if photo.face is None]
     with ThreadPoolExecutor() as pool:
-        list(pool.map(lambda photo: _put(photo, folder / photo.name), whole))
-    for path, place in {photo.facts.path: (folder / photo.name).parent for photo in photos if photo.face}.items():
+        list(_counted(pool.map(lambda photo: _put(photo, folder / photo.name), whole), progress))
+    panoramas = {photo.facts.path: (folder / photo.name).parent for photo in photos if photo.face}
+    for number, (path, place) in enumerate(panoramas.items(), start=1):
         cut_panorama(path, place)
+        progress(len(whole) + number * len(FACES))
 
 
 def find_masks(photos: Sequence[Photo], folder: Path) -> dict[str, Path]:
@@ -188,7 +214,7 @@ def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) ->
                 image.getexif()[_ORIENTATION] = photo.facts.orientation
                 ImageOps.exif_transpose(image).save(target)
             elif mask.suffix.lower() == ".png":
-                _link(mask, target)
+                copy_file(mask, target)
             else:
                 image.convert("RGB").save(target)
         made[photo.name] = target
@@ -199,7 +225,27 @@ def _facts_or_reason(path: Path) -> PhotoFacts | str:
     try:
         return photo_facts(path)
     except HyrfDataError as error:
-        return str(error).removeprefix(f"{path}: ")
+        return _reason(error, path)
+
+
+def _is_panorama_or_reason(path: Path) -> bool | str:
+    """Whether a picture is a panorama; why not even that can be told."""
+    try:
+        return is_panorama(path)
+    except HyrfDataError as error:
+        return _reason(error, path)
+
+
+def _reason(error: HyrfDataError, path: Path) -> str:
+    """Why a photo cannot be used, without its path and what to do, which is said of all such photos at once."""
+    return without_path(error, given_path(path)).partition(";")[0]
+
+
+def _counted(items: Iterable[Item], progress: Progress) -> Iterator[Item]:
+    """The items; tells how many were taken so far."""
+    for number, item in enumerate(items, start=1):
+        progress(number)
+        yield item
 
 
 def _digest(path: Path) -> str:
@@ -229,7 +275,7 @@ def _written_name(source: str, taken: set[str]) -> str:
 
 def _put(photo: Photo, target: Path) -> None:
     if photo.kept:
-        _link(photo.facts.path, target)
+        copy_file(photo.facts.path, target)
         return
     with opened(photo.facts.path) as image:
         try:
@@ -237,7 +283,7 @@ def _put(photo: Photo, target: Path) -> None:
         except Exception:  # Pillow's decoders raise whatever they meet
             upright = None
         if upright is None or upright.mode == "F":  # cannot be decoded, or shown: left out when features are found
-            _link(photo.facts.path, target)
+            copy_file(photo.facts.path, target)
             return
         jpeg = target.suffix.lower() in (".jpg", ".jpeg")
         modes = ("L", "RGB") if jpeg else _PNG_MODES
@@ -247,14 +293,3 @@ def _put(photo: Photo, target: Path) -> None:
             upright = upright.convert("RGB")
         kept = {"icc_profile": profile} if profile else {}
         upright.save(target, "JPEG" if jpeg else "PNG", **(_QUALITY if jpeg else {}), **kept)
-
-
-def _link(source: Path, target: Path) -> None:
-    """A hard link, or a copy where the file system has none or is another."""
-    real = os.path.realpath(source)
-    try:
-        os.link(real, target)
-    except OSError as error:
-        if error.errno == errno.ENOSPC:
-            raise
-        shutil.copy2(real, target)

@@ -10,11 +10,21 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from queue import Empty, Queue
+from threading import Thread
 from typing import Any
 
 from hyrfpack.errors import HyrfDataError, HyrfError
 
+REPEAT_SECONDS = 2.0  # without news, after which the last is told again: what is shown then goes on counting
 _PATIENCE = 3.0  # seconds that a process gets to end before it is killed
+_DOING = {
+    "features": "finding features",
+    "matches": "matching photos",
+    "global": "posing all photos at once",
+    "incremental": "posing photos one by one",
+}
+_FINISHING = "finishing the poses"
 _ROOT = str(Path(__file__).parents[2])  # what hyrfpack is imported from
 
 Tell = Callable[[str, float], None]
@@ -33,7 +43,7 @@ def run_stage(job: Path, stage: str, tell: Tell, *more: str) -> dict[str, Any]:
     Args:
         job: file of the Job.
         stage: its name, as `worker.run` knows it.
-        tell: called with what is going on and the share of the stage that is done.
+        tell: called with what is going on and the share of the stage that is done, at least every two seconds.
         more: arguments of the stage.
 
     Returns:
@@ -60,7 +70,7 @@ def run_stage(job: Path, stage: str, tell: Tell, *more: str) -> dict[str, Any]:
             start_new_session=True,  # Ctrl-C reaches this process alone, which ends the other
         )
         try:
-            answer = _listen(process, tell)
+            answer = _listen(process, tell, _DOING.get(stage, _FINISHING))
             code = process.wait()
         finally:
             _end(process)
@@ -71,18 +81,37 @@ def run_stage(job: Path, stage: str, tell: Tell, *more: str) -> dict[str, Any]:
     return answer
 
 
-def _listen(process: subprocess.Popen, tell: Tell) -> dict[str, Any]:
-    """Hear a process out; returns its answer, empty if it gives none."""
+def _listen(process: subprocess.Popen, tell: Tell, doing: str) -> dict[str, Any]:
+    """Hear a process out, and tell `doing` until it says something itself; returns its answer, empty for none."""
     answer: dict[str, Any] = {}
-    assert process.stdout is not None
-    for line in process.stdout:
+    latest: dict[str, Any] = {"doing": doing, "share": 0.0}
+    tell(latest["doing"], latest["share"])
+    lines: Queue[str | None] = Queue()
+    Thread(target=_read_lines, args=(process, lines), daemon=True).start()
+    while True:
+        try:
+            line = lines.get(timeout=REPEAT_SECONDS)
+        except Empty:
+            tell(latest["doing"], latest["share"])
+            continue
+        if line is None:
+            return answer
         with suppress(ValueError):  # what a library prints is no JSON
             message = json.loads(line)
             if isinstance(message, dict) and "doing" in message:
-                tell(message["doing"], message["share"])
+                latest = message
+                tell(latest["doing"], latest["share"])
             elif isinstance(message, dict) and "answer" in message:
                 answer = message["answer"]
-    return answer
+
+
+def _read_lines(process: subprocess.Popen, lines: Queue[str | None]) -> None:
+    """Put the lines of a process into a queue, and None behind the last."""
+    assert process.stdout is not None
+    with suppress(ValueError, OSError):  # closed by `_end`
+        for line in process.stdout:
+            lines.put(line)
+    lines.put(None)
 
 
 def _end(process: subprocess.Popen) -> None:
@@ -101,12 +130,7 @@ def _end(process: subprocess.Popen) -> None:
 
 def _explain(stage: str, code: int, log: Path) -> str:
     """One sentence about a process that ended without an answer."""
-    doing = {
-        "features": "finding features",
-        "matches": "matching photos",
-        "global": "posing all photos at once",
-        "incremental": "posing photos one by one",
-    }.get(stage, "finishing the poses")
+    doing = _DOING.get(stage, _FINISHING)
     text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
     if "disk is full" in text or "No space left" in text or "disk I/O error" in text:
         return f"{log.parent}: the disk is full; free some space and run the same command again, which goes on here"

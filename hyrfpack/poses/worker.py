@@ -20,13 +20,15 @@ import hyrfpack  # first: it imports zlib before pycolmap  # noqa: F401
 from hyrfpack.errors import HyrfError
 from hyrfpack.poses.job import Job
 
+_one_at_a_time = threading.Lock()  # a second thread tells of progress during long calls, see `watch`
 _DIES_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 
 
 def say(message: dict[str, Any]) -> None:
     """Send one line to whoever started this."""
-    sys.stdout.write(json.dumps(message) + "\n")
-    sys.stdout.flush()
+    with _one_at_a_time:
+        sys.stdout.write(json.dumps(message) + "\n")
+        sys.stdout.flush()
 
 
 def tell(doing: str, share: float) -> None:

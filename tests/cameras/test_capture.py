@@ -137,3 +137,43 @@ def test_cameras_without_sense_are_one_sentence(cameras):
 def test_a_forged_viewpoint_is_an_error_of_the_files(change):
     with pytest.raises(HyrfDataError, match="viewpoint"):
         orbit(Capture(facts(viewpoint={**Viewpoint.of(ring(3)).to_json(), **change})).viewpoint, 2)
+
+
+@pytest.mark.parametrize("kind", ["all cameras", "coarse cameras"])
+def test_photos_of_training_match_what_the_model_keeps_also_with_another_split(kind):
+    scene = ball_scene(20)
+    kept = provenance_of(scene)
+    capture = Capture(facts(**(kept if kind == "all cameras" else coarse(kept, 1.0))), scene)
+    assert capture.mismatch == ""
+    half = replace(scene, train=scene.test, test=scene.train[::2])
+    assert replace(capture, scene=half).mismatch == ""
+
+
+@pytest.mark.parametrize("kind", ["all cameras", "coarse cameras"])
+def test_photos_of_another_scene_or_in_another_frame_do_not_match_what_the_model_keeps(kind):
+    scene = ball_scene(20)
+    kept = provenance_of(scene)
+    model = facts(**(kept if kind == "all cameras" else coarse(kept, 1.0)))
+    moved_world, turned_world = np.eye(4), np.diag([-1.0, 1.0, -1.0, 1.0])
+    moved_world[0, 3] = 0.5
+    for change in (moved_world, turned_world):
+        views = [
+            replace(view, camera=replace(view.camera, camera_from_world=view.camera.camera_from_world @ change))
+            for view in scene.train
+        ]
+        sentence = Capture(model, replace(scene, path="other", train=views, test=[])).mismatch
+        assert sentence.startswith("other: of the ") and "another coordinate frame; name the photos" in sentence
+
+
+def test_one_camera_that_two_sets_share_by_chance_does_not_make_them_match():
+    scene, other = ball_scene(20), ball_scene(20, offset=(40.0, 0.0, 0.0))
+    other.train[3] = replace(other.train[3], camera=scene.train[3].camera)
+    sentence = Capture(facts(**provenance_of(scene)), other).mismatch
+    assert f"of the {len(scene.train)} cameras that the model keeps of its training, 1 is among" in sentence
+
+
+def test_without_photos_or_kept_cameras_there_is_no_mismatch():
+    scene = ball_scene(5)
+    assert Capture(facts(**provenance_of(scene))).mismatch == ""
+    assert Capture(facts(), scene).mismatch == ""
+    assert Capture(facts(cameras=[["damaged"]]), scene).mismatch == ""

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from hyrfpack.data.archive import unpacked
 from hyrfpack.data.pictures import PhotoFile, read_header, read_mask, read_orientation, read_pixels, same_aspect
 from hyrfpack.data.undistort import Lens
-from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.errors import HyrfDataError
 
 RAMP = np.arange(48, dtype=np.uint8).reshape(6, 8) * 5
 
@@ -126,9 +128,32 @@ def test_heic_photos_without_the_package_are_one_sentence(tmp_path, monkeypatch)
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
 
     with pytest.raises(
-        HyrfError, match=r"a\.HEIC: reading HEIC photos needs pillow-heif; run 'pip install pillow-heif'"
+        HyrfDataError, match=r"""a\.HEIC: reading HEIC photos needs pillow-heif; run 'pip install "hyrfpack\[heic\]"'"""
     ):
         read_header(tmp_path / "a.HEIC")
+
+
+@pytest.mark.parametrize("ending", ["NEF", "dng", "CR2"])
+def test_raw_files_are_refused_although_pillow_would_read_their_preview(tmp_path, ending):
+    Image.fromarray(RAMP).save(tmp_path / "preview.tif")
+    (tmp_path / f"a.{ending}").write_bytes((tmp_path / "preview.tif").read_bytes())
+
+    with pytest.raises(HyrfDataError, match="raw files are not supported; export them as JPEG"):
+        read_header(tmp_path / f"a.{ending}")
+
+
+def test_a_photo_out_of_an_archive_is_named_by_its_place_in_the_archive(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    Image.fromarray(RAMP).save(tmp_path / "a.png")
+    whole = (tmp_path / "a.png").read_bytes()
+    with zipfile.ZipFile(tmp_path / "set.zip", "w") as archive:
+        archive.writestr("set/images/cut.png", whole[: len(whole) - 30])
+        archive.writestr("set/notes.txt", "")
+    folder = unpacked(tmp_path / "set.zip")
+
+    with pytest.raises(HyrfDataError) as error:
+        read_pixels(folder / "images" / "cut.png")
+    assert str(error.value).startswith(f"{tmp_path / 'set.zip' / 'set' / 'images' / 'cut.png'}: cannot decode")
 
 
 def test_mask_is_resized_by_nearest_neighbour(tmp_path):

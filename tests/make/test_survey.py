@@ -145,7 +145,7 @@ def test_damaged_photos_are_named_and_the_others_described(photos):
     (photos / "004.jpg").write_bytes(whole[: len(whole) // 2])
     survey = describe_photos(photos)
     assert survey.decoded == 22
-    assert "003.jpg" in problem(survey, "2 photos cannot be read")
+    assert "003.jpg" in problem(survey, "2 of 24 photos cannot be read")
 
 
 def test_poses_that_cannot_be_used_are_a_problem_of_the_set(data, tmp_path):
@@ -173,7 +173,7 @@ def test_a_zip_is_described_as_its_folder(data, tmp_path, monkeypatch):
 
 
 def test_where_there_are_no_photos_it_says_so(tmp_path):
-    for name, sentence in (("", "no photos here"), ("IMG.dng", "only raw photos"), ("clip.MP4", "name the video")):
+    for name, sentence in (("", "no photos here"), ("IMG.dng", "raw file"), ("clip.MP4", "name the video itself")):
         if name:
             (tmp_path / name).touch()
         with pytest.raises(HyrfDataError, match=sentence):

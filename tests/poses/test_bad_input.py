@@ -33,7 +33,9 @@ def test_no_photos(tmp_path):
     (tmp_path / "photos").mkdir()
     assert "there are no photos here" in refused("poses", tmp_path / "photos", "-o", tmp_path / "scene")
     (tmp_path / "photos" / "clip.MP4").touch()
-    assert "name the video itself: clip.MP4" in refused("poses", tmp_path / "photos", "-o", tmp_path / "scene")
+    assert "the video clip.MP4; name the video itself" in refused(
+        "poses", tmp_path / "photos", "-o", tmp_path / "scene"
+    )
     assert "no such folder or video" in refused("poses", tmp_path / "missing", "-o", tmp_path / "scene")
 
 
@@ -59,14 +61,17 @@ def test_files_that_are_no_pictures(tmp_path):
     for number in range(4):
         (tmp_path / "photos" / f"{number}.jpg").write_bytes(b"no picture %d" % number)
     sentence = refused("poses", tmp_path / "photos", "-o", tmp_path / "scene")
-    assert "4 of 4 photos cannot be read" in sentence and "replace the files" in sentence
+    assert "4 of 4 photos cannot be read: 0.jpg, 1.jpg, 2.jpg and 1 more" in sentence
+    assert sentence.endswith("copy them again, or remove them")
 
 
 def test_photos_cut_off_in_the_middle(tmp_path):
     photos = save(tmp_path / "photos", random_pictures(4))
     for path in photos.iterdir():
         path.write_bytes(path.read_bytes()[:2000])
-    assert "0 of 4 photos can be decoded" in refused("poses", photos, "-o", tmp_path / "scene")
+    sentence = refused("poses", photos, "-o", tmp_path / "scene")
+    assert "4 of 4 photos cannot be read: 00.png, 01.png, 02.png and 1 more (cannot decode the picture" in sentence
+    assert ".poses" not in sentence
 
 
 def test_photos_with_nothing_in_them(tmp_path):

@@ -14,7 +14,7 @@ from scipy import ndimage
 
 import hyrfpack
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.poses.frames import RECORD, choose_frames, is_video
+from hyrfpack.poses.frames import RECORD, choose_frames, frame_times, is_video
 from hyrfpack.poses.hdr import HLG, PQ, standard_range
 from hyrfpack.poses.motion import distances, track
 
@@ -282,3 +282,35 @@ def test_poses_of_a_video_that_go_on_still_say_how_many_frames_were_taken(wall, 
             hyrfpack.estimate_poses(video, tmp_path / "scene", report=stop, say=sentences.append)
     assert said[1] == ["an interrupted estimation goes on", *said[0]]
     assert "frames were taken" in said[0][0]
+
+
+def test_frames_keep_their_times_so_that_messages_can_name_them(wall, tmp_path):
+    times = [int(1000 * number / 30) + (500 if number >= 30 else 0) for number in range(60)]
+    video = write(tmp_path / "clip.mp4", [seen(wall, 4 * number) for number in range(60)], times=times)
+    choose_frames(video, tmp_path / "frames")
+    found = frame_times(tmp_path / "frames")
+    assert sorted(found) == [f"frame_{number:06d}.jpg" for number in taken(tmp_path / "frames")]
+    for name, seconds in found.items():
+        assert seconds == pytest.approx(times[int(name[6:12])] / 1000, abs=0.002)
+
+
+def test_a_video_tells_how_far_it_is_at_each_step(wall, tmp_path):
+    told: list[tuple[str, float]] = []
+    video = write(tmp_path / "clip.mp4", [seen(wall, 4 * number) for number in range(60)])
+    choose_frames(video, tmp_path / "frames", report=lambda *now: told.append(now))
+    shares = [share for _, share in told]
+    assert shares == sorted(shares) and shares[-1] == 1
+    for words in ("looking at frame 60, 2 s of 2 s", "following the motion, frame 59 of 60", "writing frames, "):
+        assert any(words in doing for doing, _ in told), words
+
+
+def test_a_frame_that_is_left_out_is_named_with_its_time(wall, tmp_path):
+    from hyrfpack.poses.estimate import _Estimation
+
+    video = write(tmp_path / "clip.mp4", [seen(wall, 4 * number) for number in range(60)])
+    estimation = _Estimation(video, tmp_path / "scene", "auto", None, 0, None, None)
+    (tmp_path / "scene").mkdir()
+    estimation.output.check(video, overwrite=False)
+    job = estimation._prepare()
+    number = int(job.names[5][6:12])
+    assert estimation._name(job.names[5]) == f"{job.names[5]} (at {number / 30:.1f} s)"

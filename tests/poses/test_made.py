@@ -59,11 +59,15 @@ def pictures(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.glob("*.png"))
 
 
+def same_bytes(first: Path, second: Path) -> bool:
+    return first.read_bytes() == second.read_bytes()
+
+
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_links_that_are_all_that_is_left_of_the_photos_are_posed_again_in_place(tmp_path):
+def test_copies_that_are_all_that_is_left_of_the_photos_are_posed_again_in_place(tmp_path):
     finished(photos(tmp_path / "photos"), tmp_path / "scene")
     shutil.rmtree(tmp_path / "photos")
     for source in (tmp_path / "scene", tmp_path / "scene" / "images"):
@@ -73,11 +77,11 @@ def test_links_that_are_all_that_is_left_of_the_photos_are_posed_again_in_place(
         assert pictures(tmp_path / "scene" / "images") == ["0.png", "1.png", "2.png", "3.png"]
 
 
-def test_photos_beside_the_links_to_them_go_on_where_they_were(tmp_path):
+def test_photos_beside_the_copies_of_them_go_on_where_they_were(tmp_path):
     scene, said = photos(tmp_path / "scene"), []
     begin(scene, scene)
     begin(scene, scene, say=said.append)
-    assert said == ["an interrupted estimation goes on"]
+    assert said[0] == "an interrupted estimation goes on"
     begin(scene, scene, seed=1)
     finished(scene, scene, seed=1)
     assert pictures(scene) == pictures(scene / "images") == ["0.png", "1.png", "2.png", "3.png"]
@@ -87,9 +91,9 @@ def test_other_photos_take_the_place_of_those_that_we_put_there_and_of_no_others
     finished(photos(tmp_path / "photos"), tmp_path / "scene")
     begin(photos(tmp_path / "others", 1), tmp_path / "scene", overwrite=True)
     images = tmp_path / "scene" / "images"
-    assert (images / "0.png").samefile(tmp_path / "photos" / "0.png")  # as long as there are no new poses
+    assert same_bytes(images / "0.png", tmp_path / "photos" / "0.png")  # as long as there are no new poses
     finished(tmp_path / "others", tmp_path / "scene", overwrite=True)
-    assert (images / "0.png").samefile(tmp_path / "others" / "0.png")
+    assert same_bytes(images / "0.png", tmp_path / "others" / "0.png")
     Image.new("RGB", (30, 20)).save(images / "mine.png")
     with pytest.raises(hyrfpack.HyrfError, match="not of these photos"):
         hyrfpack.estimate_poses(tmp_path / "photos", tmp_path / "scene", overwrite=True)
@@ -141,10 +145,10 @@ def test_old_poses_never_lie_beside_new_photos(moment, tmp_path, monkeypatch):
     ]
     if (scene / "sparse").exists():
         source = "photos" if moment == 0 else "others"
-        assert all((scene / "images" / f"{n}.png").samefile(tmp_path / source / f"{n}.png") for n in range(4))
+        assert all(same_bytes(scene / "images" / f"{n}.png", tmp_path / source / f"{n}.png") for n in range(4))
     if moment < 6:
         finished(tmp_path / "others", scene, overwrite=moment == 0)
-    assert (scene / "images" / "0.png").samefile(tmp_path / "others" / "0.png")
+    assert same_bytes(scene / "images" / "0.png", tmp_path / "others" / "0.png")
     assert sorted(os.listdir(scene)) == ["images", "poses.json", "sparse"]
 
 
@@ -206,7 +210,7 @@ def test_masks_that_lie_there_are_not_taken_for_those_that_were_named(tmp_path):
         hyrfpack.estimate_poses(tmp_path / "photos", tmp_path / "scene", masks=tmp_path / "named")
     shutil.rmtree(tmp_path / "scene" / "masks")
     finished(tmp_path / "photos", tmp_path / "scene", masks=tmp_path / "named")
-    assert (tmp_path / "scene" / "masks" / "0.png.png").samefile(tmp_path / "named" / "0.png")
+    assert same_bytes(tmp_path / "scene" / "masks" / "0.png.png", tmp_path / "named" / "0.png")
 
 
 @pytest.mark.parametrize("forged", ["{", "[]", '{"made": ["images"]}'])

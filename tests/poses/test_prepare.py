@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from PIL import Image
 import hyrfpack
 from hyrfpack.data.folder import list_photos, photo_facts
 from hyrfpack.data.pictures import read_pixels
+from hyrfpack.poses.copying import copy_file
 from hyrfpack.poses.job import Device, Job
 from hyrfpack.poses.prepare import Photo, devices_of, find_masks, in_order, look_at, make_images, make_masks
 
@@ -54,11 +56,55 @@ def test_photos_stored_on_their_side_are_written_upright(orientation, name, writ
         assert np.abs(np.asarray(image).astype(float) - upright()).mean() <= most
 
 
-def test_what_is_upright_is_linked_with_its_bytes(tmp_path):
-    save(tmp_path / "in" / "left" / "a.jpg", upright())
+def test_what_is_upright_is_copied_byte_for_byte_and_edits_of_one_do_not_reach_the_other(tmp_path):
+    original, copy = tmp_path / "in" / "left" / "a.jpg", tmp_path / "out" / "left" / "a.jpg"
+    save(original, upright())
+    before = original.read_bytes()
     photos, _ = looked_at(tmp_path / "in")
     make_images(photos, tmp_path / "out")
-    assert (tmp_path / "out" / "left" / "a.jpg").samefile(tmp_path / "in" / "left" / "a.jpg")
+    assert copy.read_bytes() == before and copy.stat().st_mtime_ns == original.stat().st_mtime_ns
+    with copy.open("r+b") as file:
+        file.write(b"edited")
+    assert original.read_bytes() == before
+    with original.open("r+b") as file:
+        file.write(b"changed too")
+    assert copy.read_bytes()[:6] == b"edited"
+
+
+def test_masks_are_copied_so_that_edits_do_not_reach_the_original(tmp_path):
+    save(tmp_path / "photos" / "a.jpg", upright())
+    (tmp_path / "masks").mkdir()
+    Image.new("L", (80, 60), 255).save(tmp_path / "masks" / "a.png")
+    photos, _ = looked_at(tmp_path / "photos")
+    made = make_masks(photos, find_masks(photos, tmp_path / "masks"), tmp_path / "made")
+    assert made["a.jpg"].read_bytes() == (tmp_path / "masks" / "a.png").read_bytes()
+    assert not made["a.jpg"].samefile(tmp_path / "masks" / "a.png")
+
+
+def test_where_the_file_system_has_reflinks_the_copy_is_one(tmp_path, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+    (tmp_path / "a.jpg").write_bytes(b"photo")
+    asked = []
+
+    def reflink(target: int, request: int, source: int) -> int:
+        asked.append(request)
+        os.write(target, os.read(source, 100))
+        return 0
+
+    monkeypatch.setattr(fcntl, "ioctl", reflink)
+    monkeypatch.setattr("shutil.copyfile", lambda *paths: pytest.fail("copied byte for byte"))
+    copy_file(tmp_path / "a.jpg", tmp_path / "b.jpg")
+    assert (tmp_path / "b.jpg").read_bytes() == b"photo"
+    assert asked == [0x40049409]  # FICLONE of linux/fs.h: _IOW(0x94, 9, int)
+
+
+def test_a_photo_whose_header_alone_is_whole_is_left_out_also_where_it_may_be_a_panorama(tmp_path):
+    path = save(tmp_path / "a.jpg", np.random.default_rng(0).integers(0, 255, (200, 400, 3), np.uint8))
+    path.write_bytes(path.read_bytes()[:5000])
+    save(tmp_path / "b.jpg", upright())
+    photos, left_out = looked_at(tmp_path)
+    assert [photo.name for photo in photos] == ["b.jpg"]
+    assert left_out["a.jpg"].startswith("cannot decode the picture")
 
 
 def test_photos_that_differ_in_their_ending_alone_keep_apart(tmp_path):
@@ -68,7 +114,7 @@ def test_photos_that_differ_in_their_ending_alone_keep_apart(tmp_path):
     photos, _ = looked_at(tmp_path / "in")
     assert len({photo.name for photo in photos}) == 5
     make_images(photos, tmp_path / "out")
-    assert (tmp_path / "out" / "a.png").samefile(tmp_path / "in" / "a.png")
+    assert (tmp_path / "out" / "a.png").read_bytes() == (tmp_path / "in" / "a.png").read_bytes()
 
 
 def test_what_is_stored_on_its_side_and_cut_off_is_put_there_to_be_left_out_by_itself(tmp_path):

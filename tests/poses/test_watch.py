@@ -1,0 +1,147 @@
+"""Progress of long library calls: read from what the library writes, told at least every two seconds."""
+
+from __future__ import annotations
+
+import sqlite3
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from hyrfpack.poses import process, watch
+from hyrfpack.poses.job import Job
+from hyrfpack.poses.watch import count_rows, global_mapping_phase, watching, watching_rows
+
+# Lines of pycolmap 4.2.1's global mapper, in the order of its work.
+LOG = [
+    "I2026 global_mapper.cc:553] === Running rotation averaging ===",
+    "I2026 global_mapper.cc:565] === Running track establishment ===",
+    "I2026 global_mapper.cc:575] === Running global positioning ===",
+    "I2026 global_mapper.cc:596] === Running iterative bundle adjustment ===",
+    "I2026 global_mapper.cc:391] Global bundle adjustment iteration 1 / 3, fixed-rotation stage finished",
+    "I2026 global_mapper.cc:401] Global bundle adjustment iteration 1 / 3 finished",
+    "I2026 global_mapper.cc:391] Global bundle adjustment iteration 2 / 3, fixed-rotation stage finished",
+    "I2026 global_mapper.cc:614] === Running iterative retriangulation and refinement ===",
+]
+
+
+def job_with_pairs(folder: Path, count: int) -> Job:
+    job = Job(folder, folder, ("a.png",), (), (0,), {}, "exhaustive", 0)
+    connection = sqlite3.connect(job.database)
+    connection.execute("PRAGMA journal_mode=WAL")
+    connection.execute("CREATE TABLE two_view_geometries (pair_id INTEGER)")
+    connection.executemany("INSERT INTO two_view_geometries VALUES (?)", [(number,) for number in range(count)])
+    connection.commit()
+    connection.close()
+    return job
+
+
+def test_the_phase_of_the_global_mapper_follows_its_log_and_never_goes_back():
+    found = [global_mapping_phase("\n".join(LOG[:lines])) for lines in range(len(LOG) + 1)]
+    assert [phase for phase, _ in found] == [
+        "",
+        "camera rotations",
+        "tracks of points",
+        "positions of cameras and points",
+        "bundle adjustment, round 1",
+        "bundle adjustment, round 2",
+        "bundle adjustment, round 2",
+        "bundle adjustment, round 3",
+        "triangulation and refinement",
+    ]
+    shares = [share for _, share in found]
+    assert shares == sorted(shares) and shares[0] == 0 and shares[-1] < 1
+
+
+def test_rows_are_counted_while_another_connection_writes(tmp_path):
+    job = job_with_pairs(tmp_path, 5)
+    writer = sqlite3.connect(job.database)
+    writer.execute("INSERT INTO two_view_geometries VALUES (9)")  # a transaction that is not committed
+    assert count_rows(job, "two_view_geometries") == 5
+    writer.commit()
+    assert count_rows(job, "two_view_geometries") == 6
+    writer.close()
+
+
+def test_rows_that_a_long_call_writes_are_told_while_it_runs(tmp_path, monkeypatch):
+    monkeypatch.setattr(watch, "LOOK_SECONDS", 0.01)
+    job, told, seen = job_with_pairs(tmp_path, 5), [], threading.Event()
+
+    def tell(count: int) -> None:
+        told.append(count)
+        if count == 2:
+            seen.set()
+
+    with watching_rows(job, "two_view_geometries", tell):
+        writer = sqlite3.connect(job.database)
+        writer.executemany("INSERT INTO two_view_geometries VALUES (?)", [(6,), (7,)])
+        writer.commit()
+        writer.close()
+        assert seen.wait(60)
+    assert told == sorted(told) and told[-1] == 2
+
+
+def test_what_cannot_be_read_does_not_end_the_call_that_is_watched(monkeypatch):
+    monkeypatch.setattr(watch, "LOOK_SECONDS", 0.01)
+    tried = threading.Event()
+
+    def look() -> None:
+        tried.set()
+        raise sqlite3.OperationalError("database is locked")
+
+    with watching(look):
+        assert tried.wait(60)
+
+
+def test_a_stage_that_says_nothing_for_long_is_told_again_and_again(tmp_path, monkeypatch):
+    """The worker tells something once and then ends only when it was told of three times."""
+    monkeypatch.setattr(process, "REPEAT_SECONDS", 0.05)
+    script = (
+        "import sys, json; print(json.dumps({'doing': 'solving', 'share': 0.5}), flush=True); sys.stdin.read(1); "
+        "print(json.dumps({'answer': {'found': 1}}), flush=True)"
+    )
+    worker = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    told: list[tuple[str, float]] = []
+
+    def tell(doing: str, share: float) -> None:
+        told.append((doing, share))
+        if told.count(("solving", 0.5)) == 3:
+            assert worker.stdin is not None
+            worker.stdin.write("x")
+            worker.stdin.flush()
+
+    answer = process._listen(worker, tell, "starting")
+    process._end(worker)
+    assert answer == {"found": 1}
+    assert told[0] == ("starting", 0.0) and told.count(("solving", 0.5)) >= 3
+
+
+def test_every_stage_tells_how_far_it_is_by_its_own_measure(posed):
+    doings = [doing for doing, _ in posed[2]]
+    for words in (
+        "reading the headers of photos, 8 of 8",
+        "copying photos, 8 of 8",
+        "features of photo ",
+        "matching pair ",
+        "estimating focal lengths",
+        "posing all photos at once, run 1 of 3",
+        "posing photos one by one, 8 of 8 posed",
+        "comparing the results",
+        "adding points",
+        "finding the lens distortion",
+        "colouring points, photo 8 of 8",
+    ):
+        assert any(words in doing for doing in doings), words
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_shares_told_out_of_order_never_go_back(share, tmp_path):
+    from hyrfpack.poses.estimate import _Estimation
+
+    told: list[float] = []
+    estimation = _Estimation(tmp_path, tmp_path / "scene", "auto", None, 0, lambda doing, done: told.append(done), None)
+    estimation._tell("matches", "matching", 0.9)
+    estimation._tell("matches", "matching", share)
+    assert told[0] == told[1]
