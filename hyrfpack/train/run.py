@@ -35,6 +35,7 @@ from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.log import TrainingLog
 from hyrfpack.train.pilots import MOST_STEPS, is_undecided, is_usable, measure_budget, measures_budget
 from hyrfpack.train.progress import ProgressLine
+from hyrfpack.train.setup import check_target
 from hyrfpack.train.trainer import Trainer
 
 MODEL, CHECKPOINT, METRICS, CURVE, VIEWS = "model.hyrf", "checkpoint.pt", "metrics.json", "curve.png", "views"
@@ -119,6 +120,7 @@ def train(
     out = Path(out)
     config = TrainConfig() if config is None else config
     check_type("config", config, TrainConfig)
+    check_target(scene, config)
     checkpoint = out / CHECKPOINT
     device = choose_own_device(device, ranks)
     resume = ranks.first(resume or (ranks.restarts > 0 and checkpoint.is_file()))
