@@ -52,7 +52,5 @@ def posed(
     reporter = Reporter(["poses"], report)
     reporter.begin("poses")
     with interruptible():
-        estimate_poses(
-            source.path, scene, overwrite=overwrite, report=lambda doing, share: reporter.update(share, doing), say=say
-        )
+        estimate_poses(source.path, scene, overwrite=overwrite, report=reporter.tell, say=say)
     return scene
