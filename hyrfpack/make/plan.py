@@ -21,7 +21,6 @@ BACKGROUND_PASSES = 8.0  # as long as so many such drawings takes the search for
 PASSES_PER_SCORED_VIEW = 30.0  # most of it to predict the photo's exposure from those beside it
 POSES = 3.0  # for a photo
 UNKNOWN = 100  # photos, where that is not known yet
-EXPECTED_PILOT_STEPS = 3 * MOST_STEPS // 4  # half of all scenes need half of them
 
 
 @dataclass(frozen=True)
@@ -130,7 +129,7 @@ def forecast_scene(scene: Scene, plan: Plan, device: torch.device) -> dict[str, 
     """`forecast` for photos that are known."""
     config = plan.config(seed=0)
     gaussians, _ = budget_for(scene, config)
-    pilot_steps = EXPECTED_PILOT_STEPS if measures_budget(scene, config) else 0
+    pilot_steps = MOST_STEPS if measures_budget(scene, config) else 0
     return forecast(megapixels(scene), plan, gaussians, len(scene.test), pilot_steps, device)
 
 
@@ -139,5 +138,5 @@ def forecast_photos(sizes: Sequence[tuple[int, int]], plan: Plan, device: torch.
     width, height = sizes[0] if sizes else (1920, 1080)
     shrunk = min(1.0, plan.max_size / max(width, height)) if plan.max_size else 1.0
     pixels, count = width * height * shrunk**2 / 1e6, len(sizes) or UNKNOWN
-    pilot_steps = EXPECTED_PILOT_STEPS if plan.steps >= LEAST_STEPS and is_undecided(plan.config(seed=0)) else 0
+    pilot_steps = MOST_STEPS if plan.steps >= LEAST_STEPS and is_undecided(plan.config(seed=0)) else 0
     return {"poses": POSES * count, **forecast(pixels, plan, 20_000, count // 8, pilot_steps, device)}

@@ -9,7 +9,7 @@ from time import monotonic
 
 # Training: short runs that measure the budget, the run itself, its scores and pictures.
 STAGE_PARTS = {"training": ("pilots", "training", "results")}
-PACED_PARTS = ("training",)  # steps that are all alike: their pace says how fast the machine is
+PACED_PARTS = ("pilots", "training")  # steps that are all alike: their pace says how fast the machine is
 UNPACED_PARTS = ("poses", "measurement")  # limited by something else than what training is limited by
 MIN_PACE_SHARE, MIN_PACE_SECONDS = 0.01, 2.0  # of a part, from which on its pace says how long it takes
 MIN_SAMPLE_SECONDS = 0.5  # between two shares that are remembered
@@ -57,7 +57,7 @@ class Reporter:
         self._watch: Callable[[], None] = lambda: None
         self._part = parts_of(stages[0])[0]
         self._samples: list[tuple[float, float]] = []  # time and share, of the present part
-        self._began, self._slowdown, self._shown = monotonic(), 1.0, 0.0
+        self._began, self._share, self._shown, self._slowdown = monotonic(), 0.0, 0.0, 1.0
 
     @contextmanager
     def watched_by(self, watch: Callable[[], None]) -> Iterator[None]:
@@ -80,7 +80,7 @@ class Reporter:
 
     def skip(self, stage: str, seconds: float) -> None:
         """Take in that an earlier call has done a stage, in so many seconds."""
-        if stage in PACED_PARTS:
+        if stage in STAGE_PARTS:
             forecast = sum(self.estimates.get(part, 0.0) for part in parts_of(stage))
             self._set_slowdown(seconds, forecast)
 
@@ -92,6 +92,7 @@ class Reporter:
             words: what there is to say of it, the most important first.
         """
         self._watch()
+        self._share = share
         if self._report is None:
             return
         now = monotonic()
@@ -108,6 +109,10 @@ class Reporter:
     def tell(self, doing: str, share: float) -> None:
         """`update` in the form in which library functions report."""
         self.update(share, doing)
+
+    def say(self, sentence: str) -> None:
+        """Report what the present part is doing; its share stays as it was."""
+        self.update(self._share, sentence)
 
     def _left_of_part(self, share: float, now: float) -> float | None:
         """Seconds until the present part is done; None where nothing tells."""

@@ -159,14 +159,11 @@ def pack(work: Work, scene: Scene, plan: Plan, device: torch.device) -> dict[str
     """Compress into `model.hyrf`; returns bytes and Gaussians."""
 
     def act(going_on: bool) -> tuple[dict, list[str]]:
-        def say(sentence: str) -> None:
-            work.reporter.update(0.0, sentence)
-
         source, target = work.folder / RUN / MODEL, work.folder / PACKED
         try:
             report = compress(
                 source, target, data=scene, finetune_steps=plan.finetune_steps, target_bytes=plan.target_bytes,
-                device=device, say=say,
+                device=device, say=work.reporter.say,
             )  # fmt: skip
         except HyrfSizeError as error:
             anew = ", or name another work folder (--work) to train a smaller model for this size"
@@ -194,10 +191,7 @@ def import_splats(work: Work, source: Path, steps: int, seed: int) -> dict[str, 
     config = DistillConfig(steps=steps, seed=seed)
 
     def act(going_on: bool) -> tuple[dict, list[str]]:
-        def say(sentence: str) -> None:
-            work.reporter.update(0.0, sentence)
-
-        report = distill(source, work.folder / PACKED, config, say=say)
+        report = distill(source, work.folder / PACKED, config, say=work.reporter.say)
         return report.to_dict(), [PACKED]
 
     inputs = {"splats": digest_all(files, source.parent), "settings": asdict(config)}
@@ -212,14 +206,11 @@ def write(work: Work, model: Path, name: str, scene: Scene | None) -> tuple[dict
     target = work.folder / EXPORTED / name
 
     def act(going_on: bool) -> tuple[dict, list[str]]:
-        def say(sentence: str) -> None:
-            work.reporter.update(0.0, sentence)
-
         if name.lower().endswith(".hyrf"):
             copy(model, target)
             report: dict[str, Any] = {"bytes": target.stat().st_size}
         else:
-            made = export(model, target, data=scene, say=say)
+            made = export(model, target, data=scene, say=work.reporter.say)
             report = {**asdict(made), "file": name, "chosen_by": {}}
         files = sorted(target.rglob("*")) if target.is_dir() else [target]
         return report, [path.relative_to(work.folder).as_posix() for path in files if path.is_file()]

@@ -130,6 +130,16 @@ def test_forecasts_of_later_parts_are_scaled_by_the_pace_of_training(clock):
     assert told[-1].left == pytest.approx(3 * 16)
 
 
+def test_the_pace_of_pilots_tells_how_long_the_training_will_take(clock):
+    told: list[Progress] = []
+    reporter = Reporter(["training"], told.append)
+    reporter.estimates |= {"pilots": 40.0, "training": 300.0, "results": 5.0}
+    reporter.begin("training")
+    for clock[0] in range(1, 41):  # twice as slow as forecast
+        reporter.update(clock[0] / 80)
+    assert told[-1].left == pytest.approx(40 + 2 * (300 + 5))
+
+
 def test_a_training_of_an_earlier_call_tells_the_pace_too(clock):
     told: list[Progress] = []
     reporter = Reporter(["training", "compression"], told.append)
