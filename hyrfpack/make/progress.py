@@ -17,6 +17,8 @@ MAX_SAMPLES = 200  # of equal distance in time; there are more because the first
 TRUSTED_SECONDS = 20.0  # from which on the measured pace alone counts, and the forecast no longer
 OVERDUE_RATIO = 0.25  # of the time that an overdue part has taken: what it may take still
 SLOWDOWN_LIMITS = 0.1, 20.0  # of measured to forecast seconds
+# A busy machine slows a training, which waits for all its threads many times a step, more than what follows it.
+SLOWDOWN_EXPONENT = 0.7
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class Reporter:
 
     A stage has one or more parts, which follow each other. Before a part its time is known by a forecast only. While it
     works, its pace during the last half of its time counts more and more. Where the paced parts take longer than their
-    forecast, because the machine is slow or busy, the forecasts of the later ones are scaled by the same ratio.
+    forecast, because the machine is slow or busy, the forecasts of the later ones are scaled, too.
 
     Attributes:
         estimates: seconds of the parts, by name, as far as they can be forecast.
@@ -144,8 +146,9 @@ class Reporter:
             self._slowdown = min(max(seconds / forecast, low), high)
 
     def _forecast(self, part: str) -> float:
-        scale = 1.0 if part in UNPACED_PARTS else self._slowdown
-        return scale * self.estimates.get(part, 0.0)
+        """Seconds that a part will take, as far as the forecast and the pace of the paced parts tell."""
+        exponent = 0.0 if part in UNPACED_PARTS else 1.0 if part in PACED_PARTS else SLOWDOWN_EXPONENT
+        return self._slowdown**exponent * self.estimates.get(part, 0.0)
 
     def _later_parts(self) -> list[str]:
         parts = [part for stage in self._stages for part in parts_of(stage)]

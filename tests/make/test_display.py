@@ -10,7 +10,7 @@ from rich.console import Console
 
 from hyrfpack.make import display
 from hyrfpack.make.display import Display
-from hyrfpack.make.progress import Progress, Reporter
+from hyrfpack.make.progress import SLOWDOWN_EXPONENT, Progress, Reporter
 
 TRAINING = Progress("training", 2, 5, 0.2, 72.4, ("604/3,000", "PSNR 29.40", "4,850 Gaussians"))
 
@@ -125,9 +125,9 @@ def test_forecasts_of_later_parts_are_scaled_by_the_pace_of_training(clock):
     reporter.begin_part("training")
     for clock[0] in range(1, 151):  # three times slower than forecast
         reporter.update(clock[0] / 300)
-    assert told[-1].left == pytest.approx(150 + 3 * (4 + 16))
+    assert told[-1].left == pytest.approx(150 + 3**SLOWDOWN_EXPONENT * (4 + 16))
     reporter.begin("compression")
-    assert told[-1].left == pytest.approx(3 * 16)
+    assert told[-1].left == pytest.approx(3**SLOWDOWN_EXPONENT * 16)
 
 
 def test_the_pace_of_pilots_tells_how_long_the_training_will_take(clock):
@@ -137,7 +137,7 @@ def test_the_pace_of_pilots_tells_how_long_the_training_will_take(clock):
     reporter.begin("training")
     for clock[0] in range(1, 41):  # twice as slow as forecast
         reporter.update(clock[0] / 80)
-    assert told[-1].left == pytest.approx(40 + 2 * (300 + 5))
+    assert told[-1].left == pytest.approx(40 + 2 * 300 + 2**SLOWDOWN_EXPONENT * 5)
 
 
 def test_a_training_of_an_earlier_call_tells_the_pace_too(clock):
@@ -146,7 +146,7 @@ def test_a_training_of_an_earlier_call_tells_the_pace_too(clock):
     reporter.estimates |= {"pilots": 0.0, "training": 100.0, "results": 10.0, "compression": 16.0}
     reporter.skip("training", 220.0)
     reporter.begin("compression")
-    assert told[-1].left == pytest.approx(2 * 16)
+    assert told[-1].left == pytest.approx(2**SLOWDOWN_EXPONENT * 16)
 
 
 def test_a_stage_that_outlasts_its_forecast_is_never_said_to_be_over(clock):
