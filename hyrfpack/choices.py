@@ -13,5 +13,6 @@ LAYOUTS = (  # of photos and poses: the keys of `hyrfpack.data.LAYOUTS`
     "record3d",
 )
 MATCHING = ("auto", "exhaustive", "sequential", "retrieval")  # which photos are compared
+PRESETS = ("auto", "synthetic", "standard", "large", "street")  # the kind of scene that is trained
 PRECISIONS = ("mixed", "float32")  # what a GPU multiplies in
 QUALITIES = ("draft", "normal", "best")  # how long `make` works: the keys of `hyrfpack.make.QUALITIES`

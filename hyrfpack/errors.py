@@ -37,6 +37,18 @@ class HyrfFormatError(HyrfError):
     """A `.hyrf` file is damaged, hostile, or made by a newer version."""
 
 
+class HyrfSizeError(HyrfError):
+    """A model does not fit into the size that was asked for.
+
+    Attributes:
+        smallest: bytes that it takes at least, about; 0 where that is not known.
+    """
+
+    def __init__(self, sentence: str, smallest: int = 0) -> None:
+        super().__init__(sentence)
+        self.smallest = smallest
+
+
 class HyrfTrainingError(HyrfError):
     """Training cannot start or cannot go on (a loss that is not finite, a checkpoint that does not fit)."""
 

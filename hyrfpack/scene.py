@@ -6,8 +6,8 @@ Readers in `hyrfpack.data` bring every input to this form; nothing after them kn
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -218,6 +218,22 @@ class Scene:
             f"Scene({self.path!r}, {self.layout!r}: {len(self.train)} views to train on, {len(self.test)} held out, "
             f"{len(self.points)} points)"
         )
+
+    def with_held_out(self, names: Collection[str]) -> Scene:
+        """The same scene with other views held out.
+
+        Args:
+            names: of the views to hold out.
+
+        Raises:
+            ValueError: a name is of no view, or no view is left to train on.
+        """
+        if unknown := sorted(set(names) - {view.name for view in self.views}):
+            raise ValueError(f"no photo is named {unknown[0]}")
+        train = [view for view in self.views if view.name not in names]
+        if not train:
+            raise ValueError("all photos are held out and none is left to train on")
+        return replace(self, train=train, test=[view for view in self.views if view.name in names])
 
     @property
     def views(self) -> list[View]:

@@ -162,3 +162,19 @@ def test_pictures_and_scenes_are_equal_to_themselves_alone():
 
 def test_a_scene_prints_in_a_line():
     assert repr(ball_scene(3)) == "Scene('balls', 'colmap': 3 views to train on, 0 held out, 100 points)"
+
+
+def test_a_scene_holds_out_the_views_that_are_named_and_trains_on_the_others():
+    scene = ball_scene(5)
+    names = [view.name for view in scene.views]
+    split = scene.with_held_out([names[3]])
+    assert [view.name for view in split.test] == [names[3]]
+    assert [view.name for view in split.train] == [name for name in names if name != names[3]]
+    assert split.with_held_out([]).test == []
+
+
+@pytest.mark.parametrize("names, words", [(["nobody.jpg"], "no photo is named nobody.jpg"), (None, "none is left")])
+def test_holding_out_a_view_that_is_not_there_or_all_views_is_refused(names, words):
+    scene = ball_scene(3)
+    with pytest.raises(ValueError, match=words):
+        scene.with_held_out([view.name for view in scene.views] if names is None else names)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hyrfpack.choices import MATCHING, QUALITIES
+from hyrfpack.choices import MATCHING, PRESETS, QUALITIES
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
@@ -43,6 +43,13 @@ LISTED = 5  # photos that were left out
 )
 @click.option("--target-size", type=SIZE, metavar="SIZE", help="As good as can be in so many bytes, such as 2MB.")
 @click.option(
+    "--max-gaussians",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Budget of Gaussians, instead of --target-size.  [default: measured]",
+)
+@click.option("--preset", type=click.Choice(PRESETS), default="auto", show_default=True, help="The kind of scene.")
+@click.option(
     "--matching",
     type=click.Choice(MATCHING),
     default="auto",
@@ -74,6 +81,8 @@ def make(
     quality: str | None,
     minutes: float | None,
     target_size: int | None,
+    max_gaussians: int | None,
+    preset: str,
     matching: str,
     images: str | None,
     max_size: int | None,
@@ -103,6 +112,8 @@ def make(
     """
     if quality is not None and minutes is not None:
         raise click.UsageError("--quality and --minutes each decide how long to work; give one of them")
+    if target_size is not None and max_gaussians is not None:
+        raise click.UsageError("--max-gaussians and --target-size each decide how large the model is; give one of them")
     from hyrfpack.make import Stopped
     from hyrfpack.make import make as run
     from hyrfpack.make.display import Display
@@ -124,6 +135,8 @@ def make(
                 test_every=test_every,
                 matching=matching,
                 target_bytes=target_size,
+                max_gaussians=max_gaussians,
+                preset=preset,
                 seed=seed,
                 device=place,
                 overwrite=overwrite,
@@ -152,13 +165,16 @@ def _print(result: MakeResult) -> None:
         if (more := len(poses["left_out"]) - LISTED) > 0:
             click.echo(f"  left out: {more} more, see {result.work / 'scene' / 'poses.json'}")
     times = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())
-    click.echo(f"times: {times}; {result.work} keeps what each stage made, and may be deleted")
+    total = f"{result.total_seconds:.0f} s in all"
+    click.echo(f"times: {times}, {total}; {result.work} keeps what each stage made, and may be deleted")
     if result.psnr is not None:
         photos = f"{result.views} photo{'s' if result.views > 1 else ''}"
         predicted = at_predicted_exposure(result.psnr_predicted)
         click.echo(f"{photos} held out: PSNR {result.psnr:.2f} dB{predicted}, SSIM {result.ssim:.4f}")
     elif result.training:
         click.echo("no photo is held out, so that nothing is scored")
+    if result.note:
+        click.echo(result.note)
     click.echo(f"{result.output}: {result.bytes:,} bytes, {result.gaussians:,} Gaussians; {_where_to_look(result)}")
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from hyrfpack.choices import PRESETS
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
@@ -30,7 +31,6 @@ from hyrfpack.errors import HyrfNoPosesError
 if TYPE_CHECKING:
     from hyrfpack.parallel.ranks import Ranks
 
-PRESETS = ("auto", "synthetic", "standard", "large", "street")  # hyrfpack.train.PRESETS, without loading torch
 BACKGROUND_COLORS = ("black", "white", "random")
 
 

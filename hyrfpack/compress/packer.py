@@ -23,7 +23,7 @@ from hyrfpack.compress.search import coarsest, fullest
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.device import choose_own_device
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfError, HyrfSizeError
 from hyrfpack.evaluate import evaluate
 from hyrfpack.format.codec import (
     DEFAULT_PROFILE,
@@ -35,6 +35,7 @@ from hyrfpack.format.codec import (
     write_model,
 )
 from hyrfpack.format.info import describe
+from hyrfpack.format.smallest import check_target_bytes
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import ALONE, Ranks
@@ -141,6 +142,9 @@ def compress(
             f"{data.path}: all photos are held out, so there is none to measure at; use a larger --test-every"
         )
     model, provenance = load_with_provenance(source)
+    kept = coarse(provenance, model.config.frame.scale)
+    if target_bytes is not None:
+        check_target_bytes(target_bytes, kept)
     model = model.to(choose_own_device(device, ranks, say))
     model.precision = "float32"  # what is looked for is smaller than what a GPU rounds away otherwise
     if len(model) == 0:
@@ -150,7 +154,6 @@ def compress(
     start = distortion or default_distortion(provenance, finetune_steps)
     sensitivity, originals = calibrated(model, cameras, start, prune)
     sensitivity = ranks.first(sensitivity)  # on GPUs those of others differ in their last bits
-    kept = coarse(provenance, model.config.frame.scale)
     packer = Packer(model, kept, sensitivity, data, finetune_steps, prune, say, ranks=ranks)
     if target_bytes is not None:
         trial, found = packer.within_bytes(target_bytes, start)
@@ -247,9 +250,10 @@ class Packer:
         answer = fullest(attempt, lambda trial: len(trial.data), limit, start, self._trials(), LIMITS)
         if answer is None:
             smallest = len(self.attempt(LIMITS[1]).data)
-            raise HyrfError(
+            raise HyrfSizeError(
                 f"the model does not fit into {limit:,} bytes, the least is about {smallest:,}; "
-                "ask for more, or train with fewer Gaussians (--max-gaussians)"
+                "ask for more, or train with fewer Gaussians (--max-gaussians)",
+                smallest,
             )
         distortion, trial = answer
         return trial, f"distortion {distortion:.2g} gives {len(trial.data):,} of {limit:,} bytes"

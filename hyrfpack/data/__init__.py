@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ def load_scene(
     layout: str | None = None,
     model: str | None = None,
     max_size: int = DEFAULT_MAX_SIZE,
+    held_out: Collection[str] | None = None,
 ) -> Scene:
     """Read posed photos; pictures are decoded later, one by one, by `View.load`.
 
@@ -49,13 +51,15 @@ def load_scene(
             says so in `Scene.notes` when there was a choice.
         max_size: shrink photos with more pixels than this on the longer side to so many, as they are decoded; cameras
             and masks follow. 0 keeps them as they are. `Scene.notes` says how many are shrunk.
+        held_out: names of the views to hold out, instead of `test_every` and of a split of the set's own.
 
     Returns:
         The scene in the frame and units of its files.
 
     Raises:
         HyrfNoPosesError: there are photos, or it is a video, and there are no poses.
-        HyrfDataError: the folder cannot be used; one sentence says what, where, and what to do.
+        HyrfDataError: the folder cannot be used, or `held_out` names no photo or all; one sentence says what, where,
+            and what to do.
         ValueError: an unknown `layout`, a negative `test_every` or `max_size`.
 
     Example:
@@ -75,17 +79,18 @@ def load_scene(
     top = _folder_of(given, notes)
     reading = {"test_every": test_every, "images": images, "layout": layout, "model": model, "max_size": max_size}
     with naming_archives():
-        return _read(given, top, notes, reading)
+        return _read(given, top, notes, reading, held_out)
 
 
-def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any]) -> Scene:
+def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any], held_out: Collection[str] | None) -> Scene:
     """`load_scene` of a folder.
 
     Args:
         given: the folder or archive that the user named.
         top: the folder.
         notes: sentences for the user so far.
-        reading: the other arguments of `load_scene`.
+        reading: the other arguments of `load_scene`, but `held_out`.
+        held_out: as of `load_scene`.
     """
     layout, images, model = reading["layout"], reading["images"], reading["model"]
     folder, found = _find_set(top, layout, notes)
@@ -98,12 +103,20 @@ def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any]) -> 
     if model is not None and "model" not in reader.options:
         raise HyrfDataError(f"{folder}: the {chosen} layout has no COLMAP models to choose from; leave out '{model}'")
     wanted = {name: options[name] for name in reader.options}
-    scene = reader.read(folder, test_every=reading["test_every"], max_size=reading["max_size"], **wanted)
+    every = reading["test_every"] if held_out is None else 0
+    scene = reader.read(folder, test_every=every, max_size=reading["max_size"], **wanted)
     if len(found) > 1:
         notes.append(f"poses are there as {' and '.join(found)}; {chosen} was taken")
     scene.notes[:0] = notes
     files = (*scene.files, str(given)) if is_archive(given) else scene.files
-    return replace(scene, files=files, reading={"path": os.path.abspath(given), **reading, "layout": chosen})
+    reading = {**reading, "layout": chosen}
+    if held_out is not None:
+        try:
+            scene = scene.with_held_out(held_out)
+        except ValueError as error:
+            raise HyrfDataError(f"{folder}: {error}; name other photos to hold out") from error
+        reading["held_out"] = sorted(held_out)
+    return replace(scene, files=files, reading={"path": os.path.abspath(given), **reading})
 
 
 def _folder_of(given: Path, notes: list[str]) -> Path:

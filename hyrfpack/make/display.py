@@ -10,15 +10,16 @@ from time import monotonic
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.live import Live
 
-from hyrfpack.make.progress import Progress
+from hyrfpack.make.progress import OVERDUE_RATIO, Progress
 from hyrfpack.train.progress import LOG_EVERY, StatusLine, duration
 
 
 class Display:
     """Shows stage, share, what the stage has to say, and the time gone and left on standard error.
 
-    The clock runs on between two reports, for some stages cannot tell how far they are. A standard error that goes away
-    does not end the work.
+    The clock runs on between two reports, because some stages cannot tell how far they are. When the time that was
+    left at the last report is over, the time left grows with the silence. A standard error that goes away does not end
+    the work.
     """
 
     def __init__(self) -> None:
@@ -76,8 +77,9 @@ class Display:
             "gone": f"{duration(now - self._start)} gone",
         }
         if progress.left is not None:
-            left = progress.left - (now - at)
-            parts["left"] = f"about {duration(left)} left" if left >= 1 else "nearly done"
+            silent = now - at
+            left = max(progress.left - silent, OVERDUE_RATIO * silent, 1.0)
+            parts["left"] = f"about {duration(left)} left"
         return parts
 
     def _log(self) -> None:

@@ -13,16 +13,23 @@ import numpy as np
 import torch
 
 from hyrfpack.data import PictureCache
-from hyrfpack.make.plan import QUALITIES, Plan, megapixels, passes
+from hyrfpack.make.plan import (
+    BACKGROUND_PASSES,
+    PASSES_PER_SCORED_VIEW,
+    QUALITIES,
+    Plan,
+    megapixels,
+    passes,
+)
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.source import Reading
 from hyrfpack.make.work import Say
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render
-from hyrfpack.scene import Camera, Scene, evenly_spaced
+from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.config import FULL_STEPS
-from hyrfpack.train.pilots import MOST_STEPS, measure_budget, measures_budget
+from hyrfpack.train.pilots import MOST_STEPS, is_undecided, measure_budget, measures_budget
 from hyrfpack.train.setup import budget_for
 
 PROBE_STEPS = 45  # of a whole small run: from the first Gaussians to the budget
@@ -34,7 +41,7 @@ SIZES = (1200, 800, 600, 400)  # of photos, where the time is short
 SMALLEST = 640  # pixels: photos that are no larger are not shrunk further for the first measurement
 SETTLED = 0.92  # of the probe's pace per Gaussian: a trained scene hides more of what lies behind
 # A pass (drawing a view on the CPU and following it back) is the unit of all that comes after the training.
-SCORED, DRAWN_AFTER, VERIFIED = 0.6, 16, 12  # passes for a view that is scored; views that training and packing draw
+VERIFIED = 12  # views that packing draws
 PER_GAUSSIAN, OVERHEAD = 1.5e-4, 6.0  # seconds of coding and writing, for a Gaussian and for anything
 
 
@@ -47,8 +54,7 @@ class Cost:
         decoding: seconds that training waits for a photo to be decoded.
         cpu_pass: seconds to draw a view on the CPU and follow it back, at `gaussians`.
         gaussians: that the probe ended with.
-        target_bytes: that the packed model may have; None for no limit.
-        budget_factor: as in `TrainConfig`.
+        asked: what decides how many Gaussians there will be; its steps are not used.
     """
 
     step: float
@@ -56,8 +62,7 @@ class Cost:
     decoding: float
     cpu_pass: float
     gaussians: int
-    target_bytes: int | None = None
-    budget_factor: float | None = None
+    asked: Plan = Plan(FULL_STEPS, DEFAULT_MAX_SIZE)
 
     def scaled(self, pixels: float) -> Cost:
         """That of photos with so many times the pixels, by estimate."""
@@ -72,19 +77,20 @@ class Cost:
         return SETTLED * steps * step + self.decoding * min(steps, len(scene.train))
 
     def after(self, scene: Scene, steps: int) -> dict[str, float]:
-        """Seconds of the stages that follow, training's own scores counted as scoring."""
+        """Seconds of what follows the last step, by part (`hyrfpack.make.progress.STAGE_PARTS`) or stage."""
         budget = self._budget(scene, steps)
         at_end, at_probe = (self.step + self.step_per_gaussian * n for n in (budget, self.gaussians))
         one = SETTLED * self.cpu_pass * at_end / at_probe
+        scored = PASSES_PER_SCORED_VIEW * len(scene.test)
         return {
+            "results": one * (BACKGROUND_PASSES + scored) + OVERHEAD / 2,
             "compression": one * (passes(budget) + VERIFIED) + PER_GAUSSIAN * budget,
-            "scoring": one * (DRAWN_AFTER + 2 * SCORED * len(scene.test)) + OVERHEAD / 2,
+            "scoring": one * scored / 2,
             "export": OVERHEAD / 2,
         }
 
     def _budget(self, scene: Scene, steps: int) -> int:
-        config = TrainConfig(steps=steps, target_bytes=self.target_bytes, budget_factor=self.budget_factor)
-        return budget_for(scene, config)[0]
+        return budget_for(scene, dataclasses.replace(self.asked, steps=steps).config(seed=0))[0]
 
     def total(self, scene: Scene, steps: int) -> float:
         return self.training(scene, steps) + sum(self.after(scene, steps).values())
@@ -102,7 +108,7 @@ def measure(
     path: Path,
     reading: Reading,
     scene: Scene,
-    target_bytes: int | None,
+    asked: Plan,
     device: torch.device,
     end: float,
     seed: int,
@@ -115,14 +121,14 @@ def measure(
     Args:
         path, reading: of the photos.
         scene: them, as they are read.
-        target_bytes: that the packed model may have; None for no limit.
+        asked: what is asked for besides the time: target size, number of Gaussians, preset.
         cache: keeps photos that are decoded.
     """
     draft = QUALITIES["draft"]
     if (left := end - monotonic()) <= 0:
         say(f"the time is over before the training: a draft follows, of {draft.steps} steps")
         shrunk = min(reading.max_size or draft.max_size, draft.max_size)
-        return Plan(draft.steps, shrunk, target_bytes=target_bytes)
+        return dataclasses.replace(asked, steps=draft.steps, max_size=shrunk)
     sizes = _sizes(scene, reading.max_size)
     probed = next((size for size in reversed(sizes) if size >= SMALLEST), sizes[-1])
     scenes = {reading.max_size: scene}
@@ -131,17 +137,17 @@ def measure(
         return scenes[size] if size in scenes else scenes.setdefault(size, reading.scene(path, size))
 
     reporter.update(0.0, f"a few steps on photos of {_longest(at(probed))} pixels")
-    cost = first = probe(at(probed), target_bytes, device, seed, cache, PROBE_TIME * left)
+    cost = first = probe(at(probed), asked, device, seed, cache, PROBE_TIME * left)
     for chosen in sizes:
         cost = first.scaled(megapixels(at(chosen)) / megapixels(at(probed)))
         if cost.steps_within(at(chosen), end - monotonic()) >= USEFUL_STEPS:
             break
     if chosen != probed:
         reporter.update(0.5, f"a few steps on photos of {_longest(at(chosen))} pixels")
-        cost = probe(at(chosen), target_bytes, device, seed, cache, PROBE_TIME * left)
+        cost = probe(at(chosen), asked, device, seed, cache, PROBE_TIME * left)
     fitting = at(chosen)
-    config = TrainConfig(steps=cost.steps_within(fitting, end - monotonic()), seed=seed, target_bytes=target_bytes)
-    factor = None if target_bytes else 1.0  # which stays so where there are a few more steps
+    config = dataclasses.replace(asked, steps=cost.steps_within(fitting, end - monotonic())).config(seed)
+    factor = 1.0 if is_undecided(config) else None  # which stays so where there are a few more steps
     if measures_budget(fitting, config):
 
         def tell(step: int, loss: float, mse: float, gaussians: int) -> None:
@@ -151,7 +157,8 @@ def measure(
         if measured := measure_budget(fitting, config, cache, device, tell):
             factor, why = measured
             say(f"{factor:g} times the usual number of Gaussians: {why}")
-    cost = dataclasses.replace(cost, budget_factor=factor)
+    asked = dataclasses.replace(asked, max_size=chosen, budget_factor=factor)
+    cost = dataclasses.replace(cost, asked=asked)
     left = end - monotonic()
     steps = cost.steps_within(fitting, left)
     if steps < draft.steps:
@@ -160,21 +167,20 @@ def measure(
     else:
         enough = ", which are enough: it will be ready before" if steps == FULL_STEPS else ""
         say(f"{left / 60:.1f} minutes are left: {steps:,} steps on photos of {_longest(fitting)} pixels{enough}")
-    reporter.estimates |= {"training": cost.training(fitting, steps), **cost.after(fitting, steps)}
-    return Plan(steps, chosen, target_bytes=target_bytes, budget_factor=factor)
+    reporter.estimates |= {"pilots": 0.0, "training": cost.training(fitting, steps), **cost.after(fitting, steps)}
+    return dataclasses.replace(asked, steps=steps)
 
 
-def probe(
-    scene: Scene, target_bytes: int | None, device: torch.device, seed: int, cache: PictureCache, seconds: float
-) -> Cost:
+def probe(scene: Scene, asked: Plan, device: torch.device, seed: int, cache: PictureCache, seconds: float) -> Cost:
     """Measure what a scene costs by a small training run from its first Gaussians to a budget.
 
     Args:
-        target_bytes: that the packed model may have; None for no limit.
+        asked: what decides how many Gaussians there will be.
         seconds: after which it ends in any case, but for the steps that it takes to measure anything.
     """
-    budget, _ = budget_for(scene, TrainConfig(target_bytes=target_bytes))
-    config = TrainConfig(steps=PROBE_STEPS, seed=seed, max_gaussians=budget, density=RISING)
+    usual = dataclasses.replace(asked, steps=TrainConfig.steps).config(seed)
+    budget, _ = budget_for(scene, usual)
+    config = TrainConfig(steps=PROBE_STEPS, seed=seed, preset=asked.preset, max_gaussians=budget, density=RISING)
     trainer = Trainer(scene, config, cache, device)
     counts: list[int] = []
     working: list[float] = []
@@ -191,7 +197,7 @@ def probe(
     step, per_gaussian = _line_through(counts[COLD_STEPS:], working[COLD_STEPS:])
     views = [view.camera for view in evenly_spaced(scene.train, 4)]
     cpu_pass = _cpu_pass(trainer.model, views)
-    return Cost(step, per_gaussian, statistics.fmean(waiting), cpu_pass, counts[-1], target_bytes)
+    return Cost(step, per_gaussian, statistics.fmean(waiting), cpu_pass, counts[-1], asked)
 
 
 def _line_through(counts: Sequence[int], seconds: Sequence[float]) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,11 +11,14 @@ import torch
 from hyrfpack.compress.sensitivity import DRAWN, FEWEST, MOST
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.train.config import FULL_STEPS, TrainConfig
+from hyrfpack.train.pilots import LEAST_STEPS, MOST_STEPS, is_undecided, measures_budget
 from hyrfpack.train.setup import budget_for
 
 # Seconds, of two CPU cores: for a megapixel that is trained on once, and that is drawn and followed back while packing.
 # Only the first forecast needs them: what is measured on the way takes their place.
 STEP, STEP_GPU, PASS = 0.7, 0.02, 0.6
+BACKGROUND_PASSES = 8.0  # as long as so many such drawings takes the search for a background that nobody sees
+PASSES_PER_SCORED_VIEW = 8.0  # most of it to predict the photo's exposure from those beside it
 POSES = 3.0  # for a photo
 UNKNOWN = 100  # photos, where that is not known yet
 
@@ -63,20 +66,31 @@ class Plan:
         max_size: of photos, as in `load_scene`.
         finetune_steps: of packing.
         target_bytes: what the packed model may have; None for no limit.
-        budget_factor: as in `TrainConfig`.
+        max_gaussians, preset, budget_factor: as in `TrainConfig`.
     """
 
     steps: int
     max_size: int
     finetune_steps: int = 0
     target_bytes: int | None = None
+    max_gaussians: int | None = None
+    preset: str = "auto"
     budget_factor: float | None = None
 
     def config(self, seed: int) -> TrainConfig:
         """Settings of its training."""
         return TrainConfig(
-            steps=self.steps, seed=seed, target_bytes=self.target_bytes, budget_factor=self.budget_factor
+            steps=self.steps,
+            seed=seed,
+            preset=self.preset,
+            target_bytes=self.target_bytes,
+            max_gaussians=self.max_gaussians,
+            budget_factor=self.budget_factor,
         )
+
+    def packed_into(self, target_bytes: int | None) -> Plan:
+        """The same plan for another target size, which takes the place of a measured budget."""
+        return replace(self, target_bytes=target_bytes, budget_factor=None if target_bytes else self.budget_factor)
 
 
 def passes(gaussians: int) -> int:
@@ -89,21 +103,34 @@ def megapixels(scene: Scene) -> float:
     return float(np.mean([view.camera.width * view.camera.height for view in scene.views])) / 1e6
 
 
-def forecast(pixels: float, steps: int, finetune_steps: int, gaussians: int, device: torch.device) -> dict[str, float]:
-    """Seconds that the stages after the poses take, roughly, for photos of so many megapixels."""
-    step = pixels * (STEP if device.type == "cpu" else STEP_GPU)
+def forecast(
+    pixels: float, plan: Plan, gaussians: int, held_out: int, pilot_steps: int, device: torch.device
+) -> dict[str, float]:
+    """Seconds that what follows the poses takes, roughly, by part (`hyrfpack.make.progress.STAGE_PARTS`) or stage.
+
+    Args:
+        pixels: megapixels of a photo.
+        gaussians: that the model will have.
+        held_out: photos that are scored.
+        pilot_steps: of the short runs that measure the budget.
+    """
+    step, scored = pixels * (STEP if device.type == "cpu" else STEP_GPU), PASSES_PER_SCORED_VIEW * held_out
     return {
-        "training": 5 + steps * step,
-        "compression": 5 + (passes(gaussians) + 3 * finetune_steps) * pixels * PASS,
-        "scoring": 2 + 10 * pixels,
-        "export": 3.0,
+        "pilots": pilot_steps * step,
+        "training": 2 + plan.steps * step,
+        "results": 2 + (BACKGROUND_PASSES + scored) * pixels * PASS,
+        "compression": 3 + (passes(gaussians) + 3 * plan.finetune_steps) * pixels * PASS,
+        "scoring": 0.5 + scored / 2 * pixels * PASS,  # not all models predict exposures
+        "export": 2.0,
     }
 
 
 def forecast_scene(scene: Scene, plan: Plan, device: torch.device) -> dict[str, float]:
     """`forecast` for photos that are known."""
-    gaussians, _ = budget_for(scene, plan.config(seed=0))
-    return forecast(megapixels(scene), plan.steps, plan.finetune_steps, gaussians, device)
+    config = plan.config(seed=0)
+    gaussians, _ = budget_for(scene, config)
+    pilot_steps = MOST_STEPS if measures_budget(scene, config) else 0
+    return forecast(megapixels(scene), plan, gaussians, len(scene.test), pilot_steps, device)
 
 
 def forecast_photos(sizes: Sequence[tuple[int, int]], plan: Plan, device: torch.device) -> dict[str, float]:
@@ -111,4 +138,5 @@ def forecast_photos(sizes: Sequence[tuple[int, int]], plan: Plan, device: torch.
     width, height = sizes[0] if sizes else (1920, 1080)
     shrunk = min(1.0, plan.max_size / max(width, height)) if plan.max_size else 1.0
     pixels, count = width * height * shrunk**2 / 1e6, len(sizes) or UNKNOWN
-    return {"poses": POSES * count, **forecast(pixels, plan.steps, plan.finetune_steps, 20_000, device)}
+    pilot_steps = MOST_STEPS if plan.steps >= LEAST_STEPS and is_undecided(plan.config(seed=0)) else 0
+    return {"poses": POSES * count, **forecast(pixels, plan, 20_000, count // 8, pilot_steps, device)}

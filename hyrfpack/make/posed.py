@@ -66,6 +66,4 @@ def _estimate(photos: Path, scene: Path, overwrite: bool, report: Callable[[Prog
     reporter = Reporter(["poses"], report)
     reporter.begin("poses")
     with interruptible():
-        estimate_poses(
-            photos, scene, overwrite=overwrite, report=lambda doing, share: reporter.update(share, doing), say=say
-        )
+        estimate_poses(photos, scene, overwrite=overwrite, report=reporter.tell, say=say)

@@ -12,10 +12,13 @@ from hyrfpack.data.folder import list_photos
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.export.folder import check_folder
 from hyrfpack.export.kinds import PLAYER, check_place, check_request, kind_of
+from hyrfpack.format.smallest import check_target_bytes
 from hyrfpack.make.source import Reading, Source
 from hyrfpack.make.stages import EXPORTED
 from hyrfpack.make.state import NAME, State, digest
 from hyrfpack.outputs import Outputs
+from hyrfpack.train.config import TrainConfig
+from hyrfpack.train.setup import check_target
 
 _OF_PHOTOS = ("training", "compression", "scoring", "export")
 _STAGES = {"model": _OF_PHOTOS[-1:], "splats": ("import", "export"), "scene": _OF_PHOTOS}
@@ -41,6 +44,8 @@ class Request:
     minutes: float | None
     matching: str
     target_bytes: int | None
+    max_gaussians: int | None
+    preset: str
     seed: int
     device: torch.device
     overwrite: bool
@@ -89,11 +94,32 @@ class Request:
         elif source.kind == "model":
             raise HyrfError(f"{source.path}: this is a .hyrf file already; 'hyrfpack compress' makes it smaller")
         if source.kind in ("model", "splats"):
-            for name, value in {"minutes": self.minutes, "a target size": self.target_bytes}.items():
+            asked = {
+                "minutes": self.minutes,
+                "a target size": self.target_bytes,
+                "a number of Gaussians": self.max_gaussians,
+                "a preset": None if self.preset == "auto" else self.preset,
+            }
+            for name, value in asked.items():
                 if value is not None:
                     raise HyrfError(f"{source.path}: {name} can be asked for with photos only; leave it out")
+        if self.target_bytes is not None and self.max_gaussians is not None:
+            raise HyrfError(
+                "a target size and a number of Gaussians each decide how large the model is; give one of them "
+                "(--target-size or --max-gaussians)"
+            )
+        self._check_target()
         if source.kind == "photos" and not list_photos(source.path):
             raise HyrfDataError(f"{source.path}: there is no photo in this folder; name one that has some")
+
+    def _check_target(self) -> None:
+        """Refuse a target size that no file of these photos can have. Photos without poses are not read for it."""
+        if self.target_bytes is None:
+            return
+        if self.source.scene is None:
+            check_target_bytes(self.target_bytes)
+        else:
+            check_target(self.source.scene, TrainConfig(preset=self.preset, target_bytes=self.target_bytes))
 
     def _check_places(self) -> None:
         """Refuse places where nothing may or can be written, whatever is there."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -18,6 +18,7 @@ from hyrfpack.device import choose_device
 from hyrfpack.format import describe
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.make import stages
+from hyrfpack.make.held_out import score_note
 from hyrfpack.make.minutes import measure
 from hyrfpack.make.plan import QUALITIES, Plan, forecast_photos, forecast_scene
 from hyrfpack.make.progress import Progress, Reporter
@@ -28,7 +29,9 @@ from hyrfpack.make.work import Say, Stopped, Work, interruptible
 from hyrfpack.outputs import StrPath
 from hyrfpack.scene import Scene
 from hyrfpack.train import Trainer
-from hyrfpack.train.config import LARGEST_SEED
+from hyrfpack.train.config import LARGEST_SEED, PRESETS
+
+MEASUREMENT_TIME_RATIO = 0.15  # of the minutes that are left: probes and, for long runs, pilots
 
 __all__ = ["MakeResult", "Stopped", "make"]
 
@@ -49,8 +52,10 @@ class MakeResult:
         poses: what `hyrfpack.estimate_poses` reports; empty where the photos had poses.
         training: steps, Gaussians, bytes and choices of the training; empty where there was none.
         export: what `hyrfpack.export` reports, or `hyrfpack.distill` of splats under "import".
-        seconds: that each stage took, also those that were done in earlier calls.
+        seconds: that each stage took in all calls together, those included that were interrupted or killed.
+        total_seconds: the sum of them.
         kept: stages that were found done.
+        note: why the score says little of the scene; empty where it does say something, or there is none.
     """
 
     output: Path
@@ -66,7 +71,9 @@ class MakeResult:
     training: dict[str, Any] = field(default_factory=dict)
     export: dict[str, Any] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
+    total_seconds: float = 0.0
     kept: tuple[str, ...] = ()
+    note: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, strings, lists and dictionaries, ready for JSON."""
@@ -85,6 +92,8 @@ def make(
     test_every: int | None = None,
     matching: str = "auto",
     target_bytes: int | None = None,
+    max_gaussians: int | None = None,
+    preset: str = "auto",
     seed: int = 0,
     device: str | torch.device = "auto",
     overwrite: bool = False,
@@ -108,7 +117,9 @@ def make(
         images, max_size: as of `load_scene`; None for what the quality says.
         test_every: as of `load_scene`. None holds out every 8th photo, of fewer than 16 one and of fewer than 8 none.
         matching: as of `hyrfpack.estimate_poses`.
-        target_bytes: pack the model into so many bytes.
+        target_bytes: pack the model into so many bytes. Another size in a later call packs the trained model anew and
+            does not train it again.
+        max_gaussians, preset: as of `hyrfpack.TrainConfig`; `max_gaussians` instead of `target_bytes`.
         seed: of all that is random, 0 to 2^64 - 1.
         device: where to train and to pack, see `hyrfpack.device.choose_device`.
         overwrite: replace an output that is there. Without it, one that appears in the meantime is kept, too: a file
@@ -131,6 +142,10 @@ def make(
     """
     check_choice("quality", quality, QUALITIES)
     check_int("seed", seed, 0, LARGEST_SEED)
+    check_choice("preset", preset, PRESETS)
+    for name, value in {"target_bytes": target_bytes, "max_gaussians": max_gaussians}.items():
+        if value is not None:
+            check_int(name, value, 1)
     if minutes is not None:
         check_float("minutes", minutes, 0.0)
     began = monotonic()
@@ -146,6 +161,8 @@ def make(
                 minutes=minutes,
                 matching=matching,
                 target_bytes=target_bytes,
+                max_gaussians=max_gaussians,
+                preset=preset,
                 seed=seed,
                 device=choose_device(device),
                 overwrite=overwrite,
@@ -234,7 +251,15 @@ class _Making:
         """What the quality asks for."""
         quality = QUALITIES[self.request.quality]
         steps = quality.steps if self.request.device.type == "cpu" else quality.gpu_steps
-        return Plan(steps, self.request.reading.max_size, quality.finetune_steps, self.request.target_bytes)
+        request = self.request
+        return Plan(
+            steps,
+            request.reading.max_size,
+            quality.finetune_steps,
+            request.target_bytes,
+            request.max_gaussians,
+            request.preset,
+        )
 
     def _plan(self, path: Path, reading: Reading, scene: Scene, cache: PictureCache) -> tuple[Plan, Scene]:
         """What is asked for or fits the minutes, and the scene at the size that this takes."""
@@ -242,13 +267,15 @@ class _Making:
         if request.minutes is None:
             return self._asked(), scene
         end = self.began + 60 * request.minutes
-        self.reporter.estimates |= {"measurement": 0.0, "training": max(0.0, end - monotonic())}
+        left = max(0.0, end - monotonic())
+        measuring = MEASUREMENT_TIME_RATIO * left
+        self.reporter.estimates |= {"measurement": measuring, "training": left - measuring}
 
         def act(going_on: bool) -> tuple[dict[str, Any], list[str]]:
+            asked = replace(self._asked(), finetune_steps=0)
             plan = measure(
-                path, reading, scene, request.target_bytes, request.device, end, request.seed, cache, self.reporter,
-                self.say,
-            )  # fmt: skip
+                path, reading, scene, asked, request.device, end, request.seed, cache, self.reporter, self.say
+            )
             return asdict(plan), []
 
         inputs = {
@@ -257,8 +284,14 @@ class _Making:
             "size of photos": reading.max_size,
             "seed": request.seed,
             "target size": request.target_bytes,
+            "number of Gaussians": request.max_gaussians,
+            "preset": request.preset,
         }
-        plan = Plan(**self.work.stage("measurement", inputs, act))
+        # A training that was begun keeps its plan: another target size is only packed anew.
+        earlier = {**inputs, "target size": stages.trained_for(self.work)}
+        if self.work.state.facts("measurement", earlier) is not None:
+            inputs = earlier
+        plan = Plan(**self.work.stage("measurement", inputs, act)).packed_into(request.target_bytes)
         return plan, scene if plan.max_size == reading.max_size else reading.scene(path, plan.max_size)
 
     def _result(
@@ -273,6 +306,7 @@ class _Making:
         """Score, and write what is wanted."""
         request, work = self.request, self.work
         scores = {"views": 0} if scene is None else stages.score(work, scene, request.device)
+        psnr = scores.get("psnr") if scores.get("psnr_predicted") is None else scores["psnr_predicted"]
         exported, product = stages.write(work, model, request.output.name, scene)
         output = stages.deliver(product, request.output, overwrite=request.overwrite)  # last: where it is, all is done
         return MakeResult(
@@ -289,5 +323,7 @@ class _Making:
             training=training or {},
             export={**exported, "file": str(output), **({"import": imported} if imported else {})},
             seconds={name: round(seconds, 1) for name, seconds in work.seconds.items()},
+            total_seconds=round(sum(work.seconds.values()), 1),
             kept=tuple(work.kept),
+            note=score_note(scores["views"], psnr, (training or {}).get("psnr")),
         )

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from hyrfpack.data import load_scene
 from hyrfpack.data.archive import is_archive, unpacked
 from hyrfpack.data.folder import list_photos
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
-from hyrfpack.outputs import VIDEOS, Outputs, StrPath
+from hyrfpack.make.held_out import inner_view
+from hyrfpack.outputs import PICTURES, VIDEOS, Outputs, StrPath
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.splats.files import READ
 
@@ -21,8 +23,11 @@ _LOOSE_SOG = "meta.json"
 
 @dataclass(frozen=True)
 class Reading:
-    """How photos are read: as the arguments of `load_scene`, but that None holds out one in TEST_EVERY of many photos,
-    one of fewer than FEW, and none of fewer than LEAST."""
+    """How photos are read: the arguments of `load_scene`.
+
+    Without `test_every`, one in TEST_EVERY of many photos is held out, of fewer than FEW the one that is best
+    surrounded by others (`inner_view`), and of fewer than LEAST none. A split of the set's own counts instead.
+    """
 
     images: str | None = None
     max_size: int = DEFAULT_MAX_SIZE
@@ -31,13 +36,14 @@ class Reading:
     def scene(self, path: Path, max_size: int | None = None) -> Scene:
         """Read photos with poses, at another size than this if that is given."""
         size = self.max_size if max_size is None else max_size
-        every = TEST_EVERY if self.test_every is None else self.test_every
-        scene = load_scene(path, images=self.images, max_size=size, test_every=every)
-        count = len(scene.views)
-        if self.test_every is None and count < FEW:
-            every = count if count >= LEAST else 0
-            scene = load_scene(path, images=self.images, max_size=size, test_every=every)
-        return scene
+        read = partial(load_scene, path, images=self.images, max_size=size)
+        scene = read(test_every=TEST_EVERY if self.test_every is None else self.test_every)
+        if self.test_every is not None or len(scene.views) >= FEW:
+            return scene
+        scene = read(test_every=0)
+        if scene.test or len(scene.views) < LEAST:
+            return scene
+        return read(held_out=[inner_view(scene).name])
 
 
 @dataclass(frozen=True)
@@ -69,6 +75,11 @@ class Source:
         ending = path.suffix.lower()
         if path.is_file() and (ending == ".hyrf" or ending in READ or path.name == _LOOSE_SOG):
             return cls(path, "model" if ending == ".hyrf" else "splats")
+        if path.is_file() and not (is_archive(path) or ending in VIDEOS):
+            one = "this is one photo" if ending in PICTURES else "nothing can be made of this file"
+            raise HyrfDataError(
+                f"{path}: {one}; name a folder of photos, its .zip, a video, a .hyrf file, or splats of another program"
+            )
         try:
             return cls(path, "scene", reading.scene(path))
         except HyrfNoPosesError:

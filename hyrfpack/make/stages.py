@@ -7,7 +7,7 @@ import math
 import os
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from hyrfpack.compress import compress
 from hyrfpack.data import PictureCache
 from hyrfpack.device import describe_device
 from hyrfpack.distill import DistillConfig, distill
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfError, HyrfSizeError
 from hyrfpack.evaluate import evaluate
 from hyrfpack.evaluate.metrics import decibels
 from hyrfpack.export import export
@@ -31,10 +31,12 @@ from hyrfpack.make.work import PRODUCTS, Work
 from hyrfpack.outputs import Outputs
 from hyrfpack.scene import Scene
 from hyrfpack.train import Trainer, train
+from hyrfpack.train.pilots import MOST_STEPS
 from hyrfpack.train.progress import SMOOTHING
 from hyrfpack.train.run import CHECKPOINT, METRICS, MODEL, is_begun
 
 SCENE, RUN, PACKED, EXPORTED = (PRODUCTS[stage] for stage in ("poses", "training", "compression", "export"))
+FIXED_SETTINGS = ("target_bytes", "budget_factor")  # of a training, from when it was begun on
 POSES = "poses.json"  # the report of `hyrfpack.estimate_poses`, in the scene's folder
 
 
@@ -52,12 +54,9 @@ def pose(work: Work, photos: Path, files: Sequence[Path], matching: str, seed: i
     def act(going_on: bool) -> tuple[dict, list[str]]:
         from hyrfpack.poses import estimate_poses
 
-        def tell(doing: str, share: float) -> None:
-            work.reporter.update(share, doing)
-
         scene = work.folder / SCENE
         if not (going_on and is_posed(scene)):
-            estimate_poses(photos, scene, matching=matching, seed=seed, report=tell, say=work.say)
+            estimate_poses(photos, scene, matching=matching, seed=seed, report=work.reporter.tell, say=work.say)
         shutil.rmtree(scene / ".poses", ignore_errors=True)  # products in progress, where it was killed at the end
         files = sorted(path for path in scene.rglob("*") if path.is_file())
         report = json.loads((scene / POSES).read_bytes())
@@ -80,9 +79,22 @@ def fit(
     cache: PictureCache,
     observer: Callable[[Trainer], None] | None,
 ) -> dict[str, Any]:
-    """Train into `run/`; returns steps, Gaussians and the choices made."""
+    """Train into `run/`; returns steps, Gaussians and the choices made.
+
+    What follows from the target size stays as it was when the training was begun: another size does not train anew.
+    """
     config = plan.config(seed)
     run = work.folder / RUN
+    settings = {name: value for name, value in config.to_dict().items() if name not in FIXED_SETTINGS}
+    inputs = {"photos and poses": data, "settings": settings, **_split(scene)}
+    if work.state.is_under_way("training", inputs):
+        config = replace(config, **work.state.fixed("training"))
+    if config.target_bytes != plan.target_bytes:
+        before = "without a target size" if config.target_bytes is None else f"for {config.target_bytes:,} bytes"
+        work.say(
+            f"the model is trained {before}, and only packed for the size that is asked for now; another work folder "
+            "(--work) trains it anew"
+        )
 
     def act(going_on: bool) -> tuple[dict, list[str]]:
         if not (going_on and _is_finished(run)):
@@ -105,10 +117,16 @@ def fit(
                 raise HyrfError(trained.missing)
         metrics = json.loads((run / METRICS).read_bytes())
         facts = {key: metrics[key] for key in ("gaussians", "bytes", "choices", "device")}
-        return {"steps": plan.steps, **facts}, [f"{RUN}/{name}" for name in (MODEL, METRICS)]
+        psnr = describe(run / MODEL)["provenance"]["psnr"]
+        facts |= {"steps": plan.steps, "target_bytes": config.target_bytes, "psnr": psnr}
+        return facts, [f"{RUN}/{name}" for name in (MODEL, METRICS)]
 
-    inputs = {"photos and poses": data, "settings": config.to_dict(), **_split(scene)}
-    return work.stage("training", inputs, act)
+    return work.stage("training", inputs, act, {name: getattr(config, name) for name in FIXED_SETTINGS})
+
+
+def trained_for(work: Work) -> int | None:
+    """The target size that the training in a work folder was begun for; None for none."""
+    return work.state.fixed("training").get("target_bytes")
 
 
 def _is_finished(run: Path) -> bool:
@@ -123,21 +141,24 @@ def _split(scene: Scene) -> dict[str, Any]:
 
 
 def _training_report(reporter: Reporter, steps: int) -> Callable[[int, float, float, int], None]:
-    seen, measuring = math.nan, False
+    """What `train` is to report to: step 0 while pilots run, then each step of the training."""
+    seen, pilot_steps, training = math.nan, 0, False
 
     def report(step: int, loss: float, mse: float, gaussians: int) -> None:
-        nonlocal seen, measuring
+        nonlocal seen, pilot_steps, training
         if step == 0:
-            measuring = True
-            reporter.update(0.0, "short runs tell how many Gaussians the scene is worth")
+            pilot_steps += 1
+            reporter.update(min(1.0, pilot_steps / MOST_STEPS), "short runs tell how many Gaussians the scene is worth")
             return
-        if measuring:  # the pace of what follows is another
-            measuring = False
-            reporter.begin("training")
+        if not training:  # the pace of what follows is another
+            training = True
+            reporter.begin_part("training")
         if not math.isnan(mse):
             seen = mse if math.isnan(seen) else SMOOTHING * mse + (1 - SMOOTHING) * seen
         quality = () if math.isnan(seen) else (f"PSNR {decibels(seen):.2f}",)
         reporter.update(step / steps, f"{step:,}/{steps:,}", *quality, f"{gaussians:,} Gaussians")
+        if step == steps:
+            reporter.begin_part("results", "writing the model, its scores and pictures")
 
     return report
 
@@ -163,14 +184,18 @@ def pack(work: Work, scene: Scene, plan: Plan, device: torch.device) -> dict[str
     """Compress into `model.hyrf`; returns bytes and Gaussians."""
 
     def act(going_on: bool) -> tuple[dict, list[str]]:
-        def say(sentence: str) -> None:
-            work.reporter.update(0.0, sentence)
-
         source, target = work.folder / RUN / MODEL, work.folder / PACKED
-        report = compress(
-            source, target, data=scene, finetune_steps=plan.finetune_steps, target_bytes=plan.target_bytes,
-            device=device, say=say,
-        )  # fmt: skip
+        try:
+            report = compress(
+                source, target, data=scene, finetune_steps=plan.finetune_steps, target_bytes=plan.target_bytes,
+                device=device, say=work.reporter.say,
+            )  # fmt: skip
+        except HyrfSizeError as error:
+            anew = ", or name another work folder (--work) to train a smaller model for this size"
+            raise HyrfError(
+                f"the trained model does not fit into {plan.target_bytes:,} bytes; ask for {error.smallest:,} bytes or "
+                f"more (--target-size){anew if trained_for(work) != plan.target_bytes else ''}"
+            ) from error
         return {"bytes": report.bytes_after, "gaussians": report.gaussians, "found": report.found}, [PACKED]
 
     cameras = "photos" if plan.finetune_steps else "cameras"  # fine-tuning looks at all, the rest at where they are
@@ -191,10 +216,7 @@ def import_splats(work: Work, source: Path, steps: int, seed: int) -> dict[str, 
     config = DistillConfig(steps=steps, seed=seed)
 
     def act(going_on: bool) -> tuple[dict, list[str]]:
-        def say(sentence: str) -> None:
-            work.reporter.update(0.0, sentence)
-
-        report = distill(source, work.folder / PACKED, config, say=say)
+        report = distill(source, work.folder / PACKED, config, say=work.reporter.say)
         return report.to_dict(), [PACKED]
 
     inputs = {"splats": digest_all(files, source.parent), "settings": asdict(config)}
@@ -209,14 +231,11 @@ def write(work: Work, model: Path, name: str, scene: Scene | None) -> tuple[dict
     target = work.folder / EXPORTED / name
 
     def act(going_on: bool) -> tuple[dict, list[str]]:
-        def say(sentence: str) -> None:
-            work.reporter.update(0.0, sentence)
-
         if name.lower().endswith(".hyrf"):
             copy(model, target)
             report: dict[str, Any] = {"bytes": target.stat().st_size}
         else:
-            made = export(model, target, data=scene, say=say)
+            made = export(model, target, data=scene, say=work.reporter.say)
             report = {**asdict(made), "file": name, "chosen_by": {}}
         files = sorted(target.rglob("*")) if target.is_dir() else [target]
         return report, [path.relative_to(work.folder).as_posix() for path in files if path.is_file()]

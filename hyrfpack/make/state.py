@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,9 @@ _CHUNK = 1 << 20
 class State:
     """The record of a work folder, `make.json`, written whole after every change.
 
-    For each stage it has `inputs`, plain values that decide what the stage makes; `files`, what it made, by their paths
-    in the folder, with digests; `facts`, plain values for the report; and the `seconds` it took. A stage that has begun
-    and is not done has no `files`.
+    For each stage it has `inputs`, plain values that decide what the stage makes; `fixed`, further ones that stay as
+    they were when the stage was begun; `files`, what it made, by their paths in the folder, with digests; `facts`,
+    plain values for the report; and the `seconds` it took. A stage that has begun and is not done has no `files`.
 
     Attributes:
         folder: the work folder.
@@ -51,6 +52,10 @@ class State:
         record = self._stages.get(stage)
         return record is not None and "files" not in record and record["inputs"] == _plain(inputs)
 
+    def is_under_way(self, stage: str, inputs: dict[str, Any]) -> bool:
+        """Whether a stage was begun from these inputs, or is done and its files are as it left them."""
+        return self.begun(stage, inputs) or self.facts(stage, inputs) is not None
+
     def changed(self, stage: str, inputs: dict[str, Any]) -> list[str]:
         """What keeps a stage that was begun from being taken: names of inputs that are others now, or its files."""
         if stage not in self._stages:
@@ -69,22 +74,44 @@ class State:
         """What a stage was begun from."""
         return dict(self._stages[stage]["inputs"])
 
+    def fixed(self, stage: str) -> dict[str, Any]:
+        """The values that a stage was begun with and that are no inputs; empty where it was never begun."""
+        return dict(self._stages.get(stage, {}).get("fixed", {}))
+
+    @property
+    def has_finished(self) -> bool:
+        """Whether any stage is done."""
+        return any("files" in record for record in self._stages.values())
+
     def files(self, stage: str) -> dict[str, str]:
         """What a stage that is done made: digests by path in the folder."""
         return dict(self._stages.get(stage, {}).get("files", {}))
 
     def seconds(self, stage: str) -> float:
-        """That a stage took, in all commands together but for those that were killed."""
+        """That a stage took, in all commands together."""
         return float(self._stages.get(stage, {}).get("seconds", 0.0))
 
-    def begin(self, stage: str, inputs: dict[str, Any]) -> None:
-        self._stages[stage] = {"inputs": _plain(inputs), "seconds": 0.0}
+    def begin(self, stage: str, inputs: dict[str, Any], fixed: dict[str, Any]) -> None:
+        self._stages[stage] = {"inputs": _plain(inputs), "fixed": _plain(fixed), "seconds": 0.0}
         self._write()
 
-    def pause(self, stage: str, seconds: float) -> None:
-        """Keep the time of a stage that was interrupted."""
+    def add_seconds(self, stage: str, seconds: float) -> None:
+        """Record time that was spent on a stage which is not done yet."""
         self._stages[stage]["seconds"] += round(seconds, 3)
         self._write()
+
+    def forget(self, stage: str) -> None:
+        """Remove the record of a stage that left nothing, and with the last one the file.
+
+        Raises:
+            HyrfError: the record cannot be written.
+        """
+        self._stages.pop(stage, None)
+        if self._stages:
+            self._write()
+        else:
+            with suppress(OSError):
+                self._path.unlink(missing_ok=True)
 
     def finish(self, stage: str, files: Iterable[str], facts: dict[str, Any], seconds: float) -> None:
         """Args: files: that the stage made, by their paths in the folder."""
@@ -109,7 +136,7 @@ def _stages(content: bytes) -> dict[str, dict[str, Any]]:
             raise ValueError("it is of another version of hyrfpack")
         stages = table["stages"]
         for record in stages.values():
-            parts = [record["inputs"], record.get("files", {}), record.get("facts", {})]
+            parts = [record["inputs"], *(record.get(name, {}) for name in ("fixed", "files", "facts"))]
             typed = all(isinstance(part, dict) for part in parts) and isinstance(record["seconds"], float)
             if not typed or ("files" in record) != ("facts" in record):
                 raise TypeError

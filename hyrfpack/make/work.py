@@ -6,7 +6,7 @@ import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -23,6 +23,8 @@ PRODUCTS = {
     "import": "model.hyrf",
     "export": "export",
 }
+
+MIN_RECORD_SECONDS = 15.0  # between two records of the time that a stage has taken so far
 
 Say = Callable[[str], None]
 
@@ -63,6 +65,7 @@ class Work:
         name: str,
         inputs: dict[str, Any],
         act: Callable[[bool], tuple[dict[str, Any], Sequence[str]]],
+        fixed: dict[str, Any] | None = None,
     ) -> dict[str, Any]:
         """Do a stage, unless it is done.
 
@@ -71,6 +74,8 @@ class Work:
             inputs: plain values, all that decides what comes of it.
             act: does it; told whether it was begun before from the same inputs. Returns facts, plain values, and the
                 files that it made, by their paths in the folder.
+            fixed: plain values that are recorded when the stage is begun, for `State.fixed`. Other ones in a later
+                call do not redo the stage.
 
         Returns:
             The facts.
@@ -83,6 +88,7 @@ class Work:
         if facts is not None:
             self.kept.append(name)
             self.seconds[name] = self.state.seconds(name)
+            self.reporter.skip(name, self.seconds[name])
             self.say(f"{name}: done before, in {self.seconds[name]:.0f} s")
             return facts
         self._allow(self.state)
@@ -92,19 +98,59 @@ class Work:
                 self.say(f"{name}: made anew, for {' and '.join(changed)} changed")
             if name in PRODUCTS:
                 _remove(self.folder / PRODUCTS[name])
-            self.state.begin(name, inputs)
-        began = monotonic()
+            self.state.begin(name, inputs, fixed or {})
+        clock = _StageClock(self.state, name)
         try:
-            self.reporter.begin(name)
-            facts, files = act(going_on)
+            with self.reporter.watched_by(clock.record):
+                self.reporter.begin(name)
+                facts, files = act(going_on)
         except KeyboardInterrupt as error:
-            self.state.pause(name, monotonic() - began)
+            self.state.add_seconds(name, clock.unrecorded())
             raise Stopped(name) from error
         except HyrfError as error:
-            raise type(error)(f"{name} failed: {error}; what is finished is kept in {self.folder}") from error
-        self.state.finish(name, files, facts, monotonic() - began)
+            raise type(error)(f"{name} failed: {error}{self._what_is_left(name, clock)}") from error
+        self.state.finish(name, files, facts, clock.unrecorded())
         self.seconds[name] = self.state.seconds(name)
         return facts
+
+    def _what_is_left(self, name: str, clock: _StageClock) -> str:
+        """The end of the message about a stage that failed. Where the stage left nothing, its record is removed."""
+        product = self.folder / PRODUCTS[name] if name in PRODUCTS else None
+        try:
+            if product is None or not _has_content(product):
+                self.state.forget(name)
+            else:
+                self.state.add_seconds(name, clock.unrecorded())
+        except HyrfError:  # the failure of the stage is what the user needs to hear of
+            pass
+        return f"; what is finished is kept in {self.folder}" if self.state.has_finished else ""
+
+
+class _StageClock:
+    """Records the time that a stage takes while it works, so that a killed process loses little of it."""
+
+    def __init__(self, state: State, stage: str) -> None:
+        self._state, self._stage, self._since = state, stage, monotonic()
+
+    def unrecorded(self) -> float:
+        """Seconds since the last record, or since the stage began."""
+        return monotonic() - self._since
+
+    def record(self) -> None:
+        """Write down the time so far, unless that was done a short while ago."""
+        if self.unrecorded() >= MIN_RECORD_SECONDS:
+            with suppress(HyrfError):  # a full disk ends the stage when its product is written, not here
+                self._state.add_seconds(self._stage, self.unrecorded())
+            self._since = monotonic()
+
+
+def _has_content(product: Path) -> bool:
+    """Whether a stage has left a file. A folder without files is removed."""
+    if product.is_dir():
+        if any(path.is_file() for path in product.rglob("*")):
+            return True
+        shutil.rmtree(product, ignore_errors=True)
+    return product.exists()
 
 
 def _remove(path: Path) -> None:

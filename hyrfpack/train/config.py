@@ -7,9 +7,8 @@ from dataclasses import asdict, dataclass, field, fields
 from itertools import pairwise
 
 from hyrfpack.checks import check_bool, check_choice, check_float, check_int, check_pair
-from hyrfpack.choices import PRECISIONS
+from hyrfpack.choices import PRECISIONS, PRESETS
 
-PRESETS = ("auto", "synthetic", "standard", "large", "street")
 BACKGROUND_COLORS = ("black", "white", "random")
 LARGEST_SEED = 2**64 - 1  # torch's generators take 64 bits
 FULL_STEPS = 30_000  # the length of a run that the paper's schedule is written for

@@ -55,6 +55,10 @@ def _is_reading(path: object, options: dict) -> bool:
     """Whether these can be arguments of `load_scene`: a run's folder may come from anywhere."""
     text = (str, type(None))
     kinds: dict[str, Any] = {"test_every": int, "images": text, "layout": str, "model": text, "max_size": int}
+    held_out = options.get("held_out", [])  # there only where photos were named
+    if not isinstance(held_out, list) or not all(isinstance(name, str) for name in held_out):
+        return False
+    options = {name: value for name, value in options.items() if name != "held_out"}
     if not isinstance(path, str) or "\0" in path or options.keys() != kinds.keys():
         return False
     return (

@@ -43,6 +43,7 @@ from hyrfpack.train.results import (
     save_model,
     write_results,
 )
+from hyrfpack.train.setup import check_target
 from hyrfpack.train.trainer import Trainer
 
 __all__ = ["CHECKPOINT", "METRICS", "MODEL", "VIEWS", "TrainResult", "is_begun", "resuming", "train"]
@@ -143,6 +144,7 @@ def train(
     out = Path(out)
     config = TrainConfig() if config is None else config
     check_type("config", config, TrainConfig)
+    check_target(scene, config)
     # Whatever lies there: no folder is created where nothing may be written.
     ranks.agree(lambda: _check_outputs(out, scene, overwrite=True) if ranks.leads else None)
     with exclusive_folder(out, "another folder with -o", ranks):

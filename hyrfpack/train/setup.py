@@ -12,8 +12,10 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from hyrfpack.cameras.capture import coarse, provenance_of
 from hyrfpack.cameras.paths import common_direction
 from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.format.smallest import check_target_bytes
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.hybrid import scale_bounds
@@ -107,6 +109,21 @@ def budget_for(scene: Scene, config: TrainConfig) -> tuple[int, str]:
     if config.budget_factor not in (None, 1):
         return max(1, round(config.budget_factor * budget)), f"{config.budget_factor:g} times what suits {why}"
     return budget, why
+
+
+def check_target(scene: Scene, config: TrainConfig) -> None:
+    """Refuse a target size that no packed model of these photos can have.
+
+    A file carries some of the cameras, so that its smallest size depends on the scene.
+
+    Raises:
+        HyrfError: the target size is below that.
+    """
+    if config.target_bytes is None or not scene.train:
+        return
+    preset = config.preset if config.preset != "auto" else detect_preset(scene)[0]
+    provenance = {"steps": config.steps, "seed": config.seed, **provenance_of(scene)}
+    check_target_bytes(config.target_bytes, coarse(provenance, scene_frame(scene, preset).scale))
 
 
 def table_size_for(budget: int, config: TrainConfig) -> tuple[int, str]:

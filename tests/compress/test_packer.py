@@ -272,7 +272,7 @@ def test_the_old_word_for_distortion_is_taken_with_a_warning(trained, tmp_path):
         ({"profile": "paper", "distortion": 1e-5}, "profile 'paper' has no settings"),
         ({"profile": "raw", "finetune_steps": 5}, "profile 'raw' has no settings"),
         ({"profile": "zip"}, "no profile 'zip'"),
-        ({"target_bytes": 500}, "does not fit into 500 bytes"),
+        ({"target_bytes": 500}, "500 bytes is below the smallest possible file"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused_and_nothing_is_written(options, words, trained, tmp_path):

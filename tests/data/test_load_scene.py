@@ -33,6 +33,22 @@ def test_zero_holds_out_nothing(tmp_path, colmap_folder):
     assert (len(scene.train), len(scene.test)) == (9, 0)
 
 
+def test_photos_that_are_named_are_held_out_instead_of_every_nth(tmp_path, colmap_folder):
+    colmap_folder(tmp_path)
+
+    scene = load_scene(tmp_path, held_out=["004.png"], test_every=2)
+
+    assert [view.name for view in scene.test] == ["004.png"] and len(scene.train) == 8
+    assert load_scene(**scene.reading).test[0].name == "004.png"
+
+
+def test_a_name_of_no_photo_cannot_be_held_out(tmp_path, colmap_folder):
+    colmap_folder(tmp_path)
+
+    with pytest.raises(HyrfDataError, match="no photo is named 999.png"):
+        load_scene(tmp_path, held_out=["999.png"])
+
+
 def test_holding_out_everything_is_refused(tmp_path, colmap_folder):
     colmap_folder(tmp_path)
 

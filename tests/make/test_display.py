@@ -10,7 +10,7 @@ from rich.console import Console
 
 from hyrfpack.make import display
 from hyrfpack.make.display import Display
-from hyrfpack.make.progress import Progress, Reporter
+from hyrfpack.make.progress import SLOWDOWN_EXPONENT, Progress, Reporter
 
 TRAINING = Progress("training", 2, 5, 0.2, 72.4, ("604/3,000", "PSNR 29.40", "4,850 Gaussians"))
 
@@ -52,24 +52,121 @@ def test_nothing_is_said_of_a_time_that_is_not_known(capsys, monkeypatch):
     assert lines and all(line == "1/2 import  0 s gone" for line in lines)
 
 
-def test_what_is_left_is_of_this_stage_and_those_to_come(monkeypatch):
+def test_a_display_whose_estimate_is_over_never_says_that_nothing_is_left(monkeypatch):
     clock = [0.0]
-    monkeypatch.setattr("hyrfpack.make.progress.monotonic", lambda: clock[0])
+    monkeypatch.setattr(display, "monotonic", lambda: clock[0])
+    shown = Display()
+    shown.show(TRAINING)
+    left = []
+    for clock[0] in (0.0, 50.0, 72.0, 100.0, 400.0):
+        left.append(shown._parts()["left"])
+    assert left == ["about 72 s left", "about 22 s left", "about 18 s left", "about 25 s left", "about 100 s left"]
+
+
+# -- the estimate ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def clock(monkeypatch) -> list[float]:
+    seconds = [0.0]
+    monkeypatch.setattr("hyrfpack.make.progress.monotonic", lambda: seconds[0])
+    return seconds
+
+
+def test_before_anything_is_measured_the_time_left_is_the_sum_of_the_forecasts(clock):
     told: list[Progress] = []
     reporter = Reporter(["poses", "training", "export"], told.append)
-    reporter.estimates |= {"poses": 50.0, "training": 100.0, "export": 5.0}
+    reporter.estimates |= {"poses": 50.0, "pilots": 10.0, "training": 100.0, "results": 8.0, "export": 5.0}
     reporter.begin("poses")
-    assert told[-1].left == 155.0
-    clock[0] = 30.0
-    reporter.update(0.25, "matching")
-    assert told[-1].left == pytest.approx(0.75 * 50 + 105)  # its pace shows only from two reports on
+    assert told[-1].left == 50 + 10 + 100 + 8 + 5
     reporter.begin("training")
-    reporter.update(0.5)  # of one that is gone on with
-    clock[0] = 40.0
-    reporter.update(0.6)
-    assert told[-1].left == pytest.approx(40 + 5)
+    assert told[-1].left == 10 + 100 + 8 + 5
     reporter.begin("export")
-    clock[0] = 43.0
+    clock[0] = 3.0
     reporter.update(0.0, "writing")
-    assert told[-1].left == pytest.approx(2.0)
+    assert told[-1].left == 2.0
     assert (told[-1].place, told[-1].of, told[-1].words) == (3, 3, ("writing",))
+
+
+def test_the_pace_of_a_part_replaces_its_forecast(clock):
+    told: list[Progress] = []
+    reporter = Reporter(["poses"], told.append)
+    reporter.estimates["poses"] = 10.0
+    reporter.begin("poses")
+    for clock[0] in range(1, 31):
+        reporter.update(clock[0] / 60)
+    assert told[-1].left == pytest.approx(30.0)
+
+
+def test_the_pace_of_a_part_that_becomes_slower_is_that_of_its_last_half(clock):
+    told: list[Progress] = []
+    reporter = Reporter(["poses"], told.append)
+    reporter.begin("poses")
+    for clock[0] in range(1, 101):  # at first 1 % a second, then a fifth of it
+        reporter.update(min(clock[0], 50) / 100 + max(clock[0] - 50, 0) / 500)
+    assert told[-1].left == pytest.approx(0.4 / 0.002)
+
+
+def test_the_pace_of_a_resumed_part_does_not_count_what_was_done_before(clock):
+    told: list[Progress] = []
+    reporter = Reporter(["training"], told.append)
+    reporter.begin("training")
+    reporter.begin_part("training")
+    for clock[0] in range(1, 42):
+        reporter.update(0.5 + (clock[0] - 1) / 100)
+    assert told[-1].left == pytest.approx(10.0)
+
+
+def test_forecasts_of_later_parts_are_scaled_by_the_pace_of_training(clock):
+    told: list[Progress] = []
+    reporter = Reporter(["training", "compression"], told.append)
+    reporter.estimates |= {"pilots": 0.0, "training": 100.0, "results": 4.0, "compression": 16.0}
+    reporter.begin("training")
+    reporter.begin_part("training")
+    for clock[0] in range(1, 151):  # three times slower than forecast
+        reporter.update(clock[0] / 300)
+    assert told[-1].left == pytest.approx(150 + 3**SLOWDOWN_EXPONENT * (4 + 16))
+    reporter.begin("compression")
+    assert told[-1].left == pytest.approx(3**SLOWDOWN_EXPONENT * 16)
+
+
+def test_the_pace_of_pilots_tells_how_long_the_training_will_take(clock):
+    told: list[Progress] = []
+    reporter = Reporter(["training"], told.append)
+    reporter.estimates |= {"pilots": 40.0, "training": 300.0, "results": 5.0}
+    reporter.begin("training")
+    for clock[0] in range(1, 41):  # twice as slow as forecast
+        reporter.update(clock[0] / 80)
+    assert told[-1].left == pytest.approx(40 + 2 * 300 + 2**SLOWDOWN_EXPONENT * 5)
+
+
+def test_a_training_of_an_earlier_call_tells_the_pace_too(clock):
+    told: list[Progress] = []
+    reporter = Reporter(["training", "compression"], told.append)
+    reporter.estimates |= {"pilots": 0.0, "training": 100.0, "results": 10.0, "compression": 16.0}
+    reporter.skip("training", 220.0)
+    reporter.begin("compression")
+    assert told[-1].left == pytest.approx(2**SLOWDOWN_EXPONENT * 16)
+
+
+def test_a_stage_that_outlasts_its_forecast_is_never_said_to_be_over(clock):
+    told: list[Progress] = []
+    reporter = Reporter(["compression"], told.append)
+    reporter.estimates["compression"] = 10.0
+    reporter.begin("compression")
+    clock[0] = 40.0
+    reporter.update(0.0, "packing")
+    assert told[-1].left == 10.0
+
+
+def test_the_share_of_a_stage_counts_all_its_parts_and_never_falls(clock):
+    told: list[Progress] = []
+    reporter = Reporter(["training"], told.append)
+    reporter.estimates |= {"pilots": 20.0, "training": 60.0, "results": 20.0}
+    reporter.begin("training")
+    reporter.update(0.5)
+    reporter.begin_part("training")
+    reporter.update(0.5)
+    reporter.update(1.0)
+    reporter.begin_part("results", "scores")
+    assert [progress.share for progress in told] == pytest.approx([0.0, 0.1, 0.2, 0.5, 0.8, 0.8])

@@ -69,15 +69,15 @@ def test_an_interrupt_in_each_stage_costs_nothing(after, whole, posed, tmp_path,
 
 def test_an_interrupt_amid_training_goes_on_from_the_checkpoint(whole, posed, tmp_path, signals):
     def stop(progress):
-        if progress.stage == "training" and progress.share > 0.5:
+        if progress.words[:1] == ("5/9",):
             signal.raise_signal(signal.SIGTERM)
 
     with pytest.raises(Stopped, match="stopped in training"):
         make(posed, tmp_path / "scene.html", report=stop)
     assert (tmp_path / "scene.work" / "run" / "checkpoint.pt").is_file()
-    shares = []
-    result = make(posed, tmp_path / "scene.html", report=lambda p: shares.append((p.stage, p.share)))
-    assert next(share for stage, share in shares if stage == "training" and share) > 0.5
+    words = []
+    result = make(posed, tmp_path / "scene.html", report=lambda progress: words.extend(progress.words[:1]))
+    assert "6/9" in words and "5/9" not in words
     assert products(result.work) == whole
 
 
@@ -161,7 +161,7 @@ sys.path[:0] = sys.argv[1:3]
 import conftest, pytest
 conftest.hurry(pytest.MonkeyPatch())
 from hyrfpack.make import make
-make(sys.argv[3], sys.argv[4], report=lambda p: print(p.stage, round(p.share, 2), flush=True))
+make(sys.argv[3], sys.argv[4], report=lambda p: print(p.stage, *p.words[:1], flush=True))
 """
 
 
@@ -172,9 +172,30 @@ def start(posed: Path, output: Path) -> subprocess.Popen:
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
 
 
+def test_the_time_of_interrupted_and_killed_calls_counts(posed, tmp_path, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr("hyrfpack.make.work.monotonic", lambda: clock[0])
+
+    def end(seconds: float, error: BaseException):
+        def train(*arguments, **options):
+            clock[0] += seconds
+            options["report"](1, 0.1, 0.01, 500)  # the time so far is recorded
+            clock[0] += 5  # less than what is recorded again
+            raise error
+
+        return train
+
+    for seconds, error in ((100.0, KeyboardInterrupt()), (40.0, SystemExit("killed"))):
+        with monkeypatch.context() as patch, pytest.raises((Stopped, SystemExit)):
+            patch.setattr(stages, "train", end(seconds, error))
+            make(posed, tmp_path / "scene.html")
+    result = make(posed, tmp_path / "scene.html")
+    assert result.seconds["training"] == 100 + 5 + 40 and result.total_seconds == sum(result.seconds.values())
+
+
 def test_a_kill_costs_nothing(whole, posed, tmp_path):
     child = start(posed, tmp_path / "scene.html")
-    assert any(line.strip() == "training 0.44" for line in child.stdout)
+    assert any(line.strip() == "training 4/9" for line in child.stdout)
     child.kill()
     child.communicate()
     assert child.returncode == -signal.SIGKILL

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import zipfile
 from pathlib import Path
@@ -16,8 +17,9 @@ from PIL import Image
 
 from hyrfpack import evaluate, load, load_scene, save
 from hyrfpack.errors import HyrfError
+from hyrfpack.format.smallest import min_file_bytes
 from hyrfpack.lock import exclusive_folder
-from hyrfpack.make import make, stages
+from hyrfpack.make import Stopped, make, stages
 from hyrfpack.make.progress import Progress, Reporter
 from hyrfpack.splats.formats import ply
 from hyrfpack.train.setup import LEAST_BUDGET
@@ -43,13 +45,25 @@ def test_short_runs_before_a_training_do_not_count_in_its_forecast(monkeypatch):
     monkeypatch.setattr("hyrfpack.make.progress.monotonic", lambda: clock[0])
     told: list[Progress] = []
     reporter = Reporter(["training"], told.append)
+    reporter.estimates |= {"pilots": 10.0, "training": 30.0, "results": 0.0}
     reporter.begin("training")
     report = stages._training_report(reporter, 1000)
-    for step in [0] * 40 + list(range(1, 101)):
+    for step in [0] * 240 + list(range(1, 301)):
         clock[0] += 0.1
         report(step, 0.1, 0.01, 500)
-    assert told[1].words == ("short runs tell how many Gaussians the scene is worth",) and told[1].share == 0
-    assert told[-1].share == 0.1 and told[-1].left == pytest.approx(90.0, rel=0.02)
+    assert told[240].words == ("short runs tell how many Gaussians the scene is worth",)
+    assert told[240].share == pytest.approx(0.125)  # half of the pilots, a quarter of all
+    assert told[-1].share == pytest.approx((10 + 0.3 * 30) / 40) and told[-1].left == pytest.approx(70.0, rel=0.02)
+
+
+def test_scores_and_pictures_after_the_last_step_are_a_part_of_the_training():
+    told: list[Progress] = []
+    reporter = Reporter(["training"], told.append)
+    reporter.estimates |= {"pilots": 0.0, "training": 30.0, "results": 10.0}
+    reporter.begin("training")
+    stages._training_report(reporter, 1)(1, 0.1, 0.01, 500)
+    assert told[-1].share == 0.75 and told[-1].left > 0
+    assert told[-1].words == ("writing the model, its scores and pictures",)
 
 
 # -- what is given, and what is asked for ----------------------------------------------------------------------------
@@ -70,7 +84,8 @@ def test_photos_without_poses_get_some(photos, poses, tmp_path):
     assert list(result.seconds) == ["poses", *STAGES]
     assert result.poses["left_out"] == {"dark.jpg": "blurred"}
     assert {progress.stage for progress in shares} == {"poses", *STAGES}
-    assert all(0 <= progress.share <= 1 and progress.left is not None and progress.left >= 0 for progress in shares)
+    for progress in shares:
+        assert 0 <= progress.share <= 1 and progress.left is not None and progress.left >= 0, progress
     assert len(load_scene(result.work / "scene").views) == 18
 
 
@@ -147,8 +162,88 @@ def test_of_few_photos_few_are_held_out(count, held_out, posed, tmp_path):
 
 def test_a_target_size_is_met(made, posed, tmp_path):
     whole = (made / "model.hyrf").stat().st_size
-    result = make(posed, tmp_path / "scene.hyrf", work=copy_of(made, tmp_path), target_bytes=whole * 3 // 4)
+    result = make(posed, tmp_path / "scene.hyrf", target_bytes=whole * 3 // 4)
     assert result.bytes <= whole * 3 // 4 and result.gaussians < LEAST_BUDGET
+
+
+def test_the_number_of_gaussians_and_the_preset_are_passed_to_the_training(posed, tmp_path):
+    arguments = ("make", posed, "-o", tmp_path / "scene.hyrf", "--max-gaussians", 300, "--preset", "large", "--json")
+    choices = json.loads(succeeded(*arguments).stdout)["training"]["choices"]
+    assert choices["max_gaussians"].startswith("300: ") and choices["preset"].startswith("large: ")
+
+
+# -- target sizes ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size, meant", [("10", "10MB"), ("500", "500kB")])
+def test_an_impossible_target_size_is_refused_before_any_work(size, meant, posed, photos, poses, tmp_path, monkeypatch):
+    monkeypatch.setattr("hyrfpack.make.stages.train", None)
+    for given in (posed, photos):
+        sentence = refused("make", given, "-o", tmp_path / "scene.html", "--target-size", size)
+        assert f"{size} bytes" in sentence and f"did you mean {meant}?" in sentence
+        (smallest,) = re.findall(r"smallest possible file, about ([\d,]+) bytes", sentence)
+        assert int(smallest.replace(",", "")) >= min_file_bytes()
+    assert not poses and not (tmp_path / "scene.work").exists()
+
+
+def test_another_target_size_packs_the_trained_model_anew_and_says_how_to_train_anew(made, posed, tmp_path):
+    work, said = copy_of(made, tmp_path), []
+    target = (made / "model.hyrf").stat().st_size * 3 // 4
+    result = make(posed, tmp_path / "a.hyrf", work=work, target_bytes=target, say=said.append)
+    assert result.kept == ("training",) and result.bytes <= target
+    assert any("trained without a target size" in sentence and "--work" in sentence for sentence in said)
+    assert make(posed, tmp_path / "b.hyrf", work=work).kept == ("training",)
+    assert (tmp_path / "b.hyrf").read_bytes() == (made / "model.hyrf").read_bytes()
+
+
+def test_a_training_that_was_stopped_goes_on_as_it_was_begun_whatever_target_size_is_asked_for_then(
+    posed, tmp_path, monkeypatch
+):
+    configs = []
+    usual = stages.train
+
+    def stop(scene, run, config, **options):
+        configs.append(config)
+        usual(scene, run, config, **options)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stages, "train", stop)
+        for target in (30_000, 50_000):
+            (tmp_path / "scene.work" / "run" / "metrics.json").unlink(missing_ok=True)
+            with pytest.raises(Stopped):
+                make(posed, tmp_path / "scene.hyrf", target_bytes=target)
+    assert [config.target_bytes for config in configs] == [30_000, 30_000]
+    said = []
+    result = make(posed, tmp_path / "scene.hyrf", target_bytes=50_000, say=said.append)
+    assert result.training["target_bytes"] == 30_000 and any("for 30,000 bytes" in sentence for sentence in said)
+
+
+def test_with_minutes_another_target_size_keeps_the_measurement_and_the_training(posed, tmp_path):
+    make(posed, tmp_path / "scene.hyrf", minutes=0.01, target_bytes=30_000)
+    result = make(posed, tmp_path / "scene.hyrf", minutes=0.01, target_bytes=50_000, overwrite=True)
+    assert result.kept == ("measurement", "training")
+
+
+def test_a_target_size_that_the_trained_model_cannot_have_names_one_that_it_can(made, posed, tmp_path):
+    work = copy_of(made, tmp_path)
+    arguments = ("make", posed, "-o", tmp_path / "scene.hyrf", "--work", work)
+    sentence = refused(*arguments, "--target-size", 2_100)
+    assert "the trained model does not fit into 2,100 bytes" in sentence and "--max-gaussians" not in sentence
+    assert "another work folder (--work)" in sentence
+    (possible,) = re.findall(r"ask for ([\d,]+) bytes or more", sentence)
+    succeeded(*arguments, "--target-size", possible.replace(",", ""))
+
+
+def test_a_work_folder_of_an_earlier_version_is_trained_anew_once(made, posed, tmp_path):
+    work, said = copy_of(made, tmp_path), []
+    table = json.loads((work / "make.json").read_text())
+    training = table["stages"]["training"]
+    training["inputs"]["settings"] |= training.pop("fixed")  # where both stood before
+    (work / "make.json").write_text(json.dumps(table))
+    assert make(posed, tmp_path / "scene.hyrf", work=work, say=said.append).kept[:1] != ("training",)
+    assert "training: made anew, for settings changed" in said
+    assert len(make(posed, tmp_path / "scene.hyrf", work=work).kept) == 4
 
 
 # -- what is done anew -----------------------------------------------------------------------------------------------
@@ -162,7 +257,9 @@ def test_a_target_size_is_met(made, posed, tmp_path):
         ({"seed": 1}, ()),
         ({"test_every": 3}, ()),
         ({"max_size": 24}, ()),
-        ({"target_bytes": 50_000}, ()),
+        ({"target_bytes": 50_000}, ("training",)),
+        ({"max_gaussians": 400}, ()),
+        ({"preset": "street"}, ()),
     ],
 )
 def test_changed_settings_redo_what_depends_on_them(settings, kept, made, posed, tmp_path):
@@ -178,6 +275,12 @@ def test_a_changed_photo_redoes_poses_and_all_else_and_a_moved_folder_nothing(ph
     said: list[str] = []
     result = make(moved, tmp_path / "b.hyrf", work=tmp_path / "work", quality="draft", say=said.append)
     assert "poses" not in result.kept and "poses: made anew, for photos changed" in said
+
+
+def test_poses_are_kept_from_a_draft_to_another_quality_and_back(photos, poses, tmp_path):
+    for quality in ("draft", "normal", "draft"):
+        make(photos, tmp_path / "scene.hyrf", quality=quality, overwrite=True)
+    assert poses == [photos]
 
 
 def test_matching_is_passed_on_and_counts(photos, poses, tmp_path):
@@ -226,6 +329,7 @@ def test_what_cannot_be_is_refused_before_any_work(posed, photos, made, tmp_path
     (tmp_path / "there.html").write_bytes(b"mine")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "letter.txt").write_bytes(b"mine")
+    (tmp_path / "letter.txt").write_bytes(b"mine")
     (tmp_path / "empty").mkdir()
     (tmp_path / "videos").mkdir()
     (tmp_path / "videos" / "clip.mp4").write_bytes(b"mine")
@@ -243,7 +347,12 @@ def test_what_cannot_be_is_refused_before_any_work(posed, photos, made, tmp_path
         ("but clip.mp4; name the video", tmp_path / "videos", "-o", out),
         ("is a .hyrf file already", made / "model.hyrf", "-o", tmp_path / "a.hyrf"),
         ("with photos only", made / "model.hyrf", "-o", out, "--minutes", 3),
+        ("with photos only", made / "model.hyrf", "-o", out, "--max-gaussians", 30),
+        ("with photos only", made / "model.hyrf", "-o", out, "--preset", "large"),
         ("give one of them", posed, "-o", out, "--minutes", 3, "--quality", "draft"),
+        ("give one of them", posed, "-o", out, "--max-gaussians", 300, "--target-size", "1MB"),
+        ("name a folder of photos", tmp_path / "letter.txt", "-o", out),
+        ("this is one photo; name a folder of photos", posed / "images" / "0003.png", "-o", out),
         ("'cuda:9' is not there", posed, "-o", out, "--device", "cuda:9"),
     ):
         assert sentence in refused("make", *arguments)
@@ -260,6 +369,30 @@ def test_a_stage_that_fails_names_its_folder_and_keeps_what_is_finished(posed, t
         sentence = refused("make", posed, "-o", tmp_path / "scene.html", "--quality", "draft")
     assert "compression failed: the disk is full; what is finished is kept in" in sentence
     assert make(posed, tmp_path / "scene.html", quality="draft").kept == ("training",)
+
+
+@pytest.mark.parametrize("given", ["clip.mp4", "one photo"])
+def test_what_fails_before_any_stage_is_finished_leaves_nothing_behind(given, tmp_path, monkeypatch):
+    """With the real estimation of poses: a video that is none, and a folder with one photo."""
+    if given == "clip.mp4":
+        (tmp_path / given).write_bytes(b"no video" * 100)
+    else:
+        (tmp_path / given).mkdir()
+        Image.new("RGB", (64, 48), "red").save(tmp_path / given / "a.jpg")
+    sentence = refused("make", tmp_path / given, "-o", tmp_path / "made" / "scene.html")
+    assert "poses failed: " in sentence and "what is finished" not in sentence
+    assert sorted(path.name for path in tmp_path.iterdir()) == [given]
+
+
+def test_a_failure_after_poses_keeps_them_and_says_so(photos, poses, tmp_path, monkeypatch):
+    def fail(*arguments, **options):
+        raise HyrfError("the masks leave nothing")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stages, "train", fail)
+        with pytest.raises(HyrfError, match="training failed: .*; what is finished is kept in"):
+            make(photos, tmp_path / "scene.html")
+    assert make(photos, tmp_path / "scene.html").kept == ("poses",)
 
 
 @pytest.mark.parametrize(
@@ -315,6 +448,7 @@ def test_the_command_tells_what_was_made(photos, poses, tmp_path):
         succeeded("make", photos, "-o", tmp_path / "scene.html", "--quality", "draft", "--json").stdout
     )
     assert numbers["kept"] == ["poses", *STAGES] and numbers["views"] == 3 and numbers["poses"]["sure"] == 17
+    assert numbers["total_seconds"] == pytest.approx(sum(numbers["seconds"].values()), abs=0.1)
 
 
 def test_the_command_says_where_it_was_stopped(posed, tmp_path, monkeypatch):

@@ -17,6 +17,11 @@ from hyrfpack.make.source import Reading
 from hyrfpack.train.config import FULL_STEPS
 from hyrfpack.train.pilots import LEAST_STEPS
 
+
+def asked(target_bytes: int | None = None, max_gaussians: int | None = None) -> Plan:
+    return Plan(3_000, 1_600, target_bytes=target_bytes, max_gaussians=max_gaussians)
+
+
 COST = Cost(step=0.1, step_per_gaussian=1e-6, decoding=0.01, cpu_pass=0.05, gaussians=5_000)
 CPU = torch.device("cpu")
 
@@ -46,7 +51,7 @@ def test_more_pixels_take_as_much_longer(scene):
 
 
 def test_a_smaller_model_takes_less_time(scene):
-    small = replace(COST, target_bytes=15_000)
+    small = replace(COST, asked=asked(15_000))
     assert small.training(scene, 1000) < COST.training(scene, 1000)
     assert small.after(scene, 1000)["compression"] < COST.after(scene, 1000)["compression"]
 
@@ -59,7 +64,7 @@ def test_a_line_goes_through_what_is_on_a_line_and_never_falls():
 
 
 def test_a_measurement_gives_a_cost_of_this_scene(scene):
-    cost = minutes.probe(scene, None, CPU, 0, PictureCache(), 5.0)
+    cost = minutes.probe(scene, asked(), CPU, 0, PictureCache(), 5.0)
     assert cost.step >= 0 and cost.step_per_gaussian >= 0 and cost.step + cost.step_per_gaussian > 0
     assert cost.cpu_pass > 0 and cost.decoding >= 0 and cost.gaussians > 0
 
@@ -73,7 +78,7 @@ def test_large_photos_are_made_smaller_where_the_time_is_short(posed, scene, mon
     said: list[str] = []
 
     def planned(seconds: float) -> Plan:
-        arguments = (posed, Reading(), scene, 90_000, CPU, monotonic() + seconds, 0, PictureCache())
+        arguments = (posed, Reading(), scene, asked(90_000), CPU, monotonic() + seconds, 0, PictureCache())
         return measure(*arguments, Reporter(["training"], None), said.append)
 
     plans = [planned(seconds) for seconds in (3000.0, 300.0, 100.0)]
@@ -86,7 +91,7 @@ def test_a_long_run_has_the_budget_that_the_scene_is_worth_and_a_short_one_all(p
     monkeypatch.setattr(minutes, "measure_budget", lambda *_: (0.5, "by a coin"))
 
     def planned(seconds: float, target_bytes: int | None = None) -> Plan:
-        arguments = (posed, Reading(), scene, target_bytes, CPU, monotonic() + seconds, 0, PictureCache())
+        arguments = (posed, Reading(), scene, asked(target_bytes), CPU, monotonic() + seconds, 0, PictureCache())
         return measure(*arguments, Reporter(["training"], None), lambda sentence: None)
 
     short, long, targeted = planned(60.0), planned(600.0), planned(600.0, 90_000)
@@ -99,10 +104,26 @@ def test_a_long_run_has_the_budget_that_the_scene_is_worth_and_a_short_one_all(p
 def test_a_time_that_is_over_or_too_short_makes_a_draft_and_says_so(posed, scene):
     said: list[str] = []
     for seconds in (-1.0, 0.5):
-        arguments = (posed, Reading(), scene, 20_000, CPU, monotonic() + seconds, 0, PictureCache())
+        arguments = (posed, Reading(), scene, asked(20_000), CPU, monotonic() + seconds, 0, PictureCache())
         plan = measure(*arguments, Reporter(["training"], None), said.append)
         assert (plan.steps, plan.target_bytes) == (6, 20_000)
     assert "the time is over" in said[0] and "the time is short" in said[1]
+
+
+def test_a_number_of_gaussians_is_kept_to_and_no_budget_measured(posed, scene, monkeypatch):
+    monkeypatch.setattr(minutes, "probe", lambda *_: Cost(0.0, 1e-5, 0.0, 0.0, 100))
+    monkeypatch.setattr(minutes, "measure_budget", None)
+    arguments = (posed, Reading(), scene, asked(max_gaussians=700), CPU, monotonic() + 600, 0, PictureCache())
+    plan = measure(*arguments, Reporter(["training"], None), lambda sentence: None)
+    assert (plan.config(0).max_gaussians, plan.budget_factor) == (700, None)
+
+
+def test_photos_are_never_larger_than_asked_for(posed, scene, monkeypatch):
+    monkeypatch.setattr(minutes, "probe", lambda *_: Cost(1e-3, 0.0, 0.0, 0.0, 100))
+    reading = Reading(max_size=24)
+    for seconds in (600.0, -1.0):
+        arguments = (posed, reading, reading.scene(posed), asked(90_000), CPU, monotonic() + seconds, 0, PictureCache())
+        assert measure(*arguments, Reporter(["training"], None), lambda sentence: None).max_size == 24
 
 
 def test_what_was_decided_is_kept(posed, tmp_path, monkeypatch):

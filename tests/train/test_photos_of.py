@@ -59,7 +59,15 @@ def test_metrics_that_say_nothing_are_as_none(text, run, tmp_path):
 
 @pytest.mark.parametrize(
     "reading",
-    [{"path": 3}, {"path": "a\0b"}, {"layout": "none"}, {"test_every": -1}, {"test_every": True}, {"more": 1}],
+    [
+        {"path": 3},
+        {"path": "a\0b"},
+        {"layout": "none"},
+        {"test_every": -1},
+        {"test_every": True},
+        {"held_out": [1]},
+        {"more": 1},
+    ],
     ids=str,
 )
 def test_metrics_that_make_no_sense_are_as_none(reading, run, tmp_path):
