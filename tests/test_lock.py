@@ -105,10 +105,11 @@ def test_killed_process_leaves_no_lock(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
     command = [sys.executable, "-c", script, str(tmp_path)]
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout.readline() == "locked\n"
-        assert BUSY in refusal(tmp_path)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+        try:
+            assert process.stdout.readline() == "locked\n"
+            assert BUSY in refusal(tmp_path)
+        finally:
+            process.send_signal(signal.SIGKILL)
     with exclusive_folder(tmp_path):
         assert list(tmp_path.iterdir()) == []
 

@@ -15,13 +15,22 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-from commands import hyrfpack, refused, succeeded
+from commands import hyrfpack as run_command
+from commands import refused, succeeded
 from explicit_balls import ball
+from scenes import ring
 
+import hyrfpack
+from hyrfpack.compress.report import write_report
+from hyrfpack.data import load_scene
+from hyrfpack.demo.run import run_demo
 from hyrfpack.errors import HyrfError
-from hyrfpack.format import load
+from hyrfpack.format import CompressionReport, load, repack
 from hyrfpack.lock import exclusive_folder
+from hyrfpack.make.posed import posed
+from hyrfpack.render.files import render_files
 from hyrfpack.splats.formats import ply
+from hyrfpack.train import TrainConfig
 
 pytest.importorskip("fcntl", reason="locks are of Unix")
 FOREIGN = b"of another program"
@@ -62,6 +71,22 @@ def appears(path: str, patch: pytest.MonkeyPatch) -> None:
         fsync(descriptor)
 
     patch.setattr(os, "fsync", create)
+
+
+def looked_at_each_write(folder: str, patch: pytest.MonkeyPatch) -> list[bool]:
+    """Whether a folder is locked, asked each time that a file is written."""
+    fsync, held = os.fsync, []
+
+    def look(descriptor: int) -> None:
+        try:
+            with exclusive_folder(folder):
+                held.append(False)
+        except HyrfError:
+            held.append(True)
+        fsync(descriptor)
+
+    patch.setattr(os, "fsync", look)
+    return held
 
 
 def files_in(folder: Path) -> dict[str, bytes]:
@@ -202,10 +227,39 @@ def test_a_file_that_appears_in_a_folder_of_files_that_name_each_other_is_kept(c
 
 def refused_at_last(command: str) -> str:
     """The one sentence of a command that was refused after its work."""
-    result = hyrfpack(*command.split())
+    result = run_command(*command.split())
     assert result.exit_code == 2 and "Traceback" not in result.stderr, result.output
     (sentence,) = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
     return sentence
+
+
+WRITERS = {  # functions of the library that write one file
+    "save": lambda out: hyrfpack.save(load("model.hyrf"), out, overwrite=False),
+    "repack": lambda out: repack("packed.hyrf", out, overwrite=False),
+    "compress": lambda out: hyrfpack.compress("model.hyrf", out, "paper", overwrite=False),
+    "distill": lambda out: hyrfpack.distill("ball.ply", out, hyrfpack.DistillConfig(steps=1, size=16), overwrite=False),
+    "export": lambda out: hyrfpack.export("model.hyrf", out, degree=0, overwrite=False),
+    "compare": lambda out: hyrfpack.compare(["first", "second"], out),
+}
+
+
+@pytest.mark.usefixtures("short_imports")
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_library_call_without_overwrite_keeps_what_appears_meanwhile_and_reports_the_path(name, world, monkeypatch):
+    ending = {"export": "ply", "compare": "html"}.get(name, "hyrf")
+    appears(f"out.{ending}", monkeypatch)
+    assert WRITERS[name](f"out.{ending}").file == f"out-2.{ending}"
+    assert Path(f"out.{ending}").read_bytes() == FOREIGN and Path(f"out-2.{ending}").is_file()
+
+
+@pytest.mark.parametrize("name", [name for name in WRITERS if name != "save"])
+def test_a_library_call_without_overwrite_refuses_a_file_that_is_there_at_the_start(name, world):
+    ending = {"export": "ply", "compare": "html"}.get(name, "hyrf")
+    Path(f"out.{ending}").write_bytes(FOREIGN)
+    before = files_in(world)
+    with pytest.raises(HyrfError, match="there is a file of this name"):
+        WRITERS[name](f"out.{ending}")
+    assert files_in(world) == before
 
 
 # -- two commands in one folder ----------------------------------------------------------------------------------------
@@ -240,22 +294,49 @@ def test_a_command_is_refused_where_another_one_is_at_work_and_nothing_changes(c
         assert {name: after[name] for name in after if name not in new} == before
 
 
+CALLS = {  # functions of the library that write into a folder
+    "train": lambda: hyrfpack.train(load_scene("data"), "out", TrainConfig(steps=2), quiet=True),
+    "estimate_poses": lambda: hyrfpack.estimate_poses("photos", "out"),
+    "evaluate": lambda: hyrfpack.evaluate(load("model.hyrf"), load_scene("data").test, pictures="out"),
+    "export": lambda: hyrfpack.export("model.hyrf", "out"),
+    "export colmap": lambda: hyrfpack.export("model.hyrf", "out", colmap=True),
+    "player": lambda: hyrfpack.export.player(None, "out"),
+    "gallery": lambda: hyrfpack.export.gallery(["model.hyrf"], "out"),
+    "make": lambda: hyrfpack.make("packed.hyrf", "out", work="made"),
+    "make work": lambda: hyrfpack.make("packed.hyrf", "new.html", work="out"),
+    "render_files": lambda: list(render_files(load("model.hyrf"), ring_of_two(), "out")),
+    "write_report": lambda: write_report("out", "model.hyrf", "packed.hyrf", CompressionReport("paper", 1, 1, 1, [])),
+    "run_demo": lambda: run_demo("out", steps=1),
+    "posed": lambda: posed(Path("photos"), Path("out")),
+}
+
+
+def ring_of_two() -> list:
+    return [(str(number), camera) for number, camera in enumerate(ring(2))]
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_a_library_call_is_refused_where_another_one_is_at_work_and_nothing_changes(name, world):
+    with exclusive_folder("out"):
+        before = files_in(world)
+        with pytest.raises(HyrfError, match=f"out: {BUSY}"):
+            CALLS[name]()
+        assert files_in(world) == before
+
+
+@pytest.mark.parametrize("name", [name for name in CALLS if name in ("export", "gallery", "render_files", "evaluate")])
+def test_a_library_call_holds_its_folder_while_it_writes(name, world, monkeypatch):
+    held = looked_at_each_write("out", monkeypatch)
+    CALLS[name]()
+    assert held and all(held)
+
+
 HOLDING = [command for command in FOLDERS if "--resume" not in command and "pos" not in command]
 
 
 @pytest.mark.parametrize("command", HOLDING)
 def test_a_command_holds_its_folder_while_it_writes(command, world, monkeypatch):
-    fsync, held = os.fsync, []
-
-    def look(descriptor: int) -> None:
-        try:
-            with exclusive_folder("out"):
-                held.append(False)
-        except HyrfError:
-            held.append(True)
-        fsync(descriptor)
-
-    monkeypatch.setattr(os, "fsync", look)
+    held = looked_at_each_write("out", monkeypatch)
     succeeded(*command.split())
 
     writes = held[1:] if "--report" in command else held  # the file comes before the page

@@ -94,11 +94,11 @@ def test_an_interrupt_in_poses_goes_on(photos, poses, tmp_path, monkeypatch):
 def test_an_output_that_was_copied_in_part_is_gone_on_with(posed, tmp_path, monkeypatch):
     usual, copies = stages.copy, []
 
-    def stop(source, target):
+    def stop(source, target, **options):
         copies.append(target)
         if len(copies) == 3:
             raise KeyboardInterrupt
-        usual(source, target)
+        usual(source, target, **options)
 
     with monkeypatch.context() as patch:
         patch.setattr(stages, "copy", stop)

@@ -88,6 +88,16 @@ def test_failing_ffmpeg_is_quoted_and_leaves_the_old_video(tmp_path, monkeypatch
     assert not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.skipif(os.name == "nt", reason="needs executable scripts")
+def test_without_overwrite_a_video_that_appears_meanwhile_is_kept(tmp_path, monkeypatch):
+    video = tmp_path / "video.mp4"
+    body = f"open({str(video)!r}, 'wb').write(b'foreign')\nopen(sys.argv[-1], 'wb').write(sys.stdin.buffer.read())"
+    stand_in_ffmpeg(tmp_path, monkeypatch, body)
+    (tmp_path / "frame.png").write_bytes(b"frame")
+    assert write_video([tmp_path / "frame.png"], video, overwrite=False) == tmp_path / "video-2.mp4"
+    assert video.read_bytes() == b"foreign" and (tmp_path / "video-2.mp4").read_bytes() == b"frame"
+
+
 def test_video_without_ffmpeg_says_so(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(HyrfError, match="no ffmpeg program"):

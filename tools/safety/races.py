@@ -33,7 +33,9 @@ from pathlib import Path
 
 import torch
 
-from hyrfpack import compress, export, make  # noqa: F401 - loaded before processes are forked
+import hyrfpack.compress
+import hyrfpack.export
+import hyrfpack.make  # noqa: F401 - these three are loaded before processes are forked
 from hyrfpack.cli import main as cli
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.train.run import METRICS, MODEL
