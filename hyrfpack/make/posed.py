@@ -7,11 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hyrfpack.errors import HyrfError
+from hyrfpack.format.run_folder import CHECKPOINT, METRICS, MODEL
 from hyrfpack.make.progress import Progress, Reporter
 from hyrfpack.make.source import Reading, Source
 from hyrfpack.make.stages import SCENE, is_posed
 from hyrfpack.make.work import Say, interruptible
-from hyrfpack.train.run import CHECKPOINT, METRICS, MODEL
 
 
 def posed(

@@ -23,6 +23,7 @@ from hyrfpack.evaluate import evaluate
 from hyrfpack.evaluate.metrics import decibels
 from hyrfpack.export import export
 from hyrfpack.format import describe, load
+from hyrfpack.format.run_folder import CHECKPOINT, METRICS, MODEL
 from hyrfpack.make.plan import Plan
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.state import digest, digest_all
@@ -30,7 +31,6 @@ from hyrfpack.make.work import PRODUCTS, Work
 from hyrfpack.scene import Scene
 from hyrfpack.train import train
 from hyrfpack.train.progress import SMOOTHING
-from hyrfpack.train.run import CHECKPOINT, METRICS, MODEL
 
 SCENE, RUN, PACKED, EXPORTED = (PRODUCTS[stage] for stage in ("poses", "training", "compression", "export"))
 POSES = "poses.json"  # the report of `hyrfpack.estimate_poses`, in the scene's folder

@@ -25,6 +25,7 @@ from hyrfpack.device import choose_own_device, describe_device
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate import Evaluation, evaluate, picture_names
 from hyrfpack.evaluate.figures import training_curve
+from hyrfpack.format.run_folder import CHECKPOINT, METRICS, MODEL
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import ALONE, Ranks
@@ -37,7 +38,7 @@ from hyrfpack.train.pilots import MOST_STEPS, is_undecided, is_usable, measure_b
 from hyrfpack.train.progress import ProgressLine
 from hyrfpack.train.trainer import Trainer
 
-MODEL, CHECKPOINT, METRICS, CURVE, VIEWS = "model.hyrf", "checkpoint.pt", "metrics.json", "curve.png", "views"
+CURVE, VIEWS = "curve.png", "views"
 # What ends a run early; Windows has no SIGHUP.
 STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 Report = Callable[[int, float, float, int], None]  # step, loss, mean squared error, Gaussians
