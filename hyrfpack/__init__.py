@@ -4,7 +4,7 @@
 
     scene = hyrfpack.load_scene("data/bonsai")
     result = hyrfpack.train(scene, "runs/bonsai", hyrfpack.TrainConfig(steps=3000))
-    hyrfpack.compress("runs/bonsai/model.hyrf", "bonsai.hyrf")
+    hyrfpack.compress("runs/bonsai", "bonsai.hyrf")
     model = hyrfpack.load("bonsai.hyrf")
     print(hyrfpack.evaluate(model, scene.test).psnr)
     picture = hyrfpack.render(model, scene.test[0].camera).rgb
@@ -50,7 +50,9 @@ if TYPE_CHECKING:
     from hyrfpack.errors import HyrfTrainingError as HyrfTrainingError
     from hyrfpack.evaluate import Evaluation as Evaluation
     from hyrfpack.evaluate import evaluate as evaluate
+    from hyrfpack.export import ConversionReport as ConversionReport
     from hyrfpack.export import ExportReport as ExportReport
+    from hyrfpack.export import convert as convert
     from hyrfpack.export import export as export
     from hyrfpack.format import describe as describe
     from hyrfpack.format.codec import CompressionReport as CompressionReport
@@ -102,7 +104,9 @@ _PUBLIC = {
     "DistillConfig": "hyrfpack.distill",
     "DistillReport": "hyrfpack.distill",
     "ComparisonReport": "hyrfpack.compare",
+    "ConversionReport": "hyrfpack.export",
     "ExportReport": "hyrfpack.export",
+    "convert": "hyrfpack.export",
     "MakeResult": "hyrfpack.make",
     "PhotoSurvey": "hyrfpack.make",
     "describe_photos": "hyrfpack.make",

@@ -26,6 +26,7 @@ REFUSED = {
     "bench": ("missing.hyrf",),
     "compare": (["missing", "other"], "out.html"),
     "compress": ("missing.hyrf", "out.hyrf"),
+    "convert": ("missing.ply", "out.spz"),
     "describe": ("missing.hyrf",),
     "describe_photos": ("missing",),
     "distill": ("missing.ply", "out.hyrf"),

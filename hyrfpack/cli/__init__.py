@@ -9,24 +9,28 @@ from __future__ import annotations
 import errno
 import sys
 import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import click
 
 import hyrfpack
 from hyrfpack.cli.bench import bench
+from hyrfpack.cli.common import print_json
 from hyrfpack.cli.compare import compare
+from hyrfpack.cli.convert import convert
 from hyrfpack.cli.demo import demo
 from hyrfpack.cli.export import export
 from hyrfpack.cli.files import compress, decompress, info
 from hyrfpack.cli.imports import import_
 from hyrfpack.cli.make import make
-from hyrfpack.cli.manners import add_manners, is_verbose, keep_arguments, mend_streams, note
+from hyrfpack.cli.manners import add_manners, arguments_of, is_verbose, keep_arguments, mend_streams, note
 from hyrfpack.cli.poses import poses
 from hyrfpack.cli.train import train
 from hyrfpack.cli.view import view
 from hyrfpack.cli.views import evaluate, render
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfError, printable
 
 
 class _Commands(click.Group):
@@ -40,7 +44,17 @@ class _Commands(click.Group):
         keep_arguments(ctx, args)
         return super().parse_args(ctx, args)
 
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
+    ) -> click.Context:
+        with _errors_as_json(args):
+            return super().make_context(info_name, args, parent, **extra)
+
     def invoke(self, ctx: click.Context) -> Any:
+        with _errors_as_json(arguments_of(ctx)):
+            return self._invoke(ctx)
+
+    def _invoke(self, ctx: click.Context) -> Any:
         try:
             result = super().invoke(ctx)
         except HyrfError as error:
@@ -69,6 +83,19 @@ def _tell_of_kernels() -> None:
         )
 
 
+@contextmanager
+def _errors_as_json(arguments: Sequence[str]) -> Iterator[None]:
+    """Print an error that the user can correct on standard output, too, where --json is among the arguments."""
+    as_json = "--json" in arguments
+    try:
+        yield
+    except click.ClickException as error:
+        if as_json:
+            with suppress(OSError):  # standard output may be what the error is about
+                print_json({"error": printable(error.format_message())})
+        raise
+
+
 class _Refusal(click.ClickException):
     exit_code = 2
 
@@ -94,7 +121,23 @@ def main() -> None:
 
 
 _COMMANDS = (
-    *(make, poses, train, compare, compress, decompress, render, evaluate, export, view, import_, bench, info, demo),
+    *(
+        make,
+        poses,
+        train,
+        compare,
+        compress,
+        decompress,
+        render,
+        evaluate,
+        export,
+        view,
+        import_,
+        convert,
+        bench,
+        info,
+        demo,
+    ),
 )
 for _command in _COMMANDS:
     main.add_command(_command)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,8 @@ import click
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
+    json_option,
+    named_model,
     note,
     note_rename,
     overwrite_option,
@@ -36,8 +37,8 @@ GROUPS = ("rasterize", "hash_encode", "mlp", "render", "codec")  # hyrfpack.benc
 @click.option(
     "--markdown", type=OUTPUT, metavar="FILE", help="Also write the tables, into the places FILE has for them."
 )
-@click.option("--json", "json_file", type=click.Path(allow_dash=True), metavar="FILE", help="Also write all numbers.")
 @overwrite_option
+@json_option
 def bench(
     model: Path | None,
     data: Path | None,
@@ -46,20 +47,20 @@ def bench(
     only: tuple[str, ...],
     output: Path,
     markdown: Path | None,
-    json_file: str | None,
     overwrite: bool,
+    as_json: bool,
 ) -> None:
     """Measure each operation and each setting that trades accuracy for time, and print time beside error.
 
-    MODEL is a .hyrf file, best a run's model.hyrf; without it a small one is trained on a made-up scene first (about
+    MODEL is the folder of a run, or a .hyrf file; without it a small one is trained on a made-up scene first (about
     a minute). Losses are told in PSNR and SSIM against held-out photos of --data, or without photos against the
-    model's own exact pictures. --json - prints the numbers alone on standard output.
+    model's own exact pictures. --json prints all numbers, some of which the tables leave out.
 
     \b
     Examples:
       hyrfpack bench
-      hyrfpack bench runs/bonsai/model.hyrf --data photos/bonsai -o bonsai-speed.png
-      hyrfpack bench runs/bonsai/model.hyrf --only render --only codec --json numbers.json
+      hyrfpack bench runs/bonsai --data photos/bonsai -o bonsai-speed.png
+      hyrfpack bench runs/bonsai --only render --only codec --json > numbers.json
     """
     if data is not None and model is None:
         raise click.UsageError("--data are the photos of MODEL; name the model too")
@@ -72,19 +73,18 @@ def bench(
     from hyrfpack.format import describe
     from hyrfpack.measure.machine import machine_line
 
+    model = None if model is None else named_model(model)
     picture_format(output)
     scene = None if data is None or model is None else read_scene(data, reading, describe(model))
     outputs = Outputs(model, scene=scene, overwrite=overwrite)
     outputs.file(output)
-    if json_file not in (None, "-"):
-        outputs.file(json_file)
     page = _read_page(markdown)
     if page:  # does it have all places? Better asked now than after minutes
         words.fill(page, dict.fromkeys(("machine", *(only or GROUPS)), ""), str(markdown))
     if markdown is not None:  # a page with the places is not replaced, they are filled
         Outputs(model, scene=scene, overwrite=overwrite or bool(page)).file(markdown)
     result = measure(model, scene, repeats=repeats, only=only or None, say=note)
-    if json_file == "-":
+    if as_json:
         print_json(result.to_dict())
     else:
         click.echo(f"{machine_line(result.machine)}\n{result.subject}")
@@ -92,9 +92,6 @@ def bench(
             click.echo(f"\n{part.title}\n{table(part.header, part.cells)}")
         for sentence in result.notes:
             click.echo(f"\nnote: {sentence}")
-    if json_file not in (None, "-"):
-        numbers = json.dumps(result.to_dict(), indent=1, allow_nan=False).encode()
-        note_rename(Path(json_file), write_atomic(json_file, numbers, overwrite=overwrite))
     note(f"{note_rename(output, plot(result.rows, output, overwrite=overwrite))}: time against error")
     if markdown is not None:
         blocks = words.markdown(result)

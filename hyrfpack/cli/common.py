@@ -188,6 +188,21 @@ def note_rename(asked: Path, written: Path | str) -> Path:
     return Path(written)
 
 
+def named_model(path: Path) -> Path:
+    """Return the `.hyrf` file that an argument names, see `hyrfpack.format.find_model`.
+
+    Raises:
+        HyrfError: it is a folder without a model, or names splats, which have to be imported first.
+    """
+    from hyrfpack.format import find_model
+    from hyrfpack.splats.names import is_splats
+
+    if is_splats(path):
+        model = Path(path.stem).with_suffix(".hyrf")
+        raise HyrfError(f"{path}: these are splats, not a model; import it first: 'hyrfpack import {path} -o {model}'")
+    return find_model(path)
+
+
 def split_views(scene: Scene, split: str) -> list[View]:
     """The views of a split.
 

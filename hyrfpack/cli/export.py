@@ -21,11 +21,13 @@ from hyrfpack.cli.common import (
     scene_options,
     table,
 )
+from hyrfpack.cli.progress import shown_progress
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
     from hyrfpack.export import ExportReport
+    from hyrfpack.splats.table import Kind
 
 
 class _Box(click.ParamType):
@@ -58,6 +60,17 @@ class _Degree(click.ParamType):
         return int(str(value))
 
 
+crop_option = click.option(
+    "--crop",
+    type=_Box(),
+    metavar="BOX",
+    help="Keep what is in MINX,MINY,MINZ,MAXX,MAXY,MAXZ, world units, without the background.",
+)
+min_opacity_option = click.option(
+    "--min-opacity", type=click.FloatRange(0, 1), default=0.0, show_default=True, help="Leave out fainter Gaussians."
+)
+
+
 @click.command(short_help="Write a model for other programs.")
 @click.argument("models", metavar="[MODEL]...", type=PATH, nargs=-1)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="What to write; its ending says how.")
@@ -72,15 +85,8 @@ class _Degree(click.ParamType):
     metavar="0-3|auto",
     help="Of the spherical harmonics: how finely colour follows the direction. A .splat has 0.",
 )
-@click.option(
-    "--crop",
-    type=_Box(),
-    metavar="BOX",
-    help="Keep what is in MINX,MINY,MINZ,MAXX,MAXY,MAXZ, world units, without the background.",
-)
-@click.option(
-    "--min-opacity", type=click.FloatRange(0, 1), default=0.0, show_default=True, help="Leave out fainter Gaussians."
-)
+@crop_option
+@min_opacity_option
 @click.option("--background/--no-background", default=True, help="Take the background along.  [default: do]")
 @click.option(
     "--data",
@@ -108,7 +114,7 @@ def export(
     reading: dict[str, Any],
     as_json: bool,
 ) -> None:
-    """Write MODEL, a .hyrf file, as what other programs read, and say what was lost on the way.
+    """Write MODEL, a .hyrf file or the folder of a run, as what other programs read, and say what was lost on the way.
 
     \b
     The ending of -o is the format:
@@ -127,61 +133,72 @@ def export(
       hyrfpack export bonsai.hyrf -o bonsai.html
       hyrfpack export bonsai.hyrf -o player/
       hyrfpack export bonsai.hyrf room.hyrf -o gallery/
-      hyrfpack export runs/bonsai/model.hyrf -o bonsai.spz --sh-degree 2
+      hyrfpack export runs/bonsai -o bonsai.spz --sh-degree 2
       hyrfpack export bonsai.hyrf -o bonsai.ply --data photos/bonsai --min-opacity 0.02
       hyrfpack export bonsai.hyrf -o table.glb --crop -1,-1,-1,1,1,1
     """
     from hyrfpack.export import export as write
     from hyrfpack.export.folder import check_folder, gallery, player
     from hyrfpack.export.kinds import PLAYER, check_place, check_request, kind_of
-    from hyrfpack.format import describe
-    from hyrfpack.splats.files import READ
+    from hyrfpack.format import describe, find_model
+    from hyrfpack.splats.names import is_splats
 
     kind = kind_of(output, colmap)
     if len(models) != 1 and kind is not PLAYER:
         what = "there is no MODEL to write" if not models else "several models make a gallery, which is a folder"
         raise HyrfError(f"{output}: {what}; name one MODEL")
-    splats = [model for model in models if model.suffix.lower() in READ]
+    splats = [model for model in models if is_splats(model)]
     if splats and kind is not PLAYER:
-        raise HyrfError(
-            f"{splats[0]}: files of splats are played from a folder (-o player/); 'hyrfpack import' makes a .hyrf file"
-        )
+        raise HyrfError(_how_to_write_splats(splats[0], output, kind))
+    files = [model if model in splats else find_model(model) for model in models]
     if splats and data:
         raise HyrfError(f"{splats[0]}: photos go with .hyrf files only; leave out --data, or this file")
     if data and len(data) != len(models):
         raise HyrfError(f"--data is given {len(data)} times, for {len(models)} models; give it once for each, or not")
     check_request(kind, output, degree, crop, min_opacity, background, baked)
-    scenes = [read_scene(path, reading, describe(model)) for path, model in zip(data, models, strict=False)]
+    scenes = [read_scene(path, reading, describe(model)) for path, model in zip(data, files, strict=False)]
     if kind is PLAYER:
         check_folder(output, models, scenes, overwrite=overwrite, listed=len(models) > 1)
     else:
-        check_place(output, Outputs(*models, scene=scenes[0] if scenes else None, overwrite=overwrite), colmap)
-    if len(models) != 1:
-        report = (
-            gallery(models, output, data=scenes, overwrite=overwrite, say=note)
-            if models
-            else player(None, output, overwrite=overwrite)
-        )
-    else:
-        report = write(
-            *models,
-            output,
-            degree=degree,
-            data=scenes[0] if scenes else None,
-            crop=crop,
-            min_opacity=min_opacity,
-            background=background,
-            spz_version=int(spz_version),
-            baked=baked,
-            colmap=colmap,
-            overwrite=overwrite,
-            say=note,
-        )
+        check_place(output, Outputs(*files, scene=scenes[0] if scenes else None, overwrite=overwrite), colmap)
+    with shown_progress("export") as progress:
+        if len(models) > 1:
+            report = gallery(models, output, data=scenes, overwrite=overwrite, say=note)
+        elif not models:
+            report = player(None, output, overwrite=overwrite)
+        else:
+            report = write(
+                models[0],
+                output,
+                degree=degree,
+                data=scenes[0] if scenes else None,
+                crop=crop,
+                min_opacity=min_opacity,
+                background=background,
+                spz_version=int(spz_version),
+                baked=baked,
+                colmap=colmap,
+                overwrite=overwrite,
+                say=note,
+                report=progress,
+            )
     note_rename(output, report.file)
     if as_json:
         print_json(asdict(report))
         return
     _print(report)
+
+
+def _how_to_write_splats(source: Path, output: Path, kind: Kind) -> str:
+    """The sentence that names the command for splats of another program."""
+    from hyrfpack.splats.table import FORMATS
+
+    if kind.ending in FORMATS:
+        return f"{source}: these are splats, not a model; convert them with 'hyrfpack convert {source} {output}'"
+    return (
+        f"{source}: splats are played from a folder (-o player/); for {kind.ending or 'this'} import them first: "
+        f"'hyrfpack import {source} -o {source.with_suffix('.hyrf').name}'"
+    )
 
 
 def _print(report: ExportReport) -> None:
@@ -190,15 +207,23 @@ def _print(report: ExportReport) -> None:
             f"{report.file}: {report.bytes:,} bytes, {report.gaussians:,} Gaussians, as they are: nothing is baked"
         )
         return
+    ending = Path(report.file).suffix
     if report.views:
         rows = [
-            [f"baked, degree {report.degree}", f"{report.psnr_baked:.2f}"],
-            ["as read back from the file", f"{report.psnr:.2f}"],
+            [f"baked to harmonics of degree {report.degree}, not yet written", f"{report.psnr_baked:.2f}"],
+            [f"read back from the {ending} file", f"{report.psnr:.2f}"],
         ]
-        click.echo(table([f"against the model, {report.views} views", "PSNR (dB)"], rows))
+        click.echo(table([f"against the model's own pictures, {report.views} views", "PSNR (dB)"], rows))
+        click.echo(
+            f"the first row is what baking loses, the second what baking and the rounding of {ending} lose together; "
+            "neither compares with photos"
+        )
     behind = f", {report.background:,} of them for the background" if report.background else ""
     holds = f", {report.gaussians:,} Gaussians{behind}" if report.gaussians else ""
     cameras = f", {report.cameras:,} cameras" if report.cameras else ""
     click.echo(f"{report.file}: {report.bytes:,} bytes{holds}{cameras}")
     if report.photos_model is not None:
-        click.echo(f"held-out photos: PSNR {report.photos_model:.3f} to {report.photos_file:.3f} dB")
+        click.echo(
+            f"against held-out photos: PSNR {report.photos_model:.3f} dB of the model, {report.photos_file:.3f} dB of "
+            "the file"
+        )

@@ -14,9 +14,11 @@ from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
     SIZE,
+    at_predicted_exposure,
     chosen_device,
     device_option,
     json_option,
+    named_model,
     note,
     note_rename,
     number,
@@ -27,12 +29,15 @@ from hyrfpack.cli.common import (
     table,
 )
 from hyrfpack.cli.processes import on_processes
+from hyrfpack.cli.progress import shown_progress
 from hyrfpack.errors import printable
 from hyrfpack.outputs import ARCHIVES, PICTURES, VIDEOS, Outputs
+from hyrfpack.progress import report_part
 
 if TYPE_CHECKING:
     from hyrfpack.format import CompressionReport
     from hyrfpack.parallel.ranks import Ranks
+    from hyrfpack.progress import Report
     from hyrfpack.scene import Scene
 
 # Those of hyrfpack.format.codec, without loading torch.
@@ -115,11 +120,9 @@ def compress(
     from hyrfpack.compress import compress as pack
     from hyrfpack.compress.report_page import FILES
     from hyrfpack.format import describe
-    from hyrfpack.train.run import MODEL
 
+    model = named_model(model)
     place = chosen_device(device, ranks)
-    if model.is_dir():
-        model /= MODEL
 
     def read() -> Scene | None:
         if data is not None:
@@ -133,24 +136,26 @@ def compress(
         return scene
 
     scene = ranks.agree(read)
-    result = pack(
-        model,
-        output,
-        profile,
-        data=scene,
-        finetune_steps=finetune_steps or 0,
-        prune=prune,
-        target_bytes=target_size,
-        max_psnr_drop=max_psnr_drop,
-        overwrite=overwrite,
-        device=place,
-        say=note,
-        ranks=ranks,
-    )
-    if not ranks.leads:
-        return
+    with shown_progress("compress") as progress:
+        result = pack(
+            model,
+            output,
+            profile,
+            data=scene,
+            finetune_steps=finetune_steps or 0,
+            prune=prune,
+            target_bytes=target_size,
+            max_psnr_drop=max_psnr_drop,
+            overwrite=overwrite,
+            device=place,
+            say=note,
+            report=report_part(progress, 0.0, 0.9),
+            ranks=ranks,
+        )
+        if not ranks.leads:
+            return
+        scores = _scores(model, Path(result.file), scene, report_part(progress, 0.9, 1.0))
     written = note_rename(output, result.file)
-    scores = _scores(model, written, scene)
     if report is not None:
         from hyrfpack.compress.report import write_report
 
@@ -172,7 +177,8 @@ def compress(
 @overwrite_option
 @json_option
 def decompress(file: Path, output: Path, fraction: float | None, overwrite: bool, as_json: bool) -> None:
-    """Unpack FILE into a .hyrf file of profile raw: the numbers that FILE decodes to, bit for bit.
+    """Unpack FILE, or the model in the folder of a run, into a .hyrf file of profile raw: bit for bit what it decodes
+    to.
 
     A large file of profile compact comes in layers, the most important Gaussians first, so that its start is a model,
     too. With --fraction the rest of the file may be missing.
@@ -182,19 +188,24 @@ def decompress(file: Path, output: Path, fraction: float | None, overwrite: bool
       hyrfpack decompress bonsai.hyrf -o back.hyrf
       hyrfpack decompress bonsai.hyrf -o coarse.hyrf --fraction 0.6
     """
-    Outputs(file, overwrite=overwrite).file(output, ".hyrf")
     from hyrfpack.format import repack
 
+    file = named_model(file)
+    Outputs(file, overwrite=overwrite).file(output, ".hyrf")
     result = repack(file, output, fraction=fraction, overwrite=overwrite)
     note_rename(output, result.file)
     _print_report(result, {}, as_json)
 
 
-@click.command(short_help="Show what a file holds, or what photos are like.")
+@click.command(short_help="Show what a file, a run or a folder of photos holds.")
 @click.argument("path", metavar="FILE", type=PATH)
 @json_option
 def info(path: Path, as_json: bool) -> None:
     """Show what FILE holds: the model, the bytes of each part, and what was chosen in training and why.
+
+    Of the folder of a training run, its model, steps and scores, or how far it is.
+
+    Of splats (.ply .splat .spz .sog), their format, number, harmonics and bounds.
 
     Of a folder of photos, with poses or without, its .zip, or a video: how many there are, their poses and cameras,
     how sharp and how evenly exposed they are, what is wrong with them and what to do.
@@ -203,10 +214,19 @@ def info(path: Path, as_json: bool) -> None:
     Examples:
       hyrfpack info bonsai.hyrf
       hyrfpack info bonsai.hyrf --json
+      hyrfpack info runs/bonsai
+      hyrfpack info other.ply
       hyrfpack info photos/bonsai
       hyrfpack info clip.mp4
     """
-    if path.is_dir() or (path.is_file() and path.suffix.lower() in (*ARCHIVES, *VIDEOS, *PICTURES)):
+    from hyrfpack.format.run_folder import is_run_folder
+    from hyrfpack.splats.names import is_splats
+
+    if is_run_folder(path):
+        _describe_run(path, as_json)
+    elif is_splats(path):
+        _describe_splats(path, as_json)
+    elif path.is_dir() or (path.is_file() and path.suffix.lower() in (*ARCHIVES, *VIDEOS, *PICTURES)):
         _describe_photos(path, as_json)
     else:
         _describe_model(path, as_json)
@@ -214,18 +234,60 @@ def info(path: Path, as_json: bool) -> None:
 
 def _describe_photos(path: Path, as_json: bool) -> None:
     from hyrfpack.cli.survey import print_survey
-    from hyrfpack.make.display import Display
-    from hyrfpack.make.progress import Reporter
     from hyrfpack.make.survey import describe_photos
 
-    with Display() as display:
-        reporter = Reporter(["info"], display.show)
-        reporter.begin("info")
-        survey = describe_photos(path, report=lambda doing, share: reporter.update(share, doing))
+    with shown_progress("info") as progress:
+        survey = describe_photos(path, report=progress)
     if as_json:
         print_json(asdict(survey))
     else:
         print_survey(survey)
+
+
+def _describe_run(folder: Path, as_json: bool) -> None:
+    from hyrfpack.format import describe, read_run_status
+    from hyrfpack.format.run_folder import MODEL, describe_unfinished
+
+    run = read_run_status(folder)
+    facts = describe(folder) if (folder / MODEL).is_file() else {}
+    if as_json:
+        print_json({**facts, "run": asdict(run)})
+        return
+    if run.finished:
+        steps = "" if run.steps is None else f": {run.steps:,} steps"
+        seconds = "" if run.seconds is None else f" in {run.seconds:,.0f} s"
+        _say(f"{folder}: a finished training run{steps}{seconds}")
+    else:
+        _say(f"{folder}: {describe_unfinished(run)}")
+    if run.photos is not None:
+        _say(f"photos: {run.photos}, {run.train} to train on and {run.test} held out")
+    if run.psnr is not None and run.ssim is not None:
+        predicted = at_predicted_exposure(run.psnr_predicted)
+        _say(f"held-out photos: PSNR {run.psnr:.2f} dB{predicted}, SSIM {run.ssim:.4f}")
+    if facts:
+        click.echo()
+        _print_model(folder / MODEL, facts)
+
+
+def _describe_splats(path: Path, as_json: bool) -> None:
+    from hyrfpack.splats.facts import describe_splats
+    from hyrfpack.splats.files import read_splats
+
+    facts = describe_splats(path, read_splats(path))
+    if as_json:
+        print_json(facts.to_dict())
+        return
+    click.echo(f"{path}: {facts.bytes:,} bytes, {facts.gaussians:,} Gaussians")
+    rows = [
+        ("format", facts.format + (", antialiased" if facts.antialiased else "")),
+        ("bytes/Gaussian", f"{facts.bytes / max(facts.gaussians, 1):.1f}"),
+        ("harmonics", f"degree {facts.degree}"),
+    ]
+    if facts.low is not None and facts.high is not None and facts.opacity is not None:
+        low, high = (", ".join(f"{value:.4g}" for value in corner) for corner in (facts.low, facts.high))
+        rows += [("centres", f"from ({low}) to ({high}), world units"), ("opacity", f"median {facts.opacity:.2f}")]
+    for name, text in rows:
+        _say(f"  {name:<14}  {text}")
 
 
 def _describe_model(file: Path, as_json: bool) -> None:
@@ -234,7 +296,11 @@ def _describe_model(file: Path, as_json: bool) -> None:
     facts = describe(file)
     if as_json:
         print_json(facts)
-        return
+    else:
+        _print_model(file, facts)
+
+
+def _print_model(file: Path, facts: dict) -> None:
     config, provenance = facts["config"], facts["provenance"]
     click.echo(f"{file}: {facts['bytes']:,} bytes, {facts['gaussians']:,} Gaussians")
     _say(f"written by {facts['writer']}, format {facts['version']}, profile {facts['profile']}")
@@ -293,7 +359,7 @@ def _photos_of(model: Path) -> Scene | None:
     return scene
 
 
-def _scores(before: Path, after: Path, scene: Scene | None) -> dict[str, float]:
+def _scores(before: Path, after: Path, scene: Scene | None, report: Report) -> dict[str, float]:
     """Mean PSNR and SSIM on held-out photos of both files, where there are photos; the predicted PSNR, too, where
     exposures were learnt."""
     if scene is None or not scene.test:
@@ -303,7 +369,8 @@ def _scores(before: Path, after: Path, scene: Scene | None) -> dict[str, float]:
     from hyrfpack.format import describe, load
 
     training = scene.train if has_mean_exposure(describe(before)["provenance"]) else ()
-    old, new = (evaluate(load(path), scene.test, training=training) for path in (before, after))
+    old = evaluate(load(before), scene.test, training=training, report=report_part(report, 0.0, 0.5))
+    new = evaluate(load(after), scene.test, training=training, report=report_part(report, 0.5, 1.0))
     scores = {"psnr_before": old.psnr, "psnr": new.psnr, "ssim_before": old.ssim, "ssim": new.ssim}
     if old.psnr_predicted is not None and new.psnr_predicted is not None:
         scores |= {"psnr_predicted_before": old.psnr_predicted, "psnr_predicted": new.psnr_predicted}

@@ -21,6 +21,7 @@ from hyrfpack.cli.common import (
     print_json,
     table,
 )
+from hyrfpack.cli.progress import shown_progress
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -92,7 +93,10 @@ def import_(
     given = None if cameras is None else _cameras(cameras)
     place = chosen_device(device)
     config = DistillConfig(steps=steps, psnr=psnr, size=size, seed=seed)
-    report = distill(source, output, config, cameras=given, overwrite=overwrite, device=place, say=note, quiet=False)
+    with shown_progress("import") as progress:
+        report = distill(
+            source, output, config, cameras=given, overwrite=overwrite, device=place, say=note, report=progress
+        )
     written = note_rename(output, report.file)
     if as_json:
         print_json(report.to_dict())

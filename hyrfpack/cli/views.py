@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,13 +26,16 @@ from hyrfpack.cli.common import (
 )
 from hyrfpack.cli.manners import counted
 from hyrfpack.cli.processes import on_processes
+from hyrfpack.cli.progress import shown_progress
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
+    from hyrfpack.cli.subject import Subject
     from hyrfpack.evaluate import Evaluation, ViewScore
     from hyrfpack.model import HybridModel
     from hyrfpack.parallel.ranks import Ranks
     from hyrfpack.scene import Scene, View
+    from hyrfpack.splats.draw import Drawable
 
 SPLITS = ("test", "train", "all")
 DEFAULT_ORBIT = 60  # frames
@@ -72,7 +75,9 @@ def render(
     as_json: bool,
     ranks: Ranks,
 ) -> None:
-    """Render MODEL, a .hyrf file, to PNG pictures: the views of photos, cameras of a file, or an orbit of 60 frames.
+    """Render MODEL to PNG pictures: the views of photos, cameras of a file, or an orbit of 60 frames.
+
+    MODEL is a .hyrf file, the folder of a run, or splats (.ply .splat .spz .sog), which are drawn over black.
 
     A cameras file is a list of {"name", "width", "height", "fx", "fy", "cx", "cy", "camera_from_world": 4 x 4}
     with OpenCV axes, or a transforms.json as nerfstudio writes it.
@@ -82,27 +87,28 @@ def render(
       hyrfpack render bonsai.hyrf -o orbit --video
       hyrfpack render bonsai.hyrf -o out --data photos/bonsai --split test
       hyrfpack render bonsai.hyrf -o path --cameras path.json --depth
+      hyrfpack render other.ply -o orbit --orbit 90
     """
     if sum(source is not None for source in (data, cameras, orbit)) > 1:
         raise click.UsageError("--data, --cameras and --orbit each say what to render; give one of them")
-    from hyrfpack.cameras.capture import Capture
     from hyrfpack.cameras.files import cameras_from_json
     from hyrfpack.cameras.paths import orbit as orbit_around
-    from hyrfpack.format import describe, load
+    from hyrfpack.cli.subject import Subject
     from hyrfpack.lock import exclusive_folder
-    from hyrfpack.render.files import render_files_unlocked, rendered_names
+    from hyrfpack.render.files import render_files_unlocked, rendered_names, write_pictures
     from hyrfpack.render.video import has_ffmpeg, write_video
+    from hyrfpack.splats.draw import Drawable, draw
 
     place = chosen_device(device, ranks)
-    part, scene = 1.0 if allow_partial else None, None
+    subject, scene = ranks.agree(lambda: Subject.of(model, place, precision, allow_partial)), None
     if data is not None:
-        scene = ranks.agree(lambda: read_scene(data, reading, describe(model, part)))
+        scene = ranks.agree(lambda: read_scene(data, reading, subject.facts))
         views = split_views(scene, split)
         named = [(view.name, view.camera) for view in views]
     elif cameras is not None:
         named = cameras_from_json(cameras)
     else:
-        cameras_around = orbit_around(Capture(describe(model, part)).viewpoint, orbit or DEFAULT_ORBIT)
+        cameras_around = orbit_around(subject.viewpoint, orbit or DEFAULT_ORBIT)
         named = [(f"{number:04d}", camera) for number, camera in enumerate(cameras_around)]
     film = output / "video.mp4" if video and has_ffmpeg() else None
     names = rendered_names([name for name, _ in named], depth)
@@ -110,12 +116,16 @@ def render(
 
     def check(replace: bool) -> None:
         if ranks.leads:
-            Outputs(model, cameras, scene=scene, overwrite=replace).folder(output, names)
+            outputs = Outputs(subject.path, cameras, folder=subject.folder, scene=scene, overwrite=replace)
+            outputs.folder(output, names)
 
     def write() -> list[Path]:
-        loaded = load(model, place, part)
-        loaded.precision = precision
-        pictures = render_files_unlocked(loaded, named, output, depth=depth, overwrite=overwrite, ranks=ranks)
+        shown = subject.load()
+        if isinstance(shown, Drawable):
+            picture_of = partial(draw, shown, depth=depth)
+            pictures = write_pictures(picture_of, named, output, overwrite=overwrite, ranks=ranks)
+        else:
+            pictures = render_files_unlocked(shown, named, output, depth=depth, overwrite=overwrite, ranks=ranks)
         return list(counted(pictures, len(ranks.share(named)), "rendering"))
 
     ranks.agree(lambda: check(replace=True))  # whatever lies there: no folder is created where nothing may be written
@@ -166,7 +176,10 @@ def evaluate(
     as_json: bool,
     ranks: Ranks,
 ) -> None:
-    """Score MODEL, a .hyrf file, against photos it has not seen: PSNR, SSIM, LPIPS, bytes on disk, seconds a frame.
+    """Score MODEL against photos it has not seen: PSNR, SSIM, LPIPS, bytes on disk, seconds a frame.
+
+    MODEL is a .hyrf file, the folder of a run, or splats (.ply .splat .spz .sog) in the photos' axes and units, drawn
+    over black: what 'hyrfpack export' wrote, or another program.
 
     Renders are rounded to 8 bits before they are scored. PSNR is told three times: at the photos' mean exposure, at the
     one that training photos beside predict, and with colours corrected by the photo itself. LPIPS needs the trained
@@ -177,37 +190,39 @@ def evaluate(
     Examples:
       hyrfpack evaluate bonsai.hyrf --data photos/bonsai
       hyrfpack evaluate bonsai.hyrf --data photos/bonsai --pictures compare --json
+      hyrfpack evaluate bonsai.ply --data photos/bonsai
     """
+    from hyrfpack.cli.subject import Subject
     from hyrfpack.evaluate import evaluate as score
     from hyrfpack.evaluate import picture_names
-    from hyrfpack.format import describe, load
 
-    part = 1.0 if allow_partial else None
     device_here = chosen_device(device, ranks)
 
-    def read() -> tuple[HybridModel, Scene, list[View]]:
-        loaded = load(model, device_here, part)
-        loaded.precision = precision
-        scene = read_scene(data, reading, describe(model, part))
+    def read() -> tuple[Subject, HybridModel | Drawable, Scene, list[View]]:
+        subject = Subject.of(model, device_here, precision, allow_partial)
+        shown = subject.load()
+        scene = read_scene(data, reading, subject.facts)
         views = split_views(scene, split)
         if pictures is not None:
-            outputs = Outputs(model, lpips_weights, scene=scene, overwrite=overwrite)
+            outputs = Outputs(subject.path, lpips_weights, folder=subject.folder, scene=scene, overwrite=overwrite)
             outputs.folder(pictures, picture_names(views).values())
-        return loaded, scene, views
+        return subject, shown, scene, views
 
-    loaded, scene, views = ranks.agree(read)
-    scores = score(
-        loaded,
-        views,
-        training=scene.train,
-        lpips_weights=lpips_weights,
-        pictures=pictures,
-        overwrite=overwrite,
-        ranks=ranks,
-    )
+    subject, shown, scene, views = ranks.agree(read)
+    with shown_progress("evaluate") as progress:
+        scores = score(
+            shown,
+            views,
+            training=scene.train,
+            lpips_weights=lpips_weights,
+            pictures=pictures,
+            overwrite=overwrite,
+            report=progress,
+            ranks=ranks,
+        )
     if not ranks.leads:
         return
-    size = os.path.getsize(model)
+    size = subject.bytes
     width, height = largest_picture(view.camera for view in views)
     if scores.skipped:
         note(f"{len(scores.skipped)} photos were not scored because their masks leave no pixel")

@@ -13,8 +13,8 @@ from hyrfpack.compare.page import encode_comparison
 from hyrfpack.compare.run import read_run, short_names
 from hyrfpack.compare.views import read_views
 from hyrfpack.errors import HyrfError
+from hyrfpack.format.run_folder import METRICS, MODEL
 from hyrfpack.outputs import Outputs, StrPath
-from hyrfpack.train.run import METRICS, MODEL
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,10 @@ from typing import Any
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.format import describe
+from hyrfpack.format.run_folder import CHECKPOINT, METRICS, MODEL
 from hyrfpack.outputs import StrPath
 from hyrfpack.render.files import file_names
-from hyrfpack.train.run import CHECKPOINT, METRICS, MODEL, VIEWS
+from hyrfpack.train.run import VIEWS
 
 LARGEST = 1e15  # no step, count, size or time in the metrics of a run that ever was is larger
 KINDS: dict[type, str] = {str: "text", list: "a list", dict: "an object"}

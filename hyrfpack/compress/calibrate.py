@@ -33,10 +33,12 @@ from hyrfpack.format.sections import (
     POSITIONS,
     RADIANCE_TABLE,
     SCALES,
+    SECTIONS,
     TABLES,
 )
 from hyrfpack.model import Decoded, HybridModel
 from hyrfpack.parallel.pool import side_by_side
+from hyrfpack.progress import Report, no_report, report_part, report_round
 from hyrfpack.render import render
 from hyrfpack.scene import Camera
 
@@ -143,23 +145,35 @@ class Originals:
 
 
 def calibrated(
-    model: HybridModel, cameras: Sequence[Camera], distortion: float, prune: bool = True
+    model: HybridModel,
+    cameras: Sequence[Camera],
+    distortion: float,
+    prune: bool = True,
+    report: Report = no_report,
 ) -> tuple[Sensitivity, Originals]:
     """A model's sensitivities for about so large a distortion, calibrated, and the pictures that they are by.
 
     Args:
         cameras: where pictures will be looked at from, about; world units.
         distortion, prune: as `make_plan` takes them.
+        report: told what is being done, and the share of the work that is done.
 
     Raises:
         HyrfError: a number of the model is NaN or infinite.
     """
-    sensitivity, originals = measure_sensitivity(model, cameras), Originals.of(model, cameras)
-    return calibrate(model, sensitivity, originals, distortion, prune), originals
+    sensitivity = measure_sensitivity(model, cameras, report=report_part(report, 0.0, 0.5))
+    report("drawing what files are compared with", 0.5)
+    originals = Originals.of(model, cameras)
+    return calibrate(model, sensitivity, originals, distortion, prune, report_part(report, 0.55, 1.0)), originals
 
 
 def calibrate(
-    model: HybridModel, sensitivity: Sensitivity, originals: Originals, distortion: float, prune: bool = True
+    model: HybridModel,
+    sensitivity: Sensitivity,
+    originals: Originals,
+    distortion: float,
+    prune: bool = True,
+    report: Report = no_report,
 ) -> Sensitivity:
     """Sensitivities by which a plan for about so large a distortion foretells what its pictures show.
 
@@ -167,6 +181,7 @@ def calibrate(
         sensitivity: first-order, from `measure_sensitivity`.
         originals: pictures of the model.
         distortion, prune: as `make_plan` takes them.
+        report: told what is being done, and the share of the work that is done.
 
     Raises:
         HyrfError: a parameter is NaN or infinite.
@@ -178,17 +193,18 @@ def calibrate(
         return model.part(index), decoded_all[index]
 
     # Pruning first: what the others do depends on what is left.
-    def without_pruned(scaled: Sensitivity, _: list[Part]) -> dict[Part, Tried]:
+    def without_pruned(scaled: Sensitivity, _: list[Part], report: Report) -> dict[Part, Tried]:
+        report("calibrating what may be pruned", 0.0)
         kept = worth_keeping(scaled, each)
         return {(PRUNED,): Tried(originals.error(*part_of(kept)), float(np.delete(scaled.removals, kept).sum()))}
 
     if prune:
-        sensitivity = _corrected(sensitivity, ((PRUNED,),), distortion, without_pruned)
+        sensitivity = _corrected(sensitivity, ((PRUNED,),), distortion, without_pruned, report_part(report, 0.0, 0.2))
     left, decoded = part_of(worth_keeping(sensitivity, each, prune))
     whole = Originals.seen(originals.views, left, decoded)
     placed: tuple[np.ndarray, Plan, HybridModel] | None = None
 
-    def as_stored(scaled: Sensitivity, parts: list[Part]) -> dict[Part, Tried]:
+    def as_stored(scaled: Sensitivity, parts: list[Part], report: Report) -> dict[Part, Tried]:
         nonlocal placed
         if placed is None or not np.array_equal(placed[0], scaled.positions):
             plan = make_plan(model, scaled, distortion, prune)
@@ -206,9 +222,13 @@ def calibrate(
             changed = _changed(left, {name: stored[name] for name in part})
             return whole.error(changed, _decoded_anew(changed, decoded, part))
 
-        return {part: Tried(found(part), sum(told[name] for name in part)) for part in parts}
+        tried = {}
+        for number, part in enumerate(parts):
+            report(f"calibrating {' and '.join(SECTIONS[name] for name in part)}", number / len(parts))
+            tried[part] = Tried(found(part), sum(told[name] for name in part))
+        return tried
 
-    return _corrected(sensitivity, PARTS, distortion, as_stored)
+    return _corrected(sensitivity, PARTS, distortion, as_stored, report_part(report, 0.2, 1.0))
 
 
 def foretold(
@@ -241,7 +261,8 @@ def _corrected(
     sensitivity: Sensitivity,
     parts: Sequence[Part],
     distortion: float,
-    attempt: Callable[[Sensitivity, list[Part]], dict[Part, Tried]],
+    attempt: Callable[[Sensitivity, list[Part], Report], dict[Part, Tried]],
+    report: Report,
 ) -> Sensitivity:
     """Sensitivities whose parts foretell what is found.
 
@@ -253,11 +274,12 @@ def _corrected(
         return sensitivity.times({name: factor for part, factor in factors.items() for name in part})
 
     factors = {part: Factor(LAWS.get(part, 1.0)) for part in parts}
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
         waiting = [part for part, factor in factors.items() if not factor.done]
         if not waiting:
             break
-        for part, tried in attempt(scaled({part: factor.value for part, factor in factors.items()}), waiting).items():
+        values = scaled({part: factor.value for part, factor in factors.items()})
+        for part, tried in attempt(values, waiting, report_round(report, number)).items():
             if tried.told > 0 and max(tried.found, tried.told) > MINOR * distortion:
                 factors[part].correct(tried.found / tried.told)
             else:

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import count
 from typing import Any, cast
 
 import torch
@@ -15,7 +16,7 @@ import torch
 from hyrfpack.cameras.capture import Capture, coarse, has_mean_exposure
 from hyrfpack.checks import check_type
 from hyrfpack.compress.calibrate import Originals, calibrated, foretold
-from hyrfpack.compress.distortion import LIMITS, default_distortion
+from hyrfpack.compress.distortion import LIMITS, PSNR_DROP, default_distortion
 from hyrfpack.compress.finetune import finetune, gains_of_photos
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.quantize import quantize
@@ -35,15 +36,20 @@ from hyrfpack.format.codec import (
     write_model,
 )
 from hyrfpack.format.info import describe
+from hyrfpack.format.run_folder import find_model
 from hyrfpack.format.smallest import check_target_bytes
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import ALONE, Ranks
-from hyrfpack.scene import Scene, View
+from hyrfpack.progress import Report, no_report, report_part, report_round
+from hyrfpack.scene import Scene, View, evenly_spaced
 
+TOLERATED_DROP, DROP_VIEWS = 1.5, 8  # factor from the dB aimed at, and training photos that these are measured on
 TOLERATED, MENDED = 1.2, 3  # factor from the distortion asked for, and how often another file is made beyond it
 COARSER, FINER = 2.0, 16.0  # factors at most that another file differs by
 TRIALS, FINETUNED_TRIALS = 9, 4  # of a search
+# Shares of the whole work at which sensitivities are measured and the first file is made: alone, and of many.
+ENCODING_STARTS, SEARCH_STARTS = 0.7, 0.3
 
 
 @dataclass(frozen=True)
@@ -77,6 +83,7 @@ def compress(
     overwrite: bool = True,
     device: str | torch.device = "auto",
     say: Callable[[str], None] = lambda sentence: None,
+    report: Report = no_report,
     ranks: Ranks = ALONE,
     **settings: Any,
 ) -> CompressionReport:
@@ -87,7 +94,7 @@ def compress(
     the rest is for when that is not what is wanted. "paper" and "raw" do what they always do, and take none of it.
 
     Args:
-        source: a file of any profile, best "raw".
+        source: a file of any profile, best "raw", or the folder of a run.
         target: the file to write.
         profile: "compact", "paper" or "raw".
         data: photos of the scene.
@@ -102,6 +109,7 @@ def compress(
         device: where pictures are drawn, see `hyrfpack.device.choose_device`. On the CPU the same input gives the same
             bytes; on a GPU sums of gradients vary in their last bits, and bytes with them.
         say: told what is going on.
+        report: told what is being done, and the share of the work that is done.
         ranks: processes that share the photos of fine-tuning; rank 0 writes the file.
         settings: of "paper", see `hyrfpack.format.paper`; `noise` is the old word for `distortion`.
 
@@ -112,7 +120,7 @@ def compress(
 
     Example:
         >>> import hyrfpack
-        >>> report = hyrfpack.compress("runs/bonsai/model.hyrf", "small.hyrf")
+        >>> report = hyrfpack.compress("runs/bonsai", "small.hyrf")
         >>> report.profile, report.bytes_after < report.bytes_before
         ('compact', True)
     """
@@ -121,6 +129,7 @@ def compress(
         distortion = settings.pop("noise")
     if data is not None:
         check_type("data", data, Scene)
+    source = find_model(source)
     # The main process alone looks, and the others wait for it: what it has written is no reason to refuse.
     outputs = Outputs(source, scene=data, overwrite=overwrite)
     ranks.agree(lambda: outputs.file(target) if ranks.leads else None)
@@ -152,21 +161,26 @@ def compress(
     cameras = Capture(describe(source), data).cameras
     say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
     start = distortion or default_distortion(provenance, finetune_steps)
-    sensitivity, originals = calibrated(model, cameras, start, prune)
+    encoding_starts = SEARCH_STARTS if finetune_steps or target_bytes or max_psnr_drop is not None else ENCODING_STARTS
+    measuring = report_part(report, 0.0, encoding_starts)
+    sensitivity, originals = calibrated(model, cameras, start, prune, measuring)
     sensitivity = ranks.first(sensitivity)  # on GPUs those of others differ in their last bits
-    packer = Packer(model, kept, sensitivity, data, finetune_steps, prune, say, ranks=ranks)
+    encoding = report_part(report, encoding_starts, 1.0)
+    packer = Packer(model, kept, sensitivity, data, finetune_steps, prune, say, encoding, ranks=ranks)
     if target_bytes is not None:
         trial, found = packer.within_bytes(target_bytes, start)
     elif max_psnr_drop is not None:
         trial, found = packer.within_drop(max_psnr_drop, start)
     else:
-        trial, found = packer.attempt(start) if finetune_steps else packer.settled(start, originals), ""
+        aim = PSNR_DROP if distortion is None else None
+        trial = packer.attempt(start, encoding) if finetune_steps else packer.settled(start, originals, aim)
+        found = ""
     written = ranks.agree(lambda: write_model(trial.data, target, overwrite=overwrite) if ranks.leads else None)
-    report = cast(CompressionReport, ranks.first(written))
+    result = cast(CompressionReport, ranks.first(written))
     total = sum(trial.errors.values())
     shares = {part: error / (total or 1.0) for part, error in trial.errors.items()}
     return dataclasses.replace(
-        report,
+        result,
         shares=shares,
         error=trial.error or total,
         found=found,
@@ -187,6 +201,7 @@ class Packer:
         finetune_steps: of each file.
         prune: leave out Gaussians that cost more in bytes than they give to pictures.
         say: told what is going on.
+        report: told what is being done, and the share of all files' making that is done.
         cache: of the photos.
         ranks: processes that fine-tune together.
     """
@@ -198,52 +213,94 @@ class Packer:
     finetune_steps: int
     prune: bool
     say: Callable[[str], None]
+    report: Report = no_report
     cache: PictureCache = field(default_factory=PictureCache)
     ranks: Ranks = ALONE
 
-    def attempt(self, distortion: float) -> Trial:
+    def attempt(self, distortion: float, report: Report = no_report) -> Trial:
         """A file that adds about so large a mean squared error to pictures."""
+        report("planning quantisation", 0.0)
         model, steps = self.model, self.finetune_steps
         plan = make_plan(model, self.sensitivity, distortion, self.prune)
         if steps:
             assert self.scene is not None
             self.say(f"fine-tuning for {steps:,} steps")
-            fit = partial(finetune, gains=self._gains, cache=self.cache, ranks=self.ranks)
+
+            own_steps = -(-steps // self.ranks.size)
+
+            def stepped(step: int, loss: float) -> None:
+                report(f"fine-tuning, step {step:,} of {own_steps:,}", 0.9 * step / own_steps)
+
+            fit = partial(finetune, gains=self._gains, cache=self.cache, report=stepped, ranks=self.ranks)
             planned, plan = fit(model, plan, self.sensitivity, self.scene.train, steps)
         else:
             planned = plan.apply(model)
+        report("quantising", 0.9 if steps else 0.1)
         quantized = quantize(planned, plan, self.sensitivity, reach=0 if steps else 1)
+        report("coding", 0.95 if steps else 0.6)
         data = encode_model(planned, "compact", self.provenance, quantized=quantized)
         return Trial(data, foretold(self.model, planned, quantized, self.sensitivity))
 
-    def settled(self, wanted: float, originals: Originals) -> Trial:
-        """A file whose pictures are off by about as much as is `wanted`.
+    def settled(self, wanted: float, originals: Originals, aim: float | None = None) -> Trial:
+        """A file whose pictures are off by about as much as is `wanted`, and cost about `aim` dB on training photos.
+
+        What packing adds to the error of photos is taken to be `wanted`, which it is where the two errors have nothing
+        to do with each other. Those of a model that has hardly been trained have: packing shifts the colours of whole
+        pictures, whose exposure the model does not hit, either. Where there are photos the loss is measured on some,
+        and a file that costs more than TOLERATED_DROP times `aim` is made finer.
+        """
+        if self.scene is None or aim is None:
+            return self._settled(wanted, originals, self.report)[0]
+        trial, distortion = self._settled(wanted, originals, report_part(self.report, 0.0, 0.3))
+        views = evenly_spaced(self.scene.train, DROP_VIEWS)
+        try:
+            before = self._psnr(self.model, views, report_part(self.report, 0.3, 0.6))
+            for number in range(MENDED):
+                report = report_round(report_part(self.report, 0.6, 1.0), number)
+                lost = before - self._psnr(self.decoded(trial), views, report)
+                if lost <= TOLERATED_DROP * aim:
+                    break
+                distortion *= max(aim / lost, 1 / FINER)
+                self.say(f"training photos lose {lost:.2f} instead of {aim:g} dB: finer, for {distortion:.2g}")
+                trial = self.attempt(distortion)
+                trial = dataclasses.replace(trial, error=originals.error(self.decoded(trial)))
+        except HyrfError as error:  # a photo that cannot be read, or masks that leave nothing
+            self.say(f"{error}; the loss on training photos is not measured")
+        return trial
+
+    def _settled(self, wanted: float, originals: Originals, report: Report) -> tuple[Trial, float]:
+        """A file whose pictures are off by about as much as is `wanted`, and the distortion that it was made for.
 
         Its parts were calibrated one by one; together they may do a little more or less.
         """
 
-        def attempt(distortion: float) -> Trial:
-            trial = self.attempt(distortion)
+        def attempt(distortion: float, number: int) -> Trial:
+            trying = report_round(report, number)
+            trial = self.attempt(distortion, report_part(trying, 0.0, 0.5))
+            trying("comparing pictures of the file with the model's", 0.5)
             return dataclasses.replace(trial, error=originals.error(self.decoded(trial)))
 
-        trial, distortion = attempt(wanted), wanted
-        for _ in range(MENDED):
+        trial, distortion = attempt(wanted, 0), wanted
+        for number in range(MENDED):
             off = trial.error / wanted
             if off == 0 or 1 / TOLERATED < off < TOLERATED:
                 break
             distortion /= min(max(off, 1 / COARSER), FINER)
             kind = "finer" if off > 1 else "coarser"
             self.say(f"pictures are off by {trial.error:.2g} instead of {wanted:.2g}: {kind}, for {distortion:.2g}")
-            other = attempt(distortion)
+            other = attempt(distortion, number + 1)
             if off > 1:
                 trial = other
                 continue
-            return other if other.error < TOLERATED * wanted else trial  # once: what no view sees has a limit, too
-        return trial
+            # Once: what no view sees has a limit, too.
+            return (other, distortion) if other.error < TOLERATED * wanted else (trial, wanted)
+        return trial, distortion
 
     def within_bytes(self, limit: int, start: float) -> tuple[Trial, str]:
+        rounds = count()
+
         def attempt(distortion: float) -> Trial:
-            trial = self.attempt(distortion)
+            trial = self.attempt(distortion, report_round(self.report, next(rounds)))
             self.say(f"distortion {distortion:.2g}: {len(trial.data):,} bytes")
             return trial
 
@@ -261,10 +318,14 @@ class Packer:
     def within_drop(self, limit: float, start: float) -> tuple[Trial, str]:
         assert self.scene is not None
         views = self.scene.test or self.scene.train
+        self.report("scoring the model", 0.0)
         before = self._psnr(self.model, views)
+        rounds = count()
 
         def attempt(distortion: float) -> Trial:
-            trial = self.attempt(distortion)
+            report = report_round(self.report, next(rounds))
+            trial = self.attempt(distortion, report_part(report, 0.0, 0.7))
+            report("scoring the file", 0.7)
             lost = before - self._psnr(self.decoded(trial), views)
             trial = dataclasses.replace(trial, lost=lost)
             self.say(f"distortion {distortion:.2g}: {len(trial.data):,} bytes, {lost:+.3f} dB lost")
@@ -292,11 +353,12 @@ class Packer:
         model.precision = self.model.precision
         return model
 
-    def _psnr(self, model: HybridModel, views: Sequence[View]) -> float:
+    def _psnr(self, model: HybridModel, views: Sequence[View], report: Report = no_report) -> float:
         """At the exposure that photos beside each predict, where the model has their mean: what the photos' own
         exposures add to the error would hide what packing adds."""
         assert self.scene is not None
-        scores = evaluate(model, views, training=self.scene.train if has_mean_exposure(self.provenance) else ())
+        training = self.scene.train if has_mean_exposure(self.provenance) else ()
+        scores = evaluate(model, views, training=training, report=report)
         return scores.psnr if scores.psnr_predicted is None else scores.psnr_predicted
 
     def _trials(self) -> int:

@@ -12,6 +12,7 @@ from hyrfpack.cameras.between import views_at_and_between
 from hyrfpack.format.arrays import GROUPS
 from hyrfpack.format.sections import COLORS, MLPS, OPACITIES, POSITIONS, SCALES, TABLES
 from hyrfpack.model import Geometry, HybridModel, expand
+from hyrfpack.progress import Report, no_report
 from hyrfpack.render import render
 from hyrfpack.scene import Camera
 
@@ -69,7 +70,9 @@ class Sensitivity:
         return Sensitivity(positions, colors, scales, opacities, removals, fields)
 
 
-def measure_sensitivity(model: HybridModel, cameras: Sequence[Camera], seed: int = 0) -> Sensitivity:
+def measure_sensitivity(
+    model: HybridModel, cameras: Sequence[Camera], seed: int = 0, report: Report = no_report
+) -> Sensitivity:
     """Estimate the mean squared derivatives of pictures by every number of a model.
 
     With v a picture of random signs, the derivative of (picture . v) by a number x is a sum of random signs times the
@@ -82,6 +85,7 @@ def measure_sensitivity(model: HybridModel, cameras: Sequence[Camera], seed: int
     Args:
         cameras: where pictures will be looked at from, about; world units.
         seed: of the signs and of the views between cameras.
+        report: told of each view, and the share of the work that is done.
 
     Raises:
         HyrfError: a number of the model is NaN or infinite.
@@ -96,6 +100,7 @@ def measure_sensitivity(model: HybridModel, cameras: Sequence[Camera], seed: int
     wanted = {name: parameter.requires_grad for name, parameter in model.named_parameters()}
     pixels, field_pixels = 0, 0
     for number, camera in enumerate(views):
+        report(f"measuring sensitivities, view {number + 1} of {len(views)}", number / len(views))
         # Pairs alternate, so a field's views fall on cameras and between them.
         with_fields = number % (2 * every) < 2
         for name, parameter in model.named_parameters():

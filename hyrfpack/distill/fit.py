@@ -20,8 +20,10 @@ from hyrfpack.distill.config import DistillConfig
 from hyrfpack.distill.pack import pack
 from hyrfpack.distill.teach import teach
 from hyrfpack.outputs import Outputs
+from hyrfpack.progress import Report, no_report, report_part
 from hyrfpack.scene import Camera
 from hyrfpack.splats.files import read_splats
+from hyrfpack.splats.names import bytes_on_disk
 from hyrfpack.splats.splats import Splats
 
 
@@ -72,7 +74,7 @@ def distill(
     overwrite: bool = True,
     device: str | torch.device = "auto",
     say: Callable[[str], None] = lambda sentence: None,
-    quiet: bool = True,
+    report: Report = no_report,
 ) -> DistillReport:
     """Make a `.hyrf` file from a file of 3D Gaussians; see `distill_splats`, and `read_splats` for what is read.
 
@@ -93,11 +95,11 @@ def distill(
         check_type("each of the cameras", camera, Camera)
     Outputs(source, overwrite=overwrite).file(target)
     splats = read_splats(source)
-    report = distill_splats(
+    result = distill_splats(
         splats, target, config, name=str(source), cameras=cameras, overwrite=overwrite, device=device, say=say,
-        quiet=quiet,
+        report=report,
     )  # fmt: skip
-    return dataclasses.replace(report, bytes_source=_bytes_at(Path(source)))
+    return dataclasses.replace(result, bytes_source=bytes_on_disk(source))
 
 
 def distill_splats(
@@ -110,7 +112,7 @@ def distill_splats(
     overwrite: bool = True,
     device: str | torch.device = "auto",
     say: Callable[[str], None] = lambda sentence: None,
-    quiet: bool = True,
+    report: Report = no_report,
 ) -> DistillReport:
     """Turn splats into a hybrid model that looks like them, and pack it (profile compact).
 
@@ -128,7 +130,7 @@ def distill_splats(
             meantime is kept: the result gets a free name beside it, which the report tells.
         device: where pictures are drawn and the model learns, see `hyrfpack.device.choose_device`.
         say: told what is going on.
-        quiet: show no progress line.
+        report: told what is being done, and the share of the work that is done.
 
     Raises:
         HyrfDataError: no view shows any of the splats.
@@ -137,13 +139,16 @@ def distill_splats(
     started = time.perf_counter()
     Outputs(overwrite=overwrite).file(target)
     place = choose_device(device, say)
-    taught = teach(splats, config, name=name, cameras=cameras, device=place, say=say, quiet=quiet)
+    taught = teach(
+        splats, config, name=name, cameras=cameras, device=place, say=say, report=report_part(report, 0.0, 0.7)
+    )
     unpacked = float(np.mean(taught.test.likeness(taught.model)))
     say(f"{unpacked:.2f} dB before packing")
     imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
     provenance = {"steps": config.steps, "seed": config.seed, "psnr": unpacked, "choices": {"imported": imported}}
-    data = pack(taught, config.psnr, provenance, say)
+    data = pack(taught, config.psnr, provenance, say, report_part(report, 0.7, 0.97))
     written = write_atomic(target, data, overwrite=overwrite)  # only now: an interrupt leaves what was there before
+    report("scoring the file", 0.97)
     decoded = hyrf_format.load(written).to(place)
     decoded.precision = taught.model.precision
     scores = taught.test.likeness(decoded)
@@ -181,11 +186,3 @@ def _shortfall(reached: float, unpacked: float, config: DistillConfig, *, made_u
         return f"{told}: ask for more than you need with --psnr"
     where = ", or name with --cameras from where it will be looked at" if made_up else ""
     return f"{told}: learn longer, as with --steps {max(DistillConfig.steps, 2 * config.steps)}{where}"
-
-
-def _bytes_at(path: Path) -> int:
-    """Of a file, or of all files in a folder (that of a loose SOG's meta.json, too)."""
-    folder = path.parent if path.name == "meta.json" else path
-    if folder.is_dir():
-        return sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
-    return path.stat().st_size

@@ -12,6 +12,7 @@ from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.compress.calibrate import calibrated
 from hyrfpack.compress.packer import Packer
 from hyrfpack.distill.teach import Taught
+from hyrfpack.progress import Report, no_report, report_part, report_round
 
 PACKED = 0.8  # of what packing may add, to ask for
 LEAST_ADDED = 0.25  # of the error before packing, that packing may add in any case
@@ -19,12 +20,20 @@ HOPELESS = 0.5  # of the error allowed, that it may add where that is passed alr
 TRIALS = 5  # files that are made so
 
 
-def pack(taught: Taught, psnr: float, provenance: dict, say: Callable[[str], None] = lambda sentence: None) -> bytes:
+def pack(
+    taught: Taught,
+    psnr: float,
+    provenance: dict,
+    say: Callable[[str], None] = lambda sentence: None,
+    report: Report = no_report,
+) -> bytes:
     """A file as small as the quality that is asked for allows, as views tell that it has not learnt from.
 
     Args:
         psnr: dB of its pictures against the original's.
         provenance: that the file tells, besides where it is looked at from.
+        say: told what is going on.
+        report: told what is being done, and the share of the work that is done.
 
     Example:
         >>> from hyrfpack.distill import DistillConfig
@@ -40,17 +49,20 @@ def pack(taught: Taught, psnr: float, provenance: dict, say: Callable[[str], Non
     room = max(allowed - error, min(LEAST_ADDED * error, HOPELESS * allowed))
     say(f"measuring what each number does to pictures, at {len(taught.train)} cameras and between them")
     wanted = PACKED * added_to_each(_mse(likeness), error + room)
-    sensitivity, originals = calibrated(model, taught.train, wanted)
+    sensitivity, originals = calibrated(model, taught.train, wanted, report=report_part(report, 0.0, 0.7))
     provenance = {**provenance, "viewpoint": Viewpoint.of(taught.train).to_json()}
-    packer = Packer(model, provenance, sensitivity, scene=None, finetune_steps=0, prune=True, say=say)
+    making = report_part(report, 0.7, 0.85)
+    packer = Packer(model, provenance, sensitivity, scene=None, finetune_steps=0, prune=True, say=say, report=making)
     trial = packer.settled(wanted, originals)
-    for _ in range(TRIALS):
+    for number in range(TRIALS):
+        trying = report_round(report_part(report, 0.85, 1.0), number)
+        trying("comparing the file with the original", 0.0)
         off = _mse(np.mean(taught.deciding.likeness(packer.decoded(trial)))) - error
         if off <= room:
             break
         wanted *= max(PACKED * room / off, 1 / 16)
         say(f"packing adds {off:.2g} to the error instead of {room:.2g}: finer, for {wanted:.2g}")
-        trial = packer.attempt(wanted)
+        trial = packer.attempt(wanted, report_part(trying, 0.5, 1.0))
     return trial.data
 
 

@@ -19,6 +19,7 @@ from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.hybrid import scale_bounds
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
+from hyrfpack.progress import Report, no_report
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.harmonics import BAND_0
@@ -41,6 +42,7 @@ MOST_WEIGHT = 10.0  # of a Gaussian, in means
 COLOR_WEIGHT = 10.0  # of squared errors of colours
 OPAQUE = 0.99  # where the rasteriser cuts alpha: beyond, gradients die
 COLORS = 0.005, 0.995  # that logits are taken of
+REPORT_EVERY_STEPS = 20
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,12 @@ def model_shape(drawable: Drawable, degree: int) -> ModelConfig:
 
 
 def initial_model(
-    drawable: Drawable, light: Tensor, cameras: Sequence[Camera], seed: int, share: float = 1.0
+    drawable: Drawable,
+    light: Tensor,
+    cameras: Sequence[Camera],
+    seed: int,
+    share: float = 1.0,
+    report: Report = no_report,
 ) -> HybridModel:
     """A model of splats, as like them as regression makes it.
 
@@ -105,6 +112,7 @@ def initial_model(
         cameras: that the splats' colours are looked at from.
         seed: of the first weights, and of the order.
         share: of the usual steps of regression.
+        report: told of the steps, and the share of the work that is done.
     """
     degree = drawable.degree
     config = model_shape(drawable, degree)
@@ -119,7 +127,7 @@ def initial_model(
             values.zero_()
     if not degree:
         model.radiance.requires_grad_(False)
-    _fit(model, drawable, shapes, light, cameras if degree else (), seed, share)
+    _fit(model, drawable, shapes, light, cameras if degree else (), seed, share, report)
     with torch.no_grad():  # what the field says of sizes and opacities comes off what Gaussians store
         raw = model.geometry(model.cube_coords(gaussians.positions))
         gaussians.scale_logits.copy_(shapes.sizes[:, None] - raw[:, 1:4].mean(1, keepdim=True))
@@ -141,6 +149,7 @@ def _fit(
     cameras: Sequence[Camera],
     seed: int,
     share: float,
+    report: Report,
 ) -> None:
     """Fit the fields: the geometry to shapes, and the radiance, with the explicit colours, to colours at cameras."""
     count = len(model)
@@ -158,6 +167,8 @@ def _fit(
     keep_freed_memory()
     with torch_on_one_thread():
         for step, some in zip(range(steps), _batches(count, batch, generator, coords.device), strict=False):
+            if step % REPORT_EVERY_STEPS == 0:
+                report(f"fitting the fields, step {step:,} of {steps:,}", step / steps)
             opacity, scales, turns = model.geometry(coords.index_select(0, some)).split((1, 3, 4), 1)
             made, wanted = _Shapes.of(scales, turns + no_turn), shapes.part(some)
             errors = (made.matrices - wanted.matrices).square().sum(0)

@@ -13,14 +13,15 @@ from hyrfpack.data import PictureCache
 from hyrfpack.distill.config import DistillConfig
 from hyrfpack.distill.start import initial_model
 from hyrfpack.distill.teacher import Sample, light_of, teaching_scene
-from hyrfpack.distill.views import Weighted, surrounds, viewpoints
 from hyrfpack.errors import HyrfDataError
+from hyrfpack.evaluate.metrics import decibels
 from hyrfpack.model import HybridModel
+from hyrfpack.progress import Report, no_report, report_part
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.splats import Splats
+from hyrfpack.splats.viewpoints import Weighted, surrounds, viewpoints
 from hyrfpack.train.config import LARGEST_SEED, DensityConfig, LearningRates, TrainConfig
-from hyrfpack.train.progress import ProgressLine
 from hyrfpack.train.trainer import Trainer
 
 DECIDING = 3  # viewpoints to decide by, for each that is held out: means of few of them differ by a dB
@@ -63,7 +64,7 @@ def teach(
     cameras: Sequence[Camera] | None = None,
     device: torch.device = torch.device("cpu"),  # noqa: B008 - a constant
     say: Callable[[str], None] = lambda sentence: None,
-    quiet: bool = True,
+    report: Report = no_report,
 ) -> Taught:
     """Make a hybrid model that looks like splats. Arguments and errors as of `distill_splats`.
 
@@ -73,6 +74,7 @@ def teach(
         >>> len(teach(read_splats("bonsai.ply"), quick).model) > 0
         True
     """
+    report("choosing viewpoints", 0.0)
     weighted = Weighted.of(splats, name)
     original = Drawable.of(splats, weighted.frame, device)
     train, deciding, test = _cameras(weighted, original, config, cameras)
@@ -80,15 +82,17 @@ def teach(
         f"{len(splats):,} Gaussians, harmonics of degree {splats.degree}; {len(train)} viewpoints "
         f"{'made up' if cameras is None else 'given'} to teach with, {len(test)} held out"
     )
+    report("looking which Gaussians are seen", 0.05)
     light = light_of(original, evenly_spaced(train, LIT_FROM))
     kept = torch.from_numpy(_lit(light.cpu().numpy())).to(device)
     if not len(kept):
         raise HyrfDataError(f"{name}: no view shows anything of the Gaussians; give others with --cameras")
     say(f"{len(splats) - len(kept):,} Gaussians are hardly seen and left out; fitting the fields to the others")
     share = min(1.0, max(LEAST_REGRESSED, config.steps / REGRESSED))
-    model = initial_model(original[kept], light[kept], train, config.seed, share)
+    model = initial_model(original[kept], light[kept], train, config.seed, share, report_part(report, 0.1, 0.4))
     scene, cache = teaching_scene(name, original, train, test), PictureCache()
-    _fit_to_pictures(model, scene, config, cache, quiet)
+    _fit_to_pictures(model, scene, config, cache, report_part(report, 0.4, 0.98))
+    report("drawing the held-out views", 0.98)
     return Taught(model, train, *(Sample.of(original, cameras) for cameras in (deciding, test)))
 
 
@@ -120,7 +124,9 @@ def _lit(light: np.ndarray) -> np.ndarray:
     return np.sort(order[(sums > UNSEEN * sums[-1]) & (light[order] > 0)]) if len(order) else order
 
 
-def _fit_to_pictures(model: HybridModel, scene: Scene, config: DistillConfig, cache: PictureCache, quiet: bool) -> None:
+def _fit_to_pictures(
+    model: HybridModel, scene: Scene, config: DistillConfig, cache: PictureCache, report: Report
+) -> None:
     # No density control: every Gaussian has its place, and packing leaves out those that pictures do not miss.
     settings = TrainConfig(
         steps=config.steps,
@@ -130,5 +136,9 @@ def _fit_to_pictures(model: HybridModel, scene: Scene, config: DistillConfig, ca
         precision="float32",  # what is left to learn is smaller than what a GPU rounds away otherwise
     )
     trainer = Trainer(scene, settings, cache, model.gaussians.positions.device, model)
-    with ProgressLine(config.steps, 0, quiet) as line:
-        trainer.run(report=lambda t, loss, mse: line.update(t.step, loss, mse, len(t.model)))
+
+    def stepped(trainer: Trainer, loss: float, mse: float) -> None:
+        doing = f"training, step {trainer.step:,} of {config.steps:,}, PSNR {decibels(mse):.1f} dB"
+        report(doing, trainer.step / config.steps)
+
+    trainer.run(report=stepped)

@@ -24,9 +24,11 @@ from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.parallel.ranks import ALONE, Ranks
+from hyrfpack.progress import Report, no_report
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.render.files import file_names, save_picture
-from hyrfpack.scene import View, evenly_spaced
+from hyrfpack.scene import Camera, View, evenly_spaced
+from hyrfpack.splats.draw import Drawable, draw
 
 PICTURES = 6  # of photo, render and error beside each other that are written, unless told otherwise
 NO_LPIPS = (
@@ -89,7 +91,7 @@ class Evaluation:
 
 @torch.no_grad()
 def evaluate(
-    model: HybridModel,
+    model: HybridModel | Drawable,
     views: Sequence[View],
     *,
     training: Sequence[View] = (),
@@ -98,25 +100,25 @@ def evaluate(
     pictures: str | os.PathLike[str] | None = None,
     picture_count: int = PICTURES,
     overwrite: bool = True,
-    report: Callable[[int, int], None] = lambda done, total: None,
+    report: Report = no_report,
     warn: Callable[[str], None] | None = None,
     ranks: Ranks = ALONE,
 ) -> Evaluation:
     """Render held-out views and score them against their photos.
 
     Renders are clamped and rounded to 8 bits first, as they would be saved. Photos with transparency are laid over
-    the model's solid colour. Masked pixels do not count.
+    the model's solid colour; splats have none, and are shown over black like the photos. Masked pixels do not count.
 
     Args:
-        model: what to score.
+        model: what to score, or splats ready to be drawn (`hyrfpack.splats.draw.Drawable`).
         views: photos to compare with, not used in training.
         training: photos that were, which the exposure of those is predicted from; two near each of these are rendered.
         lpips_weights: see `hyrfpack.evaluate.lpips`; without it lpips is None.
         settings: how to render.
         pictures: folder for photo | render | error pictures of `picture_count` views spread over `views`.
         overwrite: replace files in `pictures`; without it, one that is there is an error.
-        report: told how many views are scored and how many there are: at the beginning and after each view. Each of
-            several processes reports its own share.
+        report: told of each view before it is scored, and the share of the work that is done. Each of several
+            processes reports its own share.
         warn: told of each picture that cannot be written, while scoring continues; without it that is an error.
         ranks: processes that share the views, each of which gets all scores.
 
@@ -131,7 +133,8 @@ def evaluate(
         >>> len(scores.views), scores.psnr > 10, scores.lpips is None
         (2, True, True)
     """
-    check_type("model", model, HybridModel)
+    if not isinstance(model, Drawable):
+        check_type("model", model, HybridModel)
     check_type("settings", settings, RenderSettings)
     for given in (views, training):
         for view in given if isinstance(given, Sequence) else [given]:
@@ -139,40 +142,41 @@ def evaluate(
     if not views:
         raise HyrfError("there is no view to score; name a split that has photos or a smaller --test-every")
     perceptual = None if lpips_weights is None else LPIPS.load(lpips_weights)
-    solid = np.array(model.config.solid, dtype=np.float32)
-    device = model.gaussians.positions.device
+    if isinstance(model, Drawable):
+        solid, device, count = np.zeros(3, np.float32), model.device, len(model.positions)
+    else:
+        solid, device = np.array(model.config.solid, dtype=np.float32), model.gaussians.positions.device
+        count = len(model)
     drawn = picture_names(views, picture_count)
     trained = {view.name: view for view in training}
 
     def scored() -> list[tuple[int, ViewScore | None, float]]:
         """Place, score (None where the mask leaves nothing) and seconds of each view that is this rank's."""
-        decoded = model.decode()
+        draw_colors = _color_renderer(model, settings)
 
         @functools.cache
         def gains_of(name: str) -> np.ndarray:
             photo, mask = upload(trained[name].load(), solid, device)
-            return fitted_gains(render(model, trained[name].camera, settings, decoded=decoded).rgb, photo, mask)
+            return fitted_gains(draw_colors(trained[name].camera), photo, mask)
 
-        own = ranks.share(list(enumerate(views)))
-        report(0, len(own))
-        render(model, views[0].camera, settings, decoded=decoded)  # compiles kernels and fills caches
+        draw_colors(views[0].camera)  # compiles kernels and fills caches
         scores: list[tuple[int, ViewScore | None, float]] = []
+        own = ranks.share(list(enumerate(views)))
         for done, (number, view) in enumerate(own):
-            if done:
-                report(done, len(own))
+            report(f"scoring photo {done + 1} of {len(own)}", done / len(own))
             photo = view.load()
             reference, mask = upload(photo, solid, device)
             if mask is not None and not mask.any():
                 scores.append((number, None, 0.0))
                 continue
             started = _now(device)
-            rendering = render(model, view.camera, settings, decoded=decoded)
+            rgb = draw_colors(view.camera)
             seconds = _now(device) - started
-            image = to_8bit(rendering.rgb)
+            image = to_8bit(rgb)
             foretold = None
             if trained.keys() - {view.name}:
-                gains = torch.from_numpy(predicted_gains(view.name, list(trained), gains_of)).to(rendering.rgb)
-                foretold = to_8bit(expose(rendering.rgb, gains))
+                gains = torch.from_numpy(predicted_gains(view.name, list(trained), gains_of)).to(rgb)
+                foretold = to_8bit(expose(rgb, gains))
             distance = None
             if perceptual is not None:
                 seen = image if mask is None else torch.where(mask[..., None], image, reference)
@@ -195,7 +199,6 @@ def evaluate(
                     if warn is None:
                         raise
                     warn(str(error))
-        report(len(own), len(own))
         return scores
 
     with nullcontext() if pictures is None else exclusive_folder(pictures, ranks=ranks):
@@ -211,11 +214,19 @@ def evaluate(
         ssim_predicted=_mean(score.ssim_predicted for score in scores),
         lpips=_mean(score.lpips for score in scores),
         lpips_reason=NO_LPIPS if perceptual is None else f"network {perceptual.name}",
-        gaussians=len(model),
+        gaussians=count,
         seconds_per_frame=statistics.median(seconds for _, score, seconds in told if score is not None),
         views=scores,
         skipped=[views[number].name for number, score, _ in told if score is None],
     )
+
+
+def _color_renderer(model: HybridModel | Drawable, settings: RenderSettings) -> Callable[[Camera], torch.Tensor]:
+    """The function from a camera to colours (H, W, 3), with what does not depend on the view decoded beforehand."""
+    if isinstance(model, Drawable):
+        return lambda camera: draw(model, camera, settings).rgb
+    decoded = model.decode()
+    return lambda camera: render(model, camera, settings, decoded=decoded).rgb
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

@@ -21,6 +21,7 @@ from hyrfpack.ops.rasterize.light import sent_light
 from hyrfpack.ops.rasterize.reference import ALPHA_MIN
 from hyrfpack.ops.shade import Shading, encode_directions
 from hyrfpack.parallel.pool import run_tasks, side_by_side, torch_on_one_thread
+from hyrfpack.progress import Report, no_report, reporting
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
 from hyrfpack.splats.harmonics import fibonacci_sphere, harmonics_basis, terms_of
@@ -42,6 +43,7 @@ def bake(
     cameras: Sequence[Camera],
     degrees: Sequence[int] = (3,),
     sights: Sequence[Sight] | None = None,
+    report: Report = no_report,
 ) -> dict[int, Splats]:
     """A model as explicit Gaussians in world units, in the model's order, for each degree of spherical harmonics.
 
@@ -65,6 +67,7 @@ def bake(
             alone and no opacity changes.
         degrees: of the harmonics, each 0 to 3. More than one costs little more.
         sights: what `sights_of` told of these cameras, where it is known already.
+        report: told what is being done, and the share of the work that is done.
 
     Raises:
         HyrfError: a number of the model, or a camera's pose, is NaN, infinite or beyond float32.
@@ -88,7 +91,7 @@ def bake(
         normalized_quats(geometry.quats.numpy()),
         opacities.numpy(),
     )
-    fitted = _fit(model, views, light, degrees)
+    fitted = _fit(model, views, light, degrees, report)
     baked = {}
     for degree in list(fitted):  # one at a time: all harmonics of many Gaussians are a lot
         harmonics = fitted.pop(degree)
@@ -120,14 +123,18 @@ class Sight:
 
 @torch_on_one_thread()
 @torch.no_grad()
-def sights_of(model: HybridModel, cameras: Sequence[Camera]) -> list[Sight]:
+def sights_of(model: HybridModel, cameras: Sequence[Camera], report: Report = no_report) -> list[Sight]:
     """What each camera sees of a model.
+
+    Args:
+        report: told of each camera, and the share of the work that is done.
 
     Raises:
         HyrfError: a camera's pose is NaN, infinite or beyond float32.
     """
     # Much of one runs on one core only.
-    return side_by_side(partial(_sight, model, model.decode_geometry()), cameras)
+    see = reporting(partial(_sight, model, model.decode_geometry()), report, "looking from each camera", len(cameras))
+    return side_by_side(see, cameras)
 
 
 @torch.no_grad()  # of each thread
@@ -154,7 +161,9 @@ def _sight(model: HybridModel, geometry: Geometry, camera: Camera) -> Sight:
     return Sight(camera_center(pose), drawn[lit].int(), received[lit], left_out.int(), left_out_light, some)
 
 
-def _fit(model: HybridModel, views: Sequence[Sight], light: Tensor, degrees: Iterable[int]) -> dict[int, Tensor]:
+def _fit(
+    model: HybridModel, views: Sequence[Sight], light: Tensor, degrees: Iterable[int], report: Report
+) -> dict[int, Tensor]:
     """Harmonics (N, K, 3) of all Gaussians by degree."""
     shading, positions = model.shading(), model.gaussians.positions.detach()
     fitted = {degree: positions.new_empty(len(model), terms_of(degree), 3) for degree in degrees}
@@ -187,7 +196,8 @@ def _fit(model: HybridModel, views: Sequence[Sight], light: Tensor, degrees: Ite
             some = slice(terms_of(degree))
             harmonics[here] = least_squares(owners, basis[:, some], colors, weights, gram[some, some], right[:, some])
 
-    run_tasks(fit_block, len(edges) - 1)
+    blocks = len(edges) - 1
+    run_tasks(reporting(fit_block, report, "fitting colours", blocks), blocks)
     return fitted
 
 

@@ -11,6 +11,7 @@ from hyrfpack.export.bake import Sight, bake
 from hyrfpack.export.measure import likeness
 from hyrfpack.export.source import FEW, MEASURED
 from hyrfpack.model import HybridModel
+from hyrfpack.progress import Report, no_report, report_part
 from hyrfpack.scene import Camera, evenly_spaced
 
 # Every ninth of the cameras, from the fifth on, is not fitted but chosen by; of those that `Source` makes up,
@@ -21,7 +22,11 @@ TOLERANCE = 0.2  # dB that a lower degree, which takes fewer bytes, may score le
 
 
 def choose_degree(
-    model: HybridModel, cameras: Sequence[Camera], highest: int, sights: Sequence[Sight] | None = None
+    model: HybridModel,
+    cameras: Sequence[Camera],
+    highest: int,
+    sights: Sequence[Sight] | None = None,
+    report: Report = no_report,
 ) -> tuple[int, dict[int, float]]:
     """The lowest degree of harmonics, 0 to `highest`, that looks as good as any, and the score of each, dB.
 
@@ -35,6 +40,7 @@ def choose_degree(
         cameras: that colours shall be fitted at, world units; none of those that a result will be judged by.
         highest: degree to think of, 0 to 3.
         sights: what `sights_of` told of the cameras, where it is known already.
+        report: told what is being done, and the share of the work that is done.
     """
     fitted, kept = list(cameras), list(cameras)
     every = -(-len(model) // MANY)
@@ -45,10 +51,10 @@ def choose_degree(
         kept = fitted[KEPT_BACK]
         for some in (fitted, seen or []):
             del some[KEPT_BACK]
-    baked = bake(model, fitted, range(highest + 1), seen)
+    baked = bake(model, fitted, range(highest + 1), seen, report_part(report, 0.0, 0.6))
     contenders = {str(degree): (splats, None) for degree, splats in baked.items()}
     views = [(small_camera(camera), None) for camera in evenly_spaced(kept, MEASURED)]
-    found = likeness(model, contenders, views, sphere=False)
+    found = likeness(model, contenders, views, sphere=False, report=report_part(report, 0.6, 1.0))
     scores = {degree: found[str(degree)].model for degree in baked}
     return lowest_as_good(scores), scores
 

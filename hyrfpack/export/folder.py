@@ -29,6 +29,7 @@ from hyrfpack.splats.files import READ, read_splats
 from hyrfpack.web.gallery import Card, encode_gallery
 from hyrfpack.web.html import stage
 from hyrfpack.web.player import element_script, encode_player, encode_readme
+from hyrfpack.web.view import playable_file
 
 POSTER, POSTER_BYTES = 640, 30_000  # pixels of its longer side; bytes
 INDEX, LIST_PLAYER, README, ELEMENT = "index.html", "player.html", "README.txt", "hyrf-viewer.js"
@@ -52,8 +53,8 @@ def player(
     dropped on it. `hyrf-viewer.js` beside it is for other people's pages: `<hyrf-viewer src="scene.hyrf">`.
 
     Args:
-        source: a `.hyrf` file, or one of splats (.ply, .spz, .splat, .sog), copied as it is; None for a player without
-            a scene.
+        source: a `.hyrf` file or the folder of a run, or a file of splats (.ply, .spz, .splat, .sog), copied as it is;
+            None for a player without a scene.
         folder: where; made when it is missing. Files of other names stay.
         data: photos of the scene, from where the picture is taken; else it is from where the file says.
         overwrite: replace files that are there; without it, they are an error.
@@ -85,8 +86,10 @@ def _write_player(source: StrPath | None, into: _Folder, data: Scene | None, say
     stages = {}
     description, count = "A player of 3D scenes", 0
     if source is not None:
+        title = Path(source).stem
+        source = playable_file(source)
         scene = _Content.read(source, data, say, scored=False)
-        title, count = Path(source).stem, scene.count
+        count = scene.count
         content, poster = _names([source], listed=False)[0]
         into.copy(content, source)
         stages = {content: scene.stage} if scene.stage else {}
@@ -112,7 +115,7 @@ def gallery(
     """Write a folder of static files that shows several scenes: a page that lists them, a player, and the files.
 
     Args:
-        sources: as of `player`, at least one.
+        sources: as of `player`, at least one; the folder of a run gives its name to the scene.
         folder: where; made when it is missing. Files of other names stay.
         data: photos of each scene, or None; held-out ones score it, and the list tells so. Without them it tells how
             well a model fits the photos it was trained on, where its file says.
@@ -146,10 +149,10 @@ def _write_gallery(sources: Sequence[StrPath], into: _Folder, scenes: Sequence[S
     contents = []
     for source, scene in zip(sources, scenes, strict=True):  # all, before anything is written
         say(f"reading {source}")
-        contents.append(_Content.read(source, scene, say, scored=True))
+        contents.append(_Content.read(playable_file(source), scene, say, scored=True))
     cards = []
     for source, shown, (content, poster) in zip(sources, contents, _names(sources, listed=True), strict=True):
-        into.copy(content, source)
+        into.copy(content, playable_file(source))
         if shown.poster is not None:
             into.write(poster, encode_poster(shown.poster, "JPEG", POSTER_BYTES))
         picture = None if shown.poster is None else poster
@@ -177,8 +180,9 @@ def check_folder(
     """
     names = [name for pair in _names(sources, listed=listed) for name in pair]
     names += [README, INDEX, LIST_PLAYER if listed else ELEMENT]
+    files = [playable_file(source) for source in sources]
     for scene in scenes or [None]:
-        Outputs(*sources, scene=scene, overwrite=overwrite).folder(folder, names)
+        Outputs(*files, scene=scene, overwrite=overwrite).folder(folder, names)
 
 
 @dataclass(frozen=True)

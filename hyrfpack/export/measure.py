@@ -14,6 +14,7 @@ from hyrfpack.evaluate.metrics import psnr, to_8bit
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.background import pixel_directions
 from hyrfpack.parallel.pool import side_by_side
+from hyrfpack.progress import Report, no_report, reporting
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, View
 from hyrfpack.splats.draw import Drawable, draw
@@ -42,6 +43,7 @@ def likeness(
     views: Sequence[tuple[Camera, View | None]],
     *,
     sphere: bool,
+    report: Report = no_report,
 ) -> dict[str, Likeness]:
     """How like a model splats look.
 
@@ -51,6 +53,7 @@ def likeness(
             `background_picture` makes it, or None for the model's solid colour.
         views: where to look from; photos are scored where all views have them.
         sphere: whether the model shows its background sphere.
+        report: told of each view, and the share of the work that is done.
     """
     decoded, frame = model.decode(), model.config.frame
     solid = torch.tensor(model.config.solid)
@@ -73,7 +76,8 @@ def likeness(
             for name, picture in pictures.items()
         }
 
-    scores = [found for found in side_by_side(scores_at, views) if found]
+    compare = reporting(scores_at, report, "comparing pictures with the model's", len(views))
+    scores = [found for found in side_by_side(compare, views) if found]
     return {name: _mean([found[name] for found in scores]) for name in ("model", *drawables)} if scores else {}
 
 
@@ -102,3 +106,10 @@ def _photo(view: View, model: HybridModel) -> tuple[Tensor, Tensor | None]:
 def _mean(scores: Sequence[tuple[float, float | None]]) -> Likeness:
     own, photos = zip(*scores, strict=True)
     return Likeness(fmean(own), None if None in photos else fmean(photos), len(scores))
+
+
+@torch.no_grad()
+def psnr_of_splats(before: Drawable, after: Drawable, camera: Camera) -> float:
+    """Return the PSNR in dB of what a camera sees of `after` against what it sees of `before`, both over black."""
+    shown, reference = (to_8bit(draw(drawable, camera).rgb) for drawable in (after, before))
+    return psnr(shown, reference)

@@ -36,8 +36,10 @@ from hyrfpack.export.pages import baked_page, write_native_page
 from hyrfpack.export.points import encode_points
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
+from hyrfpack.format import find_model
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
+from hyrfpack.progress import Report, no_report, report_part
 from hyrfpack.scene import Scene
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats, concatenate
@@ -63,6 +65,7 @@ def export(
     colmap: bool = False,
     overwrite: bool = True,
     say: Say = lambda sentence: None,
+    report: Report = no_report,
 ) -> ExportReport:
     """Write a `.hyrf` model as what other programs read, in its own axes and units, and measure what was lost.
 
@@ -77,7 +80,7 @@ def export(
     Nothing is measured where a part of the scene was cropped, only points or cameras were written, or the model itself.
 
     Args:
-        source: the model.
+        source: the model, a `.hyrf` file or the folder of a run.
         target: the file, or the folder, to write.
         degree: of the spherical harmonics, 0 to 3; ".splat" has 0. None for the lowest one that looks as good as any
             at cameras that are kept back for the purpose, and are not those that the result is measured at.
@@ -93,6 +96,7 @@ def export(
         overwrite: replace files that are there. Without it, they are an error. One that appears in the meantime is
             kept, too: a single file gets a free name beside it, which the report tells; in a folder it is an error.
         say: told what is going on.
+        report: told what is being done, and the share of the work that is done.
 
     Raises:
         HyrfError: a file cannot be read or written, the options do not go together, or another call is at work in the
@@ -109,6 +113,7 @@ def export(
         check_type("data", data, Scene)
     kind = kind_of(target, colmap)
     check_request(kind, target, degree, crop, min_opacity, background, baked)
+    source = find_model(source)
     if kind is PLAYER:
         return player(source, target, data=data, overwrite=overwrite, say=say)
     if kind is COLMAP:
@@ -117,7 +122,7 @@ def export(
         check_place(target, Outputs(source, scene=data, overwrite=overwrite), colmap)
         return _export(
             source, target, kind, degree=degree, data=data, crop=crop, min_opacity=min_opacity, background=background,
-            spz_version=spz_version, baked=baked, overwrite=overwrite, say=say,
+            spz_version=spz_version, baked=baked, overwrite=overwrite, say=say, report=report,
         )  # fmt: skip
 
 
@@ -135,6 +140,7 @@ def _export(
     baked: bool,
     overwrite: bool,
     say: Say,
+    report: Report,
 ) -> ExportReport:
     """As `export`, of what has been checked; into a folder that this call holds, where the kind is one of folders."""
     read = Source.read(source, data)
@@ -154,19 +160,24 @@ def _export(
     highest = kind.degree if degree is None else min(degree, kind.degree)
     chosen_by: dict[int, float] = {}
     sights = None
+    bake_starts = 0.35 if degree is None and highest else 0.0
     if degree is None and highest:
         say(f"choosing the degree of the colours among {places}")
-        sights = sights_of(read.model, read.fitted)
-        degree, chosen_by = choose_degree(read.model, read.fitted, highest, sights)
+        sights = sights_of(read.model, read.fitted, report_part(report, 0.0, 0.15))
+        degree, chosen_by = choose_degree(
+            read.model, read.fitted, highest, sights, report_part(report, 0.15, bake_starts)
+        )
         say(f"degree {degree} it is: {_listed(chosen_by)}, for degrees 0 to {highest} against the model")
     else:
         degree = highest
     say(f"fitting colours of degree {degree} at {places}")
-    sights = sights or sights_of(read.model, read.fitted)
-    splats = chosen(bake(read.model, read.fitted, (degree,), sights)[degree], crop, min_opacity)
+    sights = sights or sights_of(read.model, read.fitted, report_part(report, 0.0, 0.25))
+    fitting = report_part(report, bake_starts or 0.25, 0.4)
+    splats = chosen(bake(read.model, read.fitted, (degree,), sights, fitting)[degree], crop, min_opacity)
     if points:
         return _export_points(read, kind, target, splats, overwrite)
     say(f"writing {len(splats):,} Gaussians{' and the background' if sphere else ''}")
+    report(f"writing {len(splats):,} Gaussians", 0.4)
     count = 0
     if isinstance(kind, Format):
         if sphere:
@@ -177,7 +188,7 @@ def _export(
     else:
         packed, shown = _pack_page(read, splats, sphere, Path(target))
     written = write_atomic(target, packed, overwrite=overwrite)
-    report = ExportReport(
+    result = ExportReport(
         str(written),
         len(packed),
         len(splats),
@@ -188,8 +199,8 @@ def _export(
     del packed
     if crop is not None:
         say("nothing is measured, for a part of the scene was cropped")
-        return report
-    return _measured(report, read, shown, kind, sphere, say)
+        return result
+    return _measured(result, read, shown, kind, sphere, say, report_part(report, 0.65, 1.0))
 
 
 # Splats and the picture behind them: those that were to be written ("baked"), and those read back ("file").
@@ -210,16 +221,18 @@ def _pack_splats(read: Source, splats: Splats, target: Path, form: Format, spz_v
     return data, {"baked": (splats, None), "file": (form.decode(data, str(target)), None)}
 
 
-def _measured(report: ExportReport, read: Source, shown: Shown, kind: Kind, sphere: bool, say: Say) -> ExportReport:
-    """The report with all PSNR filled in."""
+def _measured(
+    result: ExportReport, read: Source, shown: Shown, kind: Kind, sphere: bool, say: Say, report: Report
+) -> ExportReport:
+    """The result with all PSNR filled in."""
     if not read.measured:
         say("nothing is measured, for no photo is held out")
-        return report
+        return result
     say(f"measuring at {len(read.measured)} views")
-    scores = likeness(read.model, shown, read.measured, sphere=sphere)
+    scores = likeness(read.model, shown, read.measured, sphere=sphere, report=report)
     if not scores:
         say("nothing is measured, for the masks leave no pixel of the held-out photos")
-        return report
+        return result
     file, before = scores["file"], scores["baked"]
     cost = _cost(before, file, read.error)
     if cost > COARSE:
@@ -233,7 +246,7 @@ def _measured(report: ExportReport, read: Source, shown: Shown, kind: Kind, sphe
                 "length; choose another format"
             )
     return replace(
-        report,
+        result,
         views=file.views,
         psnr_baked=before.model,
         psnr=file.model,

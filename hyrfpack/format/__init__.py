@@ -9,17 +9,21 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from hyrfpack.format.info import SectionSize, describe
+from hyrfpack.format.run_folder import RunStatus, find_model, read_run_status
 
 if TYPE_CHECKING:
     from hyrfpack.format.codec import CompressionReport, decode_model, encode_model, load, repack, save
 
 __all__ = [
     "CompressionReport",
+    "RunStatus",
     "SectionSize",
     "decode_model",
     "describe",
     "encode_model",
+    "find_model",
     "load",
+    "read_run_status",
     "repack",
     "save",
 ]

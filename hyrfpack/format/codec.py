@@ -21,6 +21,7 @@ from hyrfpack.format.arrays import RULES, check_rules, group_shapes, parse_confi
 from hyrfpack.format.container import Container, Section, raw_limit, read_container, write_container
 from hyrfpack.format.info import SectionSize, section_sizes
 from hyrfpack.format.metadata import Metadata, read_metadata
+from hyrfpack.format.run_folder import find_model
 from hyrfpack.format.sections import LAYERED, METADATA, POSITIONS, SECTIONS, group_and_layer, layer_section
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.outputs import Outputs
@@ -181,7 +182,9 @@ def write_model(data: bytes, path: str | os.PathLike[str], *, overwrite: bool = 
 def load(
     path: str | os.PathLike[str], device: str | torch.device = "cpu", fraction: float | None = None
 ) -> HybridModel:
-    """Read a model from a `.hyrf` file. Arguments and errors as `decode_model`, and where no file can be read.
+    """Read a model from a `.hyrf` file, or from the folder of a run.
+
+    Arguments and errors as `decode_model`, and where no file can be read.
 
     Example:
         >>> import hyrfpack
@@ -211,6 +214,7 @@ def repack(
         overwrite: replace a file at `target`. Without it, one that is there is an error, and one that appears in the
             meantime is kept: the result gets a free name beside it, which the report tells.
     """
+    source = find_model(source)
     Outputs(source, overwrite=overwrite).file(target)
     model, provenance = load_with_provenance(source, fraction)
     kept = provenance if profile == "raw" else coarse(provenance, model.config.frame.scale)

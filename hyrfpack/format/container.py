@@ -20,6 +20,7 @@ from functools import partial
 from typing import BinaryIO
 
 from hyrfpack.errors import HyrfFormatError
+from hyrfpack.format.run_folder import find_model
 
 MAGIC = b"\x89HYRF\r\n\n"
 MAJOR, MINOR = 1, 1
@@ -133,17 +134,19 @@ class Container:
     def open(
         cls, path: str | os.PathLike[str], known: Collection[str] | None = None, fraction: float | None = None
     ) -> Container:
-        """Open a file, reading its header and table of contents only. Arguments as the constructor's.
+        """Open a file, or the model of a run's folder, reading its header and table of contents only.
+
+        Args:
+            path: see `find_model`; the others as the constructor's.
 
         Raises:
             HyrfFormatError: as the constructor, and where there is no readable file at `path`.
         """
+        path = find_model(path)
         name = os.fspath(path)
         try:
             # Asked before opening: opening a named pipe would wait for a writer.
             mode = os.stat(path).st_mode
-            if stat.S_ISDIR(mode):
-                raise HyrfFormatError(f"{name}: this is a folder; name a .hyrf file in it")
             if not stat.S_ISREG(mode):
                 raise HyrfFormatError(f"{name}: this is not a regular file; copy its content to a .hyrf file first")
             file = open(path, "rb")

@@ -38,6 +38,7 @@ def describe(path: str | os.PathLike[str], fraction: float | None = None) -> dic
     """Say what a `.hyrf` file holds without decoding it: header, table of contents and metadata are read, no more.
 
     Args:
+        path: of the file, or of the folder of a run, see `hyrfpack.format.find_model`.
         fraction: how much of the file must be there, see `hyrfpack.load`; None for all.
 
     Returns:

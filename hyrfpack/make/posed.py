@@ -7,12 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hyrfpack.errors import HyrfError
+from hyrfpack.format.run_folder import CHECKPOINT, METRICS, MODEL
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.make.progress import Progress, Reporter
 from hyrfpack.make.source import Reading, Source
 from hyrfpack.make.stages import SCENE, is_posed
 from hyrfpack.make.work import Say, interruptible
-from hyrfpack.train.run import CHECKPOINT, METRICS, MODEL
 
 
 def posed(

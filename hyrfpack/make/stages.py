@@ -24,6 +24,7 @@ from hyrfpack.evaluate import evaluate
 from hyrfpack.evaluate.metrics import decibels
 from hyrfpack.export import export
 from hyrfpack.format import describe, load
+from hyrfpack.format.run_folder import CHECKPOINT, METRICS, MODEL
 from hyrfpack.make.plan import Plan
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.state import digest, digest_all
@@ -33,7 +34,7 @@ from hyrfpack.scene import Scene
 from hyrfpack.train import Trainer, train
 from hyrfpack.train.pilots import MOST_STEPS
 from hyrfpack.train.progress import SMOOTHING
-from hyrfpack.train.run import CHECKPOINT, METRICS, MODEL, is_begun
+from hyrfpack.train.run import is_begun
 
 SCENE, RUN, PACKED, EXPORTED = (PRODUCTS[stage] for stage in ("poses", "training", "compression", "export"))
 FIXED_SETTINGS = ("target_bytes", "budget_factor")  # of a training, from when it was begun on

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path, PurePosixPath
+from typing import Protocol
 
 import torch
 from PIL import Image
@@ -67,10 +69,33 @@ def render_files_unlocked(
     """As `render_files`, into a folder that the caller has locked."""
     with torch.no_grad():
         decoded = model.decode()
+    draw = partial(render, model, settings=settings, decoded=decoded, depth=depth)
+    return write_pictures(draw, cameras, folder, overwrite=overwrite, ranks=ranks)
+
+
+class Drawn(Protocol):
+    """A picture of colours (H, W, 3) and, where it was asked for, of depth (H, W) in world units."""
+
+    @property
+    def rgb(self) -> Tensor: ...
+
+    @property
+    def depth(self) -> Tensor | None: ...
+
+
+def write_pictures(
+    draw: Callable[[Camera], Drawn],
+    cameras: Sequence[tuple[str, Camera]],
+    folder: str | os.PathLike[str],
+    *,
+    overwrite: bool = True,
+    ranks: Ranks = ALONE,
+) -> Iterator[Path]:
+    """Write what `draw` shows of named cameras. Arguments, files and errors otherwise as of `render_files_unlocked`."""
     named = list(zip(file_names([name for name, _ in cameras]), cameras, strict=True))
     for name, (_, camera) in ranks.share(named):
         with torch.no_grad():
-            rendering = render(model, camera, settings, decoded=decoded, depth=depth)
+            rendering = draw(camera)
         path = Path(folder) / f"{name}.png"
         written = save_picture(path, to_image(rendering.rgb), overwrite=overwrite)
         if rendering.depth is not None:

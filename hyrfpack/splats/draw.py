@@ -80,6 +80,7 @@ def draw(
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     *,
     black: bool = False,
+    depth: bool = False,
 ) -> Rasterization:
     """Draw splats as a camera sees them, over black; `transmittance` of the result says what lies behind.
 
@@ -88,13 +89,14 @@ def draw(
         camera: from where, in world units.
         settings: near plane (local units), culling and transmittance as in `hyrfpack.render`.
         black: without colours, for what is covered alone.
+        depth: also return depth, (H, W) in world units.
     """
     pose = torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32)
     size = camera.intrinsics, camera.width, camera.height
     index = frustum_cull(drawable.positions, pose, *size, settings.near, settings.cull_tolerance)
     positions = drawable.positions[index]
     viewpoint = camera_center(pose).to(positions.device, non_blocking=positions.is_cuda)
-    return rasterize(
+    drawn = rasterize(
         positions,
         drawable.quats[index],
         drawable.scales[index],
@@ -105,4 +107,6 @@ def draw(
         near=settings.near,
         antialiased=drawable.antialiased,
         transmittance_min=settings.transmittance_min,
+        depth=depth,
     )
+    return drawn if drawn.depth is None else replace(drawn, depth=drawn.depth * drawable.frame.scale)

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import json
 import os
-from pathlib import Path
 from typing import Any
 
 from hyrfpack.data import LAYOUTS, load_scene
 from hyrfpack.errors import HyrfDataError
+from hyrfpack.format.run_folder import METRICS, MODEL, find_model
 from hyrfpack.scene import Scene
-from hyrfpack.train.run import METRICS, MODEL
 
 
 def photos_of(model: str | os.PathLike[str]) -> Scene | None:
     """The photos that the model of a run's folder was trained on, read and split as they were for it.
 
     Args:
-        model: `model.hyrf` in the folder that `hyrfpack.train` left it in.
+        model: the folder that `hyrfpack.train` wrote, or `model.hyrf` in it.
 
     Returns:
         The photos, or None for a file that is no run's, or a run's that does not say what it was trained on.
@@ -31,7 +30,7 @@ def photos_of(model: str | os.PathLike[str]) -> Scene | None:
         >>> len(photos.train), len(photos.test)
         (8, 2)
     """
-    model = Path(model)
+    model = find_model(model)
     if model.name != MODEL:
         return None
     try:

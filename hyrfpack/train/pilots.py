@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from statistics import fmean
 
 import torch
@@ -106,7 +105,10 @@ def measure_budget(
             trainer.run(report=tell, stop=stop)
             if stop():
                 return None
-            tell_scored = partial(phase, f"{name}: scoring")
+
+            def tell_scored(_: str, share: float, name: str = name) -> None:
+                phase(f"{name}: scoring", round(share * len(judges)), len(judges))
+
             scores.append(evaluate(trainer.model, judges, report=tell_scored).psnr_corrected)
         gains.append(scores[1] - scores[0])
     gain = fmean(gains)

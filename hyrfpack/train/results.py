@@ -27,6 +27,7 @@ from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate import evaluate, picture_names
 from hyrfpack.evaluate.figures import training_curve
 from hyrfpack.format.codec import write_model
+from hyrfpack.format.run_folder import CHECKPOINT, METRICS, MODEL
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render
 from hyrfpack.scene import Scene, evenly_spaced
@@ -34,7 +35,7 @@ from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.pilots import is_undecided
 from hyrfpack.train.trainer import Trainer
 
-MODEL, CHECKPOINT, METRICS, CURVE, VIEWS = "model.hyrf", "checkpoint.pt", "metrics.json", "curve.png", "views"
+CURVE, VIEWS = "curve.png", "views"
 RECORD = "training.json"  # the training record
 RECORD_VERSION = 1
 BACKGROUND_SEEN = 1e-3  # a background that gets less than this share of the light is not there
@@ -212,6 +213,7 @@ def write_results(
     is_scored = True
     if scene.test:
         unwritten: list[str] = []
+        photos = len(scene.test)
         try:
             # Scored on the file as it was written, not on what is in memory.
             model = hyrf_format.load(out / record.model, device)
@@ -222,7 +224,7 @@ def write_results(
                 training=scene.train,
                 pictures=out / VIEWS,
                 overwrite=overwrite,
-                report=lambda done, total: phase("scoring held-out photos", done, total),
+                report=lambda _, share: phase("scoring held-out photos", round(share * photos), photos),
                 warn=unwritten.append,
             )
             metrics["evaluation"] = scores.to_dict()

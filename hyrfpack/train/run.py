@@ -19,6 +19,7 @@ from hyrfpack.data.cache import memory_bytes
 from hyrfpack.device import choose_own_device
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate import picture_names
+from hyrfpack.format.run_folder import CHECKPOINT, METRICS, MODEL
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import ALONE, Ranks
@@ -29,10 +30,7 @@ from hyrfpack.train.log import TrainingLog
 from hyrfpack.train.pilots import PILOT_STEPS, is_undecided, is_usable, measure_budget, measures_budget
 from hyrfpack.train.progress import PhaseLine, ProgressLine
 from hyrfpack.train.results import (
-    CHECKPOINT,
     CURVE,
-    METRICS,
-    MODEL,
     RECORD,
     VIEWS,
     Phase,
@@ -46,7 +44,7 @@ from hyrfpack.train.results import (
 from hyrfpack.train.setup import check_target
 from hyrfpack.train.trainer import Trainer
 
-__all__ = ["CHECKPOINT", "METRICS", "MODEL", "VIEWS", "TrainResult", "is_begun", "resuming", "train"]
+__all__ = ["VIEWS", "TrainResult", "is_begun", "resuming", "train"]
 
 # What ends a run early; Windows has no SIGHUP.
 STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]

@@ -98,9 +98,6 @@ def _cases() -> list[Case]:
         cases += _inputs(f"export model.hyrf --data {name} -o {{}}", "model.hyrf", *_of_set(name))
         cases += _inputs(f"bench model.hyrf --data {name} -o {{}}", "model.hyrf", *_of_set(name, "new.png"))
         cases += _inputs(
-            f"bench model.hyrf --data {name} -o new.png --json {{}}", "model.hyrf", *_of_set(name, "new.json")
-        )
-        cases += _inputs(
             f"bench model.hyrf --data {name} -o new.png --markdown {{}}", "model.hyrf", *_of_set(name, "new.md")
         )
     for ending in (*KINDS, *USD):  # a file of each kind among photos that are read
@@ -129,6 +126,10 @@ def _cases() -> list[Case]:
     cases += _inputs("import ball.ply --cameras poses.hyrf -o {}", "poses.hyrf")
     cases += _inputs("import loose -o {}", "loose", "loose/meta.json", "loose/means_l.webp")
     cases += _inputs("import loose/meta.json -o {}", "loose", "loose/meta.json", "loose/means_l.webp")
+    cases += _inputs("convert ball.ply {}", "ball.ply", "{world}/ball.ply", "old/../ball.ply")
+    cases += _inputs("convert loose {}", "loose/new.ply")
+    cases += _inputs("compress first --profile paper -o {}", "first/model.hyrf")
+    cases += _inputs("decompress first -o {}", "first/model.hyrf")
     cases += _inputs("compare first second -o {}", "first", "first/metrics.json", "second/model.hyrf", "{world}/first")
     # Files of others, which only --overwrite replaces, and sets of photos that the command does not read.
     cases += [
@@ -149,13 +150,13 @@ def _cases() -> list[Case]:
         Case("export model.hyrf -o {}", "old/player", REFUSED, REPLACED),
         Case("export model.hyrf named.json -o {}", "old/gallery", REFUSED, REPLACED),
         Case("import ball.ply --steps 1 --size 16 -o {}", "old/a.hyrf", REFUSED, REPLACED),
+        Case("convert ball.ply {}", "old/a.ply", REFUSED, REPLACED),
         *(
             Case("make packed.hyrf --work made -o {}", f"old/a{ending}", REFUSED, REPLACED)
             for ending in (".html", ".ply")
         ),
         Case("make packed.hyrf --work made -o {}", "old/player", REFUSED, REPLACED),
         Case("bench model.hyrf -o {}", "old/a.png", REFUSED, WRITTEN),
-        Case("bench model.hyrf -o new.png --json {}", "old/a.json", REFUSED, WRITTEN),
         Case("bench model.hyrf -o new.png --markdown {}", "old/a.md"),  # it has no places for tables
         Case("demo --steps 1 -o {}", "old/demo", REFUSED, WRITTEN),
         *(Case("demo --steps 1 -o {}", name, REFUSED, WRITTEN) for name in SETS),

@@ -39,9 +39,10 @@ def model(tmp_path_factory):
 def test_export_says_what_it_does_and_prints_what_was_lost(model, tmp_path):
     result = succeeded("export", model, "-o", tmp_path / "a.ply", "--sh-degree", 3)
     size, splats = (tmp_path / "a.ply").stat().st_size, read_splats(tmp_path / "a.ply")
-    rows = re.findall(r"^(baked, degree 3|as read back from the file) +(\d+\.\d\d)$", result.stdout, re.MULTILINE)
-    assert [name for name, _ in rows] == ["baked, degree 3", "as read back from the file"]
-    assert result.stdout.splitlines()[0].split("  ")[0] == "against the model, 4 views"
+    rows = re.findall(r"^(baked to .*|read back from .*?) +(\d+\.\d\d)$", result.stdout, re.MULTILINE)
+    names = ["baked to harmonics of degree 3, not yet written", "read back from the .ply file"]
+    assert [name for name, _ in rows] == names
+    assert result.stdout.splitlines()[0].split("  ")[0] == "against the model's own pictures, 4 views"
     last = f"{tmp_path / 'a.ply'}: {size:,} bytes, {len(splats):,} Gaussians, {len(splats) - 40:,} of them for the"
     assert result.stdout.splitlines()[-1] == f"{last} background"
     assert [line.split()[0] for line in result.stderr.splitlines()] == ["fitting", "writing", "measuring"]
@@ -66,7 +67,8 @@ def test_identical_pictures_are_json_too(tmp_path):
 def test_photos_are_scored_if_given(model, data, tmp_path):
     arguments = ("export", model, "-o", tmp_path / "a.ply", "--overwrite", "--sh-degree", 0, "--data", data)
     last = succeeded(*arguments).stdout.splitlines()[-1]
-    assert re.fullmatch(r"held-out photos: PSNR \d+\.\d{3} to \d+\.\d{3} dB", last)
+    form = r"against held-out photos: PSNR \d+\.\d{3} dB of the model, \d+\.\d{3} dB of the file"
+    assert re.fullmatch(form, last)
     assert json.loads(succeeded(*arguments, "--test-every", 0, "--json").stdout)["photos_model"] is None
 
 
@@ -90,7 +92,7 @@ def test_the_degree_is_chosen_and_the_choice_is_told(model, tmp_path):
         *("choosing", "degree", "fitting", "writing", "measuring")
     ]
     (degree,) = re.findall(r"^degree (\d) it is: .* for degrees 0 to 3 against the model$", result.stderr, re.MULTILINE)
-    assert read_splats(tmp_path / "a.ply").degree == int(degree) and f"baked, degree {degree} " in result.stdout
+    assert read_splats(tmp_path / "a.ply").degree == int(degree) and f"harmonics of degree {degree}," in result.stdout
 
 
 def test_a_page_holds_the_model_unless_it_shall_be_baked(model, tmp_path):

@@ -11,9 +11,9 @@ from explicit_balls import ball
 from hyrfpack.cameras.files import cameras_to_json
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.distill import DistillConfig
-from hyrfpack.distill.views import Weighted, viewpoints
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.formats import ply
+from hyrfpack.splats.viewpoints import Weighted, viewpoints
 
 QUICK = ("--steps", 2, "--size", 24)
 pytestmark = pytest.mark.usefixtures("short_imports")

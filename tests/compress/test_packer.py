@@ -196,13 +196,57 @@ def test_pictures_that_are_off_by_more_or_less_than_was_asked_for_are_mended(off
     """A packer that makes distortions, of which pictures are off by what `off` says."""
     tried: list[float] = []
     packer = running.Packer(None, {}, None, None, 0, True, lambda sentence: None)
-    monkeypatch.setattr(packer, "attempt", lambda distortion: tried.append(distortion) or running.Trial(distortion, {}))
+    monkeypatch.setattr(
+        packer, "attempt", lambda distortion, report: tried.append(distortion) or running.Trial(distortion, {})
+    )
     monkeypatch.setattr(running.Packer, "decoded", lambda packer, trial: trial.data)
 
     trial = packer.settled(1e-3, SimpleNamespace(error=off))
 
     assert tried == pytest.approx(made)
     assert trial.data == pytest.approx(taken) and trial.error == off(trial.data)
+
+
+@pytest.mark.parametrize(
+    ("lost", "made", "taken"),
+    [
+        (lambda distortion: 140 * distortion, [1e-3], 1e-3),  # 0.14 dB for an aim of 0.1
+        (lambda distortion: -0.3, [1e-3], 1e-3),  # photos gain
+        (lambda distortion: 400 * distortion, [1e-3, 1e-3 / 4], 1e-3 / 4),
+        (lambda distortion: 10 * distortion**0.5, [1e-3, 10**-3.5, 10**-3.75], 10**-3.75),  # correlated errors
+    ],
+)
+def test_files_that_cost_training_photos_more_than_was_aimed_at_are_made_finer(lost, made, taken, monkeypatch):
+    """A packer whose files cost training photos the dB that `lost` says, of the model's 30."""
+    tried: list[float] = []
+    scene = SimpleNamespace(train=["a photo"])
+    packer = running.Packer(None, {}, None, scene, 0, True, lambda sentence: None)
+    monkeypatch.setattr(
+        packer, "attempt", lambda distortion, *_: tried.append(distortion) or running.Trial(distortion, {})
+    )
+    monkeypatch.setattr(running.Packer, "decoded", lambda packer, trial: trial.data)
+    monkeypatch.setattr(
+        running.Packer, "_psnr", lambda packer, shown, views, report: 30.0 if shown is None else 30.0 - lost(shown)
+    )
+
+    trial = packer.settled(1e-3, SimpleNamespace(error=lambda distortion: distortion), 0.1)
+
+    assert tried == pytest.approx(made, rel=1e-3)
+    assert trial.data == trial.error == pytest.approx(taken, rel=1e-3)
+
+
+def test_photos_that_cannot_be_read_do_not_end_the_work(monkeypatch):
+    said: list[str] = []
+    packer = running.Packer(None, {}, None, SimpleNamespace(train=["a photo"]), 0, True, said.append)
+    monkeypatch.setattr(packer, "attempt", lambda distortion, *_: running.Trial(distortion, {}))
+    monkeypatch.setattr(running.Packer, "decoded", lambda packer, trial: trial.data)
+
+    def fail(packer, shown, views, report):
+        raise HyrfError("a.png: the file is gone")
+
+    monkeypatch.setattr(running.Packer, "_psnr", fail)
+    assert packer.settled(1e-3, SimpleNamespace(error=lambda distortion: distortion), 0.1).data == 1e-3
+    assert said == ["a.png: the file is gone; the loss on training photos is not measured"]
 
 
 def test_without_photos_it_looks_from_the_cameras_that_the_file_keeps(trained, compact, scene, tmp_path):

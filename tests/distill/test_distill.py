@@ -13,10 +13,10 @@ import hyrfpack
 from hyrfpack.compress import calibrate
 from hyrfpack.distill import DistillConfig, distill_splats, fit, pack, teach, teacher
 from hyrfpack.distill.teacher import Sample, teaching_scene
-from hyrfpack.distill.views import Weighted, viewpoints
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
+from hyrfpack.splats.viewpoints import Weighted, viewpoints
 
 
 def test_report_says_what_is_in_the_file(tmp_path: Path) -> None:

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from hyrfpack.distill import start
 from hyrfpack.distill.start import initial_model, rotations
 from hyrfpack.distill.teacher import teaching_scene
-from hyrfpack.distill.views import Weighted, viewpoints
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.splats import Splats
+from hyrfpack.splats.viewpoints import Weighted, viewpoints
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 
 

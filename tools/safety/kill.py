@@ -38,9 +38,9 @@ from PIL import Image
 import hyrfpack
 from hyrfpack.atomic import PREFIX, SUFFIX
 from hyrfpack.demo.scene import write_demo_scene
+from hyrfpack.format.run_folder import CHECKPOINT, METRICS, MODEL
 from hyrfpack.make.state import NAME as RECORD
 from hyrfpack.train.checkpoint import DIGEST_BYTES
-from hyrfpack.train.run import CHECKPOINT, METRICS, MODEL
 
 ENVIRONMENT = {**os.environ, "HYRFPACK_THREADS": "1", "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
 COMMANDS = ("train", "compress", "decompress", "render", "make")  # each works on what those before it made

@@ -19,11 +19,11 @@ from pathlib import Path
 import hyrfpack
 from hyrfpack.atomic import check_writable, make_folder
 from hyrfpack.cameras.paths import Viewpoint
+from hyrfpack.format.run_folder import MODEL
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.progress import ProgressLine
-from hyrfpack.train.run import MODEL
 
 # A round can at most double the number, and splits no Gaussian that none of the views since the last round has seen.
 ROUNDS, STEPS_BETWEEN = 20, 6

@@ -33,9 +33,8 @@ from hyrfpack.splats.formats.checked import checked_splats
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.palette import build_palette, nearest
 from hyrfpack.splats.formats.smallest_three import with_largest, without_largest
+from hyrfpack.splats.names import SOG_META as META
 from hyrfpack.splats.splats import Splats
-
-META = "meta.json"
 
 _FILES = {
     "means": ("means_l.webp", "means_u.webp"),

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from explicit_balls import ball
 
-from hyrfpack.distill import views
-from hyrfpack.distill.views import CLUTTER, COVERED, DISTANCES, Weighted, coverage, viewpoints
+from hyrfpack.splats import viewpoints as views
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.splats import Splats, concatenate
+from hyrfpack.splats.viewpoints import CLUTTER, COVERED, DISTANCES, Weighted, coverage, viewpoints
 
 
 def seen(splats: Splats, count: int = 12, seed: int = 0):

@@ -1,0 +1,85 @@
+"""`hyrfpack convert`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from hyrfpack.cli.common import OUTPUT, PATH, json_option, note, note_rename, overwrite_option, print_json, table
+from hyrfpack.cli.export import crop_option, min_opacity_option
+from hyrfpack.cli.progress import shown_progress
+from hyrfpack.outputs import Outputs
+
+if TYPE_CHECKING:
+    from hyrfpack.export import ConversionReport
+
+
+@click.command(short_help="Convert splats between formats.")
+@click.argument("source", type=PATH)
+@click.argument("target", type=OUTPUT)
+@click.option(
+    "--sh-degree",
+    "degree",
+    type=click.IntRange(0, 3),
+    metavar="0-3",
+    help="Highest degree of the spherical harmonics to keep.  [default: all that the format holds]",
+)
+@crop_option
+@min_opacity_option
+@overwrite_option
+@json_option
+def convert(
+    source: Path,
+    target: Path,
+    degree: int | None,
+    crop: tuple[float, ...] | None,
+    min_opacity: float,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Convert SOURCE, 3D Gaussians of another program, to the format that the ending of TARGET names.
+
+    SOURCE is a .ply (plain or compressed), .splat, .spz or .sog file, or the folder of a SOG that is not bundled.
+    TARGET ends in .ply, .splat, .spz, .sog, .glb, .usda, .usdc or .usdz. Everything stays in its axes and units. The
+    file is read back, and its pictures are compared with those of SOURCE from 12 viewpoints.
+
+    \b
+    Examples:
+      hyrfpack convert scene.ply scene.spz
+      hyrfpack convert scene.ply small.sog --sh-degree 1 --min-opacity 0.02
+      hyrfpack convert scene.spz table.ply --crop -1,-1,-1,1,1,1
+    """
+    from hyrfpack.export.conversion import convert as run
+    from hyrfpack.export.conversion import format_of
+    from hyrfpack.splats.names import splats_folder
+
+    format_of(source, target)
+    Outputs(source, folder=splats_folder(source), overwrite=overwrite).file(target)
+    with shown_progress("convert") as progress:
+        report = run(
+            source,
+            target,
+            degree=degree,
+            crop=crop,
+            min_opacity=min_opacity,
+            overwrite=overwrite,
+            say=note,
+            report=progress,
+        )
+    note_rename(target, report.file)
+    if as_json:
+        print_json(report.to_dict())
+        return
+    _print(source, report)
+
+
+def _print(source: Path, report: ConversionReport) -> None:
+    before = [source.name, f"{report.gaussians_before:,}", str(report.degree_before), f"{report.bytes_before:,}"]
+    after = [Path(report.file).name, f"{report.gaussians_after:,}", str(report.degree_after), f"{report.bytes_after:,}"]
+    click.echo(table(["file", "Gaussians", "SH degree", "bytes"], [before, after]))
+    click.echo(
+        f"{report.views} views of the file against the same of {source.name}: PSNR {report.psnr:.2f} dB, the worst "
+        f"{report.psnr_worst:.2f}"
+    )

@@ -1,0 +1,178 @@
+"""Splats of other programs, and `hyrfpack convert`, called as a person would."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import refused, succeeded
+from explicit_balls import ball
+from PIL import Image
+from scenes import ring, small_model
+
+from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.files import cameras_to_json
+from hyrfpack.cameras.paths import Viewpoint
+from hyrfpack.format import save
+from hyrfpack.splats.files import READ
+from hyrfpack.splats.formats import sog
+from hyrfpack.splats.formats.hints import NO_HINTS
+from hyrfpack.splats.names import ENDINGS, is_splats
+from hyrfpack.splats.table import FORMATS
+
+SPLATS = ball(60)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> dict[str, Path]:
+    """The same splats in every format that is read, and as a loose SOG."""
+    folder = tmp_path_factory.mktemp("splats")
+    paths = {ending: folder / f"ball{ending}" for ending in READ}
+    for ending, path in paths.items():
+        path.write_bytes(FORMATS[ending].encode(SPLATS, NO_HINTS))
+    loose = folder / "loose"
+    loose.mkdir()
+    for name, data in sog.encode_files(SPLATS).items():
+        (loose / name).write_bytes(data)
+    return {**paths, "loose": loose, "meta.json": loose / "meta.json"}
+
+
+KINDS = [*ENDINGS, "loose", "meta.json"]
+
+
+def test_names_know_every_ending_that_is_read():
+    assert sorted(ENDINGS) == sorted(READ)
+
+
+def test_a_folder_with_another_meta_json_is_no_splats(tmp_path):
+    (tmp_path / "meta.json").write_text('{"camera": 1}')
+    assert not is_splats(tmp_path)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_info_tells_format_count_degree_bounds_and_bytes(kind, files):
+    path = files[kind]
+    facts = json.loads(succeeded("info", path, "--json").stdout)
+    loose = kind in ("loose", "meta.json")
+    size = sum(file.stat().st_size for file in files["loose"].iterdir()) if loose else path.stat().st_size
+    assert (facts["gaussians"], facts["bytes"]) == (60, size)
+    assert facts["format"] == ("sog folder" if loose else kind[1:])
+    assert facts["degree"] == min(1, FORMATS[".sog" if loose else kind].degree)
+    assert facts["low"] == pytest.approx(SPLATS.positions.min(0), abs=2e-3)
+    assert facts["high"] == pytest.approx(SPLATS.positions.max(0), abs=2e-3)
+    printed = succeeded("info", path).stdout
+    assert printed.splitlines()[0] == f"{path}: {size:,} bytes, 60 Gaussians"
+    assert f"degree {facts['degree']}" in printed and "centres" in printed
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_render_draws_splats_from_cameras_and_around(kind, files, tmp_path):
+    cameras = ring(2, width=24, height=24)
+    (tmp_path / "path.json").write_text(cameras_to_json([(f"c{n}", camera) for n, camera in enumerate(cameras)]))
+    succeeded("render", files[kind], "-o", tmp_path / "out", "--cameras", tmp_path / "path.json")
+    pictures = [np.asarray(Image.open(tmp_path / "out" / f"c{n}.png")) for n in range(2)]
+    assert all(picture.shape == (24, 24, 3) and picture[12, 12].max() > 30 for picture in pictures)
+    assert all(picture[0, 0].max() == 0 for picture in pictures)  # over black
+
+
+def test_an_orbit_of_splats_shows_them_in_the_middle(files, tmp_path):
+    succeeded("render", files[".ply"], "-o", tmp_path / "out", "--orbit", 3)
+    for path in (tmp_path / "out").iterdir():
+        picture = np.asarray(Image.open(path)).max(axis=2) > 20
+        assert picture[300, 400] and not picture[0, 0] and picture.mean() > 0.05
+
+
+def test_depth_of_splats_is_in_world_units(files, tmp_path):
+    (camera,) = ring(1, radius=5.0, elevation=0.0, width=33, height=33)
+    (tmp_path / "path.json").write_text(cameras_to_json([("c", camera)]))
+    succeeded("render", files[".ply"], "-o", tmp_path / "out", "--cameras", tmp_path / "path.json", "--depth")
+    depth = np.asarray(Image.open(tmp_path / "out" / "c.depth.tiff"))
+    assert 3.5 < depth[16, 16] < 6.5 and depth[0, 0] == 0  # of a ball of radius 1, seen from 5 away
+
+
+def test_an_exported_file_scores_what_the_export_said(data, tmp_path):
+    cameras = ring(4)
+    positions = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
+    kept = {"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json()}
+    save(small_model(positions, fields=2.0, background=True), tmp_path / "model.hyrf", provenance=kept)
+    export = ("export", tmp_path / "model.hyrf", "-o", tmp_path / "a.ply", "--data", data, "--sh-degree", 1, "--json")
+    told = json.loads(succeeded(*export).stdout)
+    scored = {
+        name: json.loads(succeeded("evaluate", tmp_path / name, "--data", data, "--json").stdout)
+        for name in ("a.ply", "model.hyrf")
+    }
+    assert scored["a.ply"]["psnr"] == pytest.approx(told["photos_file"], abs=0.01)
+    assert scored["model.hyrf"]["psnr"] == pytest.approx(told["photos_model"], abs=0.01)
+    assert scored["a.ply"]["gaussians"] == told["gaussians"]
+    assert scored["a.ply"]["bytes"] == (tmp_path / "a.ply").stat().st_size
+
+
+def test_evaluate_writes_pictures_of_splats_too(files, data, tmp_path):
+    succeeded("evaluate", files[".spz"], "--data", data, "--pictures", tmp_path / "pictures")
+    assert len(list((tmp_path / "pictures").glob("*.png"))) == 2
+
+
+@pytest.mark.parametrize("command", ["render", "evaluate"])
+def test_part_of_a_splats_file_is_refused(command, files, data, tmp_path):
+    output = ("-o", tmp_path / "out") if command == "render" else ()
+    told = refused(command, files[".ply"], "--data", data, "--allow-partial", *output)
+    assert "splats are read whole; leave out --allow-partial" in told
+
+
+@pytest.mark.parametrize("arguments", [("compress", "{}", "-o", "x.hyrf"), ("decompress", "{}", "-o", "x.hyrf")])
+def test_commands_for_models_name_the_import(arguments, files, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    told = refused(*(word.format(files[".ply"]) for word in arguments))
+    assert f"import it first: 'hyrfpack import {files['.ply']} -o ball.hyrf'" in told
+
+
+def test_export_of_splats_names_the_command_to_use(files, tmp_path):
+    convert = f"'hyrfpack convert {files['.ply']} {tmp_path / 'a.spz'}'"
+    assert convert in refused("export", files[".ply"], "-o", tmp_path / "a.spz")
+    assert f"'hyrfpack import {files['.ply']} -o ball.hyrf'" in refused(
+        "export", files[".ply"], "-o", tmp_path / "a.html"
+    )
+
+
+@pytest.mark.parametrize("command", ["view", "export"])
+def test_a_page_wants_a_loose_sog_bundled(command, files, tmp_path):
+    output = ("-o", tmp_path / "player") if command == "export" else ("--no-browser",)
+    assert f"'hyrfpack convert {files['loose']} " in refused(command, files["loose"], *output)
+
+
+# -- convert -----------------------------------------------------------------------------------------------------------
+
+
+def test_convert_prints_what_was_and_what_is(files, tmp_path):
+    target = tmp_path / "a.splat"
+    result = succeeded("convert", files[".ply"], target)
+    rows = [re.split(r" {2,}", line) for line in result.stdout.splitlines()]
+    assert rows[0] == ["file", "Gaussians", "SH degree", "bytes"]
+    assert rows[2] == ["ball.ply", "60", "1", f"{files['.ply'].stat().st_size:,}"]
+    assert rows[3] == ["a.splat", "60", "0", f"{32 * 60:,}"]
+    assert re.fullmatch(r"12 views of .* PSNR \d+\.\d\d dB, the worst \d+\.\d\d", result.stdout.splitlines()[-1])
+    assert "no harmonics above degree 0" in result.stderr
+
+
+def test_convert_reports_json_and_asks_before_it_replaces(files, tmp_path):
+    target = tmp_path / "a.spz"
+    options = ("--sh-degree", 0, "--crop", "-9,-9,-9,9,9,0", "--min-opacity", 0.5, "--json")
+    report = json.loads(succeeded("convert", files[".ply"], target, *options).stdout)
+    wanted = ((SPLATS.positions[:, 2] <= 0) & (SPLATS.opacities >= 0.5)).sum()
+    assert (report["gaussians_before"], report["gaussians_after"], report["degree_after"]) == (60, wanted, 0)
+    before = target.read_bytes()
+    assert "replace it with --overwrite" in refused("convert", files[".sog"], target)
+    assert target.read_bytes() == before
+    succeeded("convert", files[".sog"], target, "--overwrite")
+    assert target.read_bytes() != before
+
+
+def test_convert_never_writes_into_the_loose_sog_that_it_reads(files, tmp_path):
+    loose = shutil.copytree(files["loose"], tmp_path / "loose")
+    for name in ("new.ply", "means_l.webp"):
+        assert refused("convert", loose, loose / name, "--overwrite")
+    assert sorted(path.name for path in loose.iterdir()) == sorted(path.name for path in files["loose"].iterdir())

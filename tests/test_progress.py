@@ -1,0 +1,38 @@
+"""Reports of parts of the work add up to reports of the whole."""
+
+from __future__ import annotations
+
+import pytest
+
+from hyrfpack.parallel.pool import side_by_side
+from hyrfpack.progress import report_part, report_round, reporting
+
+
+def test_parts_of_parts_lie_where_they_belong_in_the_whole():
+    told = []
+    inner = report_part(report_part(lambda *said: told.append(said), 0.5, 1.0), 0.2, 0.4)
+    for share in (0, 0.5, 1):
+        inner("measuring", share)
+    assert told == [("measuring", pytest.approx(value)) for value in (0.6, 0.65, 0.7)]
+
+
+def test_rounds_follow_one_another_and_never_reach_the_end():
+    told = []
+    for number in range(30):
+        report = report_round(lambda doing, share: told.append(share), number)
+        report("round", 0)
+        report("round", 1)
+    assert told[0] == 0 and told == sorted(told) and told[-1] < 1
+    assert told[1::2][:-1] == pytest.approx(told[2::2])  # each begins where the one before has ended
+
+
+def test_calls_of_several_threads_are_counted_once_each():
+    told = []
+    assert side_by_side(reporting(abs, lambda *said: told.append(said), "drawing", 5), [-1, -2, 3, 4, -5]) == [
+        1,
+        2,
+        3,
+        4,
+        5,
+    ]
+    assert told == [("drawing", pytest.approx(count / 5)) for count in range(1, 6)]
