@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import time
 from collections.abc import Callable, Iterator
@@ -18,7 +19,7 @@ from hyrfpack.web.player import encode_player
 from hyrfpack.web.serve import MemoryFile, serving
 
 pytestmark = pytest.mark.in_turn
-COUNT = "hyrfpack.player.loaded && hyrfpack.player.scene.count"
+COUNT = "window.hyrfpack?.player.loaded && hyrfpack.player.scene.count"
 REMARK = "document.getElementById('remark').textContent"
 
 
@@ -121,3 +122,23 @@ def test_the_last_snapshot_stays_when_the_training_ends_and_the_page_says_so(bro
 def test_a_first_snapshot_that_cannot_be_read_is_said_in_a_sentence(browser: Browser):
     with trained(browser, (snapshot(20)[:-40], 1)):
         assert "scene.hyrf cannot be opened" in message(browser)
+
+
+OPENED = """(() => {
+    const chosen = new DataTransfer(), input = document.getElementById("file");
+    const bytes = Uint8Array.from(atob("%s"), (letter) => letter.charCodeAt(0));
+    chosen.items.add(new File([bytes], "other.hyrf"));
+    input.files = chosen.files;
+    input.dispatchEvent(new Event("change"));
+})()"""
+
+
+@pytest.mark.parametrize("begun", [False, True], ids=["before the first step", "after it"])
+def test_a_file_that_a_person_opens_is_not_replaced_by_a_newer_snapshot(begun, browser: Browser):
+    with trained(browser, *([(snapshot(20), 1)] if begun else [])) as (training, _):
+        until(browser, f"{COUNT} === 20" if begun else f"{REMARK} !== ''")
+        browser.evaluate(OPENED % base64.b64encode(snapshot(50)).decode())
+        until(browser, f"{COUNT} === 50")
+        training.show(snapshot(60), 2)
+        time.sleep(5)
+        assert browser.evaluate(COUNT) == 50 and browser.evaluate("document.title") == "other"

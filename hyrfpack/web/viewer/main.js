@@ -180,21 +180,25 @@ function start() {
 
   // Show a model that is being trained, and each newer snapshot of it from where one stands.
   const watchTraining = (address, updates) => new Promise((shown, failed) => {
-    let mine = null; // number of what was opened, once that is the first snapshot
+    let mine = number, begun = false; // what is opened by a person meanwhile has another number
+    const wanted = () => mine === number;
     const show = async (progress) => {
       const called = trainingTitle(beside.title, progress);
-      if (mine === null) {
+      if (!begun) {
         remark("");
-        await open(() => fetchedFile(address), called);
+        const opening = open(() => fetchedFile(address), called);
         mine = number;
+        await opening;
+        begun = true;
         return shown();
       }
-      await player.open({ ...(await fetchedFile(address)), update: true });
-      if (mine !== number) return;
+      const file = await fetchedFile(address);
+      if (!wanted()) return;
+      await player.open({ ...file, update: true });
+      if (!wanted()) return;
       title = next = called;
       panel.entitle(player.scene, title);
     };
-    const wanted = () => mine === null || mine === number;
     followTraining(updates, { show, waiting: () => remark(NOT_BEGUN), wanted }).then(() => wanted() && remark(ENDED), failed);
   });
 
