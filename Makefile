@@ -77,7 +77,7 @@ precision: $(READY) ## the same training in float32 and in float64, whole and in
 kill: $(READY) ## kill the commands at random moments and check what is left (ten minutes)
 	$(BIN)/python -m tools.safety.kill
 
-races: $(READY) ## run commands at the same time and check that no result is lost (half an hour)
+races: $(READY) ## run commands at the same time and check that no result is lost (ten minutes)
 	$(BIN)/python -m tools.safety.races
 
 fuzz: $(READY) ## feed the .hyrf reader a million hostile files (ten minutes)
