@@ -147,7 +147,7 @@ def _move_to_free_name(temporary: Path, target: Path, rename: bool) -> Path:
             if not rename:
                 raise HyrfError(
                     f"{target}: another program created this file in the meantime, and it is kept; name another place, "
-                    "or replace it with --overwrite"
+                    "or replace it with `overwrite=True`"
                 ) from None
     raise AssertionError("numbers never end")
 

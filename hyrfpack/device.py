@@ -20,10 +20,10 @@ NO_TRITON = (
 )
 OLD_GPU = (
     "this GPU is of a generation before NVIDIA's Ampere, which the kernels are not made for: they run slowly; "
-    "--precision float32 and --device cpu are worth a try"
+    "`precision='float32'` and `device='cpu'` are worth a try"
 )
 NO_METAL = (
-    "there are no kernels for Apple's GPU: it runs the plain torch reference, which is slow; --device cpu is faster"
+    "there are no kernels for Apple's GPU: it runs the plain torch reference, which is slow; `device='cpu'` is faster"
 )
 
 
@@ -60,7 +60,9 @@ def choose_device(
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
         if int(number or 0) >= count:
             there = f"torch sees {count} of them" if count else "torch sees no NVIDIA or AMD GPU"
-            raise HyrfError(f"device '{name}' is not there, {there}; install a GPU build of torch or use --device cpu")
+            raise HyrfError(
+                f"device '{name}' is not there, {there}; install a GPU build of torch or use `device='cpu'`"
+            )
         if not has_triton():
             say(NO_TRITON)
         elif not torch.version.hip and torch.cuda.get_device_capability(name) < (8, 0):
@@ -68,7 +70,7 @@ def choose_device(
         make_current(torch.device(name))
     if kind == "mps":
         if not torch.backends.mps.is_available():
-            raise HyrfError("device 'mps' is not there, torch sees no Apple GPU; use --device cpu")
+            raise HyrfError("device 'mps' is not there, torch sees no Apple GPU; use `device='cpu'`")
         say(NO_METAL)
     return torch.device(name)
 
@@ -89,7 +91,7 @@ def choose_own_device(
         if len(set(gpus)) < len(gpus):
             raise HyrfError(
                 f"{ranks.size} processes have {len(set(gpus))} GPUs between them, and each needs its own; start as "
-                "many as there are GPUs, with --device cuda, or use --device cpu"
+                "many as there are GPUs, with `device='cuda'`, or use `device='cpu'`"
             )
     return device
 

@@ -88,10 +88,12 @@ class Outputs:
             raise HyrfError(f"{path}: what is written here ends in {' or '.join(endings)}; name the file so")
         if os.path.lexists(path):
             if not self.overwrite:
-                raise HyrfError(f"{path}: there is a file of this name; name another, or replace it with --overwrite")
+                raise HyrfError(
+                    f"{path}: there is a file of this name; name another, or replace it with `overwrite=True`"
+                )
         elif not self.overwrite and _of_a_set(_folder_of(path)):
             raise HyrfError(
-                f"{path}: photos or poses lie in this folder; name another, or write there with --overwrite"
+                f"{path}: photos or poses lie in this folder; name another, or write there with `overwrite=True`"
             )
         _check_names([path])
         _check_place(_folder_of(path))
@@ -112,12 +114,13 @@ class Outputs:
                 more = f" and {len(there) - 1} more" if len(there) > 1 else ""
                 raise HyrfError(
                     f"{folder}: {there[0].relative_to(folder)}{more} of the files to be written "
-                    f"{'are' if more else 'is'} there; name another folder, or replace them with --overwrite"
+                    f"{'are' if more else 'is'} there; name another folder, or replace them with `overwrite=True`"
                 )
             for place in places:
                 if _has_poses(place) or _has_pictures(place):
                     raise HyrfError(
-                        f"{place}: photos or poses lie in this folder; name another, or write there with --overwrite"
+                        f"{place}: photos or poses lie in this folder; name another, or write there with "
+                        "`overwrite=True`"
                     )
         for place in places:
             _check_place(place)

@@ -146,5 +146,5 @@ def _photos(scene: Scene, model: HybridModel) -> tuple[list[View], list[tuple[Te
             views.append(view)
             photos.append((photo, mask))
     if not views:
-        raise HyrfError(f"{scene.path}: no held-out photo can be scored; name a smaller --test-every or other masks")
+        raise HyrfError(f"{scene.path}: no held-out photo can be scored; name a smaller `test_every` or other masks")
     return views, photos

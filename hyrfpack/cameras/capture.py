@@ -106,7 +106,7 @@ class Capture:
             return [camera_from_numbers(numbers) for numbers in self._kept or self._coarse]
         except (TypeError, ValueError, ArithmeticError) as error:
             raise HyrfDataError(
-                f"the cameras that the file keeps are not valid ({error!s:.160}); name the photos with --data"
+                f"the cameras that the file keeps are not valid ({error!s:.160}); name the photos with `data`"
             ) from error
 
     @property
@@ -133,7 +133,7 @@ class Capture:
             return Viewpoint.from_json(stored)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise HyrfDataError(
-                f"the model's viewpoint cannot be used ({error}); render with --data or --cameras instead"
+                f"the model's viewpoint cannot be used ({error}); render with `data` or `cameras` instead"
             ) from error
 
     @property

@@ -102,7 +102,7 @@ def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
         parse, items, shared = _from_ours, content, {}
     else:
         raise HyrfDataError(
-            f"{path}: there is neither a list of cameras nor 'frames' in it; see `hyrfpack render --help`"
+            f"{path}: there is neither a list of cameras nor 'frames' in it; see the help of 'hyrfpack render'"
         )
     cameras = []
     for number, item in enumerate(items):

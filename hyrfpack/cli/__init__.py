@@ -30,6 +30,7 @@ from hyrfpack.cli.poses import poses
 from hyrfpack.cli.train import train
 from hyrfpack.cli.view import view
 from hyrfpack.cli.views import evaluate, render
+from hyrfpack.cli.wording import with_options
 from hyrfpack.errors import HyrfError, printable
 
 
@@ -60,7 +61,7 @@ class _Commands(click.Group):
         except HyrfError as error:
             if is_verbose():
                 traceback.print_exc()
-            raise _Refusal(str(error)) from error
+            raise _Refusal(with_options(str(error))) from error
         except OSError as error:
             # Files are written by functions that raise HyrfError: what is left is printing onto a full disk.
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):

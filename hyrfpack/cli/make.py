@@ -114,14 +114,14 @@ def make(
         raise click.UsageError("--quality and --minutes each decide how long to work; give one of them")
     if target_size is not None and max_gaussians is not None:
         raise click.UsageError("--max-gaussians and --target-size each decide how large the model is; give one of them")
+    from hyrfpack.cli.progress import command_display
     from hyrfpack.make import Stopped
     from hyrfpack.make import make as run
-    from hyrfpack.make.display import Display
 
     place = chosen_device(device)
     try:
         with (
-            Display() as display,
+            command_display() as display,
             training_view(output.name, view, view_port, display.say) as observer,
         ):
             result = run(

@@ -14,6 +14,7 @@ from typing import Any, TextIO, TypeVar, cast
 import click
 
 import hyrfpack
+from hyrfpack.cli.wording import with_options
 
 T = TypeVar("T")
 # In click's context, where all commands see them.
@@ -73,7 +74,11 @@ def is_verbose() -> bool:
 
 
 def note(sentence: str) -> None:
-    """Tell the person something on standard error; with --verbose, with the seconds since the start before it."""
+    """Tell the person something on standard error; with --verbose, with the seconds since the start before it.
+
+    Python arguments that the sentence names become options, see `with_options`.
+    """
+    sentence = with_options(sentence)
     if is_verbose():
         sentence = f"[{time.perf_counter() - click.get_current_context().meta[_STARTED]:7.2f} s] {sentence}"
     with suppress(OSError):  # a full disk or a terminal that is gone does not end the work

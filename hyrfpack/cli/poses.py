@@ -47,12 +47,12 @@ def poses(
       hyrfpack poses clip.mp4 -o scenes/clip
       hyrfpack train scenes/garden -o runs/garden
     """
-    from hyrfpack.make.display import Display
+    from hyrfpack.cli.progress import command_display
     from hyrfpack.make.progress import Reporter
     from hyrfpack.poses import estimate_poses
 
     try:
-        with Display() as display:
+        with command_display() as display:
             reporter = Reporter(["poses"], display.show)
             reporter.begin("poses")
             found = estimate_poses(

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from hyrfpack.cli.wording import with_options
 from hyrfpack.errors import printable
 
 if TYPE_CHECKING:
@@ -35,10 +36,10 @@ def print_survey(survey: PhotoSurvey) -> None:
         if text:
             _say(f"  {name:<10} {text}")
     for note in survey.notes:
-        _say(f"  {note}")
+        _say(f"  {with_options(note)}")
     click.echo("\nwhat to do" if survey.problems else "\nnothing is wrong with it")
     for problem in survey.problems:
-        _say(f"  - {problem}")
+        _say(f"  - {with_options(problem)}")
 
 
 def _counts(counted: dict[str, int]) -> str:

@@ -162,6 +162,8 @@ def train(
         note(f"stopped after step {result.step:,}; {resuming(overwrite)} goes on from there")
     if result.model is not None:
         note_rename(out / MODEL, result.model)
+    if result.missing:
+        note(f"{resuming(overwrite)} writes what is missing")
     if as_json:
         print_json({"complete": result.complete, "step": result.step, **result.metrics})
     elif result.complete and ranks.leads:
@@ -181,11 +183,11 @@ def train(
 
 def _posed(photos: Path, run: Path, images: str | None, resume: bool, overwrite: bool) -> Path:
     """The folder of the scene that photos without poses become."""
-    from hyrfpack.make.display import Display
+    from hyrfpack.cli.progress import command_display
     from hyrfpack.make.posed import SCENE, posed
 
     try:
-        with Display() as display:
+        with command_display() as display:
             return posed(
                 photos, run, images=images, resume=resume, overwrite=overwrite, report=display.show, say=display.say
             )

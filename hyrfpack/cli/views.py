@@ -129,7 +129,7 @@ def render(
         return list(counted(pictures, len(ranks.share(named)), "rendering"))
 
     ranks.agree(lambda: check(replace=True))  # whatever lies there: no folder is created where nothing may be written
-    with exclusive_folder(output, "another folder with -o", ranks):  # until the video is written, too
+    with exclusive_folder(output, ranks=ranks):  # until the video is written, too
         ranks.agree(lambda: check(replace=overwrite))
         parts = ranks.told(ranks.agree(write))
         if not ranks.leads:

@@ -45,7 +45,7 @@ def check_scores(runs: Sequence[Run], names: Sequence[str]) -> None:
             raise HyrfDataError(
                 f"{other.folder}: other photos are held out of '{name}' ({len(other.held_out)}) than of '{first_name}' "
                 f"({len(first.held_out)}; '{odd}' of one of them alone), so that scores cannot be compared; train both "
-                "on the same photos with the same --test-every"
+                "on the same photos with the same `test_every`"
             )
 
 

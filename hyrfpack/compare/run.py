@@ -99,11 +99,11 @@ def read_run(folder: StrPath) -> Run:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise HyrfDataError(f"{folder}: there is no such folder; name one that 'hyrfpack train' wrote to with -o")
+        raise HyrfDataError(f"{folder}: there is no such folder; name one that 'hyrfpack train' wrote to")
     if (folder / CHECKPOINT).exists():
         raise HyrfDataError(
             f"{folder}: this run is not finished ({CHECKPOINT} is there); the 'hyrfpack train' command that started "
-            "it finishes it with --resume (instead of --overwrite)"
+            "it finishes it with `resume=True` (instead of `overwrite=True`)"
         )
     for name in (METRICS, MODEL):
         if not (folder / name).is_file():
@@ -118,7 +118,7 @@ def read_run(folder: StrPath) -> Run:
         reason = str(error)
     except (ValueError, RecursionError):
         reason = "it is no JSON"
-    raise HyrfDataError(f"{path}: the metrics are damaged ({reason}); train the run anew with --overwrite")
+    raise HyrfDataError(f"{path}: the metrics are damaged ({reason}); train the run anew with `overwrite=True`")
 
 
 def _refuse_constant(name: str) -> None:

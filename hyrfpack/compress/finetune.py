@@ -124,7 +124,7 @@ def finetune(
                 raise HyrfTrainingError(
                     f"fine-tuning stopped at step {step + 1} on view "
                     f"{' or '.join(repr(view.name) for view in views_of_step)}: the loss or a gradient is not "
-                    "finite; compress without --finetune"
+                    "finite; compress without `finetune_steps`"
                 )
             report(step + 1, float(loss))
     plan, placed = follow(plan, tuned)

@@ -143,12 +143,12 @@ def compress(
     if settings:
         raise HyrfError(f"profile 'compact' has no setting '{next(iter(settings))}'")
     if data is None and (finetune_steps or max_psnr_drop is not None):
-        raise HyrfError("fine-tuning and limits on PSNR need photos; name their folder with --data")
+        raise HyrfError("fine-tuning and limits on PSNR need photos; name their folder with `data`")
     if sum(option is not None for option in (target_bytes, max_psnr_drop, distortion)) > 1:
         raise HyrfError("a target size and a largest loss of PSNR each decide how fine the file is; give one of them")
     if data is not None and not data.train:
         raise HyrfError(
-            f"{data.path}: all photos are held out, so there is none to measure at; use a larger --test-every"
+            f"{data.path}: all photos are held out, so there is none to measure at; use a larger `test_every`"
         )
     model, provenance = load_with_provenance(source)
     kept = coarse(provenance, model.config.frame.scale)
@@ -309,7 +309,7 @@ class Packer:
             smallest = len(self.attempt(LIMITS[1]).data)
             raise HyrfSizeError(
                 f"the model does not fit into {limit:,} bytes, the least is about {smallest:,}; "
-                "ask for more, or train with fewer Gaussians (--max-gaussians)",
+                "ask for more, or train with fewer Gaussians (`max_gaussians`)",
                 smallest,
             )
         distortion, trial = answer

@@ -83,7 +83,7 @@ def write_report(
     """
     folder, source, packed = Path(folder), Path(source), Path(packed)
     Outputs(source, packed, scene=scene, overwrite=True).folder(folder, FILES)
-    with exclusive_folder(folder, "another folder with --report"):
+    with exclusive_folder(folder, "another folder with `report`"):
         Outputs(source, packed, scene=scene, overwrite=overwrite).folder(folder, FILES)
         return _write_report(folder, source, packed, report, scene, command, overwrite, say)
 

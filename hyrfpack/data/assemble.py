@@ -153,7 +153,7 @@ def _told(photos: list[Photo], max_size: int, about_masks: list[str]) -> list[st
         width, height = max(shrunk, key=max)
         notes.append(
             f"{len(shrunk)} of {len(photos)} photos are shrunk from up to {width} x {height} to {max_size} pixels on "
-            "the longer side; --max-size 0 keeps them"
+            "the longer side; `max_size=0` keeps them"
         )
     return notes
 

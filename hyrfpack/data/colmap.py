@@ -105,7 +105,7 @@ def _photo_folder(path: Path, base: Path, images: str | None, names: Sequence[st
     if found is None:
         raise HyrfDataError(
             f"{path}: no photo folder 'images' beside the COLMAP model, and no other that is clearly meant; "
-            f"{folders_of(path)}; name the one of the photos with --images, or give the folder that holds both"
+            f"{folders_of(path)}; name the one of the photos with `images`, or give the folder that holds both"
         )
     return found
 
@@ -119,7 +119,7 @@ def _choose_model(path: Path, models: Sequence[Path], name: str | None) -> tuple
     sizes = {model: _registered(model) for model in models}
     there = ", ".join(f"{model.name} ({size} photos)" for model, size in sizes.items())
     chosen = max(models, key=lambda model: sizes[model])  # the first of the largest
-    why = "with the most photos; --model takes another"
+    why = "with the most photos; `model` takes another"
     if name is not None:
         named = [model for model in models if model.name == name]
         if not named:

@@ -130,7 +130,7 @@ def run_demo(
     """
     folder = Path(folder)
     Outputs(overwrite=True).folder(folder, FILES)
-    with exclusive_folder(folder, "another folder with -o"):
+    with exclusive_folder(folder):
         Outputs(overwrite=overwrite).folder(folder, FILES)
         return _run_demo(folder, steps, views, size, overwrite, say)
 

@@ -183,6 +183,6 @@ def _shortfall(reached: float, unpacked: float, config: DistillConfig, *, made_u
         f"asked for {config.psnr:g} dB and reached {reached:.1f} at held-out viewpoints, {unpacked:.1f} before packing"
     )
     if not _below(unpacked, config.psnr):
-        return f"{told}: ask for more than you need with --psnr"
-    where = ", or name with --cameras from where it will be looked at" if made_up else ""
-    return f"{told}: learn longer, as with --steps {max(DistillConfig.steps, 2 * config.steps)}{where}"
+        return f"{told}: ask for more than you need with `psnr`"
+    where = ", or name with `cameras` from where it will be looked at" if made_up else ""
+    return f"{told}: learn longer, as with `steps={max(DistillConfig.steps, 2 * config.steps)}`{where}"

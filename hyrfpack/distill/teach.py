@@ -86,7 +86,7 @@ def teach(
     light = light_of(original, evenly_spaced(train, LIT_FROM))
     kept = torch.from_numpy(_lit(light.cpu().numpy())).to(device)
     if not len(kept):
-        raise HyrfDataError(f"{name}: no view shows anything of the Gaussians; give others with --cameras")
+        raise HyrfDataError(f"{name}: no view shows anything of the Gaussians; give others with `cameras`")
     say(f"{len(splats) - len(kept):,} Gaussians are hardly seen and left out; fitting the fields to the others")
     share = min(1.0, max(LEAST_REGRESSED, config.steps / REGRESSED))
     model = initial_model(original[kept], light[kept], train, config.seed, share, report_part(report, 0.1, 0.4))

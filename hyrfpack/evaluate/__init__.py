@@ -140,7 +140,7 @@ def evaluate(
         for view in given if isinstance(given, Sequence) else [given]:
             check_type("each of the views", view, View)
     if not views:
-        raise HyrfError("there is no view to score; name a split that has photos or a smaller --test-every")
+        raise HyrfError("there is no view to score; name a split that has photos or a smaller `test_every`")
     perceptual = None if lpips_weights is None else LPIPS.load(lpips_weights)
     if isinstance(model, Drawable):
         solid, device, count = np.zeros(3, np.float32), model.device, len(model.positions)

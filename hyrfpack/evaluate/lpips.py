@@ -132,7 +132,7 @@ class LPIPS:
         if min(image.shape[:2]) < self.network.smallest:
             raise HyrfError(
                 f"LPIPS ({self.name}) needs pictures of {self.network.smallest} pixels a side and these have "
-                f"{image.shape[1]} x {image.shape[0]}; score without --lpips-weights"
+                f"{image.shape[1]} x {image.shape[0]}; score without `lpips_weights`"
             )
         pair = torch.stack((image, reference)).permute(0, 3, 1, 2).float().cpu() * 2 - 1
         features = (pair - pair.new_tensor(SHIFT).view(3, 1, 1)) / pair.new_tensor(SCALE).view(3, 1, 1)

@@ -156,7 +156,7 @@ def _tell_of_limits(form: Format, splats: Splats, kept: Splats, say: Callable[[s
     if reach > form.farthest:
         raise HyrfError(
             f"the splats reach {reach:,.0f} units from the origin, and {form.ending} {form.farthest:,}; name another "
-            "format, or leave the far ones out with --crop"
+            "format, or leave the far ones out with `crop`"
         )
     if splats.degree > form.degree:
         say(f"{form.ending} holds no harmonics above degree {form.degree}; those of degree {splats.degree} are lost")

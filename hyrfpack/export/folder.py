@@ -74,7 +74,7 @@ def player(
         check_type("data", data, Scene)
     sources = [] if source is None else [source]
     check_folder(folder, sources, [data], overwrite=True, listed=False)
-    with exclusive_folder(folder, "another folder with -o"):
+    with exclusive_folder(folder):
         check_folder(folder, sources, [data], overwrite=overwrite, listed=False)
         return _write_player(source, _Folder(Path(folder), overwrite), data, say)
 
@@ -139,7 +139,7 @@ def gallery(
         if scene is not None:
             check_type("data", scene, Scene)
     check_folder(folder, sources, scenes, overwrite=True, listed=True)
-    with exclusive_folder(folder, "another folder with -o"):
+    with exclusive_folder(folder):
         check_folder(folder, sources, scenes, overwrite=overwrite, listed=True)
         return _write_gallery(sources, _Folder(Path(folder), overwrite), scenes, say)
 

@@ -44,7 +44,9 @@ def kind_of(target: str | os.PathLike[str], colmap: bool = False, *, others: tup
     name = Path(target).name.lower()
     if colmap:
         if name.endswith(ENDINGS) and not os.path.isdir(target):
-            raise HyrfError(f"{target}: a COLMAP model is a folder of tables; name one without ending for --colmap")
+            raise HyrfError(
+                f"{target}: a COLMAP model is a folder of tables; name one without ending for `colmap=True`"
+            )
         return COLMAP
     if name.endswith(".compressed.ply"):
         raise HyrfError(
@@ -79,21 +81,21 @@ def check_request(
         raise HyrfError(f"an opacity of {min_opacity} cannot be asked for; name 0 to 1")
     if kind is TRANSFORMS and (crop is not None or min_opacity > 0):
         raise HyrfError(
-            f"{target}: this holds cameras only, and --crop and --min-opacity choose Gaussians; leave them out"
+            f"{target}: this holds cameras only, and `crop` and `min_opacity` choose Gaussians; leave them out"
         )
     if baked and kind is PLAYER:
-        raise HyrfError(f"{target}: a player's folder holds the model file itself; for --baked name a file .html")
+        raise HyrfError(f"{target}: a player's folder holds the model file itself; for `baked=True` name a file .html")
     asked = {
-        "--sh-degree": degree is not None,
-        "--crop": crop is not None,
-        "--min-opacity": min_opacity > 0,
-        "--no-background": not background,
+        "`degree`": degree is not None,
+        "`crop`": crop is not None,
+        "`min_opacity`": min_opacity > 0,
+        "`background=False`": not background,
     }
     if any(asked.values()) and (kind is PLAYER or (kind is PAGE and not baked)):
         names = " and ".join(name for name, given in asked.items() if given)
         raise HyrfError(
             f"{target}: the model goes along whole, and {names} would change it; leave it out, or write splats into a "
-            "page with --baked"
+            "page with `baked=True`"
         )
     if kind.package:
         module, package = kind.package
@@ -121,7 +123,7 @@ def check_model(read: Source, kind: Kind, crop: Sequence[float] | None, min_opac
     if reach > kind.farthest:
         raise HyrfError(
             f"the scene reaches {reach:,.0f} units from the origin with its background, and {kind.ending} "
-            f"{kind.farthest:,}; export another format, or try --no-background"
+            f"{kind.farthest:,}; export another format, or try `background=False`"
         )
 
 
@@ -143,11 +145,11 @@ def kept_of(
     if crop is not None:
         keep &= ((positions >= crop[:3]) & (positions <= crop[3:])).all(axis=1)
     if not len(positions):
-        raise HyrfError("no Gaussian is left: no camera sees any; name the photos with --data, or train again")
+        raise HyrfError("no Gaussian is left: no camera sees any; name the photos with `data`, or train again")
     if not keep.any():
         low, high = (corner.round(4).tolist() for corner in (positions.min(0), positions.max(0)))
         raise HyrfError(
             f"no Gaussian is left: centres lie between {low} and {high}, opacities reach {opacities.max():.3f}; "
-            "widen --crop or lower --min-opacity"
+            "widen `crop` or lower `min_opacity`"
         )
     return keep

@@ -118,7 +118,7 @@ def export(
         return player(source, target, data=data, overwrite=overwrite, say=say)
     if kind is COLMAP:
         check_place(target, Outputs(source, scene=data, overwrite=True), colmap)
-    with exclusive_folder(target, "another folder with -o") if kind is COLMAP else nullcontext():
+    with exclusive_folder(target) if kind is COLMAP else nullcontext():
         check_place(target, Outputs(source, scene=data, overwrite=overwrite), colmap)
         return _export(
             source, target, kind, degree=degree, data=data, crop=crop, min_opacity=min_opacity, background=background,
@@ -148,14 +148,14 @@ def _export(
         return write_native_page(read, source, target, say, overwrite)
     if kind in (TRANSFORMS, COLMAP) and (read.coarse or not read.cameras):
         kept = "only coarse cameras" if read.coarse else "no cameras"
-        raise HyrfError(f"{source}: it keeps {kept}; export them from the file that training wrote, or name --data")
+        raise HyrfError(f"{source}: it keeps {kept}; export them from the file that training wrote, or name `data`")
     if kind is TRANSFORMS:
         return _export_cameras(read, target, overwrite)
     points = kind in (COLMAP, *POINTS)
     sphere = background and crop is None and read.model.config.background and not points
     check_model(read, kind, crop, min_opacity, sphere)
     places = f"{len(read.fitted)} " + (
-        "cameras" if read.cameras else "places around the scene, for the file keeps no cameras (--data names photos)"
+        "cameras" if read.cameras else "places around the scene, for the file keeps no cameras (`data` names photos)"
     )
     highest = kind.degree if degree is None else min(degree, kind.degree)
     chosen_by: dict[int, float] = {}
@@ -236,7 +236,7 @@ def _measured(
     file, before = scores["file"], scores["baked"]
     cost = _cost(before, file, read.error)
     if cost > COARSE:
-        seen = "" if read.cameras else ", seen from made-up viewpoints (name photos with --data to be sure)"
+        seen = "" if read.cameras else ", seen from made-up viewpoints (name photos with `data` to be sure)"
         if read.model.config.antialiased and not kind.antialiased:
             able = " or ".join(form.ending for form in FORMATS.values() if form.antialiased)
             say(f"{kind.ending} cannot tell that the model is antialiased: say so where it is drawn, or choose {able}")

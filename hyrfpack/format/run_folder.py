@@ -74,7 +74,7 @@ def find_model(path: str | os.PathLike[str]) -> Path:
 def describe_unfinished(run: RunStatus) -> str:
     """Return the clause that tells of an unfinished run, and how to finish it."""
     done = "" if run.step is None or run.steps is None else f" (step {run.step:,} of {run.steps:,})"
-    return f"the run has not finished{done}; finish it by running its 'hyrfpack train' command again with --resume"
+    return f"the run has not finished{done}; finish it by running its 'hyrfpack train' command again with `resume=True`"
 
 
 def read_run_status(folder: str | os.PathLike[str]) -> RunStatus:

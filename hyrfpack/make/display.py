@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from threading import Event, Thread
 from time import monotonic
@@ -22,7 +23,9 @@ class Display:
     the work.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, wording: Callable[[str], str] = lambda sentence: sentence) -> None:
+        """Args: wording: changes the words of each sentence before it is shown."""
+        self._wording = wording
         self._start = monotonic()
         self._latest: tuple[Progress, float] | None = None
         self._over = Event()
@@ -53,6 +56,7 @@ class Display:
 
     def say(self, sentence: str) -> None:
         """Tell the person something that stays."""
+        sentence = self._wording(sentence)
         with suppress(OSError, ValueError):
             if self._live:
                 self._live.console.print(sentence, markup=False, highlight=False, soft_wrap=True)

@@ -45,7 +45,7 @@ def posed(
     _check(source, run, overwrite=True)
     if Path(os.path.realpath(run)).is_relative_to(os.path.realpath(source.path)):
         raise HyrfError(f"{run}: the run would lie among the photos; name another folder")
-    with exclusive_folder(run, "another folder with -o"):
+    with exclusive_folder(run):
         _check(source, run, overwrite=overwrite or resume)
         _estimate(source.path, scene, overwrite, report, say)
     return scene
@@ -61,7 +61,7 @@ def _estimate(photos: Path, scene: Path, overwrite: bool, report: Callable[[Prog
     from hyrfpack.poses import estimate_poses
 
     if is_posed(scene) and not overwrite:
-        say(f"poses are taken from {scene}, where they were estimated before; --overwrite estimates them anew")
+        say(f"poses are taken from {scene}, where they were estimated before; `overwrite=True` estimates them anew")
         return
     reporter = Reporter(["poses"], report)
     reporter.begin("poses")

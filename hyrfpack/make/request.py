@@ -76,7 +76,7 @@ class Request:
         if not self.overwrite and os.path.lexists(self.output) and self.is_made(state):
             raise HyrfError(
                 f"{self.output}: this was made of other photos or with other settings; name another, or replace it "
-                "with --overwrite"
+                "with `overwrite=True`"
             )
 
     def is_made(self, state: State) -> bool:
@@ -106,7 +106,7 @@ class Request:
         if self.target_bytes is not None and self.max_gaussians is not None:
             raise HyrfError(
                 "a target size and a number of Gaussians each decide how large the model is; give one of them "
-                "(--target-size or --max-gaussians)"
+                "(`target_bytes` or `max_gaussians`)"
             )
         self._check_target()
         if source.kind == "photos" and not list_photos(source.path):
@@ -128,11 +128,11 @@ class Request:
             outputs.folder(self.work, [NAME])
         work, output = (Path(os.path.realpath(path)) for path in (self.work, self.output))
         if self.source.kind == "photos" and work.is_relative_to(os.path.realpath(self.source.path)):
-            raise HyrfError(f"{self.work}: the work folder would lie among the photos; name another with --work")
+            raise HyrfError(f"{self.work}: the work folder would lie among the photos; name another with `work`")
         if output.is_relative_to(work) or work.is_relative_to(output):
             raise HyrfError(
                 f"{self.output}: the output and the work folder {self.work} lie in each other; name another folder "
-                "with --work"
+                "with `work`"
             )
 
     def _check_output(self, outputs: Outputs, *, overwrite: bool) -> None:

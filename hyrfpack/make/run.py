@@ -169,8 +169,8 @@ def make(
             )
             request.check()
             with (
-                exclusive_folder(request.work, "another folder with --work"),
-                exclusive_folder(request.output, "another folder with -o") if request.makes_folder else nullcontext(),
+                exclusive_folder(request.work, "another folder with `work`"),
+                exclusive_folder(request.output) if request.makes_folder else nullcontext(),
             ):
                 return _Making(request, began, report, say, observer).run()
         except Stopped:

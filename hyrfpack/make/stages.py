@@ -94,7 +94,7 @@ def fit(
         before = "without a target size" if config.target_bytes is None else f"for {config.target_bytes:,} bytes"
         work.say(
             f"the model is trained {before}, and only packed for the size that is asked for now; another work folder "
-            "(--work) trains it anew"
+            "(`work`) trains it anew"
         )
 
     def act(going_on: bool) -> tuple[dict, list[str]]:
@@ -104,11 +104,11 @@ def fit(
                 f"on {describe_device(device)}"
             )
             resume = going_on and is_begun(run)
-            report = _training_report(work.reporter, plan.steps)
+            shown = _TrainingProgress(work.reporter, plan.steps)
             try:
                 trained = train(
                     scene, run, config, resume=resume, overwrite=True, cache=cache, device=device, quiet=True,
-                    report=report, phase=_phase_report(work.reporter), observer=observer,
+                    report=shown.step, phase=shown.phase, observer=observer,
                 )  # fmt: skip
             except HyrfError as error:  # what it says of going on is about the command `train`
                 raise error.__cause__ if isinstance(error.__cause__, HyrfError) else error from None
@@ -141,41 +141,39 @@ def _split(scene: Scene) -> dict[str, Any]:
     return {"held-out photos": [view.name for view in scene.test], "size of photos": sizes}
 
 
-def _training_report(reporter: Reporter, steps: int) -> Callable[[int, float, float, int], None]:
-    """What `train` is to report to: step 0 while pilots run, then each step of the training."""
-    seen, pilot_steps, training = math.nan, 0, False
+class _TrainingProgress:
+    """Shows the parts of a training: the pilot runs, the steps, then scores and pictures."""
 
-    def report(step: int, loss: float, mse: float, gaussians: int) -> None:
-        nonlocal seen, pilot_steps, training
+    def __init__(self, reporter: Reporter, steps: int) -> None:
+        """Args: steps: of the training."""
+        self._reporter, self._steps = reporter, steps
+        self._part, self._pilot_steps, self._mse = "pilots", 0, math.nan
+
+    def step(self, step: int, loss: float, mse: float, gaussians: int) -> None:
+        """Take in a step, as `report` of `hyrfpack.train`: number 0 while pilots run."""
         if step == 0:
-            pilot_steps += 1
-            reporter.update(min(1.0, pilot_steps / MOST_STEPS), "short runs tell how many Gaussians the scene is worth")
+            self._pilot_steps += 1
+            self._reporter.update(min(1.0, self._pilot_steps / MOST_STEPS), "estimating the Gaussian budget")
             return
-        if not training:  # the pace of what follows is another
-            training = True
-            reporter.begin_part("training")
+        self._begin("training")
         if not math.isnan(mse):
-            seen = mse if math.isnan(seen) else SMOOTHING * mse + (1 - SMOOTHING) * seen
-        quality = () if math.isnan(seen) else (f"PSNR {decibels(seen):.2f}",)
-        reporter.update(step / steps, f"{step:,}/{steps:,}", *quality, f"{gaussians:,} Gaussians")
-        if step == steps:
-            reporter.begin_part("results", "writing the model, its scores and pictures")
+            self._mse = mse if math.isnan(self._mse) else SMOOTHING * mse + (1 - SMOOTHING) * self._mse
+        quality = () if math.isnan(self._mse) else (f"PSNR {decibels(self._mse):.2f}",)
+        self._reporter.update(step / self._steps, f"{step:,}/{self._steps:,}", *quality, f"{gaussians:,} Gaussians")
+        if step == self._steps:
+            self._begin("results")
 
-    return report
+    def phase(self, what: str, done: int, total: int) -> None:
+        """Take in other work, as `phase` of `hyrfpack.train`. After the last step, it says how far the part is."""
+        if self._part == "results" and total:
+            self._reporter.update(done / total, what, f"{done:,}/{total:,}")
+        else:
+            self._reporter.say(f"{what}  {done:,}/{total:,}" if total else what)
 
-
-def _phase_report(reporter: Reporter) -> Callable[[str, int, int], None]:
-    """Tells of work before the first and after the last step, each kind of it with a share and a pace of its own."""
-    last = ""
-
-    def phase(what: str, done: int, total: int) -> None:
-        nonlocal last
-        if what != last:
-            last = what
-            reporter.begin("training", what)
-        reporter.update(done / total if total else 0.0, what, *([f"{done:,}/{total:,}"] if total else []))
-
-    return phase
+    def _begin(self, part: str) -> None:
+        if part != self._part:  # its pace is another
+            self._part = part
+            self._reporter.begin_part(part)
 
 
 # -- packing -------------------------------------------------------------------------------------------------------
@@ -189,13 +187,13 @@ def pack(work: Work, scene: Scene, plan: Plan, device: torch.device) -> dict[str
         try:
             report = compress(
                 source, target, data=scene, finetune_steps=plan.finetune_steps, target_bytes=plan.target_bytes,
-                device=device, say=work.reporter.say,
+                device=device, say=work.reporter.say, report=work.reporter.tell,
             )  # fmt: skip
         except HyrfSizeError as error:
-            anew = ", or name another work folder (--work) to train a smaller model for this size"
+            anew = ", or name another work folder (`work`) to train a smaller model for this size"
             raise HyrfError(
                 f"the trained model does not fit into {plan.target_bytes:,} bytes; ask for {error.smallest:,} bytes or "
-                f"more (--target-size){anew if trained_for(work) != plan.target_bytes else ''}"
+                f"more (`target_bytes`){anew if trained_for(work) != plan.target_bytes else ''}"
             ) from error
         return {"bytes": report.bytes_after, "gaussians": report.gaussians, "found": report.found}, [PACKED]
 
@@ -217,7 +215,7 @@ def import_splats(work: Work, source: Path, steps: int, seed: int) -> dict[str, 
     config = DistillConfig(steps=steps, seed=seed)
 
     def act(going_on: bool) -> tuple[dict, list[str]]:
-        report = distill(source, work.folder / PACKED, config, say=work.reporter.say)
+        report = distill(source, work.folder / PACKED, config, say=work.reporter.say, report=work.reporter.tell)
         return report.to_dict(), [PACKED]
 
     inputs = {"splats": digest_all(files, source.parent), "settings": asdict(config)}
@@ -236,7 +234,7 @@ def write(work: Work, model: Path, name: str, scene: Scene | None) -> tuple[dict
             copy(model, target)
             report: dict[str, Any] = {"bytes": target.stat().st_size}
         else:
-            made = export(model, target, data=scene, say=work.reporter.say)
+            made = export(model, target, data=scene, say=work.reporter.say, report=work.reporter.tell)
             report = {**asdict(made), "file": name, "chosen_by": {}}
         files = sorted(target.rglob("*")) if target.is_dir() else [target]
         return report, [path.relative_to(work.folder).as_posix() for path in files if path.is_file()]
@@ -255,7 +253,7 @@ def score(work: Work, scene: Scene, device: torch.device) -> dict[str, Any]:
         if not scene.test:
             return {"views": 0}, []
         training = scene.train if has_mean_exposure(describe(model)["provenance"]) else ()
-        scores = evaluate(load(model, device), scene.test, training=training)
+        scores = evaluate(load(model, device), scene.test, training=training, report=work.reporter.tell)
         means = {name: getattr(scores, name) for name in ("psnr", "psnr_predicted", "ssim")}
         return {"views": len(scores.views), **means}, []
 

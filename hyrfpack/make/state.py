@@ -41,11 +41,11 @@ class State:
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise HyrfError(
-                f"{self._path}: what was done so far cannot be read ({reason}); name another folder with --work, or "
+                f"{self._path}: what was done so far cannot be read ({reason}); name another folder with `work`, or "
                 "delete this one to begin anew"
             ) from error
         if there and NAME not in there and not all(name.startswith(".") for name in there):
-            raise HyrfError(f"{folder}: this folder holds something else; name another with --work")
+            raise HyrfError(f"{folder}: this folder holds something else; name another with `work`")
 
     def begun(self, stage: str, inputs: dict[str, Any]) -> bool:
         """Whether a stage was begun from these inputs and did not come to its end."""

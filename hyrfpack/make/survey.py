@@ -386,7 +386,7 @@ def _header_notes(facts: list[PhotoFacts]) -> list[str]:
     if large:
         notes.append(
             f"{large} of {len(facts)} photos are larger than {DEFAULT_MAX_SIZE:,} pixels and are shrunk to that for "
-            "training; --max-size sets another limit"
+            "training; `max_size` sets another limit"
         )
     round_ = sum(fact.size[0] == 2 * fact.size[1] for fact in facts)
     if round_:

@@ -33,7 +33,7 @@ def launch(command: Sequence[str], processes: int) -> int:
         from torch.distributed.launcher.api import LaunchConfig, elastic_launch
     except ImportError as error:
         raise HyrfError(
-            f"this build of torch cannot start processes that talk to each other ({error}); leave out --processes"
+            f"this build of torch cannot start processes that talk to each other ({error}); leave out `processes`"
         ) from error
     logging.disable()  # its reports of what the processes tell themselves
     config = LaunchConfig(

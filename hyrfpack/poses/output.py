@@ -58,7 +58,7 @@ class Output:
                 )
             if not overwrite:
                 raise HyrfError(
-                    f"{self.scene}: the folder has poses already; use them, or replace them with --overwrite"
+                    f"{self.scene}: the folder has poses already; use them, or replace them with `overwrite=True`"
                 )
         if not same(photos, self.scene) and any(name.lower().endswith(PICTURES) for name in there):
             raise HyrfError(f"{self.scene}: photos lie in this folder; name another for the scene")

@@ -50,7 +50,7 @@ def render_files(
     Raises:
         HyrfError: a picture cannot be written, or another call is at work in the folder.
     """
-    with exclusive_folder(folder, "another folder with -o", ranks):
+    with exclusive_folder(folder, ranks=ranks):
         yield from render_files_unlocked(
             model, cameras, folder, depth=depth, settings=settings, overwrite=overwrite, ranks=ranks
         )

@@ -72,7 +72,7 @@ def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor]
     ):
         raise HyrfTrainingError(
             f"{path}: the run was started with other settings ({', '.join(different)}); "
-            "resume with the same ones or train anew with --overwrite"
+            "resume with the same ones or train anew with `overwrite=True`"
         )
     return tensors, progress
 
@@ -80,7 +80,7 @@ def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor]
 def _read(path: Path) -> tuple[dict, dict[str, torch.Tensor], dict]:
     """Settings, tensors and progress."""
     if not path.is_file():
-        raise HyrfTrainingError(f"{path}: there is no checkpoint to resume from; train without --resume")
+        raise HyrfTrainingError(f"{path}: there is no checkpoint to resume from; train without `resume=True`")
     try:
         data = path.read_bytes()
         if hashlib.sha256(data[:-DIGEST_BYTES]).digest() != data[-DIGEST_BYTES:]:
@@ -94,7 +94,7 @@ def _read(path: Path) -> tuple[dict, dict[str, torch.Tensor], dict]:
         raise _damaged(path) from error
     if version != VERSION:
         raise HyrfTrainingError(
-            f"{path}: the checkpoint is of another version of hyrfpack; train anew with --overwrite"
+            f"{path}: the checkpoint is of another version of hyrfpack; train anew with `overwrite=True`"
         )
     return saved, tensors, progress
 

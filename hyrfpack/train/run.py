@@ -145,7 +145,7 @@ def train(
     check_target(scene, config)
     # Whatever lies there: no folder is created where nothing may be written.
     ranks.agree(lambda: _check_outputs(out, scene, overwrite=True) if ranks.leads else None)
-    with exclusive_folder(out, "another folder with -o", ranks):
+    with exclusive_folder(out, ranks=ranks):
         return _train_in_folder(
             scene, out, config, resume=resume, overwrite=overwrite, cache=cache, device=device, quiet=quiet,
             report=report, phase=phase, observer=observer, log=log, ranks=ranks,
@@ -248,7 +248,7 @@ def _train_in_folder(
             with _naming_the_checkpoint(trainer, overwrite):
                 record = save_model(trainer, out, tell_phase, overwrite=replace)
             results = write_results(record, scene, out, config, device, tell_phase, overwrite=replace)
-            missing = _tell_missing(results, overwrite, phases)
+            missing = _tell_missing(results, phases)
         if METRICS not in results.missing and (replace or trainer.saved is not None):
             checkpoint.unlink(missing_ok=True)
         if written:
@@ -283,20 +283,20 @@ def _complete(
         results = write_results(record, scene, out, config, device, phase or phases.update, overwrite=True)
         if written:
             _log_end(written, record.step, results)
-        missing = _tell_missing(results, overwrite=False, line=phases)
+        missing = _tell_missing(results, phases)
     if METRICS not in results.missing:
         (out / CHECKPOINT).unlink(missing_ok=True)
     return TrainResult(True, record.step, out / record.model, results.metrics, missing)
 
 
-def _tell_missing(results: Results, overwrite: bool, line: PhaseLine) -> str:
-    """Say which results are missing, if any, and return the sentence."""
+def _tell_missing(results: Results, line: PhaseLine) -> str:
+    """Note which results are missing, if any, and return the sentence."""
     if not results.missing:
         return ""
     names = " and ".join(filter(None, [", ".join(results.missing[:-1]), results.missing[-1]]))
     verb = "are" if len(results.missing) > 1 else "is"
     sentence = f"{results.reasons[0]}; the model is finished, but {names} {verb} missing"
-    line.note(f"{sentence}; {resuming(overwrite)} writes what is missing")
+    line.note(sentence)
     return sentence
 
 
@@ -317,12 +317,12 @@ def _as_step_nought(report: Report, step: int, loss: float, mse: float, gaussian
 
 def resuming(overwrite: bool) -> str:
     """The command that goes on with a run which was started with or without --overwrite."""
-    return f"the same command with --resume{' instead of --overwrite' if overwrite else ''}"
+    return f"the same command with `resume=True`{' instead of `overwrite=True`' if overwrite else ''}"
 
 
 def _shorter(device: torch.device) -> str:
     """What makes a run take less time."""
-    ways = ["fewer --steps", "smaller photos (--max-size, or --images with smaller copies)", "fewer --max-gaussians"]
+    ways = ["fewer steps", "smaller photos", "fewer Gaussians"]
     if device.type == "cpu":
         ways.append("a GPU")
     return f"{', '.join(ways[:-1])} or {ways[-1]}"
@@ -349,14 +349,14 @@ def _prepare(
         if different := changed_settings(record, scene, config):
             raise HyrfTrainingError(
                 f"{out}: the folder holds a model that was trained with other settings ({', '.join(different)}); "
-                "use the same ones to complete its results, or replace it with --overwrite"
+                "use the same ones to complete its results, or replace it with `overwrite=True`"
             )
     elif resume and not (out / CHECKPOINT).is_file():
-        raise HyrfError(f"{out}: there is no checkpoint to resume; leave out --resume to start a run")
+        raise HyrfError(f"{out}: there is no checkpoint to resume; leave out `resume=True` to start a run")
     left = [name for name in (MODEL, CHECKPOINT) if (out / name).exists()]
     if left and not (resume or overwrite or record is not None):
-        hint = "--resume goes on with it, " if CHECKPOINT in left else ""
-        raise HyrfError(f"{out}: the folder holds an earlier run ({left[-1]}); {hint}--overwrite replaces it")
+        hint = "`resume=True` goes on with it, " if CHECKPOINT in left else ""
+        raise HyrfError(f"{out}: the folder holds an earlier run ({left[-1]}); {hint}`overwrite=True` replaces it")
     _check_outputs(out, scene, overwrite=resume or overwrite or record is not None)
 
 

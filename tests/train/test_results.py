@@ -103,7 +103,6 @@ def test_pictures_that_do_not_fit_do_not_fail_the_run(full, no_training, tmp_pat
     verb = "is" if ending == "curve.png" else "are"
     told = capsys.readouterr().err
     assert f"the model is finished, but {missing} {verb} missing" in told
-    assert "the same command with --resume writes what is missing" in told
 
     full.clear()
     no_training()

@@ -107,7 +107,7 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     if length > _MAX_BYTES:
         raise HyrfDataError(
             f"{len(splats):,} Gaussians of degree {splats.degree} come to {length:,} bytes and a .glb file holds "
-            f"{_MAX_BYTES:,}; lower --sh-degree"
+            f"{_MAX_BYTES:,}; lower `degree`"
         )
     head = _HEADER.pack(b"glTF", 2, length) + _CHUNK.pack(len(text), _JSON) + text
     return b"".join((head, _CHUNK.pack(binary, _BIN), *parts))

@@ -1,0 +1,78 @@
+"""Library messages name Python arguments; the command line names its options in their place."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from commands import refused
+
+import hyrfpack
+from hyrfpack.cli.wording import with_options
+from hyrfpack.errors import HyrfError
+from hyrfpack.outputs import Outputs
+
+LIBRARY = Path(hyrfpack.__file__).parent
+# Pages for people who type commands: they name options.
+PAGES = ("compress/report_page.py", "web/", "compare/page.py", "compare/curves.py")
+
+
+def strings_of(module: Path) -> Iterator[str]:
+    """The strings of a module that are no docstrings; of f-strings, each constant part."""
+    tree = ast.parse(module.read_text(encoding="utf-8"))
+    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+            yield node.value
+
+
+def library_strings() -> list[tuple[str, str]]:
+    modules = [(path.relative_to(LIBRARY).as_posix(), path) for path in sorted(LIBRARY.rglob("*.py"))]
+    return [(name, text) for name, path in modules if not name.startswith("cli/") for text in strings_of(path)]
+
+
+def test_no_library_message_names_an_option_of_the_command_line():
+    named = [
+        (module, text)
+        for module, text in library_strings()
+        if not module.startswith(PAGES) and re.search(r"(?<![\w-])--[a-z]", text)
+    ]
+    assert named == []
+
+
+def test_every_argument_in_a_library_message_is_an_option_of_some_command():
+    arguments = [
+        (module, found) for module, text in library_strings() for found in re.findall(r"`[a-z_0-9]+(?:=[^`]+)?`", text)
+    ]
+    assert len(arguments) > 40
+    assert [(module, found) for module, found in arguments if with_options(found) == found] == []
+
+
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        ("replace it with `overwrite=True`", "replace it with --overwrite"),
+        ("name photos with `data`", "name photos with --data"),
+        ("use `device='cpu'`", "use --device cpu"),
+        ("`test_every=0` trains on all", "--test-every 0 trains on all"),
+        ("try `background=False`", "try --no-background"),
+        ("lower `degree`, or raise `target_bytes`", "lower --sh-degree, or raise --target-size"),
+        ("see `hyrfpack render --help`", "see `hyrfpack render --help`"),
+        ("the key `unheard_of` is missing", "the key `unheard_of` is missing"),
+    ],
+)
+def test_arguments_become_options(message, expected):
+    assert with_options(message) == expected
+
+
+def test_the_same_refusal_names_an_argument_in_python_and_an_option_on_the_command_line(tmp_path):
+    (tmp_path / "there.hyrf").write_bytes(b"kept")
+
+    with pytest.raises(HyrfError, match="replace it with `overwrite=True`$"):
+        Outputs().file(tmp_path / "there.hyrf")
+
+    sentence = refused("decompress", tmp_path / "model.hyrf", "-o", tmp_path / "there.hyrf")
+    assert sentence.endswith("replace it with --overwrite")
