@@ -41,7 +41,7 @@ def test_export_says_what_it_does_and_prints_what_was_lost(model, tmp_path):
     size, splats = (tmp_path / "a.ply").stat().st_size, read_splats(tmp_path / "a.ply")
     rows = re.findall(r"^(baked to .*|read back from .*?) +(\d+\.\d\d)$", result.stdout, re.MULTILINE)
     names = ["baked to harmonics of degree 3, not yet written", "read back from the .ply file"]
-    assert [name for name, _ in rows] == names
+    assert [name.rstrip() for name, _ in rows] == names
     assert result.stdout.splitlines()[0].split("  ")[0] == "against the model's own pictures, 4 views"
     last = f"{tmp_path / 'a.ply'}: {size:,} bytes, {len(splats):,} Gaussians, {len(splats) - 40:,} of them for the"
     assert result.stdout.splitlines()[-1] == f"{last} background"

@@ -157,7 +157,7 @@ def test_nothing_is_measured_or_drawn_twice_however_often_packing_is_tried(
     distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, steps=12))
 
     assert len(tried) > 2 and len(measured) == 1
-    assert len({noise for _, noise in tried}) == len(tried)
+    assert len({noise for _, noise, *_ in tried}) == len(tried)
     assert len(drawn) == LITTLE.train_views
 
 
@@ -172,7 +172,7 @@ def test_a_short_import_looks_from_fewer_places_and_regresses_less(
         with pytest.raises(KeyboardInterrupt):
             distill_splats(ball(20), tmp_path / "x.hyrf", DistillConfig(steps=steps, size=16))
     (_, _, few, *_), _, _, (_, _, many, *_), _, _ = looked  # the others decide, or are held out
-    (*_, less), (*_, whole) = started
+    (*_, less, _), (*_, whole, _) = started
     assert few <= 64 < many == DistillConfig.train_views
     assert less < whole == 1
 
