@@ -272,7 +272,9 @@ def test_without_overwrite_a_file_created_while_writing_is_kept(tmp_path):
 @pytest.mark.usefixtures("file_system")
 def test_without_overwrite_and_rename_a_file_created_while_writing_is_an_error(tmp_path):
     with (
-        pytest.raises(HyrfError, match="index.html: another program created this file in the meantime.* --overwrite"),
+        pytest.raises(
+            HyrfError, match="index.html: another program created this file in the meantime.* `overwrite=True`"
+        ),
         atomic.pending_file(tmp_path / "index.html", overwrite=False, rename=False) as pending,
     ):
         pending.temporary.write_bytes(b"new")

@@ -44,7 +44,7 @@ def test_each_thread_takes_the_gpu_it_works_on(monkeypatch):
 @needs_no_gpu
 @pytest.mark.parametrize("name", ["cuda", "cuda:0", "mps"])
 def test_a_device_that_is_not_there_is_refused_in_one_sentence(name):
-    with pytest.raises(HyrfError, match=f"'{name}' is not there.*--device cpu"):
+    with pytest.raises(HyrfError, match=f"'{name}' is not there.*`device='cpu'`"):
         choose_device(name)
 
 

@@ -72,9 +72,9 @@ def test_files_that_are_there_are_replaced_only_when_told(tmp_path, model):
     (tmp_path / "dangling.spz").symlink_to(tmp_path / "nowhere")
 
     for name in ("old.spz", "dangling.spz"):
-        with pytest.raises(HyrfError, match="there is a file of this name; .* --overwrite"):
+        with pytest.raises(HyrfError, match="there is a file of this name; .* `overwrite=True`"):
             Outputs(model).file(tmp_path / name)
-        with pytest.raises(HyrfError, match=f"{name} of the files to be written is there; .* --overwrite"):
+        with pytest.raises(HyrfError, match=f"{name} of the files to be written is there; .* `overwrite=True`"):
             Outputs(model).folder(tmp_path, ["new.spz", name])
     Outputs(model, overwrite=True).file(tmp_path / "old.spz")
     Outputs(model, overwrite=True).folder(tmp_path, ["old.spz"])

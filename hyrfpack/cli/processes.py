@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import click
 
-from hyrfpack.cli.manners import arguments_of
+from hyrfpack.cli.manners import arguments_of, note
 from hyrfpack.errors import HyrfError
 
 Command = TypeVar("Command", bound=Callable)
@@ -36,7 +36,7 @@ def on_processes(command: Command) -> Command:
             from hyrfpack.parallel.launch import launch
 
             ctx = click.get_current_context()
-            ctx.exit(launch(without(arguments_of(ctx)), processes))
+            ctx.exit(launch(without(arguments_of(ctx)), processes, note))
         with joined() as ranks, _heard(ranks.leads):
             return command(*args, ranks=ranks, **options)
 

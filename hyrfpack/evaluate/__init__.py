@@ -199,6 +199,7 @@ def evaluate(
                     if warn is None:
                         raise
                     warn(str(error))
+        report(f"{len(own)} photos are scored", 1.0)
         return scores
 
     with nullcontext() if pictures is None else exclusive_folder(pictures, ranks=ranks):

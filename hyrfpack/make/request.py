@@ -14,7 +14,7 @@ from hyrfpack.export.folder import check_folder
 from hyrfpack.export.kinds import PLAYER, check_place, check_request, kind_of
 from hyrfpack.format.smallest import check_target_bytes
 from hyrfpack.make.source import Reading, Source
-from hyrfpack.make.stages import EXPORTED
+from hyrfpack.make.stages import EXPORTED, PACKED
 from hyrfpack.make.state import NAME, State, digest
 from hyrfpack.outputs import Outputs
 from hyrfpack.train.config import TrainConfig
@@ -140,7 +140,8 @@ class Request:
             outputs.file(self.output, ".hyrf")
         elif self.makes_folder:
             outputs.folder(self.output, [])
-            check_folder(self.output, [self.source.path], [self.source.scene], overwrite=overwrite, listed=False)
+            model = self.source.path if self.source.kind == "model" else self.work / PACKED
+            check_folder(self.output, [model], [self.source.scene], overwrite=overwrite, listed=False)
         else:
             check_place(self.output, outputs)
 

@@ -116,14 +116,15 @@ class Work:
     def _what_is_left(self, name: str, clock: _StageClock) -> str:
         """The end of the message about a stage that failed. Where the stage left nothing, its record is removed."""
         product = self.folder / PRODUCTS[name] if name in PRODUCTS else None
+        has_product = product is not None and _has_content(product)
         try:
-            if product is None or not _has_content(product):
+            if not has_product:
                 self.state.forget(name)
             else:
                 self.state.add_seconds(name, clock.unrecorded())
         except HyrfError:  # the failure of the stage is what the user needs to hear of
             pass
-        return f"; what is finished is kept in {self.folder}" if self.state.has_finished else ""
+        return f"; what is finished is kept in {self.folder}" if has_product or self.state.has_finished else ""
 
 
 class _StageClock:

@@ -6,12 +6,12 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from hyrfpack.errors import HyrfError
 
 
-def launch(command: Sequence[str], processes: int) -> int:
+def launch(command: Sequence[str], processes: int, say: Callable[[str], None] = print) -> int:
     """Run `python -m hyrfpack COMMAND ...` as so many processes that find each other, and wait for them.
 
     What they print comes through. Where one ends before its time, the others are told to, and killed half a minute
@@ -20,12 +20,13 @@ def launch(command: Sequence[str], processes: int) -> int:
     Args:
         command: words after `hyrfpack`.
         processes: how many, 1 or more.
+        say: told which process was killed, where rank 0 has reported its own failure for that.
 
     Returns:
         The exit code of the first that failed, 0 where none did.
 
     Raises:
-        HyrfError: torch has no launcher here, or one was killed, which it cannot say itself.
+        HyrfError: torch has no launcher here, or rank 0 was killed, which it cannot say itself.
     """
     try:
         from torch.distributed.elastic.multiprocessing.api import SignalException
@@ -51,10 +52,14 @@ def launch(command: Sequence[str], processes: int) -> int:
         rank, failure = error.get_first_failure()
         if failure.exitcode >= 0:
             return failure.exitcode
-        raise HyrfError(
+        killed = (
             f"process {rank} of {processes} was ended by {signal.Signals(-failure.exitcode).name}, perhaps for want of "
             "memory; what was written before is kept"
-        ) from error
+        )
+        if rank == 0:
+            raise HyrfError(killed) from error
+        say(f"Error: {killed}")
+        return 2
     except SignalException:
         return 1
     finally:

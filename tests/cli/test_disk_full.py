@@ -221,7 +221,7 @@ def test_disk_that_fills_in_training_keeps_the_checkpoint_and_resumes_to_the_sam
     out.mkdir()
     (out / "model.hyrf").write_bytes(b"old")
 
-    kept = r"checkpoint of step \d+ is kept, the same command with --resume instead of --overwrite goes on"
+    kept = r"checkpoint of step \d+ is kept, the same command with `resume=True` instead of `overwrite=True` goes on"
     with pytest.raises(HyrfError, match=rf"model.hyrf: the disk is full.*{kept}") as e:
         train(balls(fill_from_the_30th), out, CONFIG, overwrite=True, cache=PictureCache(0), quiet=True)
 

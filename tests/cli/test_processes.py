@@ -351,7 +351,7 @@ def test_a_run_of_two_that_has_lost_one_says_so_and_can_be_resumed(data, uninter
     told, who = [line for line in errors.splitlines() if line.startswith("Error: ")]
     assert "one of the 2 processes has ended" in told and "the same command with --resume goes on" in told
     assert "process 1 of 2 was ended by SIGKILL" in who
-    assert output == "" and "Traceback" not in errors
+    assert json.loads(output)["error"] == told.removeprefix("Error: ") and "Traceback" not in errors
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["checkpoint.pt"]
 
     spoken_for(commanded(*words[2:-2], "--resume", folder=logs))

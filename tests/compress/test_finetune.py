@@ -141,7 +141,7 @@ def test_a_photo_of_nan_stops_it_with_the_step_and_the_view(trained, plan, sensi
 
     view = dataclasses.replace(scene.train[2], load=lambda: Broken(np.zeros((32, 32, 3), np.uint8)))
 
-    with pytest.raises(HyrfTrainingError, match="stopped at step 1 on view '002.png'.*without --finetune"):
+    with pytest.raises(HyrfTrainingError, match="stopped at step 1 on view '002.png'.*without `finetune_steps`"):
         finetune(trained, plan, sensitivity, [view], 3)
 
 

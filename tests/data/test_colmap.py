@@ -219,7 +219,7 @@ def _break_no_photo_folder(root: Path, folder) -> None:
         (_break_duplicate_name, "listed twice"),
         (_break_missing_table, "cameras.bin: missing"),
         (_break_empty_table, "images.bin"),
-        (_break_no_photo_folder, "there are the folders left, right, sparse; .* --images"),
+        (_break_no_photo_folder, "there are the folders left, right, sparse; .* `images`"),
     ],
 )
 def test_broken_model_gives_one_sentence(tmp_path, colmap_folder, damage, says):

@@ -132,7 +132,7 @@ def test_the_model_with_the_most_photos_is_taken_and_said(tmp_path, colmap_folde
     assert len(scene.views) == sizes[taken]
     (note,) = [note for note in scene.notes if "COLMAP models" in note]
     assert note.startswith(f"there are {len(sizes)} COLMAP models: ")
-    assert note.endswith(f"; {taken} was taken, with the most photos; --model takes another")
+    assert note.endswith(f"; {taken} was taken, with the most photos; `model` takes another")
     assert all(f"{name} ({count} photos)" in note for name, count in sizes.items())
     assert all("sparse" not in file or f"sparse/{taken}/" in file for file in scene.files)
 

@@ -186,7 +186,7 @@ def test_a_note_says_how_many_photos_are_shrunk_and_from_what(tmp_path, colmap_f
 
     scene = load_scene(tmp_path, max_size=20)
 
-    note = "2 of 3 photos are shrunk from up to 64 x 48 to 20 pixels on the longer side; --max-size 0 keeps them"
+    note = "2 of 3 photos are shrunk from up to 64 x 48 to 20 pixels on the longer side; `max_size=0` keeps them"
     assert note in scene.notes
     assert scene.max_size == 20
     assert [view.camera.width for view in scene.views] == [20, 20, 16]

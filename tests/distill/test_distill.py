@@ -186,7 +186,7 @@ def test_a_file_less_like_the_original_than_asked_for_says_so(tmp_path: Path) ->
     report = distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, psnr=60), say=said.append)
     assert report.psnr_asked == 60
     assert said[-1].startswith(f"asked for 60 dB and reached {report.psnr:.1f} at held-out viewpoints")
-    assert f"--steps {DistillConfig.steps}" in said[-1] and "--cameras" in said[-1]
+    assert f"`steps={DistillConfig.steps}`" in said[-1] and "`cameras`" in said[-1]
 
     said.clear()
     distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, psnr=10), say=said.append)
@@ -195,8 +195,8 @@ def test_a_file_less_like_the_original_than_asked_for_says_so(tmp_path: Path) ->
 
 def test_what_packing_took_is_asked_for_and_not_learned() -> None:
     told = fit._shortfall(36.5, 38.6, DistillConfig(psnr=37), made_up=True)
-    assert "reached 36.5" in told and told.endswith("with --psnr") and "--steps" not in told
-    assert "--cameras" not in fit._shortfall(36.5, 36.6, DistillConfig(psnr=37), made_up=False)
+    assert "reached 36.5" in told and told.endswith("with `psnr`") and "steps" not in told
+    assert "cameras" not in fit._shortfall(36.5, 36.6, DistillConfig(psnr=37), made_up=False)
     assert not fit._below(36.96, 37) and fit._below(36.94, 37)
 
 

@@ -65,9 +65,9 @@ def test_the_lowest_degree_as_good_as_any_is_taken(scores, lowest):
 def test_cameras_are_kept_back_unless_there_are_too_few_and_the_measured_ones_never_count(count, tmp_path, monkeypatch):
     fitted, judged = [], []
 
-    def watched_bake(model, cameras, which, sights):
+    def watched_bake(model, cameras, *others):
         fitted.extend(camera.position.tobytes() for camera in cameras)
-        return bake(model, cameras, which, sights)
+        return bake(model, cameras, *others)
 
     def watched_likeness(model, contenders, views, **options):
         judged.extend(camera.position.tobytes() for camera, _ in views)

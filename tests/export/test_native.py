@@ -102,21 +102,21 @@ def test_a_file_that_could_be_smaller_goes_along_and_that_is_said(model, compact
 @pytest.mark.parametrize(
     ("options", "name"),
     [
-        ({"degree": 1}, "--sh-degree"),
-        ({"crop": (0, 0, 0, 1, 1, 1)}, "--crop"),
-        ({"min_opacity": 0.1}, "--min-opacity"),
-        ({"background": False}, "--no-background"),
-        ({"background": False, "degree": 0}, "--sh-degree and --no-background"),
+        ({"degree": 1}, "`degree`"),
+        ({"crop": (0, 0, 0, 1, 1, 1)}, "`crop`"),
+        ({"min_opacity": 0.1}, "`min_opacity`"),
+        ({"background": False}, "`background=False`"),
+        ({"background": False, "degree": 0}, "`degree` and `background=False`"),
     ],
 )
 def test_what_would_change_the_model_is_refused_and_baked_is_named(target, options, name, model, tmp_path):
-    with pytest.raises(HyrfError, match=rf"^[^\n]*{target}: [^\n]* {name} [^\n]*--baked$"):
+    with pytest.raises(HyrfError, match=rf"^[^\n]*{target}: [^\n]* {name} [^\n]*`baked=True`$"):
         export(model, tmp_path / target, **options)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_baked_player_folder_is_refused(model, tmp_path):
-    with pytest.raises(HyrfError, match=r"player: [^\n]*--baked[^\n]*\.html$"):
+    with pytest.raises(HyrfError, match=r"player: [^\n]*`baked=True`[^\n]*\.html$"):
         export(model, tmp_path / "player", baked=True)
     assert list(tmp_path.iterdir()) == []
 

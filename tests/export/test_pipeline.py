@@ -278,7 +278,7 @@ JUDGED = ("photos", "cameras", "made-up viewpoints")
 def test_a_unit_of_length_that_a_format_cannot_hold_is_told(unit, judged, tmp_path):
     told, _ = told_of(unit, judged, tmp_path)
     assert re.fullmatch(r"\.spz costs \d+\.\d dB[^\n]*: it is too coarse for this scene[^\n]*another format", told)
-    assert ("--data" in told) == (judged == "made-up viewpoints")
+    assert ("`data`" in told) == (judged == "made-up viewpoints")
 
 
 @pytest.mark.parametrize("judged", JUDGED)
@@ -301,7 +301,7 @@ def test_held_out_photos_score_the_model_and_the_file_and_are_not_fitted(plain, 
     scene = replace(ball_scene(8), train=photos[1::2], test=photos[::2])
     fitted = []
     monkeypatch.setattr(
-        pipeline, "bake", lambda model, cameras, degrees, sights: fitted.extend(cameras) or bake(model, [], degrees)
+        pipeline, "bake", lambda model, cameras, degrees, *others: fitted.extend(cameras) or bake(model, [], degrees)
     )
     report = export(plain, tmp_path / "a.ply", data=scene)
     assert fitted == [view.camera for view in scene.train] and report.views == 4
@@ -337,7 +337,7 @@ def compact(plain, tmp_path_factory):
 
 @pytest.mark.parametrize("name", ["cameras.json", "colmap"])
 def test_cameras_that_a_file_does_not_keep_are_one_sentence_or_come_from_photos(name, compact, tmp_path, no_bake):
-    with pytest.raises(HyrfError, match=r"compact\.hyrf: it keeps only coarse cameras; [^\n]*--data$"):
+    with pytest.raises(HyrfError, match=r"compact\.hyrf: it keeps only coarse cameras; [^\n]*`data`$"):
         export(compact, tmp_path / name)
     assert list(tmp_path.iterdir()) == []
     if name.endswith(".json"):

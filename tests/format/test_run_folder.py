@@ -59,7 +59,7 @@ def test_a_folder_that_is_no_run_is_refused_with_what_to_name(tmp_path):
 
 
 def test_an_unfinished_run_is_refused_with_its_step_and_how_to_finish_it(unfinished):
-    with pytest.raises(HyrfFormatError, match=r"not finished \(step 120 of 3,000\); finish it .* with --resume"):
+    with pytest.raises(HyrfFormatError, match=r"not finished \(step 120 of 3,000\); finish it .* with `resume=True`"):
         find_model(unfinished)
 
 

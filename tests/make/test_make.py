@@ -140,7 +140,9 @@ def test_the_score_is_of_the_packed_model_on_the_photos_held_out(made, posed, tm
 def test_a_model_of_mean_exposure_is_scored_at_that_of_photos_beside_those_held_out_too(made, posed, tmp_path):
     save(load(made / "model.hyrf"), tmp_path / "model.hyrf", provenance={"mean_exposure": True})
     state = SimpleNamespace(inputs=lambda stage: {"photos and poses": ""})
-    work = SimpleNamespace(folder=tmp_path, state=state, stage=lambda name, inputs, act: act(False)[0])
+    reporter = Reporter(["scoring"], None)
+    stage = lambda name, inputs, act: act(False)[0]  # noqa: E731
+    work = SimpleNamespace(folder=tmp_path, state=state, reporter=reporter, stage=stage)
     scene = load_scene(posed)
 
     scores = stages.score(work, scene, torch.device("cpu"))
@@ -193,7 +195,7 @@ def test_another_target_size_packs_the_trained_model_anew_and_says_how_to_train_
     target = (made / "model.hyrf").stat().st_size * 3 // 4
     result = make(posed, tmp_path / "a.hyrf", work=work, target_bytes=target, say=said.append)
     assert result.kept == ("training",) and result.bytes <= target
-    assert any("trained without a target size" in sentence and "--work" in sentence for sentence in said)
+    assert any("trained without a target size" in sentence and "`work`" in sentence for sentence in said)
     assert make(posed, tmp_path / "b.hyrf", work=work).kept == ("training",)
     assert (tmp_path / "b.hyrf").read_bytes() == (made / "model.hyrf").read_bytes()
 
@@ -316,7 +318,7 @@ def test_made_again_it_is_all_there_and_made_otherwise_it_is_not_replaced_unaske
     make(posed, output, work=work)
     before = output.read_bytes()
     assert len(make(posed, output, work=work).kept) == 4
-    with pytest.raises(HyrfError, match="other photos or with other settings.*--overwrite"):
+    with pytest.raises(HyrfError, match="other photos or with other settings.*`overwrite=True`"):
         make(posed, output, work=work, target_bytes=1_000_000)
     assert output.read_bytes() == before
     make(posed, output, work=work, seed=3, overwrite=True)
@@ -412,14 +414,14 @@ def test_a_failure_after_poses_keeps_them_and_says_so(photos, poses, tmp_path, m
 def test_a_record_that_is_damaged_is_refused(record, reason, posed, tmp_path):
     (tmp_path / "work").mkdir()
     (tmp_path / "work" / "make.json").write_text(record)
-    with pytest.raises(HyrfError, match=f"cannot be read .*{reason}.*--work"):
+    with pytest.raises(HyrfError, match=f"cannot be read .*{reason}.*`work`"):
         make(posed, tmp_path / "scene.hyrf", work=tmp_path / "work")
 
 
 def test_two_calls_in_one_work_folder_are_kept_apart(made, posed, tmp_path):
     pytest.importorskip("fcntl", reason="locks are of Unix")
     work = copy_of(made, tmp_path)
-    with exclusive_folder(work), pytest.raises(HyrfError, match="another hyrfpack command is at work.*--work"):
+    with exclusive_folder(work), pytest.raises(HyrfError, match="another hyrfpack command is at work.*`work`"):
         make(posed, tmp_path / "scene.hyrf", work=work)
     assert len(make(posed, tmp_path / "scene.hyrf", work=work).kept) == 4
 

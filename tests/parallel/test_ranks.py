@@ -310,7 +310,7 @@ def test_each_process_has_a_gpu_of_its_own(name):
 @pytest.mark.usefixtures("two_gpus")
 @pytest.mark.parametrize(("name", "rank", "other"), [("cuda:0", 0, "uuid of 0"), ("cuda", 2, "uuid of 0")])
 def test_two_processes_on_one_gpu_are_refused(name, rank, other):
-    with pytest.raises(HyrfError, match=r"3 processes have 1 GPUs.*each needs its own.*--device cpu"):
+    with pytest.raises(HyrfError, match=r"3 processes have 1 GPUs.*each needs its own.*`device='cpu'`"):
         choose_own_device(name, Pretended(rank, 3, rank, 3, others=(other, other)))
 
 

@@ -308,7 +308,7 @@ def test_a_frame_that_is_left_out_is_named_with_its_time(wall, tmp_path):
     from hyrfpack.poses.estimate import _Estimation
 
     video = write(tmp_path / "clip.mp4", [seen(wall, 4 * number) for number in range(60)])
-    estimation = _Estimation(video, tmp_path / "scene", "auto", None, 0, None, None)
+    estimation = _Estimation(video, tmp_path / "scene", "auto", None, 0, False, None, None)
     (tmp_path / "scene").mkdir()
     estimation.output.check(video, overwrite=False)
     job = estimation._prepare()

@@ -141,7 +141,9 @@ def test_shares_told_out_of_order_never_go_back(share, tmp_path):
     from hyrfpack.poses.estimate import _Estimation
 
     told: list[float] = []
-    estimation = _Estimation(tmp_path, tmp_path / "scene", "auto", None, 0, lambda doing, done: told.append(done), None)
+    estimation = _Estimation(
+        tmp_path, tmp_path / "scene", "auto", None, 0, False, lambda _, done: told.append(done), None
+    )
     estimation._tell("matches", "matching", 0.9)
     estimation._tell("matches", "matching", share)
     assert told[0] == told[1]

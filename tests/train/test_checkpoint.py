@@ -141,7 +141,7 @@ def test_another_version_is_refused(tmp_path):
     path = tmp_path / "checkpoint.pt"
     for version in (1, 99):  # 1 knew of no exposures, so that none of its runs can be gone on with
         path.write_bytes(sealed({"version": version, "settings": "{}", "progress": "{}", "tensors": {}}))
-        with pytest.raises(HyrfTrainingError, match="another version of hyrfpack; train anew with --overwrite"):
+        with pytest.raises(HyrfTrainingError, match="another version of hyrfpack; train anew with `overwrite=True`"):
             load_checkpoint(path, {})
 
 

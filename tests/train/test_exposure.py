@@ -199,7 +199,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path):
 
 
 def test_exposure_of_photos_with_transparency_is_refused():
-    with pytest.raises(HyrfTrainingError, match=r"balls: photos with transparency .*leave out --exposure"):
+    with pytest.raises(HyrfTrainingError, match=r"balls: photos with transparency .*leave out `exposure`"):
         Trainer(ball_scene(4, alpha=True), SHORT)
 
 

@@ -80,5 +80,5 @@ def test_photos_that_are_gone_are_one_sentence(run, tmp_path):
 
 
 def test_photos_that_are_others_now_are_one_sentence(run, tmp_path):
-    with pytest.raises(HyrfDataError, match="name the photos with --data"):
+    with pytest.raises(HyrfDataError, match="name the photos with `data`"):
         photos_of(changed(run, tmp_path / "run", test_every=2))

@@ -146,7 +146,7 @@ def test_an_interruption_while_scoring_is_completed_without_training(no_training
 def test_a_model_that_does_not_fit_leaves_the_checkpoint_and_resuming_completes_the_run(full, undisturbed, tmp_path):
     full.add("model.hyrf")
     with pytest.raises(
-        HyrfError, match=r"model.hyrf: the disk is full.*checkpoint of step 19 is kept.*--resume goes on"
+        HyrfError, match=r"model.hyrf: the disk is full.*checkpoint of step 19 is kept.*`resume=True` goes on"
     ):
         train(a_scene(), tmp_path, CONFIG, quiet=True)
     assert names(tmp_path) == {"checkpoint.pt"}
@@ -174,7 +174,7 @@ def test_results_are_completed_with_the_settings_of_the_model_only(full, tmp_pat
     full.clear()
     other = dataclasses.replace(CONFIG, steps=30, seed=2)
     for resume in (False, True):
-        with pytest.raises(HyrfTrainingError, match=r"other settings \(seed, steps\).*--overwrite"):
+        with pytest.raises(HyrfTrainingError, match=r"other settings \(seed, steps\).*`overwrite=True`"):
             train(a_scene(), tmp_path, other, resume=resume, quiet=True)
     fewer = dataclasses.replace(a_scene(), test=a_scene().test[:1])
     with pytest.raises(HyrfTrainingError, match="other settings .held-out views."):

@@ -130,7 +130,7 @@ def test_the_evaluation_is_of_the_file_on_the_held_out_views(finished):
 def test_a_folder_with_a_run_is_not_trained_over_unasked(finished):
     out, _ = finished
     before = (out / "model.hyrf").read_bytes()
-    with pytest.raises(HyrfError, match="holds an earlier run.*--overwrite"):
+    with pytest.raises(HyrfError, match="holds an earlier run.*`overwrite=True`"):
         train(split_scene(), out, CONFIG, quiet=True)
     assert (out / "model.hyrf").read_bytes() == before
 
@@ -149,7 +149,7 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
 
 
 def test_resuming_nothing_is_one_sentence(tmp_path):
-    with pytest.raises(HyrfError, match="no checkpoint to resume; leave out --resume"):
+    with pytest.raises(HyrfError, match="no checkpoint to resume; leave out `resume=True`"):
         train(a_scene(), tmp_path / "run", CONFIG, resume=True, quiet=True)
     assert not (tmp_path / "run").exists()
 
@@ -192,7 +192,7 @@ def test_a_long_run_says_once_what_would_shorten_it(tmp_path, capsys, monkeypatc
         monkeypatch.setattr(progress, name, 0)
     train(a_scene(), tmp_path, dataclasses.replace(CONFIG, steps=8))
     (told,) = [line for line in capsys.readouterr().err.splitlines() if "more hours" in line]
-    assert all(way in told for way in ("--steps", "--max-size", "--images", "--max-gaussians", "a GPU"))
+    assert all(way in told for way in ("fewer steps", "smaller photos", "fewer Gaussians", "a GPU"))
 
 
 # -- stopping and going on -------------------------------------------------------------------------------------------
