@@ -262,8 +262,14 @@ def test_a_request_to_stop_is_passed_on(launched):
 @needs_ranks
 def test_another_process_that_was_killed_is_told_of_where_the_first_can_say_nothing(launched):
     """As while it is still loading, or waits for the one that is gone."""
-    code, _ = launched("test $RANK = 1 && kill -9 $$; exec sleep 500")
-    assert "process 1 of 2 was ended by SIGKILL" in code
+    code, said = launched("test $RANK = 1 && kill -9 $$; exec sleep 500")
+    assert code == 2 and "process 1 of 2 was ended by SIGKILL" in said
+
+
+@needs_ranks
+def test_a_first_process_that_was_killed_is_an_error_of_the_launcher(launched):
+    code, _ = launched("test $RANK = 0 && kill -9 $$; exec sleep 500")
+    assert "process 0 of 2 was ended by SIGKILL" in code
 
 
 # -- launchers and whole runs ----------------------------------------------------------------------------------------
