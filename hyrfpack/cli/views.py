@@ -30,11 +30,14 @@ from hyrfpack.cli.progress import shown_progress
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from hyrfpack.cli.subject import Subject
     from hyrfpack.evaluate import Evaluation, ViewScore
     from hyrfpack.model import HybridModel
     from hyrfpack.parallel.ranks import Ranks
-    from hyrfpack.scene import Scene, View
+    from hyrfpack.render.files import Drawn
+    from hyrfpack.scene import Camera, Scene, View
     from hyrfpack.splats.draw import Drawable
 
 SPLITS = ("test", "train", "all")
@@ -95,7 +98,7 @@ def render(
     from hyrfpack.cameras.paths import orbit as orbit_around
     from hyrfpack.cli.subject import Subject
     from hyrfpack.lock import exclusive_folder
-    from hyrfpack.render.files import render_files_unlocked, rendered_names, write_pictures
+    from hyrfpack.render.files import drawing_function, rendered_names, write_pictures
     from hyrfpack.render.video import has_ffmpeg, write_video
     from hyrfpack.splats.draw import Drawable, draw
 
@@ -122,10 +125,10 @@ def render(
     def write() -> list[Path]:
         shown = subject.load()
         if isinstance(shown, Drawable):
-            picture_of = partial(draw, shown, depth=depth)
-            pictures = write_pictures(picture_of, named, output, overwrite=overwrite, ranks=ranks)
+            picture_of: Callable[[Camera], Drawn] = partial(draw, shown, depth=depth)
         else:
-            pictures = render_files_unlocked(shown, named, output, depth=depth, overwrite=overwrite, ranks=ranks)
+            picture_of = drawing_function(shown, depth=depth)
+        pictures = write_pictures(picture_of, named, output, overwrite=overwrite, ranks=ranks)
         return list(counted(pictures, len(ranks.share(named)), "rendering"))
 
     ranks.agree(lambda: check(replace=True))  # whatever lies there: no folder is created where nothing may be written

@@ -6,7 +6,7 @@ import numpy as np
 
 from hyrfpack.scene import Scene, View
 
-NEIGHBOURS = 4  # cameras beside each that tell whether it stands among others
+NEAREST_CAMERAS = 4  # cameras beside each that tell whether it stands among others
 MAX_WEAK_VIEWS = 2  # held-out photos whose mean score depends on which ones they are
 # A held-out PSNR this far below that of the photos trained on means four times their squared error.
 MAX_PSNR_GAP_DB = 6.0
@@ -16,9 +16,9 @@ def inner_view(scene: Scene) -> View:
     """Choose the view that is best surrounded by others; the first by name of several that are equally so.
 
     Each camera is a point with six coordinates: its position, in units of the median distance from cameras to scene
-    points, and its viewing direction. The score of a camera is the mean distance to its NEIGHBOURS nearest others plus
-    the distance to their centre. The first part is large for a lonely camera, the second one for a camera at the edge,
-    which has all its neighbours on one side. The camera with the lowest score is chosen.
+    points, and its viewing direction. The score of a camera is the mean distance to its NEAREST_CAMERAS nearest others
+    plus the distance to their centre. The first part is large for a lonely camera, the second one for a camera at the
+    edge, which has all its neighbours on one side. The camera with the lowest score is chosen.
 
     Args:
         scene: with at least two views.
@@ -32,7 +32,7 @@ def inner_view(scene: Scene) -> View:
     for place, others in enumerate(offsets):
         others = np.delete(others, place, axis=0)
         distances = np.linalg.norm(others, axis=1)
-        near = np.argsort(distances, kind="stable")[:NEIGHBOURS]
+        near = np.argsort(distances, kind="stable")[:NEAREST_CAMERAS]
         scores.append(distances[near].mean() + np.linalg.norm(others[near].mean(axis=0)))
     return views[int(np.argmin(np.round(scores, 9)))]
 

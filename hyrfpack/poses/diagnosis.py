@@ -11,7 +11,7 @@ import numpy as np
 from hyrfpack.data.quality import is_blurred
 from hyrfpack.data.unusable import explain_no_photos, unreadable_sentences
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.poses.prepare import COPY, only_unreadable
+from hyrfpack.poses.prepare import COPY_REASON, only_unreadable
 
 LEAST = 3  # photos that poses can be found for
 _FEATURELESS = 60  # features of a typical photo, below which there is nothing to match
@@ -31,7 +31,7 @@ def check_count(given: Path, folder: Path, usable: int, left_out: Mapping[str, s
     if usable >= LEAST:
         return
     count = usable + len(left_out)
-    copies = [reason for reason in left_out.values() if reason.startswith(COPY)]
+    copies = [reason for reason in left_out.values() if reason.startswith(COPY_REASON)]
     if not count:
         raise HyrfDataError(explain_no_photos(given, folder))
     if copies and usable + len(copies) >= LEAST:

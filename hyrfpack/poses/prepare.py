@@ -31,7 +31,7 @@ _ORIENTATION = 0x0112
 _BURST = 2.0  # seconds between photos that follow each other
 
 _FACE_TAKEN = "another picture has the name of one of its faces"
-COPY = "a copy of"  # what the reason begins with for which a photo is left out
+COPY_REASON = "a copy of"  # what the reason begins with for which a photo is left out
 
 Item = TypeVar("Item")
 Progress = Callable[[int], None]  # told how many photos are done
@@ -92,7 +92,7 @@ def look_at(
         if sizes[size] > 1:
             original = first_with.setdefault((size, _digest(path)), source)
             if original != source:
-                left_out[source] = f"{COPY} {original}"
+                left_out[source] = f"{COPY_REASON} {original}"
                 continue
         panorama = _is_panorama_or_reason(path)
         if isinstance(panorama, str):
@@ -121,7 +121,7 @@ def look_at(
 
 def only_unreadable(left_out: Mapping[str, str]) -> dict[str, str]:
     """Of the photos that `look_at` leaves out, those that cannot be read."""
-    return {name: reason for name, reason in left_out.items() if not reason.startswith((COPY, _FACE_TAKEN))}
+    return {name: reason for name, reason in left_out.items() if not reason.startswith((COPY_REASON, _FACE_TAKEN))}
 
 
 def devices_of(photos: Sequence[Photo], in_place: bool) -> tuple[tuple[Device, ...], tuple[int, ...]]:

@@ -51,26 +51,8 @@ def render_files(
         HyrfError: a picture cannot be written, or another call is at work in the folder.
     """
     with exclusive_folder(folder, ranks=ranks):
-        yield from render_files_unlocked(
-            model, cameras, folder, depth=depth, settings=settings, overwrite=overwrite, ranks=ranks
-        )
-
-
-def render_files_unlocked(
-    model: HybridModel,
-    cameras: Sequence[tuple[str, Camera]],
-    folder: str | os.PathLike[str],
-    *,
-    depth: bool = False,
-    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
-    overwrite: bool = True,
-    ranks: Ranks = ALONE,
-) -> Iterator[Path]:
-    """As `render_files`, into a folder that the caller has locked."""
-    with torch.no_grad():
-        decoded = model.decode()
-    draw = partial(render, model, settings=settings, decoded=decoded, depth=depth)
-    return write_pictures(draw, cameras, folder, overwrite=overwrite, ranks=ranks)
+        draw = drawing_function(model, depth=depth, settings=settings)
+        yield from write_pictures(draw, cameras, folder, overwrite=overwrite, ranks=ranks)
 
 
 class Drawn(Protocol):
@@ -83,6 +65,18 @@ class Drawn(Protocol):
     def depth(self) -> Tensor | None: ...
 
 
+def drawing_function(
+    model: HybridModel,
+    *,
+    depth: bool = False,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+) -> Callable[[Camera], Drawn]:
+    """Return a function that renders a model, decoded once, from a camera. Arguments as of `render_files`."""
+    with torch.no_grad():
+        decoded = model.decode()
+    return partial(render, model, settings=settings, decoded=decoded, depth=depth)
+
+
 def write_pictures(
     draw: Callable[[Camera], Drawn],
     cameras: Sequence[tuple[str, Camera]],
@@ -91,7 +85,7 @@ def write_pictures(
     overwrite: bool = True,
     ranks: Ranks = ALONE,
 ) -> Iterator[Path]:
-    """Write what `draw` shows of named cameras. Arguments, files and errors otherwise as of `render_files_unlocked`."""
+    """Write what `draw` shows of named cameras into a folder that the caller has locked; see `render_files`."""
     named = list(zip(file_names([name for name, _ in cameras]), cameras, strict=True))
     for name, (_, camera) in ranks.share(named):
         with torch.no_grad():

@@ -6,17 +6,17 @@ import json
 import os
 from pathlib import Path
 
-ENDINGS = (".ply", ".splat", ".spz", ".sog")  # of the files that `hyrfpack.splats.files.read_splats` takes
+SPLATS_SUFFIXES = (".ply", ".splat", ".spz", ".sog")  # of the files that `hyrfpack.splats.files.read_splats` takes
 SOG_META = "meta.json"  # of a SOG that is not bundled: a folder of pictures, and this beside them
 
 
 def is_splats(path: str | os.PathLike[str]) -> bool:
     """Return whether a path names 3D Gaussians of another program.
 
-    It does if it has one of ENDINGS, or is the folder, or the meta.json, of a SOG that is not bundled.
+    It does if it has one of SPLATS_SUFFIXES, or is the folder, or the meta.json, of a SOG that is not bundled.
     """
     path = Path(path)
-    return path.suffix.lower() in ENDINGS or path.name == SOG_META or _is_sog_folder(path)
+    return path.suffix.lower() in SPLATS_SUFFIXES or path.name == SOG_META or _is_sog_folder(path)
 
 
 def _is_sog_folder(path: Path) -> bool:

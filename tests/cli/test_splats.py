@@ -21,7 +21,7 @@ from hyrfpack.format import save
 from hyrfpack.splats.files import READ
 from hyrfpack.splats.formats import sog
 from hyrfpack.splats.formats.hints import NO_HINTS
-from hyrfpack.splats.names import ENDINGS, is_splats
+from hyrfpack.splats.names import SPLATS_SUFFIXES, is_splats
 from hyrfpack.splats.table import FORMATS
 
 SPLATS = ball(60)
@@ -41,11 +41,11 @@ def files(tmp_path_factory) -> dict[str, Path]:
     return {**paths, "loose": loose, "meta.json": loose / "meta.json"}
 
 
-KINDS = [*ENDINGS, "loose", "meta.json"]
+KINDS = [*SPLATS_SUFFIXES, "loose", "meta.json"]
 
 
 def test_names_know_every_ending_that_is_read():
-    assert sorted(ENDINGS) == sorted(READ)
+    assert sorted(SPLATS_SUFFIXES) == sorted(READ)
 
 
 def test_a_folder_with_another_meta_json_is_no_splats(tmp_path):
