@@ -452,7 +452,7 @@ def test_the_command_tells_what_was_made(photos, poses, tmp_path):
         succeeded("make", photos, "-o", tmp_path / "scene.html", "--quality", "draft", "--json").stdout
     )
     assert numbers["kept"] == ["poses", *STAGES] and numbers["views"] == 3 and numbers["poses"]["sure"] == 17
-    assert numbers["total_seconds"] == pytest.approx(sum(numbers["seconds"].values()), abs=0.1)
+    assert numbers["total_seconds"] == pytest.approx(sum(numbers["seconds"].values()), abs=0.5)  # each is rounded
 
 
 def test_the_command_says_where_it_was_stopped(posed, tmp_path, monkeypatch):

@@ -4,7 +4,8 @@
 
 The inputs are those of `fuzz_mutate.mutant`, as whole files and every fourth as the start of one. Both readers must
 accept or both refuse; what both accept must be the same numbers, bit for bit; a refusal must be one printable
-sentence; and no file may take the reader in JavaScript more than SECONDS of processor time. What else happens is a
+sentence; and no file may take the reader in JavaScript more processor time than MIN_LIMIT_SECONDS and
+MAX_JAVASCRIPT_RATIO times what it takes the reader in Python. What else happens is a
 failure, saved with the numbers that make it again.
 """
 
@@ -36,7 +37,7 @@ from tools.safety.fuzz import LONGEST, pattern
 from tools.safety.fuzz_mutate import mutant
 
 READER = Path(__file__).parent / "read_many.mjs"
-SECONDS = 0.5
+MIN_LIMIT_SECONDS, MAX_JAVASCRIPT_RATIO = 0.5, 20.0
 NEVER_ANSWERS = 600  # seconds of a batch after which node is taken for stuck
 BATCH = 500
 CUT_EVERY = 4  # inputs, one of which is read as the start of a file
@@ -112,7 +113,7 @@ def disagreement(python: Verdict, javascript: Verdict) -> str:
         return f"other numbers in {', '.join(wrong)}"
     if javascript.refused and not (javascript.refused.isprintable() and 10 < len(javascript.refused) < LONGEST):
         return f"no sentence: {javascript.refused[:200]!r}"
-    if javascript.seconds > SECONDS:
+    if javascript.seconds > MIN_LIMIT_SECONDS + MAX_JAVASCRIPT_RATIO * python.seconds:
         return f"JavaScript takes {javascript.seconds:.2f} s (Python {python.seconds:.2f} s)"
     return ""
 
