@@ -133,7 +133,7 @@ def numbered_names(path: Path) -> Iterator[Path]:
 
 
 def describe_rename(asked: str | os.PathLike[str], written: str | os.PathLike[str]) -> str:
-    """The sentence that tells a user why a file was written under another name than the one that was asked for."""
+    """Return the sentence that says why a file was written under another name than the one that was asked for."""
     return f"{asked}: this file was created by something else in the meantime and is kept; the result is in {written}"
 
 

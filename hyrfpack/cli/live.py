@@ -39,7 +39,7 @@ def training_view(
     Args:
         title: of the page.
         view, view_port: the options.
-        say: told the page's address in a sentence.
+        say: called with a sentence that names the page's address.
 
     Raises:
         UsageError: --view-port is given alone.

@@ -47,7 +47,7 @@ def compare(runs: Sequence[StrPath], out: StrPath, *, overwrite: bool = False) -
         runs: folders that `hyrfpack.train` wrote to, two or more.
         out: the page, an .html file.
         overwrite: replace the file if it is there. Without it, a file that appears in the meantime is kept, too:
-            the page gets a free name beside it, which the report tells.
+            the page gets a free name beside it, which the report names.
 
     Raises:
         TypeError: `runs` is one path.

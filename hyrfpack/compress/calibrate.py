@@ -156,7 +156,7 @@ def calibrated(
     Args:
         cameras: where pictures will be looked at from, about; world units.
         distortion, prune: as `make_plan` takes them.
-        report: told what is being done, and the share of the work that is done.
+        report: called with what is being done and the share of the work that is done, 0 to 1.
 
     Raises:
         HyrfError: a number of the model is NaN or infinite.
@@ -181,7 +181,7 @@ def calibrate(
         sensitivity: first-order, from `measure_sensitivity`.
         originals: pictures of the model.
         distortion, prune: as `make_plan` takes them.
-        report: told what is being done, and the share of the work that is done.
+        report: called with what is being done and the share of the work that is done, 0 to 1.
 
     Raises:
         HyrfError: a parameter is NaN or infinite.

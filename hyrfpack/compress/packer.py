@@ -105,11 +105,11 @@ def compress(
             of `psnr_predicted` (`hyrfpack.Evaluation`) where photos' exposures were learnt beside the model.
         distortion: mean squared error that pictures may get, by estimate; instead of a search.
         overwrite: replace a file at `target`. Without it, one that is there is an error, and one that appears in the
-            meantime is kept: the result gets a free name beside it, which the report tells.
+            meantime is kept: the result gets a free name beside it, which the report names.
         device: where pictures are drawn, see `hyrfpack.device.choose_device`. On the CPU the same input gives the same
             bytes; on a GPU sums of gradients vary in their last bits, and bytes with them.
         say: told what is going on.
-        report: told what is being done, and the share of the work that is done.
+        report: called with what is being done and the share of the work that is done, 0 to 1.
         ranks: processes that share the photos of fine-tuning; rank 0 writes the file.
         settings: of "paper", see `hyrfpack.format.paper`; `noise` is the old word for `distortion`.
 

@@ -127,10 +127,10 @@ def distill_splats(
         cameras: that pictures shall hold at, made smaller where larger than `config.size`; one in TEST_EVERY is held
             out.
         overwrite: replace a file at `target`. Without it, one that is there is an error, and one that appears in the
-            meantime is kept: the result gets a free name beside it, which the report tells.
+            meantime is kept: the result gets a free name beside it, which the report names.
         device: where pictures are drawn and the model learns, see `hyrfpack.device.choose_device`.
         say: told what is going on.
-        report: told what is being done, and the share of the work that is done.
+        report: called with what is being done and the share of the work that is done, 0 to 1.
 
     Raises:
         HyrfDataError: no view shows any of the splats.

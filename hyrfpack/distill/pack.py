@@ -33,7 +33,7 @@ def pack(
         psnr: dB of its pictures against the original's.
         provenance: that the file tells, besides where it is looked at from.
         say: told what is going on.
-        report: told what is being done, and the share of the work that is done.
+        report: called with what is being done and the share of the work that is done, 0 to 1.
 
     Example:
         >>> from hyrfpack.distill import DistillConfig

@@ -67,7 +67,7 @@ def bake(
             alone and no opacity changes.
         degrees: of the harmonics, each 0 to 3. More than one costs little more.
         sights: what `sights_of` told of these cameras, where it is known already.
-        report: told what is being done, and the share of the work that is done.
+        report: called with what is being done and the share of the work that is done, 0 to 1.
 
     Raises:
         HyrfError: a number of the model, or a camera's pose, is NaN, infinite or beyond float32.

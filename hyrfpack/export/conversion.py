@@ -80,9 +80,9 @@ def convert(
             out. Infinite numbers leave a side open.
         min_opacity: fainter Gaussians are left out.
         overwrite: replace a file at `target`. Without it, one that is there is an error, and one that appears in the
-            meantime is kept: the result gets a free name beside it, which the report tells.
+            meantime is kept: the result gets a free name beside it, which the report names.
         say: told what the format cannot hold.
-        report: told what is being done and the share of the work that is done.
+        report: called with what is being done and the share of the work that is done, 0 to 1.
 
     Raises:
         HyrfDataError: the source cannot be read, or shows nothing.

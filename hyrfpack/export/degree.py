@@ -40,7 +40,7 @@ def choose_degree(
         cameras: that colours shall be fitted at, world units; none of those that a result will be judged by.
         highest: degree to think of, 0 to 3.
         sights: what `sights_of` told of the cameras, where it is known already.
-        report: told what is being done, and the share of the work that is done.
+        report: called with what is being done and the share of the work that is done, 0 to 1.
     """
     fitted, kept = list(cameras), list(cameras)
     every = -(-len(model) // MANY)

@@ -96,7 +96,7 @@ def export(
         overwrite: replace files that are there. Without it, they are an error. One that appears in the meantime is
             kept, too: a single file gets a free name beside it, which the report tells; in a folder it is an error.
         say: told what is going on.
-        report: told what is being done, and the share of the work that is done.
+        report: called with what is being done and the share of the work that is done, 0 to 1.
 
     Raises:
         HyrfError: a file cannot be read or written, the options do not go together, or another call is at work in the

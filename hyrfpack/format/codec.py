@@ -212,7 +212,7 @@ def repack(
 
     Args:
         overwrite: replace a file at `target`. Without it, one that is there is an error, and one that appears in the
-            meantime is kept: the result gets a free name beside it, which the report tells.
+            meantime is kept: the result gets a free name beside it, which the report names.
     """
     source = find_model(source)
     Outputs(source, overwrite=overwrite).file(target)

@@ -72,7 +72,7 @@ def live_view(title: str, *, port: int = 0, say: Callable[[str], None]) -> Itera
     Args:
         title: of the page.
         port: to listen at, 0 to 65535; 0 takes a free one.
-        say: told the page's address in a sentence.
+        say: called with a sentence that names the page's address.
 
     Raises:
         HyrfError: nothing can listen at this port.
