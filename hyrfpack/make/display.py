@@ -37,7 +37,7 @@ class Display:
     def __enter__(self) -> Display:
         if self._live:
             with suppress(OSError, ValueError):
-                self._live.start()
+                self._live.start(refresh=True)
         else:
             self._lines.start()
         return self

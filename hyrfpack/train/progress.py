@@ -69,7 +69,7 @@ class ProgressLine:
     def __enter__(self) -> ProgressLine:
         if self.live:
             with suppress(OSError, ValueError):
-                self.live.start()
+                self.live.start(refresh=True)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -142,7 +142,7 @@ class PhaseLine:
     def __enter__(self) -> PhaseLine:
         if self.live:
             with suppress(OSError, ValueError):
-                self.live.start()
+                self.live.start(refresh=True)
         elif not self.quiet:
             self._logger.start()
         return self

@@ -143,9 +143,18 @@ def test_a_terminal_gets_one_line_that_is_redrawn(width, monkeypatch):
         line.note("a sentence")
     shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
     lines = [part for part in re.split(r"[\r\n]+", shown) if part.strip()]
-    assert all(len(part) <= width for part in lines)
+    assert max(map(len, lines)) <= width, lines
     assert "a sentence" in [part.strip() for part in lines]
     assert lines[-1].startswith("604/3,000  ") and "PSNR 30.00" in lines[-1] and lines[-1].endswith(" left")
+
+
+def test_the_line_stands_before_anything_is_written_above_it(monkeypatch):
+    """Else a sentence and the first drawing of the line, by another thread, can end up in one line."""
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    with ProgressLine(3000, 0):
+        assert "preparing the first step" in terminal.getvalue()
 
 
 def test_a_terminal_that_cannot_redraw_gets_plain_lines(monkeypatch):

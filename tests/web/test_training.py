@@ -19,7 +19,7 @@ from hyrfpack.web.player import encode_player
 from hyrfpack.web.serve import MemoryFile, serving
 
 pytestmark = pytest.mark.in_turn
-COUNT = "window.hyrfpack?.player.loaded && hyrfpack.player.scene.count"
+COUNT = "window.hyrfpack?.player?.loaded && hyrfpack.player.scene.count"
 REMARK = "document.getElementById('remark').textContent"
 
 
