@@ -1,6 +1,7 @@
 """Words that settings take: for the rooms that know what they mean, and for the command line, which loads none of them
 to list its options."""
 
+AS_PHOTOGRAPHED, CONSISTENT = EXPOSURES = ("as-photographed", "consistent")  # of renders
 LAYOUTS = (  # of photos and poses: the keys of `hyrfpack.data.LAYOUTS`
     "colmap",
     "blender",

@@ -17,12 +17,13 @@ from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload
 from hyrfpack.errors import HyrfError, HyrfTrainingError
-from hyrfpack.evaluate.exposure import expose, fitted_gains
+from hyrfpack.evaluate.exposure import fitted_gains
 from hyrfpack.format.arrays import by_parameter
 from hyrfpack.format.compact.plan import Plan, from_lattice
 from hyrfpack.format.compact.quantized import Quantized
 from hyrfpack.format.sections import COLORS, POSITIONS
 from hyrfpack.model import HybridModel
+from hyrfpack.model.exposure import expose
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.parallel.ranks import ALONE, Ranks

@@ -17,12 +17,13 @@ import torch
 from hyrfpack.checks import check_type
 from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate.exposure import corrected, expose, fitted_gains, predicted_gains
+from hyrfpack.evaluate.exposure import corrected, fitted_gains, predicted_gains
 from hyrfpack.evaluate.figures import comparison
 from hyrfpack.evaluate.lpips import LPIPS
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
+from hyrfpack.model.exposure import expose
 from hyrfpack.parallel.ranks import ALONE, Ranks
 from hyrfpack.progress import Report, no_report
 from hyrfpack.render import RenderSettings, render

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.evaluate.metrics import to_8bit
+from hyrfpack.model.exposure import expose
 
 NEIGHBOURS = 2  # training photos that a held-out photo's gains are predicted from
 USABLE = 4 / 255, 251 / 255  # what every channel of a photo and of its render lies between where gains are fitted
@@ -17,28 +18,6 @@ LARGEST = 16.0  # gain, and the inverse of the smallest
 ENOUGH = 200_000  # pixels, spread over the picture
 ROUNDS = 10  # of reweighting
 CAUCHY = 2.385  # standard deviations at which a pixel counts half
-
-
-def expose(image: Tensor, gains: Tensor) -> Tensor:
-    """A picture exposed otherwise, with the shoulder of a camera's tone curve: black and white stay what they are.
-
-        y' = g y / (1 + (g - 1) y)        that is, y' / (1 - y') = g y / (1 - y)
-
-    so that g is a gain in the shadows; one of g after one of h is one of g h. Colours that photos show of a point
-    follow this more closely than a plain gain (`docs/training.md`).
-
-    Args:
-        image: (..., 3) in [0, 1].
-        gains: (3,) positive.
-
-    Returns:
-        (..., 3) in [0, 1]. Differentiable in both.
-
-    Example:
-        >>> expose(torch.tensor([0.0, 0.5, 1.0]), torch.tensor([3.0, 3.0, 3.0]))
-        tensor([0.0000, 0.7500, 1.0000])
-    """
-    return gains * image / (1 + (gains - 1) * image)
 
 
 def fitted_gains(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> np.ndarray:

@@ -19,10 +19,11 @@ from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import compact, paper, raw
 from hyrfpack.format.arrays import RULES, check_rules, group_shapes, parse_config, to_model
 from hyrfpack.format.container import Container, Section, raw_limit, read_container, write_container
+from hyrfpack.format.exposure import decode_exposure, exposure_section
 from hyrfpack.format.info import SectionSize, section_sizes
 from hyrfpack.format.metadata import Metadata, read_metadata
 from hyrfpack.format.run_folder import find_model
-from hyrfpack.format.sections import LAYERED, METADATA, POSITIONS, SECTIONS, group_and_layer, layer_section
+from hyrfpack.format.sections import EXPOSURE, LAYERED, METADATA, POSITIONS, SECTIONS, group_and_layer, layer_section
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.pool import run_tasks
@@ -99,15 +100,18 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
     counts = [section.raw_length // 12 for section in sections if group_and_layer(section.type)[0] == POSITIONS]
     layers = counts if len(counts) > 1 else []
     metadata = Metadata(profile, sum(counts), model.config.to_dict(), RULES, used, provenance or {}, layers=layers)
-    is_new = profile == "compact"  # all else is read by readers of version 1.0 too
-    sections = [metadata.to_section(deflate=is_new), *sections]
+    is_compact = profile == "compact"  # without a map, all else is read by readers of version 1.0 too
+    minor = int(is_compact)
+    if model.exposure is not None:
+        sections, minor = [exposure_section(model.exposure), *sections], 2
+    sections = [metadata.to_section(deflate=is_compact), *sections]
     stored, raw_length = (sum(sizes) for sizes in zip(*((len(s.data), s.raw_length) for s in sections), strict=True))
     if raw_length > raw_limit(stored) or sum(counts) > most_gaussians(stored):
         raise HyrfError(
             f"{raw_length:,} bytes of numbers, nearly all alike, would take only {stored:,}, and readers do not "
             "unpack so much from so few; keep this model as profile raw"
         )
-    return write_container(sections, minor=int(is_new))
+    return write_container(sections, minor=minor)
 
 
 def most_gaussians(file_length: int) -> int:
@@ -299,7 +303,12 @@ def _decode(container: Container) -> HybridModel:
             raise HyrfFormatError(f"{name}: section '{tag}' holds numbers that are not finite; write the file again")
     for group in LAYERED if there > 1 else ():
         arrays[group] = np.concatenate([arrays.pop(layer_section(group, layer)) for layer in range(there)])
-    return to_model(config, arrays).requires_grad_(False)
+    model = to_model(config, arrays).requires_grad_(False)
+    if EXPOSURE in container:
+        section = container[EXPOSURE]
+        with _naming(name, EXPOSURE):
+            model.exposure = decode_exposure(section.codec, memoryview(section.data), section.raw_length)
+    return model
 
 
 @contextmanager

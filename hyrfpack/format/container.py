@@ -23,7 +23,7 @@ from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.run_folder import find_model
 
 MAGIC = b"\x89HYRF\r\n\n"
-MAJOR, MINOR = 1, 1
+MAJOR, MINOR = 1, 2
 
 # A file that breaks one of these is refused before anything is read or allocated for it.
 MAX_SECTIONS = 1024

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 METADATA = "META"
+EXPOSURE = "EXPO"
 POSITIONS, COLORS, SCALES, OPACITIES = "POSI", "COLO", "SCAL", "OPAC"
 GEOMETRY_TABLE, GEOMETRY_DECODER, RADIANCE_TABLE, RADIANCE_DECODER = "GTAB", "GMLP", "RTAB", "RMLP"
 
@@ -13,9 +14,10 @@ MLPS = (GEOMETRY_DECODER, RADIANCE_DECODER)
 LAYERED = (POSITIONS, *LOGITS)
 MAX_LAYERS = 8
 
-# Section types and what they hold; every one is required.
+# Section types and what they hold; every one but EXPOSURE is required.
 SECTIONS = {
     METADATA: "metadata",
+    EXPOSURE: "exposure map",
     POSITIONS: "positions",
     COLORS: "colour logits",
     SCALES: "scale logits",

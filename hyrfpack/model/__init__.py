@@ -1,6 +1,7 @@
 """The representation: explicit Gaussians, two neural fields and a background, in one frame."""
 
 from hyrfpack.model.config import ModelConfig
+from hyrfpack.model.exposure import ExposureMap
 from hyrfpack.model.frame import Frame
 from hyrfpack.model.hash_grid import HashGridConfig
 from hyrfpack.model.hybrid import Decoded, Geometry, HybridModel
@@ -12,6 +13,7 @@ __all__ = [
     "BACKGROUND_RADIUS",
     "DIRECTION_FEATURES",
     "Decoded",
+    "ExposureMap",
     "Frame",
     "Geometry",
     "HashGridConfig",

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from hyrfpack.model.config import ModelConfig
+from hyrfpack.model.exposure import ExposureMap
 from hyrfpack.model.field import Field
 from hyrfpack.model.gaussians import Gaussians, take_rows
 from hyrfpack.ops import activate
@@ -76,12 +77,14 @@ class HybridModel(nn.Module):
     Attributes:
         precision: how GPU kernels multiply in the decoders, not stored in files: "mixed" rounds factors to bfloat16
             and adds up in float32, "float32" rounds nothing. The CPU always works in float32.
+        exposure: the exposure map, None for a model of one exposure. Only `hyrfpack.render` applies it.
     """
 
     def __init__(self, config: ModelConfig, gaussians: Gaussians, generator: torch.Generator | None = None) -> None:
         super().__init__()
         self.config = config
         self.precision = "mixed"
+        self.exposure: ExposureMap | None = None
         self.gaussians = gaussians
         self.geometry = Field(config.geometry, outputs=8, hidden=config.hidden, generator=generator)
         self.radiance = Field(
@@ -96,7 +99,8 @@ class HybridModel(nn.Module):
         """A model of the Gaussians at `index` (n,) int64, copied. The fields are this model's own."""
         explicit = (getattr(self.gaussians, name).detach()[index] for name in Gaussians.NAMES)
         part = HybridModel(self.config, Gaussians(*explicit))
-        part.geometry, part.radiance, part.precision = self.geometry, self.radiance, self.precision
+        part.geometry, part.radiance = self.geometry, self.radiance
+        part.precision, part.exposure = self.precision, self.exposure
         return part
 
     def cube_coords(self, positions: Tensor) -> Tensor:

@@ -12,9 +12,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hyrfpack.checks import check_float, check_int, check_type
+from hyrfpack.checks import check_choice, check_float, check_int, check_type
+from hyrfpack.choices import AS_PHOTOGRAPHED, EXPOSURES
 from hyrfpack.errors import HyrfError
 from hyrfpack.model import Decoded, HybridModel
+from hyrfpack.model.exposure import expose
 from hyrfpack.model.gaussians import take_rows
 from hyrfpack.ops.composite import composite
 from hyrfpack.ops.finite import all_finite
@@ -41,6 +43,8 @@ class RenderSettings:
         background_stride: the background is evaluated at every background_stride-th pixel of each axis and
             interpolated between; 1 is exact.
         transmittance_min: a pixel is finished once no more light than this passes; 0 blends every Gaussian.
+        exposure: "as-photographed" applies the model's exposure map, so that a view looks like the photos taken near
+            it; "consistent" shows all views at the model's own exposure. The same for a model without such a map.
     """
 
     near: float = 0.01
@@ -48,12 +52,14 @@ class RenderSettings:
     background_threshold: float = 1 / 512
     background_stride: int = 2
     transmittance_min: float = TRANSMITTANCE_MIN
+    exposure: str = AS_PHOTOGRAPHED
 
     def __post_init__(self) -> None:
         for name in ("near", "background_threshold"):
             check_float(name, getattr(self, name))
         check_float("cull_tolerance", self.cull_tolerance, most=inf)
         check_int("background_stride", self.background_stride, 1)
+        check_choice("exposure", self.exposure, EXPOSURES)
         check_float("transmittance_min", self.transmittance_min, 0, 1)
         if self.transmittance_min == 1:
             raise ValueError("transmittance_min is 1; it must lie in [0, 1), for at 1 nothing is drawn")
@@ -176,6 +182,10 @@ def render(
         # its loss tells as much.
         if on_cpu or not rgb.requires_grad:
             _refuse_nonfinite(background=behind if on_cpu else rgb)
+    if model.exposure is not None and settings.exposure == AS_PHOTOGRAPHED:
+        rgb = expose(
+            rgb, tensor_like(model.exposure.gains_of_pose(model.config.frame.local_pose(camera)).tolist(), rgb)
+        )
     return Rendering(
         rgb=rgb,
         alpha=1 - raster.transmittance,

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
-from hyrfpack.evaluate.exposure import expose
+from hyrfpack.model.exposure import expose
 from hyrfpack.ops.adam import adam_step
 from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.train.config import TrainConfig

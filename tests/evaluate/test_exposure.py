@@ -10,8 +10,9 @@ import torch
 from scenes import ball_points, ball_scene, small_model
 
 from hyrfpack.evaluate import evaluate
-from hyrfpack.evaluate.exposure import corrected, expose, fitted_gains, predicted_gains
+from hyrfpack.evaluate.exposure import corrected, fitted_gains, predicted_gains
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR, psnr, ssim, to_8bit
+from hyrfpack.model.exposure import expose
 from hyrfpack.render import render
 from hyrfpack.scene import Picture, View
 

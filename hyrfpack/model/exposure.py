@@ -1,0 +1,153 @@
+"""Exposure and white balance as a smooth function of the viewpoint: the exposure map that a model may carry.
+
+Photos of one capture differ in exposure. A model that is trained with per-image gains holds one consistent exposure;
+the map predicts the gains of any viewpoint, so that a render looks like the photos taken near it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+from torch import Tensor
+
+MAX_CENTERS = 64
+MAX_LOG_GAIN = 8.0  # no stored log gain is larger in magnitude
+POSITION_CODES, DIRECTION_CODES, WEIGHT_CODES = 255, 127, 32767  # the largest stored codes
+
+
+def expose(image: Tensor, gains: Tensor) -> Tensor:
+    """Change the exposure of a picture, with the shoulder of a camera's tone curve: black and white stay what they are.
+
+        y' = g y / (1 + (g - 1) y)        that is, logit y' = logit y + log g
+
+    so that g is a gain in the shadows, and g followed by h is g h. Colours that photos show of a point follow this
+    more closely than a plain gain (`docs/training.md`).
+
+    Args:
+        image: (..., 3) in [0, 1].
+        gains: (3,) positive.
+
+    Returns:
+        (..., 3) in [0, 1]. Differentiable in both.
+
+    Example:
+        >>> expose(torch.tensor([0.0, 0.5, 1.0]), torch.tensor([3.0, 3.0, 3.0]))
+        tensor([0.0000, 0.7500, 1.0000])
+    """
+    return gains * image / (1 + (gains - 1) * image)
+
+
+def kernel(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Inverse quadratic kernel 1 / (1 + |a - b|^2), (N, M), of features (N, D) and (M, D).
+
+    Its slope is at most 3 sqrt(3) / 8 for each unit of distance.
+    """
+    return 1 / (1 + np.square(a[:, None] - b[None]).sum(-1))
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureMap:
+    """Log gains of any viewpoint, by kernel regression over the cameras of training photos.
+
+        log g(x, f) = clip(mean + sum_m k((x', f), (x_m, f_m)) w_m, lowest, highest)
+        k((x, f), (y, h)) = 1 / (1 + |x - y|^2 / l_x^2 + |f - h|^2 / l_f^2)
+
+    x is the viewpoint's position in local units, f its unit viewing direction, x' the point nearest to x in the box
+    that holds the training cameras: outside it the exposure is that of the nearest viewpoint inside. The function is
+    continuous, and Lipschitz by `slope_bounds`. It holds the very numbers that a file stores, so that writing and
+    reading it changes nothing.
+
+    Attributes:
+        box: (2, 3) float32, the least and the largest position of the training cameras, local units.
+        lengths: (2,) float32 > 0, l_x in local units and l_f in units of the sphere of directions.
+        mean: (3,) float32 log gains far from all centres.
+        limits: (2, 3) float32, lowest and highest log gain, in [-8, 8].
+        steps: (3,) float32, the unit of the weights of each channel.
+        positions: (M, 3) uint8, x_m = least + code / 255 (largest - least). M <= 64.
+        directions: (M, 3) int8, f_m = code / 127.
+        weights: (M, 3) int16, w_m = code * step.
+    """
+
+    box: np.ndarray
+    lengths: np.ndarray
+    mean: np.ndarray
+    limits: np.ndarray
+    steps: np.ndarray
+    positions: np.ndarray
+    directions: np.ndarray
+    weights: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: a number is not finite or out of range, or shapes do not fit."""
+        count = len(self.positions)
+        shapes = ((2, 3), (2,), (3,), (2, 3), (3,), (count, 3), (count, 3), (count, 3))
+        types = ("f4",) * 5 + ("u1", "i1", "i2")
+        for field, shape, kind in zip(fields(self), shapes, types, strict=True):
+            values = getattr(self, field.name)
+            if values.shape != shape or values.dtype != np.dtype(kind):
+                raise ValueError(
+                    f"an exposure map's {field.name} are {values.dtype} {values.shape}, not {kind} {shape}"
+                )
+            if not np.isfinite(values).all():
+                raise ValueError(f"an exposure map's {field.name} must be finite")
+        if count > MAX_CENTERS:
+            raise ValueError(f"an exposure map has {count} centers; it may have {MAX_CENTERS}")
+        if not (self.box[0] <= self.box[1]).all():
+            raise ValueError("the box of an exposure map must have its least corner first")
+        if not (self.lengths > 0).all():
+            raise ValueError("the lengths of an exposure map must be positive")
+        if not (self.limits[0] <= self.limits[1]).all() or np.abs(self.limits).max() > MAX_LOG_GAIN:
+            raise ValueError(f"log gains of an exposure map must lie in order within {MAX_LOG_GAIN:g} of 0")
+
+    def log_gains(self, position: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Predict the log gains of viewpoints.
+
+        Args:
+            position: (..., 3) local units.
+            direction: (..., 3) unit viewing directions.
+
+        Returns:
+            (..., 3) float64 within `limits`.
+        """
+        shape = np.shape(position)
+        inside = np.clip(np.asarray(position, np.float64), *self.box.astype(np.float64))
+        wanted = self._features(inside.reshape(-1, 3), np.asarray(direction, np.float64).reshape(-1, 3))
+        logs = self.mean + kernel(wanted, self._centers) @ self._weights
+        return np.clip(logs, *self.limits.astype(np.float64)).reshape(shape)
+
+    def gains_of_pose(self, camera_from_local: np.ndarray) -> np.ndarray:
+        """Predict the gains (3,) float64 of a camera by its pose (4, 4), camera_from_local."""
+        pose = np.asarray(camera_from_local, np.float64)
+        return np.exp(self.log_gains(-pose[:3, :3].T @ pose[:3, 3], pose[2, :3]))
+
+    @property
+    def slope_bounds(self) -> tuple[float, float]:
+        """The largest change of a log gain for each local unit of position and each radian of viewing angle.
+
+        For f = sum_m w_m k(., v_m) with the norm |f|^2 = w^T K w of its Hilbert space,
+
+            |f(a) - f(b)| <= |f| sqrt(2 - 2 k(a, b)) <= sqrt(2) |f| |a - b|
+
+        where |a - b| is the distance of features: position over l_x, direction over l_f.
+        """
+        gram = kernel(self._centers, self._centers)
+        norm = float(np.sqrt(np.maximum(np.einsum("mc,mn,nc->c", self._weights, gram, self._weights), 0).max()))
+        along_position, along_direction = np.sqrt(2) * norm / self.lengths.astype(np.float64)
+        return float(along_position), float(along_direction)
+
+    @cached_property
+    def _centers(self) -> np.ndarray:
+        least, largest = self.box.astype(np.float64)
+        positions = least + self.positions / POSITION_CODES * (largest - least)
+        return self._features(positions, self.directions / DIRECTION_CODES)
+
+    @cached_property
+    def _weights(self) -> np.ndarray:
+        return self.weights * self.steps.astype(np.float64)
+
+    def _features(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """(N, 6) what the kernel compares."""
+        length, chord = self.lengths.astype(np.float64)
+        return np.concatenate((positions / length, directions / chord), 1)
