@@ -59,9 +59,8 @@ BACKGROUND_COLORS = ("black", "white", "random")
 )
 @click.option(
     "--exposure/--no-exposure",
-    default=False,
-    show_default=True,
-    help="Learn per-image exposure gains; the file then holds the photos' mean exposure.",
+    default=None,
+    help="Learn per-image exposure gains and an exposure map, or not.  [default: by pilot runs]",
 )
 @click.option("--antialiased", is_flag=True, help="Compensate small Gaussians for the pixel filter.")
 @click.option("--log2-table-size", type=click.IntRange(4, 24), metavar="B", help="Hash rows a level, as 2^B.")

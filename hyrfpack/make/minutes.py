@@ -29,7 +29,7 @@ from hyrfpack.render import render
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.config import FULL_STEPS
-from hyrfpack.train.pilots import MOST_STEPS, is_undecided, measure_budget, measures_budget
+from hyrfpack.train.decisions import decide, is_budget_open, max_pilot_steps
 from hyrfpack.train.setup import budget_for
 
 PROBE_STEPS = 45  # of a whole small run: from the first Gaussians to the budget
@@ -147,17 +147,19 @@ def measure(
         cost = probe(at(chosen), asked, device, seed, cache, PROBE_TIME * left)
     fitting = at(chosen)
     config = dataclasses.replace(asked, steps=cost.steps_within(fitting, end - monotonic())).config(seed)
-    factor = 1.0 if is_undecided(config) else None  # which stays so where there are a few more steps
-    if measures_budget(fitting, config):
+    most = max(max_pilot_steps(fitting, config), 1)
 
-        def tell(step: int, loss: float, mse: float, gaussians: int) -> None:
-            share = 0.6 + 0.4 * step / MOST_STEPS
-            reporter.update(share, "short runs tell how many Gaussians the scene is worth")
+    def tell(step: int, loss: float, mse: float, gaussians: int) -> None:
+        reporter.update(0.6 + 0.4 * step / most, "pilot runs choose the exposure compensation and the Gaussian budget")
 
-        if measured := measure_budget(fitting, config, cache, device, tell):
-            factor, why = measured
-            say(f"{factor:g} times the usual number of Gaussians: {why}")
-    asked = dataclasses.replace(asked, max_size=chosen, budget_factor=factor)
+    decisions = decide(fitting, config, cache, device, tell)
+    assert decisions is not None  # nothing stops it
+    factor = decisions.config.budget_factor
+    if is_budget_open(config) and factor is None:
+        factor = 1.0  # which stays so where there are a few more steps
+    for reason in decisions.reasons.values():
+        say(f"pilot runs: {reason}")
+    asked = dataclasses.replace(asked, max_size=chosen, budget_factor=factor, exposure=decisions.config.exposure)
     cost = dataclasses.replace(cost, asked=asked)
     left = end - monotonic()
     steps = cost.steps_within(fitting, left)

@@ -11,7 +11,7 @@ import torch
 from hyrfpack.compress.sensitivity import DRAWN, FEWEST, MOST
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.train.config import FULL_STEPS, TrainConfig
-from hyrfpack.train.pilots import LEAST_STEPS, MOST_STEPS, is_undecided, measures_budget
+from hyrfpack.train.decisions import MAX_PILOT_STEPS, MIN_BUDGET_STEPS, max_pilot_steps
 from hyrfpack.train.setup import budget_for
 
 # Seconds, of two CPU cores: for a megapixel that is trained on once, and that is drawn and followed back while packing.
@@ -66,7 +66,7 @@ class Plan:
         max_size: of photos, as in `load_scene`.
         finetune_steps: of packing.
         target_bytes: what the packed model may have; None for no limit.
-        max_gaussians, preset, budget_factor: as in `TrainConfig`.
+        max_gaussians, preset, budget_factor, exposure: as in `TrainConfig`.
     """
 
     steps: int
@@ -76,6 +76,7 @@ class Plan:
     max_gaussians: int | None = None
     preset: str = "auto"
     budget_factor: float | None = None
+    exposure: bool | None = None
 
     def config(self, seed: int) -> TrainConfig:
         """Settings of its training."""
@@ -86,6 +87,7 @@ class Plan:
             target_bytes=self.target_bytes,
             max_gaussians=self.max_gaussians,
             budget_factor=self.budget_factor,
+            exposure=self.exposure,
         )
 
     def packed_into(self, target_bytes: int | None) -> Plan:
@@ -112,7 +114,7 @@ def forecast(
         pixels: megapixels of a photo.
         gaussians: that the model will have.
         held_out: photos that are scored.
-        pilot_steps: of the short runs that measure the budget.
+        pilot_steps: of the pilot runs.
     """
     step, scored = pixels * (STEP if device.type == "cpu" else STEP_GPU), PASSES_PER_SCORED_VIEW * held_out
     return {
@@ -129,8 +131,7 @@ def forecast_scene(scene: Scene, plan: Plan, device: torch.device) -> dict[str, 
     """`forecast` for photos that are known."""
     config = plan.config(seed=0)
     gaussians, _ = budget_for(scene, config)
-    pilot_steps = MOST_STEPS if measures_budget(scene, config) else 0
-    return forecast(megapixels(scene), plan, gaussians, len(scene.test), pilot_steps, device)
+    return forecast(megapixels(scene), plan, gaussians, len(scene.test), max_pilot_steps(scene, config), device)
 
 
 def forecast_photos(sizes: Sequence[tuple[int, int]], plan: Plan, device: torch.device) -> dict[str, float]:
@@ -138,5 +139,5 @@ def forecast_photos(sizes: Sequence[tuple[int, int]], plan: Plan, device: torch.
     width, height = sizes[0] if sizes else (1920, 1080)
     shrunk = min(1.0, plan.max_size / max(width, height)) if plan.max_size else 1.0
     pixels, count = width * height * shrunk**2 / 1e6, len(sizes) or UNKNOWN
-    pilot_steps = MOST_STEPS if plan.steps >= LEAST_STEPS and is_undecided(plan.config(seed=0)) else 0
+    pilot_steps = MAX_PILOT_STEPS if plan.steps >= MIN_BUDGET_STEPS else 0
     return {"poses": POSES * count, **forecast(pixels, plan, 20_000, count // 8, pilot_steps, device)}

@@ -32,12 +32,12 @@ from hyrfpack.make.work import PRODUCTS, Work
 from hyrfpack.outputs import Outputs
 from hyrfpack.scene import Scene
 from hyrfpack.train import Trainer, train
-from hyrfpack.train.pilots import MOST_STEPS
+from hyrfpack.train.decisions import max_pilot_steps
 from hyrfpack.train.progress import SMOOTHING
 from hyrfpack.train.run import is_begun
 
 SCENE, RUN, PACKED, EXPORTED = (PRODUCTS[stage] for stage in ("poses", "training", "compression", "export"))
-FIXED_SETTINGS = ("target_bytes", "budget_factor")  # of a training, from when it was begun on
+FIXED_SETTINGS = ("target_bytes", "budget_factor", "exposure")  # of a training, from when it was begun on
 POSES = "poses.json"  # the report of `hyrfpack.estimate_poses`, in the scene's folder
 
 
@@ -104,7 +104,7 @@ def fit(
                 f"on {describe_device(device)}"
             )
             resume = going_on and is_begun(run)
-            shown = _TrainingProgress(work.reporter, plan.steps)
+            shown = _TrainingProgress(work.reporter, plan.steps, max_pilot_steps(scene, config))
             try:
                 trained = train(
                     scene, run, config, resume=resume, overwrite=True, cache=cache, device=device, quiet=True,
@@ -144,16 +144,16 @@ def _split(scene: Scene) -> dict[str, Any]:
 class _TrainingProgress:
     """Shows the parts of a training: the pilot runs, the steps, then scores and pictures."""
 
-    def __init__(self, reporter: Reporter, steps: int) -> None:
-        """Args: steps: of the training."""
-        self._reporter, self._steps = reporter, steps
+    def __init__(self, reporter: Reporter, steps: int, max_pilot_steps: int) -> None:
+        """Args: steps: of the training; max_pilot_steps: of all pilot runs before it."""
+        self._reporter, self._steps, self._max_pilot_steps = reporter, steps, max_pilot_steps
         self._part, self._pilot_steps, self._mse = "pilots", 0, math.nan
 
     def step(self, step: int, loss: float, mse: float, gaussians: int) -> None:
         """Take in a step, as `report` of `hyrfpack.train`: number 0 while pilots run."""
         if step == 0:
             self._pilot_steps += 1
-            self._reporter.update(min(1.0, self._pilot_steps / MOST_STEPS), "estimating the Gaussian budget")
+            self._reporter.update(min(1.0, self._pilot_steps / max(self._max_pilot_steps, 1)), "pilot runs")
             return
         self._begin("training")
         if not math.isnan(mse):

@@ -111,11 +111,17 @@ class ExposureMap:
         Returns:
             (..., 3) float64 within `limits`.
         """
-        shape = np.shape(position)
-        inside = np.clip(np.asarray(position, np.float64), *self.box.astype(np.float64))
-        wanted = self._features(inside.reshape(-1, 3), np.asarray(direction, np.float64).reshape(-1, 3))
-        logs = self.mean + kernel(wanted, self._centers) @ self._weights
-        return np.clip(logs, *self.limits.astype(np.float64)).reshape(shape)
+        places, directions = (np.asarray(part, np.float64).reshape(-1, 3) for part in (position, direction))
+        logs = self.mean + self.kernel_at(places, directions) @ self._weights
+        return np.clip(logs, *self.limits.astype(np.float64)).reshape(np.shape(position))
+
+    def kernel_at(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """The kernel (N, M) between viewpoints, positions and directions (N, 3) as in `log_gains`, and the centres."""
+        return kernel(self._features(np.clip(positions, *self.box.astype(np.float64)), directions), self._centers)
+
+    def kernel_of_centers(self) -> np.ndarray:
+        """The kernel (M, M) among the centres."""
+        return kernel(self._centers, self._centers)
 
     def gains_of_pose(self, camera_from_local: np.ndarray) -> np.ndarray:
         """Predict the gains (3,) float64 of a camera by its pose (4, 4), camera_from_local."""
@@ -132,7 +138,7 @@ class ExposureMap:
 
         where |a - b| is the distance of features: position over l_x, direction over l_f.
         """
-        gram = kernel(self._centers, self._centers)
+        gram = self.kernel_of_centers()
         norm = float(np.sqrt(np.maximum(np.einsum("mc,mn,nc->c", self._weights, gram, self._weights), 0).max()))
         along_position, along_direction = np.sqrt(2) * norm / self.lengths.astype(np.float64)
         return float(along_position), float(along_direction)

@@ -42,19 +42,22 @@ def save_checkpoint(
     write_atomic(path, buffer.getbuffer(), overwrite=overwrite, rename=False)
 
 
-def saved_budget_factor(path: Path) -> float | None:
-    """`TrainConfig.budget_factor` of the run that a checkpoint is of, which may have been measured.
+def saved_decisions(path: Path) -> tuple[float | None, bool]:
+    """What pilots may have decided for the run of a checkpoint: its budget factor, and whether gains are learnt.
 
     Raises:
         HyrfTrainingError: it is missing, damaged or of another version.
     """
-    factor = _read(path)[0].get("budget_factor")
+    saved = _read(path)[0]
+    factor, exposure = saved.get("budget_factor"), saved.get("exposure", False)
     if factor is not None:
         try:
             check_float("budget_factor", factor, *BUDGET_FACTORS)
         except ValueError as error:
             raise _damaged(path) from error
-    return factor
+    if not isinstance(exposure, bool):
+        raise _damaged(path)
+    return factor, exposure
 
 
 def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor], dict]:

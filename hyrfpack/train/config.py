@@ -116,9 +116,9 @@ class TrainConfig:
         log2_table_size: rows per level of the radiance grid as a power of two (the geometry grid has half);
             None follows the budget. 4 to 24.
         background: whether a background sphere is trained; None lets the preset decide.
-        exposure: whether per-image gains are learnt beside the model (exposure compensation). The file then holds the
-            mean exposure of all photos, so a render may look unlike the photos taken near it and plain PSNR on
-            held-out photos falls, see `hyrfpack.train.exposure`.
+        exposure: whether per-image gains are learnt beside the model (exposure compensation), and an exposure map over
+            viewpoints that the file carries. None leaves it to pilot runs, see `hyrfpack.train.exposure_pilots`; a
+            `Trainer` by itself then learns none.
         background_color: what transparent pictures are laid over: "black", "white" or "random" (a new colour
             every step; the model then has black behind it).
         ssim_weight: w in (1 - w) L1 + w (1 - SSIM).
@@ -137,7 +137,7 @@ class TrainConfig:
     target_bytes: int | None = None
     log2_table_size: int | None = None
     background: bool | None = None
-    exposure: bool = False
+    exposure: bool | None = None
     background_color: str = "black"
     antialiased: bool = False
     ssim_weight: float = 0.2
@@ -173,9 +173,10 @@ class TrainConfig:
         check_choice("background_color", self.background_color, BACKGROUND_COLORS)
         check_choice("scale_rule", self.scale_rule, ("sum", "product"))
         check_choice("direction_encoding", self.direction_encoding, ("frequency", "sh"))
-        if self.background is not None:
-            check_bool("background", self.background)
-        for name in ("exposure", "antialiased", "scale_grows", "position_gradients"):
+        for name in ("background", "exposure"):
+            if getattr(self, name) is not None:
+                check_bool(name, getattr(self, name))
+        for name in ("antialiased", "scale_grows", "position_gradients"):
             check_bool(name, getattr(self, name))
         check_float("ssim_weight", self.ssim_weight, 0, 1)
         check_pair("grid_resolutions", self.grid_resolutions)

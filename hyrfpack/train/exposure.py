@@ -19,9 +19,11 @@ from torch import Tensor, nn
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.model.exposure import expose
+from hyrfpack.model.frame import Frame
 from hyrfpack.ops.adam import adam_step
 from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.train.config import TrainConfig
+from hyrfpack.train.exposure_map import ExposureFit, fit_exposure_map
 
 STOPS = 2.2 / 2 / np.log(2)  # of light that middle grey becomes lighter by, for each unit of a gain's logarithm
 PULL = 1e-4  # towards gains of one: the gradient of a gain's logarithm, for each unit of it
@@ -152,6 +154,11 @@ class Exposures:
         """A render (H, W, 3) as the view's photo was exposed; differentiable."""
         return expose(rgb, self.values[self._row[view.name]].exp())
 
+    def fit_map(self, frame: Frame, views: Sequence[View]) -> ExposureFit:
+        """Fit the exposure map of the views' gains; `views` as at the start, `frame` that of the model."""
+        poses = [frame.local_pose(view.camera) for view in views]
+        return fit_exposure_map(poses, self.values.detach().cpu().numpy())
+
     @torch.no_grad()
     def step(self, rate: float, views: Iterable[View]) -> Tensor:
         """One step of Adam for the photos of these views, by the gradients of `values`, which are cleared; then the
@@ -191,12 +198,21 @@ class Exposures:
         self._steps = state["steps"].tolist()
 
 
+def exposure_spread(scene: Scene, cache: PictureCache) -> float:
+    """Standard deviation of the training photos' exposures by their tracks, stops; 0 where no tracks tell.
+
+    Raises:
+        HyrfDataError: a photo cannot be read.
+    """
+    return float(gains_from(observe(scene, cache), len(scene.train)).mean(1).std()) * STOPS
+
+
 def exposures_for(
     scene: Scene, config: TrainConfig, cache: PictureCache, device: torch.device
 ) -> tuple[Exposures | None, str]:
     """Estimate the per-image gains that a run starts from.
 
-    Gains are learnt only where `config.exposure` asks for them: they lower the plain PSNR of held-out photos.
+    Gains are learnt only where `config.exposure` says so.
 
     Returns:
         The gains, None where exposure compensation is off, and a sentence for the run's record.

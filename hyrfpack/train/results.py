@@ -32,7 +32,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.render import render
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train.config import TrainConfig
-from hyrfpack.train.pilots import is_undecided
+from hyrfpack.train.decisions import is_budget_open
 from hyrfpack.train.trainer import Trainer
 
 CURVE, VIEWS = "curve.png", "views"
@@ -100,10 +100,12 @@ def read_record(out: Path) -> TrainingRecord | None:
 
 
 def changed_settings(record: TrainingRecord, scene: Scene, config: TrainConfig) -> list[str]:
-    """Names of the settings that differ from those of the finished run; a measured budget is no difference."""
+    """Names of the settings that differ from those of the finished run; what pilots decided is no difference."""
     asked = json.loads(json.dumps(_settings_of(scene, config)))
-    if is_undecided(config):
+    if is_budget_open(config):
         asked["budget_factor"] = record.settings.get("budget_factor")
+    if config.exposure is None:
+        asked["exposure"] = record.settings.get("exposure")
     keys = asked.keys() | record.settings.keys()
     return sorted(key for key in keys if asked.get(key) != record.settings.get(key))
 
@@ -131,6 +133,7 @@ def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) ->
             f"{scene.path}: masks leave no pixel of the photos that the {trainer.steps:,} steps came to; "
             "take more steps than there are photos"
         )
+    trainer.fit_exposure_map()
     model = _drop_unseen_background(trainer, phase)
     phase("writing the model", 0, 0)
     provenance = {
@@ -154,6 +157,7 @@ def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) ->
             "reading": dict(scene.reading),
         },
         "choices": trainer.choices,
+        "pilots": trainer.pilots,
         "notes": scene.notes,
         "gaussians": len(model),
         "bytes": len(data),

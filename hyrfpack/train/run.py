@@ -24,10 +24,11 @@ from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import ALONE, Ranks
 from hyrfpack.scene import Scene, View
-from hyrfpack.train.checkpoint import saved_budget_factor
+from hyrfpack.train.checkpoint import saved_decisions
 from hyrfpack.train.config import TrainConfig
+from hyrfpack.train.decisions import Decisions, decide, is_budget_open, measures_budget, measures_exposure
 from hyrfpack.train.log import TrainingLog
-from hyrfpack.train.pilots import PILOT_STEPS, is_undecided, is_usable, measure_budget, measures_budget
+from hyrfpack.train.pilots import Report, is_usable
 from hyrfpack.train.progress import PhaseLine, ProgressLine
 from hyrfpack.train.results import (
     CURVE,
@@ -48,7 +49,7 @@ __all__ = ["VIEWS", "TrainResult", "is_begun", "resuming", "train"]
 
 # What ends a run early; Windows has no SIGHUP.
 STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-Report = Callable[[int, float, float, int], None]  # step, loss, mean squared error, Gaussians
+CHOICE_LABELS = {"exposure": "Exposure compensation", "max_gaussians": "Gaussians at most"}
 Observer = Callable[[Trainer], None]
 
 
@@ -194,25 +195,27 @@ def _train_in_folder(
         return _complete(record, scene, out, config, device, phase, silent, log, ranks)
     if overwrite and not resume and ranks.leads:
         (out / RECORD).unlink(missing_ok=True)  # of the earlier run: this one is not to be taken for it
-    why = ""
-    if resume and is_undecided(config):
-        saved = ranks.agree(lambda: saved_budget_factor(checkpoint) if ranks.leads else None)
-        config = dataclasses.replace(config, budget_factor=ranks.first(saved))
-    elif not resume and measures_budget(scene, config):
+    if resume:
+        saved = ranks.agree(lambda: _with_saved_decisions(config, checkpoint) if ranks.leads else config)
+        decisions = Decisions(ranks.first(saved), {}, [])
+    else:
         with PhaseLine(silent) as phases, _stop_requests() as stop:
-            phases.note(f"estimating the Gaussian budget from pilot runs of {PILOT_STEPS} steps")
+            if questions := _open_questions(scene, config):
+                phases.note(f"{questions} by short pilot runs, scored on training photos that they leave out")
             tell: Report = _ignore_step if report is None else partial(_as_step_nought, report)
             # Each does it for itself: none waits for another.
-            pilots = partial(measure_budget, scene, config, cache, device, tell, stop, phase or phases.update)
+            pilots = partial(decide, scene, config, cache, device, tell, stop, phase or phases.update)
             answers = ranks.told(ranks.agree(pilots))
-            measured = None if None in answers else answers[0]
-            if measured is None:
-                return TrainResult(False, 0, None, {})
-            config, why = dataclasses.replace(config, budget_factor=measured[0]), f": {measured[1]}"
+        if answers[0] is None or None in answers:
+            return TrainResult(False, 0, None, {})
+        decisions = answers[0]
+    config = decisions.config
     with PhaseLine(silent) as phases:
         (phase or phases.update)("reading photos and setting up the model", 0, 0)
         trainer = ranks.agree(lambda: Trainer(scene, config, cache, device, ranks=ranks))
-    trainer.choices["max_gaussians"] += why
+    for choice, reason in decisions.reasons.items():
+        trainer.choices[choice] += f": {reason}"
+    trainer.pilots = [dataclasses.asdict(score) for score in decisions.scores]
     if resume:
         trainer.load(checkpoint)
     elif ranks.leads and not ranks.alone:  # one of an earlier run is not what to go on from, should we be started anew
@@ -223,8 +226,8 @@ def _train_in_folder(
             ProgressLine(trainer.steps, trainer.step, silent, _shorter(device)) as line,
             _stop_requests() as stop,
         ):
-            if why:
-                line.note(f"Gaussians at most: {trainer.choices['max_gaussians']}")
+            for choice in decisions.reasons:
+                line.note(f"{CHOICE_LABELS[choice]}: {trainer.choices[choice]}")
             written = None
             if log is not None and ranks.leads:
                 written = stack.enter_context(
@@ -254,6 +257,21 @@ def _train_in_folder(
         if written:
             _log_end(written, record.step, results)
     return TrainResult(True, trainer.step, out / record.model, results.metrics, missing)
+
+
+def _with_saved_decisions(config: TrainConfig, checkpoint: Path) -> TrainConfig:
+    """The settings, with what they leave open as the interrupted run has it."""
+    factor, exposure = saved_decisions(checkpoint)
+    if is_budget_open(config):
+        config = dataclasses.replace(config, budget_factor=factor)
+    return config if config.exposure is not None else dataclasses.replace(config, exposure=exposure)
+
+
+def _open_questions(scene: Scene, config: TrainConfig) -> str:
+    """What pilot runs decide, as the beginning of a sentence; "" where nothing is open."""
+    questions = ["choosing exposure compensation"] * measures_exposure(scene, config)
+    questions += ["estimating the Gaussian budget"] * measures_budget(scene, config)
+    return " and ".join(questions)
 
 
 def is_begun(out: Path) -> bool:

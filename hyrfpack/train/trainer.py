@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 import hyrfpack
+from hyrfpack.choices import CONSISTENT
 from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload_array
 from hyrfpack.errors import HyrfError, HyrfTrainingError
@@ -24,12 +25,12 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.parallel.ranks import ALONE, Ranks
-from hyrfpack.render import render
+from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.density import DensityControl
-from hyrfpack.train.exposure import exposures_for
+from hyrfpack.train.exposure import STOPS, exposures_for
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.setup import build_model
 from hyrfpack.train.strategy import Strategy
@@ -94,6 +95,7 @@ class Trainer:
         self.device = device
         self.photos = Photos(device)
         self.choices: dict[str, str] = {}  # what was chosen for the run, each with its reason
+        self.pilots: list[dict] = []  # scores of the pilot runs by which it was chosen
         if model is None:
             model, self.budget, self.choices = build_model(scene, config)
         else:
@@ -228,6 +230,7 @@ class Trainer:
             rendering = render(
                 self.model,
                 view.camera,
+                RenderSettings(exposure=CONSISTENT),  # the photo's own gains come after
                 absgrad=self.strategy.watching(self.step),
                 solid=None if solid is None else upload_array(solid, self.device),
             )
@@ -244,6 +247,16 @@ class Trainer:
             self.strategy.observe(rendering, view.camera, self.model)
         with self._timed("loss"):
             return loss.detach(), _mean_square(image.detach() - target, mask)
+
+    def fit_exposure_map(self) -> None:
+        """Give the model the exposure map of the per-image gains that were learnt, if any."""
+        if self.exposures is None:
+            return
+        fit = self.exposures.fit_map(self.model.config.frame, self.scene.train)
+        self.model.exposure = fit.map
+        self.choices["exposure_map"] = (
+            f"{len(fit.map.positions)} centers; leave-one-out error {fit.leave_one_out_error * STOPS:.2f} stops"
+        )
 
     def _learnt(self) -> list[nn.Parameter]:
         """What gradients are shared of."""
@@ -318,6 +331,7 @@ class Trainer:
         explicit = [tensors[f"model.gaussians.{name}"] for name in Gaussians.NAMES]
         model = HybridModel(self.model.config, Gaussians(*explicit))
         model.load_state_dict(_under("model.", tensors))
+        model.exposure = self.model.exposure
         self._take(model)
         self.optimizer.load_state_dict(_under("adam.", tensors))
         if self.exposures is not None:
@@ -342,6 +356,7 @@ class Trainer:
             "seconds": dict(self.seconds),
             "elapsed": self.elapsed,
             "choices": self.choices,
+            "pilots": self.pilots,
         }
         save_checkpoint(path, settings=self._settings(), tensors=tensors, progress=progress, overwrite=overwrite)
         self.saved = self.step
@@ -360,6 +375,7 @@ class Trainer:
         self.saved = self.step
         self.seconds, self.elapsed = defaultdict(float, progress["seconds"]), progress["elapsed"]
         self.choices |= progress.get("choices", {})
+        self.pilots = progress.get("pilots", [])
 
 
 def _on_cpu(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -14,8 +14,8 @@ from hyrfpack.make.minutes import Cost, measure
 from hyrfpack.make.plan import Plan
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.source import Reading
+from hyrfpack.train import decisions
 from hyrfpack.train.config import FULL_STEPS
-from hyrfpack.train.pilots import LEAST_STEPS
 
 
 def asked(target_bytes: int | None = None, max_gaussians: int | None = None) -> Plan:
@@ -88,16 +88,16 @@ def test_large_photos_are_made_smaller_where_the_time_is_short(posed, scene, mon
 
 def test_a_long_run_has_the_budget_that_the_scene_is_worth_and_a_short_one_all(posed, scene, monkeypatch):
     monkeypatch.setattr(minutes, "probe", lambda *_: Cost(0.0, 1e-5, 0.0, 0.0, 100))
-    monkeypatch.setattr(minutes, "measure_budget", lambda *_: (0.5, "by a coin"))
+    monkeypatch.setattr(decisions, "measure_budget", lambda *_: (0.5, "by a coin"))
 
     def planned(seconds: float, target_bytes: int | None = None) -> Plan:
         arguments = (posed, Reading(), scene, asked(target_bytes), CPU, monotonic() + seconds, 0, PictureCache())
         return measure(*arguments, Reporter(["training"], None), lambda sentence: None)
 
     short, long, targeted = planned(60.0), planned(600.0), planned(600.0, 90_000)
-    assert short.steps < LEAST_STEPS <= long.steps
+    assert short.steps < decisions.MIN_BUDGET_STEPS <= long.steps
     assert (short.budget_factor, long.budget_factor, targeted.budget_factor) == (1.0, 0.5, None)
-    monkeypatch.setattr(minutes, "measures_budget", lambda *_: False)
+    monkeypatch.setattr(decisions, "measures_budget", lambda *_: False)
     assert planned(600.0).steps < 0.8 * long.steps
 
 
@@ -112,7 +112,7 @@ def test_a_time_that_is_over_or_too_short_makes_a_draft_and_says_so(posed, scene
 
 def test_a_number_of_gaussians_is_kept_to_and_no_budget_measured(posed, scene, monkeypatch):
     monkeypatch.setattr(minutes, "probe", lambda *_: Cost(0.0, 1e-5, 0.0, 0.0, 100))
-    monkeypatch.setattr(minutes, "measure_budget", None)
+    monkeypatch.setattr(decisions, "measure_budget", None)
     arguments = (posed, Reading(), scene, asked(max_gaussians=700), CPU, monotonic() + 600, 0, PictureCache())
     plan = measure(*arguments, Reporter(["training"], None), lambda sentence: None)
     assert (plan.config(0).max_gaussians, plan.budget_factor) == (700, None)

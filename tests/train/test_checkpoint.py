@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from hyrfpack.errors import HyrfTrainingError
-from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint, saved_budget_factor
+from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint, saved_decisions
 
 SETTINGS = {"steps": 40, "rates": (1e-3, 1e-5), "views": [["a.png", 4, 3]], "budget": None}
 PROGRESS = {"step": 12, "records": [{"step": 1, "loss": 0.25}], "seconds": {"data": 0.5}}
@@ -43,20 +43,28 @@ def test_what_was_saved_comes_back(path):
 
 
 @pytest.mark.parametrize("factor", [None, 0.25, 1])
-def test_the_budget_factor_can_be_asked_for(path, factor):
-    save_checkpoint(path, settings={**SETTINGS, "budget_factor": factor}, tensors={}, progress=PROGRESS)
-    assert saved_budget_factor(path) == factor
+@pytest.mark.parametrize("exposure", [False, True])
+def test_what_pilots_decided_can_be_read_back(path, factor, exposure):
+    decided = {"budget_factor": factor, "exposure": exposure}
+    save_checkpoint(path, settings={**SETTINGS, **decided}, tensors={}, progress=PROGRESS)
+    assert saved_decisions(path) == (factor, exposure)
 
 
-def test_a_run_of_before_there_was_one_has_no_budget_factor(path):
-    assert saved_budget_factor(path) is None
+def test_a_checkpoint_from_before_such_decisions_has_none(path):
+    assert saved_decisions(path) == (None, False)
+
+
+def test_an_exposure_that_is_neither_on_nor_off_is_damage(path):
+    save_checkpoint(path, settings={**SETTINGS, "exposure": None}, tensors={}, progress=PROGRESS)
+    with pytest.raises(HyrfTrainingError, match="damaged"):
+        saved_decisions(path)
 
 
 @pytest.mark.parametrize("factor", ["1", -1.0, float("nan"), float("inf"), [1.0], True])
 def test_a_budget_factor_that_is_none_is_damage(path, factor):
     save_checkpoint(path, settings={**SETTINGS, "budget_factor": factor}, tensors={}, progress=PROGRESS)
     with pytest.raises(HyrfTrainingError, match="damaged"):
-        saved_budget_factor(path)
+        saved_decisions(path)
 
 
 def test_only_the_checkpoint_is_left_in_the_folder(path):

@@ -27,7 +27,7 @@ WRONG = {
     "preset": ("indoor", None, 1),
     "precision": ("float16", None),
     "background": (1, "no", math.nan),
-    "exposure": (1, None, "no", math.nan),
+    "exposure": (1, "no", math.nan),
     "background_color": ("grey", None),
     "antialiased": (None, 1, "yes"),
     "ssim_weight": (1.1, -0.1, *NO_FLOAT),

@@ -1,11 +1,10 @@
-"""What two short runs make of a scene, and that the run they were for keeps to it."""
+"""What pilot runs decide for a scene, and that the run they were for keeps to it."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import signal
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,43 +13,70 @@ from scenes import ball_scene
 
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.evaluate import Evaluation, ViewScore
+from hyrfpack.model.exposure import expose
 from hyrfpack.scene import Scene, View
-from hyrfpack.train import TrainConfig, pilots, train
-from hyrfpack.train.pilots import FACTORS, measure_budget, measures_budget
+from hyrfpack.train import TrainConfig, budget_pilots, decisions, exposure_pilots, pilots, train
+from hyrfpack.train.budget_pilots import FACTORS, measure_budget
+from hyrfpack.train.decisions import (
+    MIN_BUDGET_STEPS,
+    MIN_EXPOSURE_STEPS,
+    Decisions,
+    decide,
+    max_pilot_steps,
+    measures_budget,
+    measures_exposure,
+)
+from hyrfpack.train.exposure import STOPS
+from hyrfpack.train.exposure_pilots import measure_exposure
+from hyrfpack.train.pilots import PilotsStopped, ScenePilots
 
 CPU = torch.device("cpu")
-LONG = TrainConfig(steps=pilots.LEAST_STEPS)
+LONG = TrainConfig(steps=MIN_BUDGET_STEPS)
 
 
 def a_scene(views: int = 10) -> Scene:
     return ball_scene(views=views, points=60, side=24)
 
 
-def measured(scene: Scene, config: TrainConfig = LONG, **options) -> tuple[float, str] | None:
-    return measure_budget(scene, config, PictureCache(), CPU, **options)
+def measured(scene: Scene, config: TrainConfig = LONG, **options) -> tuple[float, str]:
+    return measure_budget(ScenePilots(scene, config, PictureCache(), CPU, **options))
 
 
 @pytest.fixture
 def short(monkeypatch) -> None:
     """Pilots before runs of ten steps, and short ones."""
-    monkeypatch.setattr(pilots, "LEAST_STEPS", 10)
-    monkeypatch.setattr(pilots, "PILOT_STEPS", 6)
+    monkeypatch.setattr(decisions, "MIN_BUDGET_STEPS", 10)
+    monkeypatch.setattr(budget_pilots, "BUDGET_PILOT_STEPS", 6)
+
+
+def scored(psnr: float, corrected: float = 0.0, apart: tuple[float, ...] = (0.0, 0.0)) -> Evaluation:
+    views = [ViewScore("view", psnr + part, None, corrected, 0.5, None, None) for part in apart]
+    return Evaluation(psnr, None, corrected, 0.5, None, None, "", 0, 0.0, views)
 
 
 @pytest.fixture
-def scores(monkeypatch) -> dict[int, float]:
-    """What models score, by their Gaussians at most; they are not trained."""
-    table: dict[int, float] = {}
+def scores(monkeypatch) -> dict:
+    """What models score, by their Gaussians at most, or by whether they learn gains; they are not trained."""
+    table: dict = {}
 
     class Untrained:
         def __init__(self, scene, config, cache, device):
-            self.model = config.max_gaussians
+            self.model = config
 
         def run(self, report, stop):
             pass
 
+        def fit_exposure_map(self):
+            pass
+
+    def evaluate(config, views, report):
+        if config.exposure in table:
+            return scored(table[config.exposure][config.seed], 0.0, table["apart"] if config.exposure else (0.0,) * 5)
+        return scored(0.0, table[config.max_gaussians])
+
     monkeypatch.setattr(pilots, "Trainer", Untrained)
-    monkeypatch.setattr(pilots, "evaluate", lambda model, views, report: SimpleNamespace(psnr_corrected=table[model]))
+    monkeypatch.setattr(pilots, "evaluate", evaluate)
     return table
 
 
@@ -59,15 +85,15 @@ def scores(monkeypatch) -> dict[int, float]:
     [(-1.0, 0.25), (0.0, 0.25), (0.29, 0.25), (0.31, 0.35), (0.5, 0.5), (0.8, 0.7), (1.2, 1.0), (1.3, 1.5), (9.0, 1.5)],
 )
 def test_a_scene_gets_gaussians_in_proportion_to_what_two_doublings_bring(scores, gain, factor):
-    gain *= pilots.EXPECTED
+    gain *= budget_pilots.EXPECTED_GAIN_DB
     scores |= {1250: 20.0, 5000: 20.0 + gain}
-    why = f"in {pilots.PILOT_STEPS} steps 5,000 Gaussians scored {gain:+.2f} dB over 1,250"
+    why = f"in {budget_pilots.BUDGET_PILOT_STEPS} steps 5,000 Gaussians scored {gain:+.2f} dB over 1,250"
     assert measured(a_scene()) == (factor, why)
 
 
 @pytest.mark.parametrize(("first", "second", "factor"), [(0.1, 0.9, 0.5), (0.9, 0.1, 0.5), (1.0, 0.0, 1.0)])
 def test_what_would_make_the_model_smaller_is_asked_twice(monkeypatch, scores, first, second, factor):
-    gains = {0: first * pilots.EXPECTED, 1: second * pilots.EXPECTED}
+    gains = {0: first * budget_pilots.EXPECTED_GAIN_DB, 1: second * budget_pilots.EXPECTED_GAIN_DB}
     seeds: list[int] = []
 
     class Seeded(pilots.Trainer):  # the one of `scores`
@@ -76,7 +102,7 @@ def test_what_would_make_the_model_smaller_is_asked_twice(monkeypatch, scores, f
             seeds.append(config.seed)
 
     monkeypatch.setattr(pilots, "Trainer", Seeded)
-    monkeypatch.setattr(pilots, "evaluate", lambda model, views, report: SimpleNamespace(psnr_corrected=model))
+    monkeypatch.setattr(pilots, "evaluate", lambda model, views, report: scored(0.0, model))
     assert measured(a_scene())[0] == factor
     assert seeds == ([0, 0] if first >= 1 else [0, 0, 1, 1])
 
@@ -86,7 +112,7 @@ def test_what_would_make_the_model_smaller_is_asked_twice(monkeypatch, scores, f
     [
         ({}, 8, True),
         ({}, 7, False),
-        ({"steps": pilots.LEAST_STEPS - 1}, 8, False),
+        ({"steps": MIN_BUDGET_STEPS - 1}, 8, False),
         ({"max_gaussians": 500}, 8, False),
         ({"target_bytes": 50_000}, 8, False),
         ({"budget_factor": 1.0}, 8, False),
@@ -100,8 +126,8 @@ def test_it_is_measured_where_nobody_has_said_and_there_is_time_and_photos_enoug
 def test_photos_to_judge_by_are_not_trained_on_and_lie_among_those_that_are(views):
     near, judges = pilots.split(range(views))
     assert not set(near) & set(judges) and set(near) | set(judges) <= set(range(views))
-    assert near == sorted(near) and len(near) == min(pilots.PILOT_STEPS, views - len(judges))
-    assert 1 <= len(judges) <= pilots.JUDGES
+    assert near == sorted(near) and len(near) == min(pilots.MAX_TRAINING_VIEWS, views - len(judges))
+    assert 1 <= len(judges) <= pilots.MAX_VALIDATION_VIEWS
     assert all(min(abs(judge - n) for n in near) == 1 for judge in judges)
 
 
@@ -118,7 +144,8 @@ def test_pilots_say_the_same_twice_and_report_each_step():
 @pytest.mark.usefixtures("short")
 def test_pilots_end_where_they_are_asked_to():
     told: list[int] = []
-    assert measured(a_scene(), report=lambda step, *_: told.append(step), stop=lambda: len(told) >= 8) is None
+    with pytest.raises(PilotsStopped):
+        measured(a_scene(), report=lambda step, *_: told.append(step), stop=lambda: len(told) >= 8)
     assert told[-1] == 8
 
 
@@ -129,7 +156,7 @@ def test_photos_that_masks_leave_nothing_of_do_not_judge(left, monkeypatch):
     monkeypatch.setattr(
         pilots,
         "evaluate",
-        lambda _, views, report: judged.append([view.name for view in views]) or SimpleNamespace(psnr_corrected=20.0),
+        lambda _, views, report: judged.append([view.name for view in views]) or scored(0.0, 20.0),
     )
     scene = a_scene()
     judges = [view.name for view in pilots.split(scene.train)[1]]
@@ -149,7 +176,7 @@ def masked(view: View) -> View:
 
 @pytest.mark.usefixtures("short")
 def test_a_run_has_the_budget_that_pilots_tell_and_says_why(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("hyrfpack.train.run.measure_budget", lambda *_: (0.5, "by a coin"))
+    monkeypatch.setattr(decisions, "measure_budget", lambda *_: (0.5, "by a coin"))
     train(a_scene(), tmp_path, TrainConfig(steps=10))
     metrics = json.loads((tmp_path / "metrics.json").read_bytes())
     assert metrics["settings"]["budget_factor"] == 0.5
@@ -176,7 +203,7 @@ def test_a_run_that_goes_on_keeps_its_budget_and_the_reason(tmp_path, monkeypatc
     train(a_scene(), tmp_path / "whole", config, quiet=True)
     assert train(a_scene(), tmp_path / "again", config, report=interrupted_at(6)).step == 6
 
-    monkeypatch.setattr("hyrfpack.train.run.measure_budget", lambda *_: pytest.fail("measured again"))
+    monkeypatch.setattr(decisions, "measure_budget", lambda *_: pytest.fail("measured again"))
     for asked in ({"max_gaussians": 5_000}, {"target_bytes": 20_000}, {"budget_factor": 0.9}):
         with pytest.raises(HyrfTrainingError, match="started with other settings"):
             train(a_scene(), tmp_path / "again", dataclasses.replace(config, **asked), resume=True, quiet=True)
@@ -206,9 +233,109 @@ def test_the_report_hears_of_pilots_as_step_nought(tmp_path):
 def test_pilot_runs_tell_each_step_and_each_view_that_is_scored():
     told: list[tuple[str, int, int]] = []
     measured(a_scene(), phase=lambda *progress: told.append(progress))
-    assert [row for row in told if row[0] == "pilot run 1 of 2: training"] == [
-        ("pilot run 1 of 2: training", step, 6) for step in range(1, 7)
+    assert [row for row in told if row[0] == "pilot run 1 of 2 for the budget: training"] == [
+        ("pilot run 1 of 2 for the budget: training", step, 6) for step in range(1, 7)
     ]
-    assert [row for row in told if row[0] == "pilot run 2 of 2: scoring"] == [
-        ("pilot run 2 of 2: scoring", done, 2) for done in range(3)
+    assert [row for row in told if row[0] == "pilot run 2 of 2 for the budget: scoring"] == [
+        ("pilot run 2 of 2 for the budget: scoring", done, 2) for done in range(3)
     ]
+
+
+# -- exposure --------------------------------------------------------------------------------------------------------
+
+
+def relit(scene: Scene, stops: list[float]) -> Scene:
+    """The scene, its training photos exposed by gains, one after another."""
+
+    def exposed(view: View, gain: float) -> View:
+        picture = view.load()
+        rgb = expose(torch.from_numpy(picture.rgb).double() / 255, torch.full((3,), gain).double())
+        lit = dataclasses.replace(picture, rgb=(rgb * 255).round().byte().numpy())
+        return dataclasses.replace(view, load=lambda: lit)
+
+    gains = np.exp(np.resize(stops, len(scene.train)) / STOPS)
+    return dataclasses.replace(scene, train=[exposed(*pair) for pair in zip(scene.train, gains, strict=True)])
+
+
+@pytest.mark.parametrize(
+    ("compensated", "apart", "expected", "rounds"),
+    [
+        ([20.3, 20.2], (0.0,) * 5, True, 2),
+        ([20.3, 20.2], (-0.2, 0.2, 0.0, -0.2, 0.2), True, 2),
+        ([20.3, 20.2], (-2.0, 2.0, 0.0, -2.0, 2.0), False, 2),
+        ([20.5, 19.9], (0.0,) * 5, False, 2),
+        ([20.05, 20.05], (0.0,) * 5, False, 2),
+        ([19.9, 25.0], (0.0,) * 5, False, 1),
+        ([20.0, 25.0], (0.0,) * 5, False, 1),
+    ],
+)
+def test_gains_are_learnt_only_where_renders_come_closer_to_photos_by_more_than_chance(
+    scores, monkeypatch, compensated, apart, expected, rounds
+):
+    monkeypatch.setattr(exposure_pilots, "exposure_spread", lambda *_: 1.0)
+    scores |= {False: [20.0, 20.0], True: compensated, "apart": apart}
+    runs = ScenePilots(a_scene(20), LONG, PictureCache(), CPU, validation_every=4)
+    decision, reason = measure_exposure(runs)
+
+    assert decision is expected and "validation photos" in reason
+    assert [(score.seed, score.exposure) for score in runs.scores] == [(0, False), (0, True), (1, False), (1, True)][
+        : 2 * rounds
+    ]
+
+
+def test_photos_of_one_exposure_take_no_pilots():
+    runs = ScenePilots(a_scene(20), LONG, PictureCache(), CPU, validation_every=4)
+    decision, reason = measure_exposure(runs)
+    assert (decision, runs.scores) == (False, []) and "stops" in reason
+
+
+def test_few_photos_take_no_pilots_for_exposure_and_learn_no_gains():
+    runs = ScenePilots(relit(a_scene(16), [0.5, -0.5]), LONG, PictureCache(), CPU, validation_every=4)
+    decision, reason = measure_exposure(runs)
+    assert (decision, runs.scores) == (False, []) and "4 validation photos are too few" in reason
+
+
+@pytest.mark.parametrize(
+    ("change", "views", "expected"),
+    [
+        ({}, 8, True),
+        ({}, 7, False),
+        ({"steps": MIN_EXPOSURE_STEPS - 1}, 8, False),
+        ({"exposure": False}, 8, False),
+        ({"exposure": True}, 8, False),
+    ],
+)
+def test_exposure_is_decided_where_nobody_has_said_and_there_is_time_and_photos_enough(change, views, expected):
+    assert measures_exposure(a_scene(views), dataclasses.replace(LONG, **change)) is expected
+
+
+def test_photos_with_transparency_get_no_gains():
+    assert not measures_exposure(ball_scene(views=10, points=60, side=24, alpha=True), LONG)
+
+
+def test_what_is_settled_takes_no_pilots():
+    config = TrainConfig(steps=MIN_BUDGET_STEPS, exposure=True, max_gaussians=100)
+    assert decide(a_scene(), config, PictureCache(), CPU) == Decisions(config, {}, [])
+    assert max_pilot_steps(a_scene(), config) == 0
+
+
+def test_a_short_run_without_a_decision_learns_no_gains():
+    decided = decide(a_scene(), TrainConfig(steps=10), PictureCache(), CPU)
+    assert decided is not None and decided.config.exposure is False and decided.config.budget_factor is None
+
+
+@pytest.mark.usefixtures("short", "signals")
+def test_a_run_that_goes_on_keeps_its_exposure_compensation(tmp_path, monkeypatch):
+    monkeypatch.setattr(decisions, "MIN_EXPOSURE_STEPS", 10)
+    monkeypatch.setattr(decisions, "measure_exposure", lambda *_: (True, "by a coin"))
+    scene, config = relit(a_scene(), [0.5, -0.5]), TrainConfig(steps=10)
+    train(scene, tmp_path / "whole", config, quiet=True)
+    assert train(scene, tmp_path / "again", config, report=interrupted_at(6)).step == 6
+    monkeypatch.setattr(decisions, "measure_exposure", lambda *_: pytest.fail("measured again"))
+    train(scene, tmp_path / "again", config, resume=True, quiet=True)
+
+    whole, again = (json.loads((tmp_path / name / "metrics.json").read_bytes()) for name in ("whole", "again"))
+    assert whole["settings"]["exposure"] is again["settings"]["exposure"] is True
+    assert whole["choices"] == again["choices"] and whole["pilots"] == again["pilots"]
+    assert "by a coin" in whole["choices"]["exposure"] and "centers" in whole["choices"]["exposure_map"]
+    assert (tmp_path / "whole/model.hyrf").read_bytes() == (tmp_path / "again/model.hyrf").read_bytes()

@@ -1,0 +1,159 @@
+"""Fit the exposure map of a model to the per-image gains that were learnt beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from hyrfpack.model.exposure import (
+    DIRECTION_CODES,
+    MAX_CENTERS,
+    MAX_LOG_GAIN,
+    POSITION_CODES,
+    WEIGHT_CODES,
+    ExposureMap,
+    kernel,
+)
+
+# The kernel's lengths and the ridge that are tried: position in root mean square distances of the cameras from their
+# mean, direction as an angle in degrees, ridge as the variance of noise relative to that of the gains.
+POSITION_LENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)
+DIRECTION_ANGLES = (15.0, 30.0, 60.0, 120.0)
+RIDGES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
+MAX_SLOPE_PER_DEGREE = 0.15  # change of a log gain for each degree of viewing angle, by its bound
+MAX_SLOPE_PER_RADIUS = 20.0  # and for each root mean square distance of the cameras from their mean
+MIN_CENTER_VARIANCE_RIDGES = 0.1  # of a centre given those before it: with less, it is left out
+
+
+@dataclass(frozen=True)
+class ExposureFit:
+    """An exposure map and how well it predicts photos that it has not seen.
+
+    Attributes:
+        map: the exposure map.
+        leave_one_out_error: root mean square of log gains of photos predicted from all other photos; 0 for one photo.
+    """
+
+    map: ExposureMap
+    leave_one_out_error: float
+
+
+def fit_exposure_map(poses: Sequence[np.ndarray], log_gains: np.ndarray) -> ExposureFit:
+    """Fit log gains over viewpoints by kernel ridge regression.
+
+        minimise  sum_n |y_n - mean - sum_m k(v_n, v_m) w_m|^2 + ridge w^T K w
+
+    The centres v_m are a subset of the cameras, chosen by pivoted Cholesky factorisation of the kernel matrix: each
+    next one is the camera that the others predict worst, until the rest is small. Lengths of the kernel and ridge have
+    the least leave-one-out error.
+
+    Args:
+        poses: N >= 1 poses (4, 4), camera_from_local, of the training photos.
+        log_gains: (N, 3) finite log gains of these photos.
+    """
+    gains = np.clip(np.asarray(log_gains, np.float64), -MAX_LOG_GAIN, MAX_LOG_GAIN)
+    matrices = np.asarray(poses, np.float64)
+    positions = -np.einsum("nji,nj->ni", matrices[:, :3, :3], matrices[:, :3, 3])
+    directions = matrices[:, 2, :3]
+    radius = float(np.sqrt(np.square(positions - positions.mean(0)).sum(1).mean())) or 1.0
+    candidates = []
+    for length, angle in product(POSITION_LENGTHS, DIRECTION_ANGLES):
+        lengths = np.array([length * radius, 2 * np.sin(np.radians(angle) / 2)], np.float32)
+        features = np.concatenate((positions / lengths[0], directions / lengths[1]), 1)
+        centers, factor, variances = choose_centers(features)
+        for ridge in RIDGES:
+            count = int((variances >= MIN_CENTER_VARIANCE_RIDGES * ridge).sum())  # they fall
+            error = leave_one_out_error(factor[:, :count], gains, ridge)
+            candidates.append((error, lengths, centers[:count], ridge))
+    for error, lengths, centers, ridge in sorted(candidates, key=lambda candidate: candidate[0]):
+        fitted = _solve(
+            _without_weights(positions, directions, gains, lengths, centers), positions, directions, gains, ridge
+        )
+        per_unit, per_radian = fitted.slope_bounds
+        if radius * per_unit <= MAX_SLOPE_PER_RADIUS and np.radians(per_radian) <= MAX_SLOPE_PER_DEGREE:
+            return ExposureFit(fitted, error)
+    spread = float(np.sqrt(np.square(gains - gains.mean(0)).mean()))
+    return ExposureFit(_without_weights(positions, directions, gains, lengths, []), spread)
+
+
+def _without_weights(
+    positions: np.ndarray, directions: np.ndarray, gains: np.ndarray, lengths: np.ndarray, centers: list[int]
+) -> ExposureMap:
+    """A map of the mean exposure everywhere, with centres that have no weight yet."""
+    box = np.stack((positions.min(0), positions.max(0))).astype(np.float32)
+    box[0] = np.nextafter(box[0], -np.inf, dtype=np.float32)  # rounding leaves no camera outside
+    box[1] = np.nextafter(box[1], np.inf, dtype=np.float32)
+    size = np.maximum(box[1].astype(np.float64) - box[0], 1e-30)
+    return ExposureMap(
+        box=box,
+        lengths=lengths,
+        mean=gains.mean(0).astype(np.float32),
+        limits=np.stack((gains.min(0), gains.max(0))).astype(np.float32),
+        steps=np.ones(3, np.float32),
+        positions=np.rint((positions[centers] - box[0]) / size * POSITION_CODES).clip(0, 255).astype(np.uint8),
+        directions=np.rint(directions[centers] * DIRECTION_CODES).astype(np.int8),
+        weights=np.zeros((len(centers), 3), np.int16),
+    )
+
+
+def choose_centers(features: np.ndarray) -> tuple[list[int], np.ndarray, np.ndarray]:
+    """Choose centres by pivoted Cholesky factorisation of the kernel matrix.
+
+    Args:
+        features: (N, D) of the cameras, see `hyrfpack.model.exposure.kernel`.
+
+    Returns:
+        Rows of the centres in the order chosen, M <= 64; F (N, M) with F F^T close to the kernel matrix; and (M,) the
+        variance of each centre given those before it, which falls.
+    """
+    residual = np.ones(len(features))
+    factor = np.zeros((len(features), 0))
+    centers: list[int] = []
+    variances: list[float] = []
+    while len(centers) < min(MAX_CENTERS, len(features)):
+        row = int(residual.argmax())
+        if residual[row] < MIN_CENTER_VARIANCE_RIDGES * RIDGES[0]:
+            break
+        column = (kernel(features, features[row : row + 1])[:, 0] - factor @ factor[row]) / np.sqrt(residual[row])
+        factor = np.column_stack((factor, column))
+        centers.append(row)
+        variances.append(residual[row])
+        residual = residual - column**2
+    return centers, factor, np.array(variances)
+
+
+def leave_one_out_error(factor: np.ndarray, gains: np.ndarray, ridge: float) -> float:
+    """Root mean square error of each photo's log gains predicted from those of all others.
+
+    Of a linear smoother with the matrix H the residual of a row that was left out is (y - H y) / (1 - H_nn).
+    """
+    if len(gains) < 2:
+        return 0.0
+    design = np.column_stack((np.ones(len(gains)), factor))
+    penalty = np.diag([0.0] + [ridge] * factor.shape[1])
+    solver = np.linalg.solve(design.T @ design + penalty, design.T)
+    kept = np.maximum(1 - np.einsum("nm,mn->n", design, solver), 1e-9)
+    return float(np.sqrt(np.square((gains - design @ (solver @ gains)) / kept[:, None]).mean()))
+
+
+def _solve(
+    exposure: ExposureMap, positions: np.ndarray, directions: np.ndarray, gains: np.ndarray, ridge: float
+) -> ExposureMap:
+    """The map with the weights and the mean of the least penalised error, for its centres as they are stored."""
+    across = exposure.kernel_at(positions, directions)
+    among = exposure.kernel_of_centers()
+    count = len(among)
+    design = np.column_stack((np.ones(len(gains)), across))
+    penalty = np.zeros((count + 1, count + 1))
+    penalty[1:, 1:] = ridge * among
+    # Two centres may have become one by rounding: of several solutions the smallest.
+    solution = np.linalg.lstsq(design.T @ design + penalty, design.T @ gains, rcond=1e-10)[0]
+    mean, weights = solution[0], solution[1:]
+    steps = np.full(3, 1.0, np.float32)
+    if count:
+        steps = np.maximum(np.abs(weights).max(0) / WEIGHT_CODES, 1e-12).astype(np.float32)
+    codes = np.rint(weights / steps).clip(-WEIGHT_CODES, WEIGHT_CODES).astype(np.int16)
+    return replace(exposure, mean=mean.astype(np.float32), steps=steps, weights=codes)
