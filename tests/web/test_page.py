@@ -118,7 +118,7 @@ def test_a_player_is_told_what_lies_beside_it():
     assert 'id="content"' not in empty and 'id="poster"' not in empty and 'id="scene"' not in empty
 
 
-@pytest.mark.parametrize(("readers", "most"), [(False, 50_500), (True, 58_500)])
+@pytest.mark.parametrize(("readers", "most"), [(False, 51_800), (True, 59_400)])
 def test_the_player_alone_is_small(readers, most):
     assert len(gzip.compress(player_page("hyrfpack", [], "a player", readers=readers))) <= most
 

@@ -23,6 +23,7 @@ const FREE_BYTES = 3 * 2 ** 24;
 const MOST_LAYERS = 8;
 export const LAYERED_TYPES = ["POSI", "COLO", "SCAL", "OPAC"];
 export const FIELD_TYPES = ["GTAB", "GMLP", "RTAB", "RMLP"];
+export const EXPOSURE_TYPE = "EXPO"; // optional
 
 /**
  * What a section of a layer is called: "POSI", then "POS1", "POS2", ...
@@ -31,7 +32,7 @@ export const FIELD_TYPES = ["GTAB", "GMLP", "RTAB", "RMLP"];
  */
 export const layerType = (type, layer) => (layer ? type.slice(0, 3) + layer : type);
 
-const KNOWN_TYPES = new Set(["META", ...FIELD_TYPES]);
+const KNOWN_TYPES = new Set(["META", EXPOSURE_TYPE, ...FIELD_TYPES]);
 for (let layer = 0; layer < MOST_LAYERS; layer++) {
   for (const type of LAYERED_TYPES) KNOWN_TYPES.add(layerType(type, layer));
 }

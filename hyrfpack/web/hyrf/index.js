@@ -1,8 +1,9 @@
-// The model out of the bytes of a `.hyrf` file, version 1.0 and 1.1 (docs/format.md).
+// The model out of the bytes of a `.hyrf` file, versions 1.0 to 1.2 (docs/format.md).
 
 import { decodeChannels } from "./channels.js";
-import { Container, FIELD_TYPES, LAYERED_TYPES, incompleteFile, layerType } from "./container.js";
+import { Container, EXPOSURE_TYPE, FIELD_TYPES, LAYERED_TYPES, incompleteFile, layerType } from "./container.js";
 import { DamagedData, HyrfFormatError, damagedFile, newerFile } from "./errors.js";
+import { decodeExposure } from "./exposure.js";
 import { ROW_FEATURES, decoderSize, tableRows } from "./grids.js";
 import { decodeGroups, decoderGroups, tableGroups } from "./groups.js";
 import { decodeLattice, latticePositions } from "./lattice.js";
@@ -16,6 +17,7 @@ const GAUSSIANS_A_BYTE = 32, FREE_GAUSSIANS = 2 ** 18;
 
 /**
  * @typedef {import("./container.js").Entry} Entry
+ * @typedef {import("./exposure.js").ExposureMap} ExposureMap
  * @typedef {import("./grids.js").FieldName} FieldName
  * @typedef {import("./lattice.js").LatticePoints} LatticePoints
  * @typedef {import("./metadata.js").Config} Config
@@ -36,7 +38,8 @@ const GAUSSIANS_A_BYTE = 32, FREE_GAUSSIANS = 2 ** 18;
  *   opacityLogits: Float32Array,
  *   geometry: Field,
  *   radiance: Field,
- * }} Model
+ *   exposure: ExposureMap | null,
+ * }} Model `exposure`: how exposure varies with the viewpoint, null where the file does not say; see `logGains`
  *
  * @typedef {{
  *   version: [number, number],
@@ -50,7 +53,7 @@ const GAUSSIANS_A_BYTE = 32, FREE_GAUSSIANS = 2 ** 18;
  */
 
 const CODEC_FLOAT32 = 1, CODEC_FLOAT16 = 2, CODEC_VECTORS = 3, CODEC_MIN_MAX = 4;
-const CODEC_LATTICE = 6, CODEC_CHANNELS = 7, CODEC_GROUPS = 8;
+const CODEC_LATTICE = 6, CODEC_CHANNELS = 7, CODEC_GROUPS = 8, CODEC_EXPOSURE = 9;
 const KNOWN_CODECS = [CODEC_FLOAT32, CODEC_FLOAT16, CODEC_VECTORS, CODEC_MIN_MAX];
 KNOWN_CODECS.push(CODEC_LATTICE, CODEC_CHANNELS, CODEC_GROUPS);
 const LAYERED_COLUMNS = [3, 3, 1, 1];
@@ -132,11 +135,24 @@ const readModel = (container) => {
     opacityLogits,
     geometry: { table: arrayOf(arrays, "GTAB"), decoder: arrayOf(arrays, "GMLP") },
     radiance: { table: arrayOf(arrays, "RTAB"), decoder: arrayOf(arrays, "RMLP") },
+    exposure: readExposure(container),
   };
 };
 
 /**
- * All sections that a model has but the metadata; positions come before what leans on them.
+ * The exposure map, null where the file has none or its bytes are not there yet.
+ * @param {Container} container
+ * @returns {ExposureMap | null}
+ */
+const readExposure = (container) => {
+  if (!container.has(EXPOSURE_TYPE)) return null;
+  const { codec, raw } = entryOf(container, EXPOSURE_TYPE);
+  if (codec !== CODEC_EXPOSURE) newerFile(`section '${EXPOSURE_TYPE}' has the codec ${codec}, which is unknown`);
+  return decodeNamed(EXPOSURE_TYPE, () => decodeExposure(container.stored(EXPOSURE_TYPE), raw));
+};
+
+/**
+ * All sections that a model must have but the metadata; positions come before what leans on them.
  * @param {Config} config
  * @param {number[]} counts of the layers
  * @returns {WantedSection[]}
@@ -190,12 +206,26 @@ const checkSection = (container, { type, rows, columns }) => {
 const decodeSection = (container, section, config, points) => {
   const { type } = section, { codec } = entryOf(container, type);
   const data = container.stored(type);
-  try {
+  return decodeNamed(type, () => {
     const numbers = decodeNumbers(section, codec, data, config, points);
     for (let i = 0; i < numbers.length; i++) {
       if (numbers[i] - numbers[i] !== 0) throw new DamagedData("it holds numbers that are not finite");
     }
     return numbers;
+  });
+};
+
+/**
+ * What `decode` returns; an error about damaged data gets the section's name.
+ * @template Decoded
+ * @param {string} type
+ * @param {() => Decoded} decode
+ * @returns {Decoded}
+ * @throws {HyrfFormatError}
+ */
+const decodeNamed = (type, decode) => {
+  try {
+    return decode();
   } catch (error) {
     if (!(error instanceof DamagedData)) throw error;
     throw new HyrfFormatError(`Section '${type}' is damaged: ${error.message}; fetch or write the file again.`);

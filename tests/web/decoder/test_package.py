@@ -19,7 +19,7 @@ from hyrfpack.model import HashGridConfig
 ROOT = Path(__file__).parents[3]
 PACKAGE = ROOT / "hyrfpack" / "web" / "hyrf"
 GOLDEN = ROOT / "tests" / "golden"
-PUBLIC = ("index", "grids", "fields", "harmonics", "viewpoint")
+PUBLIC = ("index", "grids", "exposure", "fields", "harmonics", "viewpoint")
 
 
 def run_module(code: str, folder: Path, *arguments: str) -> object:
