@@ -70,6 +70,7 @@ def test_nothing_overlaps_or_sticks_out_whatever_is_said(browser: Browser, tmp_p
     opened(browser, tmp_path, page_of(cloud(50), title="a_very_long_name_of_a_scene " * 8 + "without_any_space" * 9))
     browser.evaluate(
         "document.getElementById('hint').hidden = false,"
+        "document.getElementById('exposure').hidden = false,"
         "document.getElementById('remark').textContent = 'Drawn with harmonics: this device is too weak.',"
         "document.getElementById('remark').hidden = document.getElementById('panel').hidden = false"
     )
@@ -401,7 +402,7 @@ def test_keys_press_every_button(browser: Browser, tmp_path: Path):
     browser.resize(1280, 800)
     opened(browser, tmp_path, page_of(cloud(50)))
     keys = browser.evaluate("[...document.querySelectorAll('[data-key]')].map((button) => button.dataset.key)")
-    assert sorted(keys) == sorted("PNRTLC?FH")
+    assert sorted(keys) == sorted("PNRTLC?FHX")
     for key, effect in {
         "t": "document.getElementById('turn').getAttribute('aria-pressed') === 'true'",
         "3": "document.getElementById('cameras').selectedIndex === 2",

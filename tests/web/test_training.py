@@ -10,11 +10,13 @@ from contextlib import ExitStack, contextmanager
 
 import numpy as np
 import pytest
+from exposures import random_map
 from scenes import small_model
 from web.pages import Browser, eye, message, rested, settled, until
 
 from hyrfpack.format import encode_model
 from hyrfpack.model import Frame
+from hyrfpack.model.exposure import ExposureMap
 from hyrfpack.web.player import encode_player
 from hyrfpack.web.serve import MemoryFile, serving
 
@@ -23,10 +25,12 @@ COUNT = "window.hyrfpack?.player?.loaded && hyrfpack.player.scene.count"
 REMARK = "document.getElementById('remark').textContent"
 
 
-def snapshot(count: int, scale: float = 1.0) -> bytes:
+def snapshot(count: int, scale: float = 1.0, exposure: ExposureMap | None = None) -> bytes:
     """A model of so many Gaussians; those of a smaller one are the first ones of a larger one."""
     positions = np.random.default_rng(0).normal(size=(100, 3))[:count] * 0.3
-    return encode_model(small_model(positions, frame=Frame((0.0, 0.0, 0.0), scale, (1.0, 1.0, 1.0))))
+    model = small_model(positions, frame=Frame((0.0, 0.0, 0.0), scale, (1.0, 1.0, 1.0)))
+    model.exposure = exposure
+    return encode_model(model)
 
 
 class Training:
@@ -97,6 +101,23 @@ def test_a_training_in_another_frame_is_looked_at_anew(browser: Browser):
         training.show(snapshot(30, scale=7.0), 2)
         until(browser, f"{COUNT} === 30")
         assert np.linalg.norm(eye(browser).position) == pytest.approx(7 * np.linalg.norm(before), rel=1e-6)
+
+
+def test_a_snapshot_brings_the_exposure_map_and_its_control(browser: Browser):
+    exposure = random_map(3, 8)
+    control = "!document.getElementById('exposure').hidden"
+    with trained(browser, (snapshot(20), 1)) as (training, _):
+        until(browser, f"{COUNT} === 20")
+        assert not browser.evaluate(control)
+        training.show(snapshot(30, exposure=exposure), 2)
+        until(browser, f"{COUNT} === 30")
+        camera = eye(settled(browser))
+        assert browser.evaluate(control)
+        gains = browser.evaluate("hyrfpack.player.gains(hyrfpack.player.view())")
+        np.testing.assert_allclose(gains, np.exp(exposure.log_gains(camera.position, camera.forward)), rtol=1e-9)
+        training.show(snapshot(40), 3)
+        until(browser, f"{COUNT} === 40")
+        assert not browser.evaluate(control)
 
 
 def test_a_snapshot_that_cannot_be_read_leaves_the_one_before(browser: Browser):

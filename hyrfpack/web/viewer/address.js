@@ -1,6 +1,8 @@
-// What the page's address asks for: ?content=URL&camera=...&poster=URL&title=...&noui&autorotate, and #camera=...
+// What the page's address asks for: ?content=URL&camera=...&poster=URL&title=...&exposure=consistent&noui&autorotate,
+// and #camera=...
 
 import { cameraOf, viewOf } from "./camera.js";
+import { EXPOSURES } from "./exposure.js";
 import { normalizedQuat, quatOf, rowsOf } from "./rotation.js";
 
 const SIDE = 1000; // pixels of the picture of a camera that is told without one
@@ -23,8 +25,8 @@ export function webAddress(text, what) {
 
 const shortened = (text) => (text.length > 60 ? `${text.slice(0, 60)}…` : text || "an empty one");
 
-// {content, poster, title, camera, noui, autorotate}, null where nothing is said, and `wrong`: sentences about addresses
-// that cannot be used, which are "" then.
+// {content, poster, title, camera, exposure, noui, autorotate}, null where nothing is said, and `wrong`: sentences about
+// what cannot be used; addresses are "" then, the exposure is null.
 export function readSearch(search) {
   const asked = new URLSearchParams(search), wrong = [];
   const web = (name, what) => {
@@ -36,12 +38,17 @@ export function readSearch(search) {
       return "";
     }
   };
+  const exposure = asked.get("exposure");
+  if (exposure !== null && !EXPOSURES.includes(exposure)) {
+    wrong.push(`The exposure in the address must be ${EXPOSURES.join(" or ")}, not ${shortened(exposure)}.`);
+  }
   const flag = (name) => asked.has(name) && !["0", "false", "no", "off"].includes(asked.get(name).toLowerCase());
   return {
     content: web("content", "content"),
     poster: web("poster", "poster"),
     title: asked.get("title")?.trim().slice(0, LONGEST) || null,
     camera: asked.get("camera"),
+    exposure: EXPOSURES.includes(exposure) ? exposure : null,
     noui: flag("noui"),
     autorotate: flag("autorotate"),
     wrong,

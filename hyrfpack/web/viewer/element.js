@@ -1,4 +1,5 @@
-// <hyrf-viewer src="scene.hyrf" camera="2" poster="scene.jpg" autorotate noui>: the player beside this script, in a frame.
+// <hyrf-viewer src="scene.hyrf" camera="2" poster="scene.jpg" exposure="consistent" autorotate noui>: the player beside
+// this script, in a frame.
 // `src` and `poster` are relative to the page that the element is on. Events: "load", "error" (detail: a sentence).
 
 const PLAYER = new URL("index.html", document.currentScript?.src ?? scriptAddress());
@@ -11,7 +12,7 @@ function scriptAddress() {
 }
 
 class HyrfViewer extends HTMLElement {
-  static observedAttributes = ["src", "camera", "poster", "title", "autorotate", "noui"];
+  static observedAttributes = ["src", "camera", "poster", "title", "exposure", "autorotate", "noui"];
 
   constructor() {
     super();
@@ -56,6 +57,7 @@ class HyrfViewer extends HTMLElement {
       }
     }
     if (this.title) address.searchParams.set("title", this.title);
+    if (this.hasAttribute("exposure")) address.searchParams.set("exposure", this.getAttribute("exposure"));
     for (const name of ["autorotate", "noui"]) {
       if (this.hasAttribute(name)) address.searchParams.set(name, "");
     }

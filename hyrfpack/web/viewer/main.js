@@ -2,6 +2,7 @@
 
 import { compactCamera, parseCamera, readHash, readSearch, webAddress } from "./address.js";
 import { Controls } from "./controls.js";
+import { AS_PHOTOGRAPHED, CONSISTENT } from "./exposure.js";
 import { Help } from "./help.js";
 import { Damper, Glide, Turntable, calm } from "./motion.js";
 import { announce, dismiss, fail, progress, remark, toast } from "./notes.js";
@@ -9,7 +10,7 @@ import { Panel } from "./panel.js";
 import { element, textOf } from "./parts.js";
 import { payload } from "./payload.js";
 import { Player } from "./player.js";
-import { savePicture, shareCamera } from "./share.js";
+import { savePicture, shareView } from "./share.js";
 import { chosenFile, fetchedFile } from "./source.js";
 import { followTraining, trainingTitle } from "./training.js";
 
@@ -97,6 +98,17 @@ function start() {
     element("turn").setAttribute("aria-pressed", String(on));
   };
 
+  const switchExposure = () => {
+    if (!player.hasExposureMap) return;
+    player.exposure = player.exposure === CONSISTENT ? AS_PHOTOGRAPHED : CONSISTENT;
+    announce(`Exposure: ${player.exposure.replace("-", " ")}`);
+  };
+
+  const share = () => {
+    const exposure = player.hasExposureMap && player.exposure === CONSISTENT ? CONSISTENT : null;
+    return shareView(compactCamera(player.eye, player.scene), exposure, own);
+  };
+
   const whenThere = (action) => () => player.loaded && action();
   const panel = new Panel(player, {
     choose,
@@ -106,7 +118,8 @@ function start() {
     O: () => pick(player.canvas.clientWidth / 2, player.canvas.clientHeight / 2),
     T: () => turn(!turntable.on),
     F: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.())?.catch(() => {}),
-    L: whenThere(() => shareCamera(compactCamera(player.eye, player.scene), own)),
+    X: whenThere(switchExposure),
+    L: whenThere(share),
     C: whenThere(async () => savePicture(await player.capture(), title)),
     H: () => panel.toggle(),
     "?": () => help.show(),
@@ -122,6 +135,7 @@ function start() {
     acted, pick, press: (key) => panel.press(key), ignored: (kind) => toast(IGNORED[kind]),
   });
   player.movers.push(controls, damper, glide, turntable);
+  if (asked.exposure) player.exposure = asked.exposure;
 
   // ---- what the player tells
 

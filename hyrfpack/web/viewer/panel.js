@@ -1,5 +1,6 @@
 // The panel: what a person chooses and is told of the scene.
 
+import { AS_PHOTOGRAPHED } from "./exposure.js";
 import { element } from "./parts.js";
 
 const SMALL = "(max-width: 640px), (max-height: 480px)"; // it would cover the scene
@@ -23,6 +24,7 @@ export class Panel {
       player.redraw();
     };
     player.addEventListener("drawn", ({ detail }) => (element("speed").textContent = `${Math.round(1000 / detail)} fps`));
+    player.addEventListener("exposed", () => this.showExposure());
     player.addEventListener("stood", ({ detail }) => (element("cameras").selectedIndex = detail));
   }
 
@@ -39,6 +41,13 @@ export class Panel {
     const options = cameras.map((_, number) => new Option(`Camera ${number + 1} of ${cameras.length}`));
     element("cameras").replaceChildren(...options);
     for (const name of ["previous", "next", "cameras"]) element(name).disabled = cameras.length < 2;
+  }
+
+  // Offer the exposure where the scene has a map of it, and tell which one is chosen.
+  showExposure() {
+    const { hasExposureMap, exposure } = this.player;
+    for (const part of document.querySelectorAll("[data-needs-map]")) part.hidden = !hasExposureMap;
+    element("exposure").setAttribute("aria-pressed", String(exposure === AS_PHOTOGRAPHED));
   }
 
   press(key) {

@@ -2,11 +2,12 @@
 //
 // Events: "progress" (detail: {part: 0 to 1, what: "loading" | "unpacking" | "preparing"}), "opened" (detail: the scene
 // of a file that came without one), "counted" (detail: the same, when more of the file is there), "loaded" (there is
-// something to see), "said" (detail: a sentence for the corner, "" for none), "drawn" (detail: ms a frame while
+// something to see), "exposed" (the exposure was chosen, or may have got or lost its map), "said" (detail: a sentence for the corner, "" for none), "drawn" (detail: ms a frame while
 // moving), "stood" (detail: number of the camera), "failed" (detail: Error). Movers, see `movers`, move the eye from
 // frame to frame.
 
 import { Eye, cameraOf, viewOf } from "./camera.js";
+import { AS_PHOTOGRAPHED, EXPOSURES, viewGains } from "./exposure.js";
 import { Fields, Unfit } from "./fields.js";
 import { ContextLost, countLoss } from "./graphics.js";
 import { Loader, Superseded } from "./loader.js";
@@ -39,6 +40,7 @@ export class Player extends EventTarget {
     this.movers = []; // {active, advance(seconds)}: whether it holds the eye now; move it and tell whether it moved
     this.resolution = 1; // of the canvas, chosen by a person
     this.automatic = true; // coarser while moving, if slow
+    this.chosenExposure = AS_PHOTOGRAPHED;
     this.frames = 0; // drawn so far
     this.times = { first: null, complete: null }; // ms since the page was opened: something, everything was seen
     this.moved = -Infinity; // when
@@ -204,6 +206,7 @@ export class Player extends EventTarget {
     this.scene = scene;
     this.whole = whole || loader.broken;
     this.loaded = true;
+    this.tell("exposed");
     this.moves++;
     this.stale = this.unsorted = true;
     if (begins && !stays) this.tell("opened", scene);
@@ -248,6 +251,27 @@ export class Player extends EventTarget {
   }
 
   // ---- drawing
+
+  // "as-photographed" or "consistent", see exposure.js.
+  get exposure() {
+    return this.chosenExposure;
+  }
+
+  set exposure(exposure) {
+    if (!EXPOSURES.includes(exposure)) throw new Error(`The exposure must be ${EXPOSURES.join(" or ")}, not ${exposure}.`);
+    this.chosenExposure = exposure;
+    this.tell("exposed");
+    this.redraw();
+  }
+
+  // Whether the scene has an exposure map, without which both exposures are the same.
+  get hasExposureMap() {
+    return Boolean(this.scene?.exposure);
+  }
+
+  gains(view) {
+    return viewGains(this.scene, view, this.exposure);
+  }
 
   get scale() {
     return this.moving && this.automatic ? Math.max(COARSEST, this.resolution * this.coarse) : this.resolution;
@@ -312,7 +336,7 @@ export class Player extends EventTarget {
     if (this.stale || this.shown !== scale) {
       const view = this.view(), { content } = this.renderer;
       if (moving) content.recolor(view, this.scene.tolerance, COLORING * Math.max(FRAME, this.took ?? 0));
-      this.renderer.draw(view, scale);
+      this.renderer.draw(view, scale, this.gains(view));
       if (this.renderer.drawn) this.times.first ??= performance.now();
       this.frames++;
       this.began = now;
@@ -412,7 +436,8 @@ export class Player extends EventTarget {
 
   // PNG of what the window shows, at its full size.
   capture() {
-    this.renderer.draw(this.view(), this.resolution);
+    const view = this.view();
+    this.renderer.draw(view, this.resolution, this.gains(view));
     return new Promise((resolve) => this.canvas.toBlob(resolve, "image/png"));
   }
 
@@ -429,7 +454,7 @@ export class Player extends EventTarget {
       const sorted = await this.loader.sort(view, this.scene);
       if (!sorted || !this.loaded || content !== this.renderer.content) throw new ContextLost();
       this.order(sorted);
-      return this.renderer.read(view);
+      return this.renderer.read(view, this.gains(view));
     });
     this.unsorted = true;
     this.redraw();

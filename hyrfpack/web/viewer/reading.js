@@ -142,7 +142,7 @@ async function decode(partial) {
   let positions;
   if (kind !== "other" && length >= MARK.length) {
     const model = await read(bytes, { partial });
-    content.scene = scene ?? { ...modelScene(model, name), ...stage };
+    content.scene = { ...(scene ?? { ...modelScene(model, name), ...stage }), exposure: model.exposure };
     positions = model.positions;
     if (plain) {
       tell("unpacking", 1);

@@ -1,5 +1,5 @@
 // Draws splats with WebGL 2: project (one fragment a splat), blend (one quad a splat, farthest first), resolve (over
-// the background).
+// the background, with the gains of the exposure).
 
 import { Graphics } from "./graphics.js";
 import { SPHERE_RADIUS, TEXTURE_WIDTH } from "./layout.js";
@@ -81,22 +81,22 @@ export class Renderer {
     this.drawn = drawn;
   }
 
-  // Draw a view to the canvas, splats at `scale` times its resolution.
-  draw(view, scale) {
+  // Draw a view to the canvas, splats at `scale` times its resolution. `gains`: of the exposure, see exposure.js.
+  draw(view, scale, gains) {
     const size = [view.width, view.height].map((side) => Math.max(1, Math.round(side * scale)));
     this.splats(resized(view, ...size));
-    this.over(view, size, null);
+    this.over(view, size, null, gains);
   }
 
   // Draw a view and read it: RGB, top row first. Throws an Error with a sentence where the device cannot.
-  read(view) {
+  read(view, gains) {
     const { gl, graphics } = this, { width, height } = view;
     this.check(view);
     gl.getError(); // of anything before
     const texture = graphics.texture(gl.TEXTURE_2D, gl.RGBA8, width, height);
     const target = graphics.framebuffer(texture);
     this.splats(view);
-    this.over(view, [width, height], target);
+    this.over(view, [width, height], target, gains);
     const rgba = new Uint8Array(4 * width * height);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
     const refused = gl.getError() !== gl.NO_ERROR && !gl.isContextLost();
@@ -185,7 +185,7 @@ export class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  over(view, used, target) {
+  over(view, used, target, gains) {
     const { gl, graphics, resolve: r, scene, content } = this, picture = content.panorama?.texture ?? this.picture;
     const { center, radius } = sphereOf(scene);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
@@ -196,6 +196,7 @@ export class Renderer {
     gl.uniform1i(r.u_pictured, picture ? 1 : 0);
     gl.uniform3fv(r.u_from, view.eye.map((value, axis) => (value - center[axis]) / radius));
     gl.uniform3fv(r.u_solid, scene.solid);
+    gl.uniform3fv(r.u_gains, gains);
     gl.uniformMatrix3fv(r.u_world, false, view.rows.flat()); // rows read as columns: transposed
     gl.uniform4f(r.u_intrinsics, view.fx, view.fy, view.cx, view.cy);
     gl.uniform2f(r.u_size, view.width, view.height);

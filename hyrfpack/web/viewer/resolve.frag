@@ -1,5 +1,5 @@
 #version 300 es
-// The blended splats over the background.
+// The blended splats over the background, exposed.
 precision highp float;
 precision highp sampler2D; // else lowp, which phones take at its word
 
@@ -9,6 +9,7 @@ uniform bool u_pictured; // the background is a picture, else a colour
 uniform sampler2D u_background; // equirectangular, on a sphere
 uniform vec3 u_from; // the eye in units of the sphere's radius, from its centre
 uniform vec3 u_solid;
+uniform vec3 u_gains; // of the exposure; 1 changes nothing
 uniform mat3 u_world; // world from camera
 uniform vec4 u_intrinsics; // fx, fy, cx, cy in pixels of the target
 uniform vec2 u_size; // of the target
@@ -32,5 +33,6 @@ void main() {
     vec4 splats = texture(u_splats, texel / vec2(textureSize(u_splats, 0)));
     vec3 behind = u_solid;
     if (u_pictured) behind = background(normalize(u_world * vec3((pixel - u_intrinsics.zw) / u_intrinsics.xy, 1.0)));
-    o_color = vec4(splats.rgb + (1.0 - splats.a) * behind, 1.0);
+    vec3 color = clamp(splats.rgb + (1.0 - splats.a) * behind, 0.0, 1.0);
+    o_color = vec4(u_gains * color / (1.0 + (u_gains - 1.0) * color), 1.0);
 }

@@ -2,9 +2,12 @@
 
 import { toast } from "./notes.js";
 
-// The page's address with this camera, copied. `holds`: whether it brings the scene, too.
-export async function shareCamera(camera, holds) {
-  const address = new URL(location.href);
+// The page's address with this camera and exposure (null for the usual one), copied. `holds`: whether it brings the
+// scene, too.
+export async function shareView(camera, exposure, holds) {
+  const address = new URL(location.href), { searchParams: asked } = address;
+  if (exposure) asked.set("exposure", exposure);
+  else if (asked.has("exposure")) asked.delete("exposure");
   address.hash = `camera=${camera}`;
   try {
     history.replaceState(null, "", address);
