@@ -18,13 +18,15 @@ MIN_EXPOSURE_VALIDATION_VIEWS = 5
 MAX_EXPOSURE_ROUNDS = 2  # of two pilots: one with gains, one without
 MIN_EXPOSURE_SPREAD_STOPS = 0.05  # standard deviation; photos that differ less need no gains
 MIN_EXPOSURE_GAIN_DB = 0.1  # in the mean of the rounds
+MAX_VIEW_GAIN_DB = 3.0  # counts of one photo, either way: one whose exposure nothing predicts does not decide alone
 
 
 def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
     """Measure whether learning per-image gains makes renders more like photos that were not trained on.
 
-    They are learnt where the gain in plain PSNR is at least `MIN_EXPOSURE_GAIN_DB`, larger than its standard error over
-    the validation photos, and positive with each of two seeds. Otherwise the safe default stands: no gains.
+    They are learnt where the gain in plain PSNR is at least `MIN_EXPOSURE_GAIN_DB`, no less than its standard error
+    over the validation photos, and positive with each of two seeds. Otherwise the safe default stands: no gains. The
+    gain of each photo counts up to `MAX_VIEW_GAIN_DB` either way.
 
     Returns:
         Whether gains are to be learnt, and the reason in words.
@@ -52,7 +54,7 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
             )
             for number, exposure in enumerate((False, True), 1)
         )
-        rounds.append(compensated - without)
+        rounds.append(np.clip(compensated - without, -MAX_VIEW_GAIN_DB, MAX_VIEW_GAIN_DB))
     per_view = np.mean(rounds, 0)
     gain, error = float(per_view.mean()), float(per_view.std(ddof=1) / np.sqrt(count))
     is_better = all(gains.mean() > 0 for gains in rounds) and gain >= max(MIN_EXPOSURE_GAIN_DB, error)

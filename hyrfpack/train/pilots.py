@@ -139,7 +139,6 @@ class ScenePilots:
         trainer.run(report=tell, stop=self._stop)
         if self._stop():
             raise PilotsStopped
-        trainer.fit_exposure_map()
         count = len(self.validation)
         result: Evaluation = evaluate(
             trainer.model,

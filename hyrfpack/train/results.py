@@ -133,7 +133,6 @@ def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) ->
             f"{scene.path}: masks leave no pixel of the photos that the {trainer.steps:,} steps came to; "
             "take more steps than there are photos"
         )
-    trainer.fit_exposure_map()
     model = _drop_unseen_background(trainer, phase)
     phase("writing the model", 0, 0)
     provenance = {

@@ -159,8 +159,10 @@ class Trainer:
                 loss, mse, stopped = self._train_step(views, stop)
                 self.elapsed += time.perf_counter() - start
                 self._record(loss, mse)
-                report(self, loss, mse)
                 complete = self.step == self.steps
+                if complete:
+                    self._fit_exposure_map()
+                report(self, loss, mse)
                 stopped = (stop() if self.ranks.alone else stopped) and not complete
                 if checkpoint and (stopped or (self.step % every == 0 and not complete)):
                     try:
@@ -248,7 +250,7 @@ class Trainer:
         with self._timed("loss"):
             return loss.detach(), _mean_square(image.detach() - target, mask)
 
-    def fit_exposure_map(self) -> None:
+    def _fit_exposure_map(self) -> None:
         """Give the model the exposure map of the per-image gains that were learnt, if any."""
         if self.exposures is None:
             return

@@ -67,9 +67,6 @@ def scores(monkeypatch) -> dict:
         def run(self, report, stop):
             pass
 
-        def fit_exposure_map(self):
-            pass
-
     def evaluate(config, views, report):
         if config.exposure in table:
             return scored(table[config.exposure][config.seed], 0.0, table["apart"] if config.exposure else (0.0,) * 5)
@@ -263,6 +260,8 @@ def relit(scene: Scene, stops: list[float]) -> Scene:
         ([20.3, 20.2], (0.0,) * 5, True, 2),
         ([20.3, 20.2], (-0.2, 0.2, 0.0, -0.2, 0.2), True, 2),
         ([20.3, 20.2], (-2.0, 2.0, 0.0, -2.0, 2.0), False, 2),
+        ([20.5, 20.5], (-9.0, 0.0, 0.0, 0.0, 0.0), False, 1),
+        ([22.5, 22.5], (-9.0, 0.0, 0.0, 0.0, 0.0), True, 2),
         ([20.5, 19.9], (0.0,) * 5, False, 2),
         ([20.05, 20.05], (0.0,) * 5, False, 2),
         ([19.9, 25.0], (0.0,) * 5, False, 1),
