@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from hyrfpack.model.exposure import ExposureMap
+from hyrfpack.model.exposure import DIRECTION_CODES, POSITION_CODES, WEIGHT_CODES, ExposureMap
+from hyrfpack.model.frame import Frame
+from hyrfpack.scene import Camera
 
 
 def random_map(seed: int, centers: int | None = None) -> ExposureMap:
@@ -21,4 +25,28 @@ def random_map(seed: int, centers: int | None = None) -> ExposureMap:
         positions=rng.integers(0, 256, (count, 3)).astype(np.uint8),
         directions=rng.integers(-127, 128, (count, 3)).astype(np.int8),
         weights=rng.integers(-2000, 2001, (count, 3)).astype(np.int16),
+    )
+
+
+def map_through(cameras: Sequence[Camera], frame: Frame, gains: np.ndarray) -> ExposureMap:
+    """A map that predicts gains (N, 3) or (N, 1) at so many cameras, which see different directions, to about 1 %."""
+    logs = np.log(np.broadcast_to(gains, (len(cameras), 3)))
+    poses = [frame.local_pose(camera) for camera in cameras]
+    places, directions = np.array([-p[:3, :3].T @ p[:3, 3] for p in poses]), np.array([p[2, :3] for p in poses])
+    low, high = places.min(0), places.max(0)
+    codes = np.rint((places - low) / np.maximum(high - low, 1e-9) * POSITION_CODES)
+    turned = np.rint(directions * DIRECTION_CODES)
+    stored = low + codes / POSITION_CODES * (high - low), turned / DIRECTION_CODES
+    squares = [np.square(part[:, None] - part[None]).sum(-1) for part in stored]
+    weights = np.linalg.solve(1 / (1 + squares[0] + squares[1] / 0.25**2), logs)
+    steps = np.maximum(np.abs(weights).max(0), 1e-6) / WEIGHT_CODES
+    return ExposureMap(
+        box=np.array((low, high), np.float32),
+        lengths=np.array((1.0, 0.25), np.float32),
+        mean=np.zeros(3, np.float32),
+        limits=np.array(((-4.0,) * 3, (4.0,) * 3), np.float32),
+        steps=steps.astype(np.float32),
+        positions=codes.astype(np.uint8),
+        directions=turned.astype(np.int8),
+        weights=np.rint(weights / steps).astype(np.int16),
     )

@@ -220,9 +220,9 @@ def largest_picture(cameras: Iterable[Camera]) -> tuple[int, int]:
     return max(((camera.width, camera.height) for camera in cameras), key=lambda size: size[0] * size[1])
 
 
-def at_predicted_exposure(psnr: float | None) -> str:
-    """What to put behind a PSNR: that of renders exposed as photos beside them predict, where it is known."""
-    return "" if psnr is None else f" ({psnr:.2f} at the exposure that photos beside them predict)"
+def at_one_exposure(psnr_consistent: float | None) -> str:
+    """Return what is printed behind a PSNR: that of renders at one exposure, or "" for a model without a map."""
+    return "" if psnr_consistent is None else f" ({psnr_consistent:.2f} dB at one exposure)"
 
 
 def print_json(values: dict) -> None:

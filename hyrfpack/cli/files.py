@@ -14,7 +14,7 @@ from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
     SIZE,
-    at_predicted_exposure,
+    at_one_exposure,
     chosen_device,
     device_option,
     json_option,
@@ -262,8 +262,8 @@ def _describe_run(folder: Path, as_json: bool) -> None:
     if run.photos is not None:
         _say(f"photos: {run.photos}, {run.train} to train on and {run.test} held out")
     if run.psnr is not None and run.ssim is not None:
-        predicted = at_predicted_exposure(run.psnr_predicted)
-        _say(f"held-out photos: PSNR {run.psnr:.2f} dB{predicted}, SSIM {run.ssim:.4f}")
+        consistent = at_one_exposure(run.psnr_consistent)
+        _say(f"held-out photos: PSNR {run.psnr:.2f} dB{consistent}, SSIM {run.ssim:.4f}")
     if facts:
         click.echo()
         _print_model(folder / MODEL, facts)
@@ -360,21 +360,15 @@ def _photos_of(model: Path) -> Scene | None:
 
 
 def _scores(before: Path, after: Path, scene: Scene | None, report: Report) -> dict[str, float]:
-    """Mean PSNR and SSIM on held-out photos of both files, where there are photos; the predicted PSNR, too, where
-    exposures were learnt."""
+    """Mean PSNR and SSIM on held-out photos of both files, where there are photos."""
     if scene is None or not scene.test:
         return {}
-    from hyrfpack.cameras.capture import has_mean_exposure
     from hyrfpack.evaluate import evaluate
-    from hyrfpack.format import describe, load
+    from hyrfpack.format import load
 
-    training = scene.train if has_mean_exposure(describe(before)["provenance"]) else ()
-    old = evaluate(load(before), scene.test, training=training, report=report_part(report, 0.0, 0.5))
-    new = evaluate(load(after), scene.test, training=training, report=report_part(report, 0.5, 1.0))
-    scores = {"psnr_before": old.psnr, "psnr": new.psnr, "ssim_before": old.ssim, "ssim": new.ssim}
-    if old.psnr_predicted is not None and new.psnr_predicted is not None:
-        scores |= {"psnr_predicted_before": old.psnr_predicted, "psnr_predicted": new.psnr_predicted}
-    return scores
+    old = evaluate(load(before), scene.test, report=report_part(report, 0.0, 0.5))
+    new = evaluate(load(after), scene.test, report=report_part(report, 0.5, 1.0))
+    return {"psnr_before": old.psnr, "psnr": new.psnr, "ssim_before": old.ssim, "ssim": new.ssim}
 
 
 def _print_report(report: CompressionReport, scores: dict[str, float], as_json: bool) -> None:
@@ -394,11 +388,6 @@ def _print_report(report: CompressionReport, scores: dict[str, float], as_json: 
         click.echo(
             f"held-out photos: PSNR {scores['psnr_before']:.3f} to {scores['psnr']:.3f} dB, "
             f"SSIM {scores['ssim_before']:.4f} to {scores['ssim']:.4f}"
-        )
-    if "psnr_predicted" in scores:
-        click.echo(
-            "at the exposure that photos beside them predict: "
-            f"PSNR {scores['psnr_predicted_before']:.3f} to {scores['psnr_predicted']:.3f} dB"
         )
 
 

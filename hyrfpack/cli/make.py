@@ -13,7 +13,7 @@ from hyrfpack.cli.common import (
     PATH,
     SEED,
     SIZE,
-    at_predicted_exposure,
+    at_one_exposure,
     chosen_device,
     json_option,
     note,
@@ -169,8 +169,8 @@ def _print(result: MakeResult) -> None:
     click.echo(f"times: {times}, {total}; {result.work} keeps what each stage made, and may be deleted")
     if result.psnr is not None:
         photos = f"{result.views} photo{'s' if result.views > 1 else ''}"
-        predicted = at_predicted_exposure(result.psnr_predicted)
-        click.echo(f"{photos} held out: PSNR {result.psnr:.2f} dB{predicted}, SSIM {result.ssim:.4f}")
+        consistent = at_one_exposure(result.psnr_consistent)
+        click.echo(f"{photos} held out: PSNR {result.psnr:.2f} dB{consistent}, SSIM {result.ssim:.4f}")
     elif result.training:
         click.echo("no photo is held out, so that nothing is scored")
     if result.note:

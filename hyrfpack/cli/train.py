@@ -13,7 +13,7 @@ from hyrfpack.cli.common import (
     PATH,
     SEED,
     SIZE,
-    at_predicted_exposure,
+    at_one_exposure,
     chosen_device,
     detail,
     device_options,
@@ -172,8 +172,8 @@ def train(
             f"{metrics['seconds']:.0f} s of training"
         )
         if scores := metrics.get("evaluation"):
-            predicted = at_predicted_exposure(scores["psnr_predicted"])
-            click.echo(f"held-out views: {scores['psnr']:.2f} dB{predicted}, SSIM {scores['ssim']:.4f}")
+            consistent = at_one_exposure(scores.get("psnr_consistent"))
+            click.echo(f"held-out views: {scores['psnr']:.2f} dB{consistent}, SSIM {scores['ssim']:.4f}")
         if view:
             note(f"'hyrfpack view {result.model}' shows the model again")
     if not result.complete:

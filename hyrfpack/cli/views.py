@@ -11,6 +11,7 @@ import click
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
+    at_one_exposure,
     chosen_device,
     device_options,
     json_option,
@@ -184,8 +185,8 @@ def evaluate(
     MODEL is a .hyrf file, the folder of a run, or splats (.ply .splat .spz .sog) in the photos' axes and units, drawn
     over black: what 'hyrfpack export' wrote, or another program.
 
-    Renders are rounded to 8 bits before they are scored. PSNR is told three times: at the photos' mean exposure, at the
-    one that training photos beside predict, and with colours corrected by the photo itself. LPIPS needs the trained
+    Renders are rounded to 8 bits before they are scored. PSNR is of the pictures that 'hyrfpack render' writes;
+    "corrected" is PSNR after an affine map of colours that is fitted to the photo itself. LPIPS needs the trained
     weights of the lpips package:
     torch.save(lpips.LPIPS(net="alex").state_dict(), FILE)
 
@@ -216,7 +217,6 @@ def evaluate(
         scores = score(
             shown,
             views,
-            training=scene.train,
             lpips_weights=lpips_weights,
             pictures=pictures,
             overwrite=overwrite,
@@ -233,19 +233,16 @@ def evaluate(
         print_json({"bytes": size, "max_size": scene.max_size, "picture_size": [width, height], **scores.to_dict()})
         return
     rows = [*(_row(view.name, view) for view in scores.views), _row("mean", scores)]
-    click.echo(table(["view", "PSNR (dB)", "predicted", "corrected", "SSIM", "predicted", "LPIPS"], rows))
+    click.echo(table(["view", "PSNR (dB)", "corrected", "SSIM", "LPIPS"], rows))
     limit = f"--max-size {scene.max_size}" if scene.max_size else "as they are stored"
     click.echo(f"{len(scores.views)} photos of up to {width} x {height} pixels ({limit})")
+    if scores.psnr_consistent is not None:
+        click.echo(f"mean PSNR {scores.psnr:.2f} dB{at_one_exposure(scores.psnr_consistent)}")
     click.echo(f"{model}: {size:,} bytes, {scores.gaussians:,} Gaussians, {scores.seconds_per_frame:.4f} s a frame")
     if scores.lpips is None:
         click.echo(f"LPIPS: {scores.lpips_reason}")
 
 
 def _row(name: str, scores: ViewScore | Evaluation) -> list[str]:
-    decibels = (scores.psnr, scores.psnr_predicted, scores.psnr_corrected)
-    similar = (scores.ssim, scores.ssim_predicted, scores.lpips)
-    return [name, *(_optional(value, 2) for value in decibels), *(_optional(value) for value in similar)]
-
-
-def _optional(value: float | None, digits: int = 4) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+    perceptual = "-" if scores.lpips is None else f"{scores.lpips:.4f}"
+    return [name, f"{scores.psnr:.2f}", f"{scores.psnr_corrected:.2f}", f"{scores.ssim:.4f}", perceptual]

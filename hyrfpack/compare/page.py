@@ -57,7 +57,6 @@ def _tables(runs: Sequence[Run], names: Sequence[str], ranked: bool) -> list[str
     """Numbers, and what differs; with `ranked`, the best scores stand out."""
     numbers = [
         *_scores("held-out PSNR (dB)", [run.psnr for run in runs], 2, max if ranked else None),
-        *_scores("at predicted exposure (dB)", [run.psnr_predicted for run in runs], 2, max if ranked else None),
         *_scores("held-out SSIM", [run.ssim for run in runs], 4, max if ranked else None),
         *_scores("held-out LPIPS", [run.lpips for run in runs], 4, min if ranked else None),
         _row("Gaussians", [f"{run.gaussians:,}" for run in runs]),

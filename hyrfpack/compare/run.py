@@ -54,7 +54,6 @@ class Run:
         notes: what the reader of photos had to say.
         curve: at least one record.
         psnr, ssim, lpips: means over the held-out photos; None where there are none.
-        psnr_predicted: the same, as in `hyrfpack.Evaluation`.
         scores: of each held-out photo.
         skipped: names of held-out photos that their masks leave nothing of.
         pictures: the file of photo, render and error map, by the name of its photo.
@@ -72,7 +71,6 @@ class Run:
     notes: list[str]
     curve: list[Record]
     psnr: float | None
-    psnr_predicted: float | None
     ssim: float | None
     lpips: float | None
     scores: list[Score]
@@ -153,7 +151,6 @@ def _run(folder: Path, metrics: Any) -> Run:
         curve=curve,
         psnr=_number(evaluation, "psnr") if evaluation else None,
         ssim=_number(evaluation, "ssim") if evaluation else None,
-        psnr_predicted=_optional(evaluation, "psnr_predicted"),
         lpips=_optional(evaluation, "lpips"),
         scores=scores,
         skipped=skipped,

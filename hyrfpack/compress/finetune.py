@@ -76,7 +76,8 @@ def finetune(
         views: photos to fit.
         steps: optimiser steps of one process, one view each; several take as many views together.
         seed: of the order of views.
-        gains: of each photo, that renders are exposed by before they are compared, see `gains_of_photos`.
+        gains: of each photo, that renders as photographed are exposed by before they are compared, see
+            `gains_of_photos`; None compares renders as they are.
         cache: holds decoded photos.
         report: called after each step with its number, from 1, and the photometric loss.
         ranks: processes that fit the same model together, as in `Trainer`; all get the same.
@@ -148,19 +149,28 @@ def _fit(
 
 @torch.no_grad()
 def gains_of_photos(model: HybridModel, views: Sequence[View], cache: PictureCache | None = None) -> dict[str, Tensor]:
-    """The gains of `expose` that bring a model of mean exposure to each photo, by name, (3,) on the model's device.
+    """Fit the residual gains of each photo: those of `expose` that bring the render as photographed to the photo.
 
-    The mean of their logarithms is zero, so that a model fitted with them keeps its exposure.
+    With the gains g_map of the model's exposure map and the residual gains g of a photo,
+
+        photo = expose(expose(consistent, g_map), g) + e = expose(consistent, g_map g) + e
+
+    so that a model which is fitted to photos with these gains keeps its consistent exposure and its map: what the map
+    does not explain of a photo's exposure goes into g. Without a map, g holds all of it. A photo that is nearly black
+    or white has gains of one, the exposure that the map predicts.
+
+    Returns:
+        (3,) gains on the model's device, by the name of the photo.
     """
     device = model.gaussians.positions.device
     solid = None if model.config.background else np.array(model.config.solid, np.float32)
-    decoded, logs = model.decode(), []
+    decoded, gains = model.decode(), {}
     with closing((cache or PictureCache()).stream(views)) as pictures, torch_on_one_thread():
         for view, picture in pictures:
             photo, mask = upload(picture, solid, device)
-            logs.append(np.log(fitted_gains(render(model, view.camera, decoded=decoded).rgb, photo, mask)))
-    centred = torch.from_numpy(np.exp(logs - np.mean(logs, 0))).float().to(device)
-    return {view.name: gains for view, gains in zip(views, centred, strict=True)}
+            fitted = fitted_gains(render(model, view.camera, decoded=decoded).rgb, photo, mask)
+            gains[view.name] = torch.from_numpy(fitted).float().to(device)
+    return gains
 
 
 @torch.no_grad()

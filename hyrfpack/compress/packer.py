@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import count
@@ -42,7 +42,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import ALONE, Ranks
 from hyrfpack.progress import Report, no_report, report_part, report_round
-from hyrfpack.scene import Scene, View, evenly_spaced
+from hyrfpack.scene import Scene, evenly_spaced
 
 TOLERATED_DROP, DROP_VIEWS = 1.5, 8  # factor from the dB aimed at, and training photos that these are measured on
 TOLERATED, MENDED = 1.2, 3  # factor from the distortion asked for, and how often another file is made beyond it
@@ -101,8 +101,7 @@ def compress(
         finetune_steps: steps of fitting the quantised model to the photos of `data`; buys smaller files with time.
         prune: leave out Gaussians that cost more in bytes than they give to pictures.
         target_bytes: make the file as good as can be within so many bytes.
-        max_psnr_drop: make the file as small as can be for so many dB of mean PSNR on the held-out photos of `data`;
-            of `psnr_predicted` (`hyrfpack.Evaluation`) where photos' exposures were learnt beside the model.
+        max_psnr_drop: make the file as small as can be for so many dB of mean PSNR on the held-out photos of `data`.
         distortion: mean squared error that pictures may get, by estimate; instead of a search.
         overwrite: replace a file at `target`. Without it, one that is there is an error, and one that appears in the
             meantime is kept: the result gets a free name beside it, which the report names.
@@ -254,10 +253,10 @@ class Packer:
         trial, distortion = self._settled(wanted, originals, report_part(self.report, 0.0, 0.3))
         views = evenly_spaced(self.scene.train, DROP_VIEWS)
         try:
-            before = self._psnr(self.model, views, report_part(self.report, 0.3, 0.6))
+            before = evaluate(self.model, views, report=report_part(self.report, 0.3, 0.6)).psnr
             for number in range(MENDED):
                 report = report_round(report_part(self.report, 0.6, 1.0), number)
-                lost = before - self._psnr(self.decoded(trial), views, report)
+                lost = before - evaluate(self.decoded(trial), views, report=report).psnr
                 if lost <= TOLERATED_DROP * aim:
                     break
                 distortion *= max(aim / lost, 1 / FINER)
@@ -319,14 +318,14 @@ class Packer:
         assert self.scene is not None
         views = self.scene.test or self.scene.train
         self.report("scoring the model", 0.0)
-        before = self._psnr(self.model, views)
+        before = evaluate(self.model, views).psnr
         rounds = count()
 
         def attempt(distortion: float) -> Trial:
             report = report_round(self.report, next(rounds))
             trial = self.attempt(distortion, report_part(report, 0.0, 0.7))
             report("scoring the file", 0.7)
-            lost = before - self._psnr(self.decoded(trial), views)
+            lost = before - evaluate(self.decoded(trial), views).psnr
             trial = dataclasses.replace(trial, lost=lost)
             self.say(f"distortion {distortion:.2g}: {len(trial.data):,} bytes, {lost:+.3f} dB lost")
             return trial
@@ -341,9 +340,9 @@ class Packer:
 
     @cached_property
     def _gains(self) -> dict[str, torch.Tensor] | None:
-        """Of the photos to fine-tune on; None where the model has the exposure of each."""
+        """Residual gains of the photos to fine-tune on; None where no per-image gains were learnt with the model."""
         assert self.scene is not None
-        if not has_mean_exposure(self.provenance):
+        if self.model.exposure is None and not has_mean_exposure(self.provenance):
             return None
         return gains_of_photos(self.model, self.scene.train, self.cache)
 
@@ -352,14 +351,6 @@ class Packer:
         model = decode_model(trial.data).to(self.model.gaussians.positions.device)
         model.precision = self.model.precision
         return model
-
-    def _psnr(self, model: HybridModel, views: Sequence[View], report: Report = no_report) -> float:
-        """At the exposure that photos beside each predict, where the model has their mean: what the photos' own
-        exposures add to the error would hide what packing adds."""
-        assert self.scene is not None
-        training = self.scene.train if has_mean_exposure(self.provenance) else ()
-        scores = evaluate(model, views, training=training, report=report)
-        return scores.psnr if scores.psnr_predicted is None else scores.psnr_predicted
 
     def _trials(self) -> int:
         return FINETUNED_TRIALS if self.finetune_steps else TRIALS

@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-import functools
 import os
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from hyrfpack.checks import check_type
+from hyrfpack.choices import AS_PHOTOGRAPHED, CONSISTENT
 from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate.exposure import corrected, fitted_gains, predicted_gains
+from hyrfpack.evaluate.exposure import corrected
 from hyrfpack.evaluate.figures import comparison
 from hyrfpack.evaluate.lpips import LPIPS
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
-from hyrfpack.model.exposure import expose
 from hyrfpack.parallel.ranks import ALONE, Ranks
 from hyrfpack.progress import Report, no_report
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.render import RenderSettings, apply_exposure_map, render
 from hyrfpack.render.files import file_names, save_picture
 from hyrfpack.scene import Camera, View, evenly_spaced
 from hyrfpack.splats.draw import Drawable, draw
@@ -44,26 +43,24 @@ class ViewScore:
 
     name: str
     psnr: float
-    psnr_predicted: float | None
+    psnr_consistent: float | None
     psnr_corrected: float
     ssim: float
-    ssim_predicted: float | None
     lpips: float | None
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Scores on held-out views; the first six are means over `views`.
+    """Scores on held-out views; the first five are means over `views`.
 
     Attributes:
-        psnr: dB, pooled over each picture's pixels and channels, then averaged over views; of renders as they are, at
-            the training photos' mean exposure.
-        psnr_predicted: of renders exposed as training photos near by predict, see
-            `hyrfpack.evaluate.exposure.predicted_gains`: the held-out photo is not looked at. None without such photos.
+        psnr: dB, pooled over each picture's pixels and channels, then averaged over views; of renders as photographed,
+            which is what `hyrfpack.render` shows, unless `settings` ask for the consistent exposure.
+        psnr_consistent: of renders at the model's one consistent exposure; None of a model without an exposure map, and
+            of splats.
         psnr_corrected: of renders brought to the colours of the very photo that they are scored against, see
             `hyrfpack.evaluate.exposure.corrected`.
-        ssim: 11x11 Gaussian window, sigma 1.5; of renders as they are.
-        ssim_predicted: of renders exposed as for `psnr_predicted`.
+        ssim: 11x11 Gaussian window, sigma 1.5; of the renders of `psnr`.
         lpips: perceptual distance, or None.
         lpips_reason: why lpips is None, or which network made it.
         gaussians: how many the model has.
@@ -74,10 +71,9 @@ class Evaluation:
     """
 
     psnr: float
-    psnr_predicted: float | None
+    psnr_consistent: float | None
     psnr_corrected: float
     ssim: float
-    ssim_predicted: float | None
     lpips: float | None
     lpips_reason: str
     gaussians: int
@@ -95,7 +91,6 @@ def evaluate(
     model: HybridModel | Drawable,
     views: Sequence[View],
     *,
-    training: Sequence[View] = (),
     lpips_weights: str | os.PathLike[str] | None = None,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     pictures: str | os.PathLike[str] | None = None,
@@ -113,9 +108,8 @@ def evaluate(
     Args:
         model: what to score, or splats ready to be drawn (`hyrfpack.splats.draw.Drawable`).
         views: photos to compare with, not used in training.
-        training: photos that were, which the exposure of those is predicted from; two near each of these are rendered.
         lpips_weights: see `hyrfpack.evaluate.lpips`; without it lpips is None.
-        settings: how to render.
+        settings: how to render, and at which exposure.
         pictures: folder for photo | render | error pictures of `picture_count` views spread over `views`.
         overwrite: replace files in `pictures`; without it, one that is there is an error.
         report: told of each view before it is scored, and the share of the work that is done. Each of several
@@ -137,9 +131,8 @@ def evaluate(
     if not isinstance(model, Drawable):
         check_type("model", model, HybridModel)
     check_type("settings", settings, RenderSettings)
-    for given in (views, training):
-        for view in given if isinstance(given, Sequence) else [given]:
-            check_type("each of the views", view, View)
+    for view in views if isinstance(views, Sequence) else [views]:
+        check_type("each of the views", view, View)
     if not views:
         raise HyrfError("there is no view to score; name a split that has photos or a smaller `test_every`")
     perceptual = None if lpips_weights is None else LPIPS.load(lpips_weights)
@@ -149,17 +142,10 @@ def evaluate(
         solid, device = np.array(model.config.solid, dtype=np.float32), model.gaussians.positions.device
         count = len(model)
     drawn = picture_names(views, picture_count)
-    trained = {view.name: view for view in training}
 
     def scored() -> list[tuple[int, ViewScore | None, float]]:
         """Place, score (None where the mask leaves nothing) and seconds of each view that is this rank's."""
         draw_colors = _color_renderer(model, settings)
-
-        @functools.cache
-        def gains_of(name: str) -> np.ndarray:
-            photo, mask = upload(trained[name].load(), solid, device)
-            return fitted_gains(draw_colors(trained[name].camera), photo, mask)
-
         draw_colors(views[0].camera)  # compiles kernels and fills caches
         scores: list[tuple[int, ViewScore | None, float]] = []
         own = ranks.share(list(enumerate(views)))
@@ -171,13 +157,9 @@ def evaluate(
                 scores.append((number, None, 0.0))
                 continue
             started = _now(device)
-            rgb = draw_colors(view.camera)
+            rgb, consistent = draw_colors(view.camera)
             seconds = _now(device) - started
             image = to_8bit(rgb)
-            foretold = None
-            if trained.keys() - {view.name}:
-                gains = torch.from_numpy(predicted_gains(view.name, list(trained), gains_of)).to(rgb)
-                foretold = to_8bit(expose(rgb, gains))
             distance = None
             if perceptual is not None:
                 seen = image if mask is None else torch.where(mask[..., None], image, reference)
@@ -185,10 +167,9 @@ def evaluate(
             score = ViewScore(
                 name=view.name,
                 psnr=psnr(image, reference, mask),
-                psnr_predicted=None if foretold is None else psnr(foretold, reference, mask),
+                psnr_consistent=None if consistent is None else psnr(to_8bit(consistent), reference, mask),
                 psnr_corrected=psnr(corrected(image, reference, mask), reference, mask),
                 ssim=ssim(image, reference, mask),
-                ssim_predicted=None if foretold is None else ssim(foretold, reference, mask),
                 lpips=distance,
             )
             scores.append((number, score, seconds))
@@ -210,10 +191,9 @@ def evaluate(
         raise HyrfError("the masks of all views leave no pixel to score; check that white means 'use this pixel'")
     return Evaluation(
         psnr=statistics.fmean(score.psnr for score in scores),
-        psnr_predicted=_mean(score.psnr_predicted for score in scores),
+        psnr_consistent=_mean(score.psnr_consistent for score in scores),
         psnr_corrected=statistics.fmean(score.psnr_corrected for score in scores),
         ssim=statistics.fmean(score.ssim for score in scores),
-        ssim_predicted=_mean(score.ssim_predicted for score in scores),
         lpips=_mean(score.lpips for score in scores),
         lpips_reason=NO_LPIPS if perceptual is None else f"network {perceptual.name}",
         gaussians=count,
@@ -223,12 +203,25 @@ def evaluate(
     )
 
 
-def _color_renderer(model: HybridModel | Drawable, settings: RenderSettings) -> Callable[[Camera], torch.Tensor]:
-    """The function from a camera to colours (H, W, 3), with what does not depend on the view decoded beforehand."""
+def _color_renderer(
+    model: HybridModel | Drawable, settings: RenderSettings
+) -> Callable[[Camera], tuple[torch.Tensor, torch.Tensor | None]]:
+    """Return a function that renders a camera: (H, W, 3) as `settings` ask, and (H, W, 3) at the consistent exposure.
+
+    The second is None of a model without an exposure map and of splats. What does not depend on the view is decoded
+    once.
+    """
     if isinstance(model, Drawable):
-        return lambda camera: draw(model, camera, settings).rgb
-    decoded = model.decode()
-    return lambda camera: render(model, camera, settings, decoded=decoded).rgb
+        return lambda camera: (draw(model, camera, settings).rgb, None)
+    decoded, at_one_exposure = model.decode(), replace(settings, exposure=CONSISTENT)
+
+    def draw_colors(camera: Camera) -> tuple[torch.Tensor, torch.Tensor | None]:
+        rgb = render(model, camera, at_one_exposure, decoded=decoded).rgb
+        if model.exposure is None:
+            return rgb, None
+        return apply_exposure_map(model, camera, rgb) if settings.exposure == AS_PHOTOGRAPHED else rgb, rgb
+
+    return draw_colors
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

@@ -1,8 +1,6 @@
-"""What a difference in exposure and white balance between photos takes from PSNR: two ways to leave it out."""
+"""Differences in exposure and white balance between a render and its photo: per-channel gains and affine correction."""
 
 from __future__ import annotations
-
-from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -11,7 +9,6 @@ from torch import Tensor
 from hyrfpack.evaluate.metrics import to_8bit
 from hyrfpack.model.exposure import expose
 
-NEIGHBOURS = 2  # training photos that a held-out photo's gains are predicted from
 USABLE = 4 / 255, 251 / 255  # what every channel of a photo and of its render lies between where gains are fitted
 LEAST = 16  # pixels; fewer tell nothing, and the gains are one
 LARGEST = 16.0  # gain, and the inverse of the smallest
@@ -92,31 +89,6 @@ def corrected(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tenso
     affine = torch.from_numpy(change).to(image.device)
     whole = image.double()
     return to_8bit(whole + whole @ affine[:3] + affine[3])
-
-
-def predicted_gains(name: str, training: Sequence[str], gains_of: Callable[[str], np.ndarray]) -> np.ndarray:
-    """Gains of a photo by those of training photos near by: the nearest in the order of names, the nearer the more.
-
-        log g = sum_n w_n log g_n,  w_n ~ 1 / (places between them)
-
-    Args:
-        name: of the photo, which is left out of the training photos if it is among them.
-        training: names of the training photos; at least one other.
-        gains_of: (3,) gains of a training photo, asked for as they are needed.
-
-    Returns:
-        (3,) float64.
-
-    Example:
-        >>> predicted_gains("b", ["a", "c", "d"], lambda name: np.full(3, {"a": 1.0, "c": 4.0, "d": 9.0}[name]))
-        array([2., 2., 2.])
-    """
-    order = sorted({name, *training})
-    place = order.index(name)
-    others = sorted((n for n in range(len(order)) if n != place), key=lambda n: abs(n - place))[:NEIGHBOURS]
-    weights = np.array([1 / abs(n - place) for n in others])
-    logs = np.log([gains_of(order[n]) for n in others])
-    return np.exp(weights @ logs / weights.sum())
 
 
 def _pixels(image: Tensor, photo: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:

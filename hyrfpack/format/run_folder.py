@@ -26,7 +26,7 @@ class RunStatus:
         photos: folder of the photos that it trains on.
         train, test: how many photos it trains on, and how many are held out.
         seconds: spent on training.
-        psnr, psnr_predicted, ssim: means over the held-out photos, as in `hyrfpack.Evaluation`; PSNR in dB.
+        psnr, psnr_consistent, ssim: means over the held-out photos, as in `hyrfpack.Evaluation`; PSNR in dB.
     """
 
     folder: str
@@ -39,7 +39,7 @@ class RunStatus:
     test: int | None = None
     seconds: float | None = None
     psnr: float | None = None
-    psnr_predicted: float | None = None
+    psnr_consistent: float | None = None
     ssim: float | None = None
 
 
@@ -100,7 +100,7 @@ def read_run_status(folder: str | os.PathLike[str]) -> RunStatus:
         test=_count(scene, "test"),
         seconds=_number(metrics, "seconds"),
         psnr=_number(scores, "psnr"),
-        psnr_predicted=_number(scores, "psnr_predicted"),
+        psnr_consistent=_number(scores, "psnr_consistent"),
         ssim=_number(scores, "ssim"),
     )
 

@@ -85,7 +85,7 @@ class Cost:
         return {
             "results": one * (BACKGROUND_PASSES + scored) + OVERHEAD / 2,
             "compression": one * (passes(budget) + VERIFIED) + PER_GAUSSIAN * budget,
-            "scoring": one * scored / 2,
+            "scoring": one * scored,
             "export": OVERHEAD / 2,
         }
 

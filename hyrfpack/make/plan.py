@@ -18,7 +18,7 @@ from hyrfpack.train.setup import budget_for
 # Only the first forecast needs them: what is measured on the way takes their place.
 STEP, STEP_GPU, PASS = 0.7, 0.02, 0.6
 BACKGROUND_PASSES = 8.0  # as long as so many such drawings takes the search for a background that nobody sees
-PASSES_PER_SCORED_VIEW = 8.0  # most of it to predict the photo's exposure from those beside it
+PASSES_PER_SCORED_VIEW = 2.0  # as long as so many such drawings takes a held-out photo, its scores and picture
 POSES = 3.0  # for a photo
 UNKNOWN = 100  # photos, where that is not known yet
 
@@ -122,7 +122,7 @@ def forecast(
         "training": 2 + plan.steps * step,
         "results": 2 + (BACKGROUND_PASSES + scored) * pixels * PASS,
         "compression": 3 + (passes(gaussians) + 3 * plan.finetune_steps) * pixels * PASS,
-        "scoring": 0.5 + scored / 2 * pixels * PASS,  # not all models predict exposures
+        "scoring": 0.5 + scored * pixels * PASS,
         "export": 2.0,
     }
 

@@ -48,7 +48,7 @@ class MakeResult:
         work: the folder of every stage's product.
         views: how many held-out photos the model was scored on.
         psnr, ssim: their means; None where there was nothing to score on.
-        psnr_predicted: mean, as in `hyrfpack.Evaluation`; None also where no exposures of photos were learnt.
+        psnr_consistent: mean, as in `hyrfpack.Evaluation`; None also where the model has no exposure map.
         poses: what `hyrfpack.estimate_poses` reports; empty where the photos had poses.
         training: steps, Gaussians, bytes and choices of the training; empty where there was none.
         export: what `hyrfpack.export` reports, or `hyrfpack.distill` of splats under "import".
@@ -65,7 +65,7 @@ class MakeResult:
     work: Path
     views: int = 0
     psnr: float | None = None
-    psnr_predicted: float | None = None
+    psnr_consistent: float | None = None
     ssim: float | None = None
     poses: dict[str, Any] = field(default_factory=dict)
     training: dict[str, Any] = field(default_factory=dict)
@@ -306,7 +306,6 @@ class _Making:
         """Score, and write what is wanted."""
         request, work = self.request, self.work
         scores = {"views": 0} if scene is None else stages.score(work, scene, request.device)
-        psnr = scores.get("psnr") if scores.get("psnr_predicted") is None else scores["psnr_predicted"]
         exported, product = stages.write(work, model, request.output.name, scene)
         output = stages.deliver(product, request.output, overwrite=request.overwrite)  # last: where it is, all is done
         return MakeResult(
@@ -317,7 +316,7 @@ class _Making:
             work=work.folder,
             views=scores["views"],
             psnr=scores.get("psnr"),
-            psnr_predicted=scores.get("psnr_predicted"),
+            psnr_consistent=scores.get("psnr_consistent"),
             ssim=scores.get("ssim"),
             poses=poses or {},
             training=training or {},
@@ -325,5 +324,5 @@ class _Making:
             seconds={name: round(seconds, 1) for name, seconds in work.seconds.items()},
             total_seconds=round(sum(work.seconds.values()), 1),
             kept=tuple(work.kept),
-            note=score_note(scores["views"], psnr, (training or {}).get("psnr")),
+            note=score_note(scores["views"], scores.get("psnr"), (training or {}).get("psnr")),
         )

@@ -14,7 +14,6 @@ from typing import Any
 import torch
 
 from hyrfpack.atomic import pending_file
-from hyrfpack.cameras.capture import has_mean_exposure
 from hyrfpack.compress import compress
 from hyrfpack.data import PictureCache
 from hyrfpack.device import describe_device
@@ -252,9 +251,8 @@ def score(work: Work, scene: Scene, device: torch.device) -> dict[str, Any]:
     def act(going_on: bool) -> tuple[dict, list[str]]:
         if not scene.test:
             return {"views": 0}, []
-        training = scene.train if has_mean_exposure(describe(model)["provenance"]) else ()
-        scores = evaluate(load(model, device), scene.test, training=training, report=work.reporter.tell)
-        means = {name: getattr(scores, name) for name in ("psnr", "psnr_predicted", "ssim")}
+        scores = evaluate(load(model, device), scene.test, report=work.reporter.tell)
+        means = {name: getattr(scores, name) for name in ("psnr", "psnr_consistent", "ssim")}
         return {"views": len(scores.views), **means}, []
 
     inputs = {"model": digest(model), "photos": work.state.inputs("training")["photos and poses"], **_split(scene)}

@@ -1,5 +1,5 @@
 """Model + camera -> picture."""
 
-from hyrfpack.render.renderer import Rendering, RenderSettings, render
+from hyrfpack.render.renderer import Rendering, RenderSettings, apply_exposure_map, render
 
-__all__ = ["RenderSettings", "Rendering", "render"]
+__all__ = ["RenderSettings", "Rendering", "apply_exposure_map", "render"]

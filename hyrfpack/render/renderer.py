@@ -182,10 +182,8 @@ def render(
         # its loss tells as much.
         if on_cpu or not rgb.requires_grad:
             _refuse_nonfinite(background=behind if on_cpu else rgb)
-    if model.exposure is not None and settings.exposure == AS_PHOTOGRAPHED:
-        rgb = expose(
-            rgb, tensor_like(model.exposure.gains_of_pose(model.config.frame.local_pose(camera)).tolist(), rgb)
-        )
+    if settings.exposure == AS_PHOTOGRAPHED:
+        rgb = apply_exposure_map(model, camera, rgb)
     return Rendering(
         rgb=rgb,
         alpha=1 - raster.transmittance,
@@ -196,6 +194,23 @@ def render(
         pairs=raster.pairs,
         seconds=seconds,
     )
+
+
+def apply_exposure_map(model: HybridModel, camera: Camera, rgb: Tensor) -> Tensor:
+    """Expose a render of the consistent exposure as `render` does for "as-photographed".
+
+    Args:
+        model: the model that was rendered.
+        camera: the camera that it was rendered from, in world units.
+        rgb: (H, W, 3) in [0, 1], rendered with `RenderSettings(exposure="consistent")`.
+
+    Returns:
+        (H, W, 3) in [0, 1]; `rgb` itself where the model has no exposure map. Differentiable in `rgb`.
+    """
+    if model.exposure is None:
+        return rgb
+    gains = model.exposure.gains_of_pose(model.config.frame.local_pose(camera))
+    return expose(rgb, tensor_like(gains.tolist(), rgb))
 
 
 def _refuse_nonfinite(**values: Tensor) -> None:

@@ -224,7 +224,6 @@ def write_results(
             scores = evaluate(
                 model,
                 scene.test,
-                training=scene.train,
                 pictures=out / VIEWS,
                 overwrite=overwrite,
                 report=lambda _, share: phase("scoring held-out photos", round(share * photos), photos),

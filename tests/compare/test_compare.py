@@ -123,15 +123,23 @@ def test_the_best_score_stands_out_unless_scores_cannot_be_compared(runs, tmp_pa
         return [name for name, attributes in page.tags if attributes.get("class") == "best"]
 
     for run, psnr in zip(runs, (20.0, 21.0), strict=True):
-        scores = {"psnr": psnr, "psnr_predicted": 30 - psnr / 10, "ssim": 0.5}
+        scores = {"psnr": psnr, "ssim": 0.8 - psnr / 100}
         changed(run, lambda values, scores=scores: values["evaluation"].update(scores))
     hyrfpack.compare(runs, tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text()
-    assert '<td class="best">21.00</td>' in text and '<td class="best">28.00</td>' in text
+    assert '<td class="best">21.00</td>' in text and '<td class="best">0.6000</td>' in text
     assert best(Page(tmp_path / "page.html")) == ["td", "td"]
     repaint(runs[1] / "views" / "000.png")
     hyrfpack.compare(runs, tmp_path / "page.html", overwrite=True)
     assert best(Page(tmp_path / "page.html")) == []
+
+
+def test_scores_at_a_predicted_exposure_of_runs_of_earlier_versions_are_left_out(runs, tmp_path):
+    for run in runs:
+        changed(run, lambda values: values["evaluation"].update(psnr_predicted=12.34, ssim_predicted="none"))
+    hyrfpack.compare(runs, tmp_path / "page.html")
+    page = Page(tmp_path / "page.html")
+    assert "12.34" not in page.words and not [name for name in page.rows if "predicted" in name]
 
 
 def test_views_are_the_photo_and_each_render_with_their_scores(runs, tmp_path):

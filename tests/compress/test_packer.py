@@ -226,7 +226,9 @@ def test_files_that_cost_training_photos_more_than_was_aimed_at_are_made_finer(l
     )
     monkeypatch.setattr(running.Packer, "decoded", lambda packer, trial: trial.data)
     monkeypatch.setattr(
-        running.Packer, "_psnr", lambda packer, shown, views, report: 30.0 if shown is None else 30.0 - lost(shown)
+        running,
+        "evaluate",
+        lambda shown, views, report: SimpleNamespace(psnr=30.0 if shown is None else 30.0 - lost(shown)),
     )
 
     trial = packer.settled(1e-3, SimpleNamespace(error=lambda distortion: distortion), 0.1)
@@ -241,10 +243,10 @@ def test_photos_that_cannot_be_read_do_not_end_the_work(monkeypatch):
     monkeypatch.setattr(packer, "attempt", lambda distortion, *_: running.Trial(distortion, {}))
     monkeypatch.setattr(running.Packer, "decoded", lambda packer, trial: trial.data)
 
-    def fail(packer, shown, views, report):
+    def fail(shown, views, report):
         raise HyrfError("a.png: the file is gone")
 
-    monkeypatch.setattr(running.Packer, "_psnr", fail)
+    monkeypatch.setattr(running, "evaluate", fail)
     assert packer.settled(1e-3, SimpleNamespace(error=lambda distortion: distortion), 0.1).data == 1e-3
     assert said == ["a.png: the file is gone; the loss on training photos is not measured"]
 

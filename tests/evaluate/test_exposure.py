@@ -1,19 +1,21 @@
-"""PSNR without what exposure and white balance take from it: gains and maps of colour that are known."""
+"""Scores of models with an exposure map, and the gains and colour maps that are fitted to photos."""
 
 from __future__ import annotations
 
-import dataclasses
+import copy
 
 import numpy as np
 import pytest
 import torch
+from exposures import random_map
 from scenes import ball_points, ball_scene, small_model
 
 from hyrfpack.evaluate import evaluate
-from hyrfpack.evaluate.exposure import corrected, fitted_gains, predicted_gains
+from hyrfpack.evaluate.exposure import corrected, fitted_gains
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR, psnr, ssim, to_8bit
+from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import expose
-from hyrfpack.render import render
+from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Picture, View
 
 GAINS = np.array([0.8, 1.0, 1.3])
@@ -75,59 +77,81 @@ def test_pictures_that_are_not_finite_are_refused(function):
             function(*pair)
 
 
-def test_gains_are_predicted_by_the_nearest_names_the_nearer_the_more():
-    known = {"a": 9.0, "b": 1.0, "d": 8.0, "z": 5.0}
-
-    def gains_of(name: str) -> np.ndarray:
-        return np.full(3, known[name])
-
-    def predicted(name: str) -> float:
-        return predicted_gains(name, list(known), gains_of)[0]
-
-    assert predicted("c") == pytest.approx(8**0.5)  # one place from b and from d
-    assert predicted("zz") == pytest.approx(5 ** (2 / 3) * 8 ** (1 / 3))  # one place from z, two from d
-    assert predicted("b") == pytest.approx(72**0.5), "its own gains are not asked for"
-    assert predicted_gains("c", ["a"], gains_of)[0] == pytest.approx(9)
+def exposed_by_formula(image: torch.Tensor, gains: np.ndarray) -> np.ndarray:
+    """A render as a camera with these gains shows it, in 8 bits: y' = g y / (1 + (g - 1) y), in float64."""
+    image = image.double().numpy()
+    return np.rint(255 * gains * image / (1 + (gains - 1) * image)) / 255
 
 
-def exposed(view: View, model, gains) -> View:
-    """The view's photo is what the model renders there, exposed by gains."""
-    image = expose(render(model, view.camera).rgb.detach(), torch.as_tensor(gains, dtype=torch.float32))
-    picture = Picture((to_8bit(image) * 255).byte().numpy())
-    return dataclasses.replace(view, load=lambda: picture)
-
-
-def test_three_scores_leave_out_what_they_say():
+@pytest.fixture
+def plain() -> HybridModel:
+    """A model of the balls, without an exposure map."""
     points, colors = ball_points(150)
-    model = small_model(points, color_logits=torch.from_numpy(colors) * 4 - 2, scale_logits=-1.5)
-    gains = [0.5, 0.7, 0.9 * GAINS, 0.8, 0.7]
-    views = [exposed(view, model, gain) for view, gain in zip(ball_scene(5).train, gains, strict=True)]
-    held_out, training = [views[1], views[3]], views[::2]
-
-    scores = evaluate(model, held_out, training=training)
-
-    for score, own, beside in zip(scores.views, (gains[1], gains[3]), ((0, 2), (2, 4)), strict=True):
-        view = next(view for view in held_out if view.name == score.name)
-        image = render(model, view.camera).rgb.detach()
-        predicted = torch.as_tensor(np.sqrt(gains[beside[0]] * gains[beside[1]]) * np.ones(3)).float()
-        photo = torch.from_numpy(view.load().rgb) / 255
-        assert score.psnr_predicted == pytest.approx(psnr(to_8bit(expose(image, predicted)), photo), abs=0.3)
-        assert score.ssim_predicted == pytest.approx(ssim(to_8bit(expose(image, predicted)), photo), abs=0.01)
-        assert score.ssim < score.ssim_predicted <= 1
-        assert score.psnr < score.psnr_predicted < 42 < score.psnr_corrected <= IDENTICAL_PSNR
-        assert score.psnr == pytest.approx(psnr(to_8bit(image), photo)) and np.all(own != 1)
-    assert scores.psnr_predicted == pytest.approx(np.mean([score.psnr_predicted for score in scores.views]))
-    assert scores.ssim_predicted == pytest.approx(np.mean([score.ssim_predicted for score in scores.views]))
-    assert scores.psnr_corrected == pytest.approx(np.mean([score.psnr_corrected for score in scores.views]))
+    return small_model(points, color_logits=torch.from_numpy(colors) * 4 - 2, scale_logits=-1.5)
 
 
-def test_without_training_photos_nothing_is_predicted_and_nothing_else_changes():
-    points, colors = ball_points(60)
-    model, views = small_model(points), ball_scene(3).train
+@pytest.fixture
+def mapped(plain) -> HybridModel:
+    """The same model with an exposure map of another exposure in every place."""
+    model = copy.copy(plain)
+    model.exposure = random_map(3, centers=6)
+    return model
 
-    alone, beside = evaluate(model, views[:1]), evaluate(model, views[:1], training=views)
 
-    for score in (alone, alone.views[0]):
-        assert score.psnr_predicted is None and score.ssim_predicted is None
-    assert (alone.psnr, alone.psnr_corrected, alone.ssim) == (beside.psnr, beside.psnr_corrected, beside.ssim)
-    assert evaluate(model, views[:1], training=views[:1]).psnr_predicted is None
+def test_psnr_is_of_renders_as_photographed_and_psnr_consistent_of_those_at_one_exposure(plain, mapped):
+    views = ball_scene(4).train
+
+    scores = evaluate(mapped, views)
+
+    for view, score in zip(views, scores.views, strict=True):
+        photo = view.load().rgb / 255
+        image = render(plain, view.camera).rgb.detach()
+        gains = mapped.exposure.gains_of_pose(plain.config.frame.local_pose(view.camera))
+        assert np.abs(np.log(gains)).max() > 0.1
+        for told, drawn in ((score.psnr, gains), (score.psnr_consistent, np.ones(3))):
+            expected = -10 * np.log10(np.mean((exposed_by_formula(image, drawn) - photo) ** 2))
+            assert told == pytest.approx(expected, abs=0.01)
+    for name in ("psnr", "psnr_consistent", "psnr_corrected", "ssim"):
+        assert getattr(scores, name) == pytest.approx(np.mean([getattr(score, name) for score in scores.views]))
+
+
+def test_the_scores_are_of_the_very_pictures_that_render_shows_at_each_exposure(plain, mapped):
+    views = ball_scene(3).train
+    photos = [torch.from_numpy(view.load().rgb) / 255 for view in views]
+
+    for exposure, model in (("as-photographed", mapped), ("consistent", plain)):
+        scores = evaluate(mapped, views, settings=RenderSettings(exposure=exposure))
+        images = [to_8bit(render(mapped, view.camera, RenderSettings(exposure=exposure)).rgb) for view in views]
+        pairs = list(zip(images, photos, strict=True))
+        assert [score.psnr for score in scores.views] == pytest.approx([psnr(*pair) for pair in pairs], abs=1e-6)
+        assert [score.ssim for score in scores.views] == pytest.approx([ssim(*pair) for pair in pairs], abs=1e-6)
+        assert scores.psnr_consistent == evaluate(plain, views).psnr
+        for image, view in zip(images, views, strict=True):
+            assert torch.equal(image, to_8bit(render(model, view.camera).rgb))
+
+
+def test_a_map_of_the_photos_gains_scores_what_the_model_without_it_scores_on_unexposed_photos(plain, mapped):
+    cameras = [view.camera for view in ball_scene(4).train]
+    unexposed, exposed = [], []
+    for number, camera in enumerate(cameras):
+        image = render(plain, camera).rgb.detach()
+        gains = mapped.exposure.gains_of_pose(plain.config.frame.local_pose(camera))
+        for views, by in ((unexposed, np.ones(3)), (exposed, gains)):
+            pixels = (255 * exposed_by_formula(image, by)).round().astype(np.uint8)
+            views.append(View(str(number), camera, lambda pixels=pixels: Picture(pixels)))
+
+    scores = evaluate(mapped, exposed)
+
+    assert evaluate(plain, unexposed).psnr == IDENTICAL_PSNR
+    assert scores.psnr > 70  # a few values round to the other of two levels
+    assert scores.psnr_consistent == evaluate(plain, exposed).psnr < 35
+
+
+def test_without_an_exposure_map_nothing_is_said_of_one_exposure_and_both_exposures_score_alike(plain):
+    views = ball_scene(2).train
+
+    scores = evaluate(plain, views)
+
+    assert scores.psnr_consistent is None and {score.psnr_consistent for score in scores.views} == {None}
+    consistent = evaluate(plain, views, settings=RenderSettings(exposure="consistent"))
+    assert (scores.psnr, scores.ssim) == (consistent.psnr, consistent.ssim)

@@ -27,7 +27,7 @@ def run(tmp_path: Path) -> Path:
         "settings": {"steps": 1200},
         "scene": {"path": "photos/bonsai", "train": 7, "test": 2},
         "seconds": 12.5,
-        "evaluation": {"psnr": 25.5, "psnr_predicted": None, "ssim": 0.75},
+        "evaluation": {"psnr": 25.5, "psnr_consistent": 21.25, "ssim": 0.75},
     }
     (folder / "metrics.json").write_text(json.dumps(metrics))
     return folder
@@ -124,7 +124,7 @@ def test_the_status_of_a_finished_run_is_what_its_metrics_say(run):
     assert status.finished and not status.has_checkpoint
     assert (status.step, status.steps, status.seconds) == (1200, 1200, 12.5)
     assert (status.photos, status.train, status.test) == ("photos/bonsai", 7, 2)
-    assert (status.psnr, status.psnr_predicted, status.ssim) == (25.5, None, 0.75)
+    assert (status.psnr, status.psnr_consistent, status.ssim) == (25.5, 21.25, 0.75)
 
 
 def test_a_run_with_a_model_and_a_checkpoint_is_not_finished(run):

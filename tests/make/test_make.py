@@ -13,6 +13,7 @@ import pytest
 import torch
 from commands import hyrfpack, refused, succeeded
 from explicit_balls import ball
+from exposures import random_map
 from PIL import Image
 
 from hyrfpack import evaluate, load, load_scene, save
@@ -134,11 +135,13 @@ def test_the_score_is_of_the_packed_model_on_the_photos_held_out(made, posed, tm
     result = make(posed, tmp_path / "scene.hyrf", work=copy_of(made, tmp_path))
     scores = evaluate(load(result.output), load_scene(posed).test)
     assert (result.psnr, result.ssim, result.views) == (scores.psnr, scores.ssim, 3)
-    assert result.psnr_predicted is None  # all photos are of one exposure
+    assert result.psnr_consistent is None  # the model has no exposure map
 
 
-def test_a_model_of_mean_exposure_is_scored_at_that_of_photos_beside_those_held_out_too(made, posed, tmp_path):
-    save(load(made / "model.hyrf"), tmp_path / "model.hyrf", provenance={"mean_exposure": True})
+def test_a_model_with_an_exposure_map_is_scored_as_render_shows_it_and_at_one_exposure(made, posed, tmp_path):
+    model = load(made / "model.hyrf")
+    model.exposure = random_map(3, centers=6)
+    save(model, tmp_path / "model.hyrf")
     state = SimpleNamespace(inputs=lambda stage: {"photos and poses": ""})
     reporter = Reporter(["scoring"], None)
     stage = lambda name, inputs, act: act(False)[0]  # noqa: E731
@@ -147,10 +150,11 @@ def test_a_model_of_mean_exposure_is_scored_at_that_of_photos_beside_those_held_
 
     scores = stages.score(work, scene, torch.device("cpu"))
 
-    expected = evaluate(load(tmp_path / "model.hyrf"), scene.test, training=scene.train)
+    expected = evaluate(model, scene.test)
     assert scores == {
-        "views": 3, "psnr": expected.psnr, "psnr_predicted": expected.psnr_predicted, "ssim": expected.ssim
+        "views": 3, "psnr": expected.psnr, "psnr_consistent": expected.psnr_consistent, "ssim": expected.ssim
     }  # fmt: skip
+    assert expected.psnr != expected.psnr_consistent == evaluate(load(made / "model.hyrf"), scene.test).psnr
 
 
 @pytest.mark.parametrize("count, held_out", [(3, 0), (8, 1), (15, 1)])

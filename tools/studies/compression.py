@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 import hyrfpack
-from hyrfpack.cameras.capture import coarse, has_mean_exposure
+from hyrfpack.cameras.capture import coarse
 from hyrfpack.compress.calibrate import Originals, calibrate
 from hyrfpack.compress.distortion import default_distortion
 from hyrfpack.compress.packer import Packer, Trial
@@ -61,7 +61,6 @@ class Set:
         self.scene = hyrfpack.load_scene(data)
         self.model, provenance = load_with_provenance(folder / "model.hyrf")
         self.provenance = coarse(provenance, self.model.config.frame.scale)
-        self.exposed = self.scene.train if has_mean_exposure(provenance) else ()
         self.raw = self.scores(self.model)
         self.held_out = Originals.seen([view.camera for view in evenly_spaced(self.scene.test, HELD_OUT)], self.model)
         start = time.perf_counter()
@@ -71,10 +70,8 @@ class Set:
 
     def scores(self, model: HybridModel) -> tuple[float, float]:
         """PSNR and SSIM on the held-out photos."""
-        scores = hyrfpack.evaluate(model, self.scene.test, training=self.exposed)
-        if scores.psnr_predicted is None or scores.ssim_predicted is None:
-            return scores.psnr, scores.ssim
-        return scores.psnr_predicted, scores.ssim_predicted
+        scores = hyrfpack.evaluate(model, self.scene.test)
+        return scores.psnr, scores.ssim
 
     def made(self, data: bytes, distortion: float, start: float, trial: Trial | None = None) -> Made:
         seconds = time.perf_counter() - start

@@ -2,9 +2,8 @@
 
     python -m tools.studies.processes --sets gerrard_hall indoor_room --steps 2000 --processes 1 2 4
 
-Each process has one thread. PSNR and SSIM are of held-out photos, at the exposure that photos beside them predict where
-exposures were learnt. "Of the ideal" is the seconds of one process over W times those of W; it means something only
-where each process has a core of its own.
+Each process has one thread. PSNR and SSIM are of held-out photos. "Of the ideal" is the seconds of one process
+over W times those of W; it means something only where each process has a core of its own.
 """
 
 from __future__ import annotations
@@ -33,15 +32,13 @@ def trained(data: Path, out: Path, processes: int, options: Sequence[str]) -> di
 def row(name: str, processes: int, metrics: dict, alone: dict) -> list[str]:
     """A run beside that of one process."""
     scores, first = metrics["evaluation"], alone["evaluation"]
-    kind = "psnr" if scores["psnr_predicted"] is None else "psnr_predicted"
-    similar = kind.replace("psnr", "ssim")
     exchange = metrics["stage_seconds"].get("exchange", 0.0)
     return [
         name,
         str(processes),
         f"{metrics['gaussians']:,}",
-        f"{scores[kind]:.2f} ({scores[kind] - first[kind]:+.2f})",
-        f"{scores[similar]:.4f} ({scores[similar] - first[similar]:+.4f})",
+        f"{scores['psnr']:.2f} ({scores['psnr'] - first['psnr']:+.2f})",
+        f"{scores['ssim']:.4f} ({scores['ssim'] - first['ssim']:+.4f})",
         f"{metrics['seconds']:.0f}",
         f"{exchange / metrics['seconds']:.1%}",
         f"{alone['seconds'] / metrics['seconds'] / processes:.2f}",

@@ -4,12 +4,12 @@
     python -m tools.studies.quality --against ../before --steps 2000
 
 Each set is trained with both versions at several budgets of Gaussians, as shares of this version's, by the command
-line of each, and packed by it; both are scored by this version, on held-out photos, from the files as decoded: PSNR
-at the exposure that training photos foretell (`psnr_predicted`), plain PSNR, and SSIM of both. Then for each set the
-difference in bytes at equal PSNR (Bjontegaard's, over the PSNR that both reach, by monotone cubics through the
-points), and the difference in scores at the most bytes that both have. A share of `measured` is the budget that a
-version takes by itself. Runs are kept below --out, and one that is there is not trained again, nor scored again while
-its scores.json is there. The other version runs with this environment's packages.
+line of each, and packed by it; both are scored by this version, on held-out photos, from the files as decoded, by PSNR
+and SSIM of what `render` shows. Then for each set the difference in bytes at equal PSNR (Bjontegaard's, over the PSNR
+that both reach, by monotone cubics through the points), and the difference in scores at the most bytes that both have.
+A share of `measured` is the budget that a version takes by itself. Runs are kept below --out, and one that is there is
+not trained again, nor scored again while its scores.json is there. The other version runs with this environment's
+packages.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ SETS = (
     "street_lund",
 )
 MEASURED = "measured"
-SCORES = ("bytes", "psnr_predicted", "psnr", "ssim_predicted", "ssim", "seconds", "gaussians")
+SCORES = ("bytes", "psnr", "ssim", "seconds", "gaussians")
 
 
 def run(version: Path, scene: Scene, steps: int, gaussians: int | None, seed: int, out: Path) -> dict[str, float]:
@@ -63,13 +63,11 @@ def run(version: Path, scene: Scene, steps: int, gaussians: int | None, seed: in
     packed = out / "compact.hyrf"
     packed.unlink(missing_ok=True)
     _command(version, "compress", str(out / "model.hyrf"), "-o", str(packed))
-    scores = hyrfpack.evaluate(hyrfpack.load(packed), scene.test, training=scene.train)
+    scores = hyrfpack.evaluate(hyrfpack.load(packed), scene.test)
     trained = json.loads((out / "metrics.json").read_text())
     found = {
         "bytes": packed.stat().st_size,
-        "psnr_predicted": scores.psnr_predicted,
         "psnr": scores.psnr,
-        "ssim_predicted": scores.ssim_predicted,
         "ssim": scores.ssim,
         "seconds": trained["seconds"],
         "gaussians": trained["gaussians"],
@@ -130,19 +128,18 @@ def row(name: str, ours: list[dict[str, float]], theirs: list[dict[str, float]])
     def pair(score: str) -> list[np.ndarray]:
         return [np.stack((curve["bytes"], curve[score]), 1) for curve in curves]
 
-    saved = bytes_at_equal_psnr(*pair("psnr_predicted"))
+    saved = bytes_at_equal_psnr(*pair("psnr"))
     cells = [name, "" if saved is None else f"{100 * saved:+.0f} %"]
     cells += [f"{at_equal_bytes(*pair(score)):+.{digits}f}" for score, digits in _DIGITS.items()]
     cells.append(f"{np.sum(curves[0]['seconds']) / np.sum(curves[1]['seconds']):.2f}")
     for curve in curves[::-1]:
-        points = zip(curve["bytes"], curve["psnr_predicted"], strict=True)
+        points = zip(curve["bytes"], curve["psnr"], strict=True)
         cells.append(", ".join(f"{size / 1000:.0f}: {psnr:.2f}" for size, psnr in points))
     return cells
 
 
-_DIGITS = {"psnr_predicted": 2, "psnr": 2, "ssim_predicted": 3, "ssim": 3}
-_HEADER = ["set", "bytes at equal PSNR", "dB, predicted", "dB, plain", "SSIM, predicted", "SSIM, plain", "time"]
-_HEADER += ["before, kB: dB", "now, kB: dB"]
+_DIGITS = {"psnr": 2, "ssim": 3}
+_HEADER = ["set", "bytes at equal PSNR", "dB", "SSIM", "time", "before, kB: dB", "now, kB: dB"]
 
 
 def mean_over_seeds(points: Sequence[dict[str, float]]) -> dict[str, float]:

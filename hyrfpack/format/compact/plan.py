@@ -63,7 +63,7 @@ class Plan:
         places = [from_lattice(layer.points, model.config.frame) for layer in self.layers]
         arrays[POSITIONS] = np.concatenate(places)
         stored = to_model(model.config, arrays).to(model.gaussians.positions.device)
-        stored.precision = model.precision
+        stored.precision, stored.exposure = model.precision, model.exposure
         return stored
 
 
