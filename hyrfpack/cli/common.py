@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from hyrfpack.atomic import describe_rename
-from hyrfpack.choices import LAYOUTS, PRECISIONS
+from hyrfpack.choices import AS_PHOTOGRAPHED, EXPOSURES, LAYOUTS, PRECISIONS
 from hyrfpack.cli.manners import detail, note
 from hyrfpack.errors import HyrfError
 
@@ -133,6 +133,16 @@ device_option = click.option(
     default="auto",
     show_default=True,
     help="cpu, cuda (NVIDIA and AMD), cuda:N or mps; auto takes cuda where it and Triton are.",
+)
+
+
+exposure_option = click.option(
+    "--exposure",
+    type=click.Choice(EXPOSURES),
+    default=AS_PHOTOGRAPHED,
+    show_default=True,
+    help="Expose each view like the photos taken near it, or all views alike. The same for a model without an "
+    "exposure map.",
 )
 
 

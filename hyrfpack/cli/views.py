@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from hyrfpack.choices import AS_PHOTOGRAPHED
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
     at_one_exposure,
     chosen_device,
     device_options,
+    exposure_option,
     json_option,
     largest_picture,
     note,
@@ -58,6 +60,7 @@ DEFAULT_ORBIT = 60  # frames
 @click.option(
     "--allow-partial", is_flag=True, help="Take a file that is cut short: a coarser model, if enough is there."
 )
+@exposure_option
 @overwrite_option
 @on_processes
 @device_options
@@ -73,6 +76,7 @@ def render(
     depth: bool,
     video: bool,
     allow_partial: bool,
+    exposure: str,
     overwrite: bool,
     device: str,
     precision: str,
@@ -99,11 +103,12 @@ def render(
     from hyrfpack.cameras.paths import orbit as orbit_around
     from hyrfpack.cli.subject import Subject
     from hyrfpack.lock import exclusive_folder
+    from hyrfpack.render import RenderSettings
     from hyrfpack.render.files import drawing_function, rendered_names, write_pictures
     from hyrfpack.render.video import has_ffmpeg, write_video
     from hyrfpack.splats.draw import Drawable, draw
 
-    place = chosen_device(device, ranks)
+    place, settings = chosen_device(device, ranks), RenderSettings(exposure=exposure)
     subject, scene = ranks.agree(lambda: Subject.of(model, place, precision, allow_partial)), None
     if data is not None:
         scene = ranks.agree(lambda: read_scene(data, reading, subject.facts))
@@ -126,9 +131,9 @@ def render(
     def write() -> list[Path]:
         shown = subject.load()
         if isinstance(shown, Drawable):
-            picture_of: Callable[[Camera], Drawn] = partial(draw, shown, depth=depth)
+            picture_of: Callable[[Camera], Drawn] = partial(draw, shown, settings=settings, depth=depth)
         else:
-            picture_of = drawing_function(shown, depth=depth)
+            picture_of = drawing_function(shown, depth=depth, settings=settings)
         pictures = write_pictures(picture_of, named, output, overwrite=overwrite, ranks=ranks)
         return list(counted(pictures, len(ranks.share(named)), "rendering"))
 
@@ -162,6 +167,7 @@ def render(
 @click.option(
     "--allow-partial", is_flag=True, help="Take a file that is cut short: a coarser model, if enough is there."
 )
+@exposure_option
 @overwrite_option
 @on_processes
 @device_options
@@ -174,6 +180,7 @@ def evaluate(
     lpips_weights: Path | None,
     pictures: Path | None,
     allow_partial: bool,
+    exposure: str,
     overwrite: bool,
     device: str,
     precision: str,
@@ -199,6 +206,7 @@ def evaluate(
     from hyrfpack.cli.subject import Subject
     from hyrfpack.evaluate import evaluate as score
     from hyrfpack.evaluate import picture_names
+    from hyrfpack.render import RenderSettings
 
     device_here = chosen_device(device, ranks)
 
@@ -218,6 +226,7 @@ def evaluate(
             shown,
             views,
             lpips_weights=lpips_weights,
+            settings=RenderSettings(exposure=exposure),
             pictures=pictures,
             overwrite=overwrite,
             report=progress,
@@ -236,7 +245,7 @@ def evaluate(
     click.echo(table(["view", "PSNR (dB)", "corrected", "SSIM", "LPIPS"], rows))
     limit = f"--max-size {scene.max_size}" if scene.max_size else "as they are stored"
     click.echo(f"{len(scores.views)} photos of up to {width} x {height} pixels ({limit})")
-    if scores.psnr_consistent is not None:
+    if scores.psnr_consistent is not None and exposure == AS_PHOTOGRAPHED:
         click.echo(f"mean PSNR {scores.psnr:.2f} dB{at_one_exposure(scores.psnr_consistent)}")
     click.echo(f"{model}: {size:,} bytes, {scores.gaussians:,} Gaussians, {scores.seconds_per_frame:.4f} s a frame")
     if scores.lpips is None:
