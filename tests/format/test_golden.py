@@ -7,9 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hyrfpack.choices import CONSISTENT
 from hyrfpack.format import describe, load, metadata
 from hyrfpack.model import Frame, HashGridConfig, ModelConfig
+from hyrfpack.render import RenderSettings, render
 from tools.safety.make_golden import FILES as GOLDEN_FILES
+from tools.safety.make_golden import golden_camera
 from tools.safety.plans import encode
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -26,7 +29,7 @@ def test_golden_file_decodes_to_the_recorded_numbers(file):
 
     decoded = {name: value.numpy() for name, value in load(file).state_dict().items()}
 
-    assert sorted(decoded) == sorted(recorded.files)
+    assert sorted(decoded) == sorted(name for name in recorded.files if not name.startswith("exposure."))
     for name, values in decoded.items():
         # As bits: -0.0 is not 0.0, and denormals count.
         assert np.array_equal(values.view(np.uint32), recorded[name].view(np.uint32)), name
@@ -51,13 +54,48 @@ def test_golden_file_has_the_recorded_configuration(file):
     )
 
 
+WITH_EXPOSURE = sorted(name for name, (_, _, exposure) in GOLDEN_FILES.items() if exposure is not None)
+
+
+def test_golden_files_have_an_exposure_map_from_version_1_2_on():
+    assert WITH_EXPOSURE == ["v1.2_compact_exposure"]
+    for file in FILES:
+        assert (load(file).exposure is not None) == (file.stem in WITH_EXPOSURE)
+
+
+@pytest.mark.parametrize("name", WITH_EXPOSURE)
+def test_golden_exposure_map_gives_the_recorded_log_gains(name):
+    recorded = np.load(GOLDEN / f"{name}.npz")
+    exposure = load(GOLDEN / f"{name}.hyrf").exposure
+    lowest, highest = exposure.limits
+
+    gains = exposure.log_gains(recorded["exposure.positions"], recorded["exposure.directions"])
+
+    np.testing.assert_allclose(gains, recorded["exposure.log_gains"], rtol=0, atol=1e-12)
+    assert np.isclose(gains, lowest).any() and np.isclose(gains, highest).any()  # both limits are tested
+    assert ((gains > lowest) & (gains < highest)).all(1).sum() > 5
+
+
+@pytest.mark.parametrize("name", WITH_EXPOSURE)
+def test_golden_file_with_an_exposure_map_renders_the_recorded_picture(name):
+    recorded = np.load(GOLDEN / f"{name}.npz")["exposure.picture"]
+    model, camera = load(GOLDEN / f"{name}.hyrf"), golden_camera()
+
+    picture = render(model, camera).rgb.numpy()
+
+    np.testing.assert_allclose(picture, recorded, rtol=0, atol=2e-3)
+    assert np.abs(render(model, camera, RenderSettings(exposure=CONSISTENT)).rgb.numpy() - recorded).max() > 0.02
+
+
 @pytest.mark.parametrize("name", GOLDEN_FILES)
 def test_golden_model_encodes_to_the_same_bytes(name, monkeypatch):
     golden = (GOLDEN / f"{name}.hyrf").read_bytes()
-    info, (profile, settings) = describe(GOLDEN / f"{name}.hyrf"), GOLDEN_FILES[name]
+    info, (profile, settings, exposure) = describe(GOLDEN / f"{name}.hyrf"), GOLDEN_FILES[name]
     monkeypatch.setattr(metadata, "writer", lambda: info["writer"])
+    model = load(GOLDEN / "v1.0_raw.hyrf")
+    model.exposure = exposure
 
-    data = encode(load(GOLDEN / "v1.0_raw.hyrf"), profile, info["provenance"], **settings)
+    data = encode(model, profile, info["provenance"], **settings)
 
     assert data == golden
     assert (info["version"], info["profile"]) == (name[1:4], profile)

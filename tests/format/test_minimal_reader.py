@@ -17,6 +17,7 @@ from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import decode_model
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.container import read_container, write_container
+from hyrfpack.model import ExposureMap
 from hyrfpack.quant.integers import encode_integers
 from tools.safety import minimal_reader
 from tools.safety.plans import encode
@@ -39,7 +40,7 @@ def model_of(count: int, **settings):
 
 
 def assert_same_bits(data: bytes, part: bool = False) -> None:
-    metadata, groups = minimal_reader.read(data, part)
+    metadata, groups, exposure = minimal_reader.read(data, part)
     model = decode_model(data, fraction=1.0 if part else None)
 
     assert metadata["config"] == json.loads(json.dumps(model.config.to_dict()))
@@ -49,6 +50,18 @@ def assert_same_bits(data: bytes, part: bool = False) -> None:
         assert values.shape == expected[name].shape, name
         assert values.dtype == np.float32
         assert np.array_equal(values.view(np.uint32), expected[name].view(np.uint32)), name
+    assert (exposure is None) == (model.exposure is None)
+    if exposure is not None:
+        assert_same_gains(exposure, model.exposure)
+
+
+def assert_same_gains(read: minimal_reader.Exposure, exposure: ExposureMap) -> None:
+    rng = np.random.default_rng(0)
+    positions, directions = 2 * rng.normal(size=(20, 3)), rng.normal(size=(20, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    gains = [minimal_reader.log_gains(read, *view) for view in zip(positions, directions, strict=True)]
+
+    np.testing.assert_allclose(exposure.log_gains(positions, directions), gains, rtol=1e-12, atol=1e-12)
 
 
 def test_minimal_reader_is_independent():
@@ -58,7 +71,7 @@ def test_minimal_reader_is_independent():
     imported |= {node.module for node in nodes if isinstance(node, ast.ImportFrom)}
 
     assert imported == {
-        *("bisect", "collections.abc", "dataclasses", "json", "math", "struct", "typing", "zlib"),
+        *("__future__", "bisect", "collections.abc", "dataclasses", "json", "math", "struct", "typing", "zlib"),
         "numpy",
     }
 

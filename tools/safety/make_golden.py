@@ -8,26 +8,42 @@ A golden file is never made again once a release has written such files: delete 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
+from hyrfpack.choices import CONSISTENT
 from hyrfpack.format import decode_model
 from hyrfpack.format.arrays import to_arrays
-from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
+from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.render import RenderSettings, render
+from hyrfpack.scene import Camera
 from tools.safety import minimal_reader
 from tools.safety.plans import encode
 
 TESTS = Path(__file__).parents[2] / "tests"
 FOLDER = TESTS / "golden"
 PROVENANCE = {"preset": "standard", "steps": 100, "why": {"geometry": "one entry a Gaussian", "name": "caf\u00e9"}}
-# File -> profile and settings.
-FILES = {
-    "v1.0_raw": ("raw", {}),
-    "v1.0_paper": ("paper", {"color": (3, 8), "scale": (2, 4), "opacity": (1, 16)}),
-    "v1.1_compact": ("compact", {"distortion": 5e-4}),
-    "v1.1_compact_layers": ("compact", {"distortion": 1e-5, "layered": True}),
+# The smallest and the largest codes of centers, and limits that are reached.
+EXPOSURE = ExposureMap(
+    box=np.array([[-0.5, -0.25, -1.0], [0.75, -0.25, 2.0]], np.float32),
+    lengths=np.array([0.7, 1.3], np.float32),
+    mean=np.array([0.1, 0.0, -0.05], np.float32),
+    limits=np.array([[-0.6, -0.5, -0.7], [0.9, 0.8, 0.4]], np.float32),
+    steps=np.array([3e-5, 2e-5, 4e-5], np.float32),
+    positions=np.array([[0, 0, 0], [255, 7, 255], [128, 255, 90], [33, 64, 200]], np.uint8),
+    directions=np.array([[0, 0, 127], [-128, 0, 0], [90, -90, 5], [-60, 1, 111]], np.int8),
+    weights=np.array([[32767, -20000, 1], [-32768, 9000, 250], [15000, 30000, -12000], [0, -1, 22222]], np.int16),
+)
+# File -> profile, settings and exposure map.
+FILES: dict[str, tuple[str, dict[str, Any], ExposureMap | None]] = {
+    "v1.0_raw": ("raw", {}, None),
+    "v1.0_paper": ("paper", {"color": (3, 8), "scale": (2, 4), "opacity": (1, 16)}, None),
+    "v1.1_compact": ("compact", {"distortion": 5e-4}, None),
+    "v1.1_compact_layers": ("compact", {"distortion": 1e-5, "layered": True}, None),
+    "v1.2_compact_exposure": ("compact", {"distortion": 5e-4}, EXPOSURE),
 }
 
 
@@ -68,13 +84,14 @@ def expected(model: HybridModel, name: str) -> np.ndarray:
 
 def recorded(model: HybridModel, profile: str, data: bytes) -> dict[str, np.ndarray]:
     """What the file must decode to, by parameter."""
-    _, groups = minimal_reader.read(data)
+    _, groups, exposure = minimal_reader.read(data)
+    gains = {} if exposure is None else recorded_gains(exposure, decode_model(data))
     if profile == "compact":
         # What is kept and how finely is the encoder's choice, so these come from the minimal reader.
         decoded = decode_model(data)
         for group, values in to_arrays(decoded).items():
             assert np.array_equal(values.view(np.uint32), groups[group].view(np.uint32)), group
-        return {name: value.numpy() for name, value in decoded.state_dict().items()}
+        return {name: value.numpy() for name, value in decoded.state_dict().items()} | gains
     original = {name: value.numpy() for name, value in model.state_dict().items()}
     values = dict(original) if profile == "raw" else {name: expected(model, name) for name in original}
     for group, name in {"COLO": "color_logits", "SCAL": "scale_logits", "OPAC": "opacity_logits"}.items():
@@ -83,16 +100,44 @@ def recorded(model: HybridModel, profile: str, data: bytes) -> dict[str, np.ndar
         # Codebooks depend on k-means, so these come from the minimal reader, and are near the original.
         assert np.abs(after - before).max() < 0.5 * before.std()
         values[f"gaussians.{name}"] = after
-    return values
+    return values | gains
+
+
+def golden_camera() -> Camera:
+    """A camera that sees the golden model from inside the box of the exposure map."""
+    config = golden_model().config
+    pose = np.eye(4)
+    pose[:3, 3] = config.frame.scale * np.array([0.1, 0.2, 1.0]) - np.array(config.frame.center)
+    return Camera(16, 12, 20.0, 20.0, 8.0, 6.0, pose)
+
+
+def recorded_gains(exposure: minimal_reader.Exposure, model: HybridModel) -> dict[str, np.ndarray]:
+    """Log gains (20, 3) at 20 viewpoints and a picture as photographed, (12, 16, 3), by the equations of the page.
+
+    Positions are in local units, inside and outside the box; the first viewpoint is that of `golden_camera`.
+    """
+    rng = np.random.default_rng(0)
+    positions, directions = rng.uniform(-2, 3, (20, 3)), rng.normal(size=(20, 3))
+    positions[0], directions[0] = (-0.1, -0.2, -1.0), (0.0, 0.0, 1.0)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    logs = np.array([minimal_reader.log_gains(exposure, *view) for view in zip(positions, directions, strict=True)])
+    consistent = render(model, golden_camera(), RenderSettings(exposure=CONSISTENT)).rgb.double().numpy()
+    return {
+        "exposure.positions": positions,
+        "exposure.directions": directions,
+        "exposure.log_gains": logs,
+        "exposure.picture": minimal_reader.expose(consistent, np.exp(logs[0])),
+    }
 
 
 def main() -> None:
     model = golden_model()
-    for name, (profile, settings) in FILES.items():
+    for name, (profile, settings, exposure) in FILES.items():
         target = FOLDER / f"{name}.hyrf"
         if target.exists():
             print(f"{target} is there already and is kept")
             continue
+        model.exposure = exposure
         data = encode(model, profile, PROVENANCE, **settings)
         values = recorded(model, profile, data)
         FOLDER.mkdir(exist_ok=True)

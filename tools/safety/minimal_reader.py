@@ -1,11 +1,15 @@
-"""A reader of `.hyrf` files, version 1.0 and 1.1, written from docs/format.md alone: numpy and the standard library.
+"""A reader of `.hyrf` files, version 1.0 to 1.2, written from docs/format.md alone: numpy and the standard library.
 
 It shares no code with hyrfpack, and so tells whether the page says enough and whether hyrfpack does what the page says.
 Plain rather than fast: a file of 30,000 Gaussians takes some seconds. Section numbers are those of the page.
 
-    metadata, groups = read(Path("scene.hyrf").read_bytes())
+    metadata, groups, exposure = read(Path("scene.hyrf").read_bytes())
     groups["POSI"]      # float32 (N, 3), the Gaussians of all layers
+    if exposure:        # the file has an exposure map
+        log_gains(exposure, position, direction)
 """
+
+from __future__ import annotations
 
 import json
 import math
@@ -47,8 +51,9 @@ FRAME_KEYS = {"center", "scale", "half_extent"}
 GRID_KEYS = {"log2_table_size", "levels", "base", "finest"}
 
 
-def read(data: bytes, part: bool = False) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Metadata and the eight groups of part 2, by type of the first layer, as float32 matrices (rows, columns).
+def read(data: bytes, part: bool = False) -> tuple[dict[str, Any], dict[str, np.ndarray], Exposure | None]:
+    """Metadata, the eight groups of part 2, by type of the first layer, as float32 matrices (rows, columns), and the
+    exposure map, None where the file has none.
 
     With `part`, `data` may be the start of a file: layers that are not whole, and what follows them, are left out.
     Raises ValueError for files that the page tells a reader to refuse (zlib.error where a deflate stream is damaged).
@@ -97,7 +102,8 @@ def read(data: bytes, part: bool = False) -> tuple[dict[str, Any], dict[str, np.
         need(numbers.size == rows * columns, f"{group}: {numbers.size} numbers")
         matrices[group].append(numbers.astype(np.float32).reshape(rows, columns))
         need(bool(np.isfinite(matrices[group][-1]).all()), f"{group}: NaN or infinite")
-    return metadata, {group: np.concatenate(parts) for group, parts in matrices.items()}
+    exposure = read_exposure(sections["EXPO"]) if "EXPO" in sections and sections["EXPO"].whole else None
+    return metadata, {group: np.concatenate(parts) for group, parts in matrices.items()}, exposure
 
 
 # Bytes
@@ -172,7 +178,7 @@ def section_type(group: str, layer: int) -> str:
     return f"{group[:3]}{layer}" if layer else group
 
 
-KNOWN = {"META", *FIELDS, *(section_type(group, layer) for group in LAYERED for layer in range(8))}
+KNOWN = {"META", "EXPO", *FIELDS, *(section_type(group, layer) for group in LAYERED for layer in range(8))}
 
 
 def read_container(data: bytes, part: bool = False) -> dict[str, Section]:
@@ -536,3 +542,68 @@ def table_groups(grid: dict[str, int], m: np.ndarray) -> np.ndarray:
             use += np.bincount(row, minlength=rows)
         groups += [16 * level + (count.bit_length() + 1) // 2 for count in use.tolist()]
     return np.array(groups)
+
+
+# 2.9 Exposure map
+
+
+@dataclass(frozen=True)
+class Center:
+    position: list[float]
+    direction: list[float]
+    weight: list[float]
+
+
+@dataclass(frozen=True)
+class Exposure:
+    position_length: float
+    direction_length: float
+    least: list[float]
+    largest: list[float]
+    mean: list[float]
+    lowest: list[float]
+    highest: list[float]
+    centers: list[Center]
+
+
+def read_exposure(section: Section) -> Exposure:
+    need(section.codec == 9, "EXPO: unknown codec")
+    need(section.raw_length == section.stored_length, "EXPO: wrong raw length")
+    source = Cursor(section.read())
+    count, *reserved = source.unpack("BBBB")
+    need(count <= 64 and not any(reserved), "EXPO: too many centers or reserved bytes")
+    position_length, direction_length, *rest = source.unpack("20f")
+    need(all(map(math.isfinite, (position_length, direction_length, *rest))), "EXPO: NaN or infinite")
+    least, largest, mean, lowest, highest, steps = (rest[at : at + 3] for at in range(0, 18, 3))
+    need(position_length > 0 and direction_length > 0, "EXPO: lengths must be positive")
+    need(all(low <= high for low, high in zip(least, largest, strict=True)), "EXPO: the box is not in order")
+    limits_in_order = all(-8 <= low <= high <= 8 for low, high in zip(lowest, highest, strict=True))
+    need(limits_in_order, "EXPO: limits out of range")
+    centers = []
+    for _ in range(count):
+        x, f, w = source.unpack("3B"), source.unpack("3b"), source.unpack("3h")
+        position = [low + code / 255 * (high - low) for code, low, high in zip(x, least, largest, strict=True)]
+        weight = [code * step for code, step in zip(w, steps, strict=True)]
+        centers.append(Center(position, [code / 127 for code in f], weight))
+    source.end()
+    return Exposure(position_length, direction_length, least, largest, mean, lowest, highest, centers)
+
+
+def log_gains(exposure: Exposure, position: Sequence[float], direction: Sequence[float]) -> list[float]:
+    """Log gains (red, green, blue) at a viewpoint: position in local units, unit viewing direction."""
+    box = zip(position, exposure.least, exposure.largest, strict=True)
+    inside = [min(max(value, low), high) for value, low, high in box]
+    gains = list(exposure.mean)
+    for center in exposure.centers:
+        distance = sum(((a - b) / exposure.position_length) ** 2 for a, b in zip(inside, center.position, strict=True))
+        distance += sum(
+            ((a - b) / exposure.direction_length) ** 2 for a, b in zip(direction, center.direction, strict=True)
+        )
+        gains = [gain + weight / (1 + distance) for gain, weight in zip(gains, center.weight, strict=True)]
+    limits = zip(gains, exposure.lowest, exposure.highest, strict=True)
+    return [min(max(gain, low), high) for gain, low, high in limits]
+
+
+def expose(rgb: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    """A picture (..., 3) in [0, 1] at the exposure of the gains (3,)."""
+    return gains * rgb / (1 + (gains - 1) * rgb)
