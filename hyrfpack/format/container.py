@@ -300,17 +300,19 @@ class Container:
         return HyrfFormatError(f"{self.name}: {what}; the file is damaged, copy or write it again")
 
 
-def write_container(sections: Sequence[Section], minor: int = MINOR) -> bytes:
+def write_container(sections: Sequence[Section], minor: int) -> bytes:
     """Lay sections out as a `.hyrf` file: same sections, same bytes.
 
     Args:
         sections: in file order.
-        minor: the minor version that a reader must know to read them, 0 to MINOR.
+        minor: the lowest minor version of the format that has all these sections and codecs, 0 to MINOR.
 
     Raises:
         ValueError: what `read_container` would refuse: a malformed or repeated type, a number out of range, too
             many sections, or more decoded bytes than `raw_limit` allows.
     """
+    if not 0 <= minor <= MINOR:
+        raise ValueError(f"format version {MAJOR}.{minor} cannot be written; the newest is {MAJOR}.{MINOR}")
     if len(sections) > MAX_SECTIONS:
         raise ValueError(f"{len(sections)} sections are more than {MAX_SECTIONS}")
     types = [section.type for section in sections]

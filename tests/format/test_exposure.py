@@ -11,7 +11,7 @@ from scenes import ball_points, small_model
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.codec import decode_model, encode_model
-from hyrfpack.format.container import read_container, write_container
+from hyrfpack.format.container import MINOR, read_container, write_container
 from hyrfpack.format.exposure import CODEC_EXPOSURE, decode_exposure, exposure_section
 from hyrfpack.format.sections import EXPOSURE
 from hyrfpack.model.exposure import MAX_CENTERS, ExposureMap
@@ -99,4 +99,4 @@ def test_a_damaged_map_names_file_and_section():
         dataclasses.replace(part, data=b"\0" * len(part.data)) if part.type == EXPOSURE else part for part in sections
     ]
     with pytest.raises(HyrfFormatError, match="scene.hyrf: section 'EXPO'"):
-        decode_model(write_container(broken), name="scene.hyrf")
+        decode_model(write_container(broken, minor=MINOR), name="scene.hyrf")
