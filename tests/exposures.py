@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -50,3 +51,10 @@ def map_through(cameras: Sequence[Camera], frame: Frame, gains: np.ndarray) -> E
         directions=turned.astype(np.int8),
         weights=np.rint(weights / steps).astype(np.int16),
     )
+
+
+def same_map(one: ExposureMap | None, other: ExposureMap | None) -> bool:
+    """Whether two maps hold the same numbers; None is not the same as any map."""
+    if one is None or other is None:
+        return False
+    return all(np.array_equal(getattr(one, f.name), getattr(other, f.name)) for f in dataclasses.fields(one))

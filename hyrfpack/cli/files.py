@@ -312,6 +312,9 @@ def _print_model(file: Path, facts: dict) -> None:
     _say(f"  {'box':<18}  {half} around ({center}), world units")
     for name in ("geometry", "radiance"):
         _say(f"  {name + ' grid':<18}  {_in_words(config[name])}")
+    if (exposure := facts["exposure"]) is not None:
+        lowest, highest = exposure["stops"]
+        _say(f"  {'exposure map':<18}  {exposure['centers']} centers, {lowest:+.2f} to {highest:+.2f} stops")
     for name, value in config.items():
         if name not in ("frame", "geometry", "radiance"):
             _say(f"  {name.replace('_', ' '):<18}  {value}")
@@ -393,7 +396,7 @@ def _print_report(report: CompressionReport, scores: dict[str, float], as_json: 
 
 def _section_table(sections: list[dict], total: int, gaussians: int, shares: dict[str, float] | None = None) -> str:
     """Bytes of each section, all layers together, and what part of the loss comes from it where that is known."""
-    from hyrfpack.format.sections import METADATA, SECTIONS, group_and_layer
+    from hyrfpack.format.sections import NON_PARAMETERS, SECTIONS, group_and_layer
 
     together: dict[str, list] = {}
     for part in sections:
@@ -405,7 +408,7 @@ def _section_table(sections: list[dict], total: int, gaussians: int, shares: dic
     parts.append(("", "header, table of contents, padding", "", total - sum(after for *_, after in parts)))
     rows, header = [], ["section", "unpacked bytes", "stored bytes", "share", "bits/Gaussian", "bits/number"]
     for tag, holds, before, after in parts:
-        numbers = int(before.replace(",", "") or 0) / 4 if tag not in (METADATA, "") else 0
+        numbers = int(before.replace(",", "") or 0) / 4 if tag not in (*NON_PARAMETERS, "") else 0
         rows.append(
             [
                 f"{tag} {holds}".strip(),

@@ -152,7 +152,7 @@ def compress(
     model, provenance = load_with_provenance(source)
     kept = coarse(provenance, model.config.frame.scale)
     if target_bytes is not None:
-        check_target_bytes(target_bytes, kept)
+        check_target_bytes(target_bytes, kept, model.exposure)
     model = model.to(choose_own_device(device, ranks, say))
     model.precision = "float32"  # what is looked for is smaller than what a GPU rounds away otherwise
     if len(model) == 0:

@@ -23,7 +23,15 @@ from hyrfpack.format.exposure import decode_exposure, exposure_section
 from hyrfpack.format.info import SectionSize, section_sizes
 from hyrfpack.format.metadata import Metadata, read_metadata
 from hyrfpack.format.run_folder import find_model
-from hyrfpack.format.sections import EXPOSURE, LAYERED, METADATA, POSITIONS, SECTIONS, group_and_layer, layer_section
+from hyrfpack.format.sections import (
+    EXPOSURE,
+    LAYERED,
+    NON_PARAMETERS,
+    POSITIONS,
+    SECTIONS,
+    group_and_layer,
+    layer_section,
+)
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.pool import run_tasks
@@ -179,7 +187,7 @@ def write_model(data: bytes, path: str | os.PathLike[str], *, overwrite: bool = 
     written = write_atomic(path, data, overwrite=overwrite)
     container = read_container(data, SECTIONS)
     metadata, sizes = read_metadata(container), section_sizes(container)
-    before = sum(size.before for size in sizes if size.type != METADATA)
+    before = sum(size.before for size in sizes if size.type not in NON_PARAMETERS)
     return CompressionReport(metadata.profile, metadata.gaussians, before, len(data), sizes, file=str(written))
 
 

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-import struct
-
 import numpy as np
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.container import Section
+from hyrfpack.format.exposure_head import CENTER_BYTES, CODEC_EXPOSURE, ExposureHead, read_exposure_head
 from hyrfpack.format.sections import EXPOSURE
 from hyrfpack.model.exposure import ExposureMap
 
-CODEC_EXPOSURE = 9
-_HEAD = struct.Struct("<B3x20f")
 _CENTER = np.dtype([("position", "u1", 3), ("direction", "i1", 3), ("weight", "<i2", 3)])
+assert _CENTER.itemsize == CENTER_BYTES
 
 
 def exposure_section(exposure: ExposureMap) -> Section:
     """The optional section that holds an exposure map; readers that do not know it show the consistent exposure."""
-    numbers = (exposure.lengths, exposure.box, exposure.mean, exposure.limits, exposure.steps)
     centers = np.zeros(len(exposure.positions), _CENTER)
     centers["position"], centers["direction"] = exposure.positions, exposure.directions
     centers["weight"] = exposure.weights
-    data = _HEAD.pack(len(centers), *np.concatenate([part.ravel() for part in numbers])) + centers.tobytes()
+    parts = (exposure.lengths, exposure.box, exposure.mean, exposure.limits, exposure.steps)
+    head = ExposureHead(len(centers), *(tuple(part.ravel().tolist()) for part in parts))
+    data = head.to_bytes() + centers.tobytes()
     return Section(EXPOSURE, CODEC_EXPOSURE, data, len(data), required=False)
 
 
@@ -30,25 +29,17 @@ def decode_exposure(codec: int, data: memoryview, raw_length: int) -> ExposureMa
     """Read an exposure map.
 
     Raises:
-        HyrfFormatError: the codec is unknown, there are more or fewer bytes than the map has, or its numbers are out of
-            range.
+        HyrfFormatError: as `read_exposure_head`, or numbers are out of range.
     """
-    if codec != CODEC_EXPOSURE:
-        raise HyrfFormatError(f"the codec {codec} is unknown; update hyrfpack")
-    if len(data) < _HEAD.size or len(data) != raw_length or len(data) != _HEAD.size + data[0] * _CENTER.itemsize:
-        raise HyrfFormatError(f"its {len(data)} bytes are no exposure map; the file is damaged, write it again")
-    if any(data[1:4]):
-        raise HyrfFormatError("its reserved bytes are not zero; the file is damaged, write it again")
-    numbers = np.array(_HEAD.unpack_from(data)[1:], np.float32)
-    lengths, box, mean, limits, steps = np.split(numbers, [2, 8, 11, 17])
-    centers = np.frombuffer(data[_HEAD.size :], _CENTER)
+    head, rest = read_exposure_head(codec, data, raw_length)
+    centers = np.frombuffer(rest, _CENTER)
     try:
         return ExposureMap(
-            box=box.reshape(2, 3),
-            lengths=lengths,
-            mean=mean,
-            limits=limits.reshape(2, 3),
-            steps=steps,
+            box=np.array(head.box, np.float32).reshape(2, 3),
+            lengths=np.array(head.lengths, np.float32),
+            mean=np.array(head.mean, np.float32),
+            limits=np.array(head.limits, np.float32).reshape(2, 3),
+            steps=np.array(head.steps, np.float32),
             positions=np.ascontiguousarray(centers["position"]),
             directions=np.ascontiguousarray(centers["direction"]),
             weights=np.ascontiguousarray(centers["weight"]).astype(np.int16),

@@ -13,6 +13,7 @@ MLPS = (GEOMETRY_DECODER, RADIANCE_DECODER)
 # Gaussians may come in layers, the most important first: sections of the first, and how many layers there may be.
 LAYERED = (POSITIONS, *LOGITS)
 MAX_LAYERS = 8
+NON_PARAMETERS = (METADATA, EXPOSURE)  # sections that hold no parameters of the model
 
 # Section types and what they hold; every one but EXPOSURE is required.
 SECTIONS = {

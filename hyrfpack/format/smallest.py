@@ -12,7 +12,7 @@ from hyrfpack.format.compact.groups import MODELS, GroupSymbols, StepGroups
 from hyrfpack.format.compact.plan import Layer, Plan, groups_of
 from hyrfpack.format.compact.quantized import COLUMNS, Quantized
 from hyrfpack.format.sections import MLPS, TABLES
-from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
+from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.quant.points import Points, encode_points
 from hyrfpack.quant.steps import NOT_CODED
@@ -22,14 +22,15 @@ MAX_MEGABYTES_SUGGESTED = 100  # a target size below this many bytes was most li
 MAX_KILOBYTES_SUGGESTED = 1_000  # and one below this in kilobytes
 
 
-def min_file_bytes(provenance: dict | None = None) -> int:
+def min_file_bytes(provenance: dict | None = None, exposure: ExposureMap | None = None) -> int:
     """Count the bytes of the smallest `.hyrf` file that packing can write.
 
     It is the encoded file, profile "compact", of a model without Gaussians whose fields are zero: what is left are the
-    headers of all sections and the metadata, which every file has.
+    headers of all sections and the metadata, which every file has, and the exposure map.
 
     Args:
         provenance: that the file carries; None for none.
+        exposure: the exposure map that the file carries; None for none.
 
     Example:
         >>> min_file_bytes() < min_file_bytes({"source": "a drone"}) < 2000
@@ -39,6 +40,7 @@ def min_file_bytes(provenance: dict | None = None) -> int:
     config = ModelConfig(Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0)), table, table, background=False)
     triple, single = torch.zeros(0, 3), torch.zeros(0, 1)
     model = HybridModel(config, Gaussians(triple, triple, single, single), torch.Generator().manual_seed(0))
+    model.exposure = exposure
     data, _, points = encode_points(Points(np.zeros((0, 3), np.int64), np.zeros(0, np.uint8), np.ones(1, np.int64)))
     groups = {group: groups_of(group, config, points) for group in (*TABLES, *MLPS)}
     plan = Plan(np.zeros(0, np.int64), (Layer(points, data),), np.eye(3, dtype=np.float32), groups, 0.0)
@@ -48,17 +50,18 @@ def min_file_bytes(provenance: dict | None = None) -> int:
     return len(encode_model(model, "compact", provenance, quantized=Quantized(plan, [channels], symbols)))
 
 
-def check_target_bytes(target_bytes: int, provenance: dict | None = None) -> None:
+def check_target_bytes(target_bytes: int, provenance: dict | None = None, exposure: ExposureMap | None = None) -> None:
     """Refuse a target size below the smallest file.
 
     Args:
         target_bytes: bytes that the packed file may have.
         provenance: that the file will carry, as far as it is known.
+        exposure: the exposure map that the file will carry, as far as it is known.
 
     Raises:
         HyrfError: no packed file is so small. The message suggests a unit where it looks forgotten.
     """
-    smallest = min_file_bytes(provenance)
+    smallest = min_file_bytes(provenance, exposure)
     if target_bytes >= smallest:
         return
     unit = "MB" if target_bytes < MAX_MEGABYTES_SUGGESTED else "kB" if target_bytes < MAX_KILOBYTES_SUGGESTED else None

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.format.exposure_head import STOPS_PER_LOG_GAIN
 from hyrfpack.model.exposure import expose
 from hyrfpack.model.frame import Frame
 from hyrfpack.ops.adam import adam_step
@@ -25,7 +26,6 @@ from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.exposure_map import ExposureFit, fit_exposure_map
 
-STOPS = 2.2 / 2 / np.log(2)  # of light that middle grey becomes lighter by, for each unit of a gain's logarithm
 PULL = 1e-4  # towards gains of one: the gradient of a gain's logarithm, for each unit of it
 LONGEST = 500  # tracks of a photo that are looked at, the longest ones
 REACH = 2  # pixels around a point whose mean is its colour in a photo
@@ -230,6 +230,6 @@ def exposures_for(
     observed = observe(scene, cache)
     gains = gains_from(observed, len(scene.train))
     known = len(np.unique(observed.photo))
-    spread = float(gains.mean(1).std()) * STOPS
+    spread = float(gains.mean(1).std()) * STOPS_PER_LOG_GAIN
     found = f"by their tracks the photos differ by {spread:.2f} stops" if known else "no tracks tell of the photos"
     return Exposures(scene.train, gains, device), f"per-image gains: {found}"

@@ -1,10 +1,11 @@
 from __future__ import annotations
 
 import dataclasses
+import struct
 
 import numpy as np
 import pytest
-from exposures import random_map
+from exposures import random_map, same_map
 from hypothesis import given
 from hypothesis import strategies as st
 from scenes import ball_points, small_model
@@ -12,17 +13,13 @@ from scenes import ball_points, small_model
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.codec import decode_model, encode_model
 from hyrfpack.format.container import MINOR, read_container, write_container
-from hyrfpack.format.exposure import CODEC_EXPOSURE, decode_exposure, exposure_section
+from hyrfpack.format.exposure import decode_exposure, exposure_section
+from hyrfpack.format.exposure_head import CODEC_EXPOSURE
 from hyrfpack.format.sections import EXPOSURE
-from hyrfpack.model.exposure import MAX_CENTERS, ExposureMap
+from hyrfpack.model.exposure import MAX_CENTERS
+from tools.safety.plans import encode
 
 SEEDS = st.integers(0, 2**32 - 1)
-
-
-def same(one: ExposureMap, other: ExposureMap) -> bool:
-    return all(
-        np.array_equal(getattr(one, field.name), getattr(other, field.name)) for field in dataclasses.fields(one)
-    )
 
 
 @given(SEEDS, st.integers(0, MAX_CENTERS))
@@ -31,7 +28,7 @@ def test_a_map_is_read_as_it_was_written(seed, centers):
     section = exposure_section(exposure)
 
     assert len(section.data) == section.raw_length == 84 + 12 * centers and not section.required
-    assert same(decode_exposure(section.codec, memoryview(section.data), section.raw_length), exposure)
+    assert same_map(decode_exposure(section.codec, memoryview(section.data), section.raw_length), exposure)
 
 
 def stored(numbers: list[float], centers: bytes) -> bytes:
@@ -62,23 +59,67 @@ def test_bytes_that_do_not_fit_are_refused(change):
         decode_exposure(CODEC_EXPOSURE, memoryview(data), raw_length)
 
 
+HEAD = "<BBBB2f6f3f6f3f"  # by docs/format.md
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        *[(place, 1) for place in (1, 2, 3)],  # reserved
+        *[(place, value) for place in (4, 5) for value in (0.0, -1.0)],  # lengths
+        *[(place, 1e6) for place in (6, 7, 8)],  # least corner
+        *[(place, -1e6) for place in (9, 10, 11)],  # largest corner
+        *[(place, value) for place in (15, 16, 17) for value in (-8.001, 7.9)],  # lowest log gains
+        *[(place, value) for place in (18, 19, 20) for value in (-7.9, 8.001)],  # highest log gains
+        *[(place, value) for place in range(4, 24) for value in (np.nan, np.inf, -np.inf)],
+    ],
+)
+def test_a_number_out_of_the_range_of_the_specification_is_refused(place, value):
+    section = exposure_section(random_map(3, 2))
+    numbers = list(struct.unpack_from(HEAD, section.data))
+    assert struct.pack(HEAD, *numbers) == section.data[:84]
+    numbers[place] = value
+    data = struct.pack(HEAD, *numbers) + section.data[84:]
+
+    with pytest.raises(HyrfFormatError, match="damaged"):
+        decode_exposure(section.codec, memoryview(data), len(data))
+
+
+@pytest.mark.parametrize("count", [65, 255])
+def test_more_centers_than_the_specification_allows_are_refused(count):
+    section = exposure_section(random_map(3, 0))
+    data = bytes([count]) + section.data[1:] + bytes(12 * count)
+
+    with pytest.raises(HyrfFormatError, match="64"):
+        decode_exposure(section.codec, memoryview(data), len(data))
+
+
+@given(st.integers(0, MAX_CENTERS), st.binary(min_size=12 * MAX_CENTERS, max_size=12 * MAX_CENTERS))
+def test_every_code_of_a_center_is_allowed_and_written_again_as_it_was(count, centers):
+    head = exposure_section(random_map(5, 0)).data[1:84]
+    data = bytes([count]) + head + centers[: 12 * count]
+
+    assert exposure_section(decode_exposure(CODEC_EXPOSURE, memoryview(data), len(data))).data == data
+
+
 def test_another_codec_is_refused():
     section = exposure_section(random_map(0, 3))
     with pytest.raises(HyrfFormatError, match="update hyrfpack"):
         decode_exposure(1, memoryview(section.data), section.raw_length)
 
 
-@pytest.mark.parametrize("profile", ["raw", "paper"])
-def test_a_file_keeps_the_map_of_its_model(profile):
+@pytest.mark.parametrize(("profile", "plain_minor"), [("raw", 0), ("paper", 0), ("compact", 1)])
+def test_a_file_keeps_the_map_of_its_model_and_has_version_1_2_only_with_a_map(profile, plain_minor):
     model = small_model(ball_points(50)[0])
-    plain = encode_model(model, profile)
+    plain = encode(model, profile)
     model.exposure = random_map(7, 20)
-    data = encode_model(model, profile)
+    data = encode(model, profile)
 
-    assert same(decode_model(data).exposure, model.exposure)
+    assert same_map(decode_model(data).exposure, model.exposure)
     assert decode_model(plain).exposure is None
-    assert read_container(plain).version == (1, 0) and read_container(data).version == (1, 2)
-    assert encode_model(decode_model(data), profile) == data or profile == "paper"
+    assert read_container(plain).version == (1, plain_minor) and read_container(data).version == (1, 2)
+    assert list(read_container(data).entries)[:2] == ["META", "EXPO"]
+    assert len(data) == len(plain) + 40 + (84 + 12 * 20 + 7) // 8 * 8  # a line of the table, and the section
 
 
 def test_readers_that_know_no_map_read_the_rest():

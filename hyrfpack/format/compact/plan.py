@@ -56,7 +56,10 @@ class Plan:
     distortion_per_number: float
 
     def apply(self, model: HybridModel) -> HybridModel:
-        """The part of a model that is stored, on its device: the Gaussians kept, in order, moved to the lattice."""
+        """The part of a model that is stored, on its device: the Gaussians kept, in order, moved to the lattice.
+
+        The exposure map goes along.
+        """
         arrays = to_arrays(model)
         for group in LOGITS:
             arrays[group] = arrays[group][self.kept]
