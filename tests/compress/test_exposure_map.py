@@ -1,0 +1,111 @@
+"""Packing a model with an exposure map: the file has the map, and losses are those of renders as photographed."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from exposures import random_map, same_map
+from scenes import ball_points, ball_scene, small_model, view_of
+
+from hyrfpack.choices import CONSISTENT
+from hyrfpack.compress import compress
+from hyrfpack.errors import HyrfError
+from hyrfpack.evaluate import evaluate
+from hyrfpack.format import describe, load, save
+from hyrfpack.format.smallest import min_file_bytes
+from hyrfpack.model import ExposureMap, HybridModel
+from hyrfpack.render import RenderSettings, render
+from hyrfpack.scene import Picture, Scene
+
+LOG_GAIN = 2.0  # of every viewpoint; 0.5 is shown as 0.88
+
+
+def bright() -> ExposureMap:
+    gains = np.full(3, LOG_GAIN, np.float32)
+    return dataclasses.replace(random_map(0, centers=9), mean=gains, limits=np.stack((gains, gains)))
+
+
+@pytest.fixture(scope="module")
+def model() -> HybridModel:
+    points, colors = ball_points(400)
+    logits = np.log(colors / (1 - colors))
+    model = small_model(points, fields=0.3, color_logits=logits, scale_logits=-2.5, opacity_logits=2.0)
+    model.exposure = bright()
+    return model.requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def scene(model) -> Scene:
+    """Photos that show what the model's renders as photographed show, and noise of about 33 dB."""
+    rng, views = np.random.default_rng(0), []
+    for view in ball_scene(8).train:
+        rgb = 255 * render(model, view.camera).rgb.numpy() + rng.normal(0, 6, (32, 32, 3))
+        views.append(view_of(view.name, view.camera, Picture(rgb.round().clip(0, 255).astype(np.uint8))))
+    return dataclasses.replace(ball_scene(8), train=views[1:], test=views[:1])
+
+
+@pytest.fixture(scope="module")
+def source(model, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("source") / "model.hyrf"
+    save(model, path)
+    return path
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"distortion": 1e-5},
+        {"target_bytes": 6000},
+        {"max_psnr_drop": 0.5},
+        {"finetune_steps": 3},
+        {"prune": False},
+        {"profile": "paper"},
+        {"profile": "raw"},
+    ],
+    ids=str,
+)
+def test_a_packed_file_keeps_the_map(options, source, scene, tmp_path):
+    data = None if "profile" in options else scene
+    report = compress(source, tmp_path / "small.hyrf", data=data, **options)
+
+    assert same_map(load(tmp_path / "small.hyrf").exposure, bright())
+    assert describe(tmp_path / "small.hyrf")["version"] == "1.2"
+    assert "EXPO" in {section.type for section in report.sections}
+
+
+def test_the_error_is_measured_on_renders_as_photographed(model, source, scene, tmp_path):
+    report = compress(source, tmp_path / "small.hyrf", data=scene, distortion=3e-5)
+
+    packed, errors = load(tmp_path / "small.hyrf"), {}
+    for exposure in ("as-photographed", CONSISTENT):
+        settings = RenderSettings(exposure=exposure)
+        differences = [
+            (render(model, view.camera, settings).rgb - render(packed, view.camera, settings).rgb).square().mean()
+            for view in scene.train
+        ]
+        errors[exposure] = float(torch.stack(differences).mean())
+    assert report.error / 1.5 < errors["as-photographed"] < 1.5 * report.error
+    assert errors[CONSISTENT] < errors["as-photographed"] / 1.5  # the two differ, so the test can tell them apart
+
+
+def test_fine_tuning_fits_renders_as_photographed_and_leaves_the_exposure_to_the_map(model, source, scene, tmp_path):
+    compress(source, tmp_path / "tuned.hyrf", data=scene, finetune_steps=40)
+
+    tuned = load(tmp_path / "tuned.hyrf")
+    assert evaluate(tuned, scene.train).psnr > 28
+    consistent = RenderSettings(exposure=CONSISTENT)
+    for view in scene.test:
+        shown, expected = (render(each, view.camera, consistent).rgb.mean() for each in (tuned, model))
+        assert float(shown) == pytest.approx(float(expected), abs=0.02)
+
+
+def test_a_target_size_below_the_smallest_file_with_a_map_is_refused(source, tmp_path):
+    assert min_file_bytes(exposure=bright()) > min_file_bytes() + 84
+    with pytest.raises(HyrfError, match=f"about {min_file_bytes(exposure=bright()):,} bytes"):
+        compress(source, tmp_path / "small.hyrf", target_bytes=min_file_bytes() + 1)
+    assert not (tmp_path / "small.hyrf").exists()
