@@ -13,6 +13,7 @@ import tracemalloc
 from collections import Counter
 from contextlib import redirect_stdout
 from pathlib import Path
+from random import Random
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.format import encode_model, repack
 from hyrfpack.format.codec import FREE_GAUSSIANS, most_gaussians
 from hyrfpack.format.sections import SECTIONS
-from tools.safety.fuzz import allowance, check_file, check_model, decode
+from tools.safety.fuzz import allowance, check_file, check_model, decode, pattern
 from tools.safety.fuzz_mutate import GROUPS, KINDS, assemble, disassemble, mutant, seeds
 from tools.safety.plans import even
 
@@ -209,8 +210,8 @@ def test_seeds_reach_every_group_and_codec():
     met = {(part.tag.decode(), part.codec) for data in seeds()[0] for part in disassemble(data)[1:]}
 
     groups = {group for group, _ in met}
-    assert groups >= {*GROUPS, "POS1", "COL1", "SCA1", "OPA2"} and groups < set(SECTIONS)
-    assert {codec for _, codec in met} == {1, 2, 3, 4, 6, 7, 8}
+    assert groups >= {*GROUPS, "POS1", "COL1", "SCA1", "OPA2", "EXPO"} and groups < set(SECTIONS)
+    assert {codec for _, codec in met} == {1, 2, 3, 4, 6, 7, 8, 9}
     assert {disassemble(data)[0].codec for data in seeds()[0]} == {0, 5}
     assert all(not isinstance(decode(data), str) for data in seeds()[0])
 
@@ -231,3 +232,29 @@ def test_every_group_may_have_stages_up_to_the_limit_and_not_one_more():
     assert torch.isfinite(decode(data).gaussians.color_logits).all()
     with pytest.raises(HyrfError, match="17 stages"):
         encode_model(model, "paper", color=(17, 2))
+
+
+def test_forged_exposure_maps_meet_every_check_of_the_reader():
+    """Each sentence of the readers of codec 9, and maps that are decoded."""
+    outcomes = Counter()
+    for number in range(500):
+        outcome = decode(KINDS["forged exposure map"][1](Random(number)))
+        if isinstance(outcome, str):
+            assert "section 'EXPO'" in outcome or "decode to" in outcome, outcome
+        else:
+            check_model(outcome)
+            assert outcome.exposure is not None
+        outcomes[pattern(outcome) if isinstance(outcome, str) else "decoded"] += 1
+
+    assert outcomes["decoded"] > 50
+    sentences = " | ".join(outcomes)
+    for words in (
+        "are no exposure map",
+        "reserved bytes",
+        "not finite",
+        "centers",
+        "box",
+        "lengths",
+        "must lie in order",
+    ):
+        assert words in sentences, words

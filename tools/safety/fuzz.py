@@ -38,6 +38,7 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from hyrfpack.cameras.between import small_camera
@@ -47,7 +48,9 @@ from hyrfpack.cli.files import info
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import decode_model, describe, encode_model, load
 from hyrfpack.format.container import raw_limit
+from hyrfpack.format.exposure import exposure_section
 from hyrfpack.model import HybridModel
+from hyrfpack.model.exposure import MAX_LOG_GAIN
 from hyrfpack.render.renderer import render
 from tools.safety.fuzz_mutate import mutant, seeds
 
@@ -117,14 +120,23 @@ def decode(data: bytes) -> HybridModel | str:
 
 
 def check_model(model: HybridModel) -> None:
-    """Raise Failure unless every number is finite and the model survives profile raw."""
+    """Raise Failure unless every number is finite, the model survives profile raw, and log gains are within bounds."""
     state = model.state_dict()
-    again = decode_model(encode_model(model, "raw")).state_dict()
+    again = decode_model(encode_model(model, "raw"))
+    again_values = again.state_dict()
     for name, values in state.items():
         if not torch.isfinite(values).all():
             raise Failure(f"{name} is not finite")
-        if not torch.equal(values, again[name]):
+        if not torch.equal(values, again_values[name]):
             raise Failure(f"{name} does not survive")
+    if model.exposure is None:
+        return
+    if again.exposure is None or exposure_section(again.exposure) != exposure_section(model.exposure):
+        raise Failure("the exposure map does not survive")
+    for position in (np.zeros(3), np.full(3, 1e30)):
+        gains = model.exposure.log_gains(position, np.array([0.0, 0.0, 1.0]))
+        if not (np.abs(gains) <= MAX_LOG_GAIN).all():
+            raise Failure(f"the exposure map gives the log gains {gains}")
 
 
 def check_trace(data: bytes) -> tuple[int, float]:

@@ -24,7 +24,8 @@ from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import group_shapes, parse_config, to_arrays
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.container import read_container
-from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
+from hyrfpack.format.exposure import exposure_section
+from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.quant import HuffmanCode, MinMaxQuantizer, ResidualVectorQuantizer, huffman_encode
 from tools.safety.plans import encode
@@ -36,6 +37,9 @@ EXTREMES += tuple(2**power + step for power in (20, 28, 31, 32, 34, 40, 48, 60, 
 HOSTILE_TEXT = ("", "\n", "\x1b[2J", "\ud800", "\0", "a" * 3000, "__class__", "../../x", "\u202e", "NaN", "sum", "sh")
 HOSTILE_JSON = (None, True, False, 0, 1, -1, 0.5, -0.0, 5e-324, 1e-300, 1e308, -1e308, 10**18, 2**63, 10**400, [], {})
 HOSTILE_JSON += (*HOSTILE_TEXT, [0, 0, 0], [1e308] * 3, [[[]]], {"a": 1})
+# As the bits of float32: signed zeros, denormals, bounds of log gains and what lies beyond, the largest, infinity, NaN.
+HOSTILE_FLOAT_BITS = (0, 1 << 31, 1, 0x007FFFFF, 0x40FFFFFF, 0x41000000, 0x41000001, 0xC1000000, 0xC1000001)
+HOSTILE_FLOAT_BITS += (0x3F800000, 0x7F7FFFFF, 0xFF7FFFFF, 0x7F800000, 0xFF800000, 0x7FC00000, 0x7F800001)
 RANGES = {"log2_table_size": (3, 25), "levels": (0, 33), "base": (1, 70), "finest": (1, 70), "hidden": (0, 70)}
 
 
@@ -55,7 +59,7 @@ class Part:
 
 def assemble(parts: list[Part]) -> bytes:
     """A file of these sections with all places, lengths and checksums right, whatever the sections say."""
-    minor = int(any(5 <= part.codec <= 8 for part in parts))
+    minor = 2 if any(part.codec == 9 for part in parts) else int(any(5 <= part.codec <= 8 for part in parts))
     offset = 48 + 40 * len(parts)
     toc, payloads = [], []
     for part in parts:
@@ -134,7 +138,7 @@ def seeds() -> tuple[tuple[bytes, ...], tuple[float, ...]]:
     """Valid files, and how often each is taken: the small ones, which decode faster, more often.
 
     Each profile with 0, 1, 20 and 200 Gaussians, with and without background; the golden files; Gaussians in layers;
-    and groups in codecs that no profile gives them.
+    groups in codecs that no profile gives them; and exposure maps of up to 64 centers in each profile.
     """
     rng = Random(0)
     models = [_model(0), _model(1, background=False), _model(20, direction_encoding="sh"), _model(200, hidden=2)]
@@ -156,7 +160,25 @@ def seeds() -> tuple[tuple[bytes, ...], tuple[float, ...]]:
                     part.codec = rng.choice((2, 3, 3, 4, 4))
                     part.data = _codec(arrays[part.tag.decode()], part.codec, rng)
             files.append((assemble(parts), weight))
+    for profile, centers in zip(PROFILES, (0, 3, 64), strict=True):
+        exposed = _model(20, background=False)
+        exposed.exposure = _exposure(centers)
+        files.append((encode(exposed, profile), 10))
     return tuple(zip(*files, strict=True))
+
+
+def _exposure(centers: int) -> ExposureMap:
+    rng = np.random.default_rng(centers)
+    return ExposureMap(
+        box=np.sort(rng.normal(size=(2, 3)), 0).astype(np.float32),
+        lengths=rng.uniform(0.1, 3, 2).astype(np.float32),
+        mean=rng.normal(size=3).astype(np.float32),
+        limits=np.sort(rng.uniform(-8, 8, (2, 3)), 0).astype(np.float32),
+        steps=rng.uniform(1e-5, 1e-4, 3).astype(np.float32),
+        positions=rng.integers(0, 256, (centers, 3)).astype(np.uint8),
+        directions=rng.integers(-128, 128, (centers, 3)).astype(np.int8),
+        weights=rng.integers(-32768, 32768, (centers, 3)).astype(np.int16),
+    )
 
 
 def _alike(model: HybridModel) -> HybridModel:
@@ -266,14 +288,14 @@ def _forge_sections(rng: Random) -> bytes:
             borrowed = rng.choice(_pick(rng))
             parts[one].data, parts[one].codec = borrowed.data, borrowed.codec
         elif kind == 5:
-            parts[one].codec = rng.choice((*range(10), 65535))
+            parts[one].codec = rng.choice((*range(11), 65535))
         elif kind == 6:
             parts[one].raw_length = rng.choice((*EXTREMES, parts[one].raw_length + 4))
         elif kind == 7:
             parts[one].flags = rng.choice((0, 1, 2, 65535))
         else:
             parts[one].tag = rng.choice(
-                (b"NEW_", b"posi", b"\0\0\0\0", b"\xff\n\x1b ", b"META", b"POSI", b"POS1", b"COL3")
+                (b"NEW_", b"posi", b"\0\0\0\0", b"\xff\n\x1b ", b"META", b"POSI", b"POS1", b"COL3", b"EXPO")
             )
     return assemble(parts)
 
@@ -283,7 +305,7 @@ def _forge_payload(rng: Random) -> bytes:
     parts = [replace(part) for part in _pick(rng)]
     part = rng.choice(parts)
     part.data = edit_bytes(part.data, rng)
-    if part.tag == b"META" and part.codec == 0:
+    if (part.tag == b"META" and part.codec == 0) or part.codec == 9:
         part.raw_length = len(part.data)
     return assemble(parts)
 
@@ -327,8 +349,9 @@ def _forge_metadata(rng: Random) -> bytes:
         try:
             shapes = group_shapes(parse_config(values["config"]), int(values["gaussians"]))
             for part in parts[1:]:
-                rows, columns = shapes[part.tag.decode()]
-                part.raw_length = 4 * rows * columns
+                if part.tag != b"EXPO":
+                    rows, columns = shapes[part.tag.decode()]
+                    part.raw_length = 4 * rows * columns
         except Exception:  # the metadata is no longer sane, and need not be
             pass
     return assemble(parts)
@@ -386,6 +409,30 @@ def _forge_fields(rng: Random) -> bytes:
     part.data = b"".join(
         value[0].to_bytes(value[1], "little") if isinstance(value, tuple) else value for value in fields.values()
     )
+    return assemble(parts)
+
+
+def _forge_exposure(rng: Random) -> bytes:
+    """An exposure map with other numbers, centers or lengths, also in files without one; often of the right length."""
+    parts = [replace(part) for part in _pick(rng)]
+    place = next((index for index, part in enumerate(parts) if part.tag == b"EXPO"), None)
+    if place is None:
+        section, place = exposure_section(_exposure(rng.choice((0, 1, 5, 64)))), 1
+        parts.insert(place, Part(section.type.encode(), section.codec, 0, section.data, section.raw_length))
+    data = bytearray(parts[place].data)
+    for _ in range(rng.choice((1, 1, 2))):
+        kind = rng.randrange(4)
+        if kind < 2:
+            struct.pack_into("<I", data, 4 + 4 * rng.randrange(20), rng.choice(HOSTILE_FLOAT_BITS))
+        elif kind == 2:
+            data[84:] = edit_bytes(bytes(data[84:]), rng)
+        else:
+            data[rng.choice((0, 0, 1, 2, 3))] = rng.choice((0, 1, 2, 63, 64, 65, 255))
+    if rng.random() < 0.7:
+        del data[84 + (len(data) - 84) // 12 * 12 :]
+        data[0] = (len(data) - 84) // 12 % 256
+    parts[place].data = bytes(data)
+    parts[place].raw_length = len(data) if rng.random() < 0.9 else rng.choice((*EXTREMES, len(data) + 4))
     return assemble(parts)
 
 
@@ -502,6 +549,7 @@ KINDS: dict[str, tuple[int, Callable[[Random], bytes]]] = {
     "forged payload": (10, _forge_payload),
     "forged metadata": (15, _forge_metadata),
     "forged codec field": (15, _forge_fields),
+    "forged exposure map": (8, _forge_exposure),
 }
 
 
