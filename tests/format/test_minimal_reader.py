@@ -10,6 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from exposures import random_map
+from hypothesis import given
+from hypothesis import strategies as st
 from scenes import small_model
 
 from hyrfpack.compress import plan
@@ -17,6 +20,7 @@ from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import decode_model
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.container import MINOR, read_container, write_container
+from hyrfpack.format.exposure import decode_exposure, exposure_section
 from hyrfpack.model import ExposureMap
 from hyrfpack.quant.integers import encode_integers
 from tools.safety import minimal_reader
@@ -120,6 +124,59 @@ def test_the_start_of_a_file_in_layers_reads_the_same(in_layers, least, monkeypa
             decode_model(in_layers[:cut], fraction=1.0)
 
 
+def exposure_part(data: bytes) -> minimal_reader.Section:
+    """A section EXPO of these bytes."""
+    padded = data + bytes(-len(data) % 8)
+    return minimal_reader.Section("EXPO", 9, len(data), len(data), zlib.crc32(data), padded, whole=True)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 64))
+def test_exposure_maps_of_any_numbers_give_the_same_gains(seed, centers):
+    exposure = random_map(seed, centers)
+
+    assert_same_gains(minimal_reader.read_exposure(exposure_part(exposure_section(exposure).data)), exposure)
+
+
+# Numbers near the bounds that the page gives, and any others.
+FLOATS = (
+    st.floats(width=32) | st.sampled_from([0.0, -0.0, 1.0, 8.0, -8.0, 2.0**-149, 3.4e38]) | st.floats(-9, 9, width=32)
+)
+
+
+@given(
+    count=st.integers(0, 70),
+    reserved=st.sampled_from([bytes(3), b"\0\0\1"]),
+    lengths=st.lists(FLOATS.map(abs) | FLOATS, min_size=2, max_size=2),
+    box=st.lists(FLOATS, min_size=6, max_size=6),
+    rest=st.lists(FLOATS, min_size=12, max_size=12),
+    is_sorted=st.booleans(),
+    extra=st.sampled_from([0, 0, 0, 1, 12]),
+)
+def test_both_readers_accept_the_same_exposure_maps(count, reserved, lengths, box, rest, is_sorted, extra):
+    if is_sorted:  # lowest corners and limits first, as they should be
+        box = np.sort(np.reshape(box, (2, 3)), 0).ravel().tolist()
+        rest[3:9] = np.sort(np.clip(np.reshape(rest[3:9], (2, 3)), -8, 8), 0).ravel().tolist()
+    data = bytes([count]) + reserved + np.array([*lengths, *box, *rest], "<f4").tobytes() + bytes(12 * count + extra)
+    try:
+        read = minimal_reader.read_exposure(exposure_part(data))
+    except ValueError:
+        with pytest.raises(HyrfFormatError):
+            decode_exposure(9, memoryview(data), len(data))
+    else:
+        assert_same_gains(read, decode_exposure(9, memoryview(data), len(data)))
+
+
+def test_the_start_of_a_file_without_the_bytes_of_its_exposure_map_reads_without_one():
+    model = model_of(30)
+    model.exposure = random_map(1, 5)
+    sections = list(read_container(encode(model, "raw")).sections)
+    data = write_container(sorted(sections, key=lambda section: section.type == "EXPO"), minor=MINOR)
+
+    assert minimal_reader.read(data)[2] is not None and minimal_reader.read(data[:-1], part=True)[2] is None
+    assert_same_bits(data)
+    assert_same_bits(data[:-1], part=True)
+
+
 def test_the_stream_of_the_page_is_read():
     data = bytes.fromhex("00 12 29 B0 03 00 69 B1 00")
 
@@ -170,12 +227,15 @@ def test_both_readers_bound_the_basis_alike(sign):
             decode_model(with_basis(first))
 
 
-@pytest.mark.parametrize("profile", [*PROFILES, "compact in layers"])
+@pytest.mark.parametrize("profile", [*PROFILES, "compact in layers", "raw with an exposure map"])
 def test_both_readers_refuse_the_same_damage(profile, monkeypatch):
     rng = np.random.default_rng(0)
     if profile == "compact in layers":
         monkeypatch.setattr(plan, "LEAST_OF_LAYER", (1, 100))
-    sections = list(read_container(encode(model_of(30), profile.split()[0])).sections)
+    model = model_of(30)
+    if profile.endswith("map"):
+        model.exposure = random_map(2, 40)
+    sections = list(read_container(encode(model, profile.split()[0])).sections)
     assert (profile == "compact in layers") == any(section.type == "OPA1" for section in sections)
     refused, count = 0, 30
 
