@@ -314,7 +314,7 @@ def _print_model(file: Path, facts: dict) -> None:
         _say(f"  {name + ' grid':<18}  {_in_words(config[name])}")
     if (exposure := facts["exposure"]) is not None:
         lowest, highest = exposure["stops"]
-        _say(f"  {'exposure map':<18}  {exposure['centers']} centers, {lowest:+.2f} to {highest:+.2f} stops")
+        _say(f"  {'exposure map':<18}  {exposure['centers']} centres, {lowest:+.2f} to {highest:+.2f} stops")
     for name, value in config.items():
         if name not in ("frame", "geometry", "radiance"):
             _say(f"  {name.replace('_', ' '):<18}  {value}")

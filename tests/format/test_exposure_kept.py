@@ -187,7 +187,7 @@ def test_info_tells_of_the_map(raw):
 
     assert json.loads(succeeded("info", raw, "--json").stdout)["exposure"]["centers"] == 17
     lines = succeeded("info", raw).stdout.splitlines()
-    assert f"exposure map        17 centers, {lowest:+.2f} to {highest:+.2f} stops" in [line.strip() for line in lines]
+    assert f"exposure map        17 centres, {lowest:+.2f} to {highest:+.2f} stops" in [line.strip() for line in lines]
     (section,) = [line.split() for line in lines if line.startswith("EXPO exposure map")]
     assert section[3:5] == [str(EXPOSURE_BYTES)] * 2 and len(section) == 7  # bits/number is left out
 
