@@ -30,12 +30,11 @@ def kept_cameras(cameras: Sequence[Camera]) -> list[list[float]]:
     return [camera_to_numbers(camera) for camera in evenly_spaced(cameras, KEPT)]
 
 
-def provenance_of(scene: Scene, mean_exposure: bool = False) -> dict:
-    """What the provenance of a model trained on a scene keeps of it, for `Capture` and `has_mean_exposure`.
+def provenance_of(scene: Scene) -> dict:
+    """What the provenance of a model trained on a scene keeps of it, for `Capture`.
 
     `max_size` is left out where reading the photos again with DEFAULT_MAX_SIZE gives the same pictures: a model of
-    small photos is the same file, byte for byte, whether or not there is such a limit. So is `mean_exposure` where no
-    gains of photos were learnt.
+    small photos is the same file, byte for byte, whether or not there is such a limit.
     """
     cameras = [view.camera for view in scene.train]
     kept: dict = {"viewpoint": Viewpoint.of(cameras).to_json(), "cameras": kept_cameras(cameras)}
@@ -43,7 +42,7 @@ def provenance_of(scene: Scene, mean_exposure: bool = False) -> dict:
     needless = scene.max_size is None or (small and scene.max_size == DEFAULT_MAX_SIZE)
     if not needless:
         kept["max_size"] = scene.max_size
-    return {**kept, "mean_exposure": True} if mean_exposure else kept
+    return kept
 
 
 def coarse(provenance: dict, scale: float) -> dict:
@@ -71,9 +70,9 @@ def coarse(provenance: dict, scale: float) -> dict:
 
 
 def has_mean_exposure(provenance: dict) -> bool:
-    """Whether a model has its photos' mean exposure, gains of each having been learnt beside it, by its provenance.
+    """Whether a model has its photos' mean exposure and no exposure map, as an earlier version wrote it.
 
-    Where it has, what differs between a render and a photo is the photo's own exposure, too.
+    What differs between its renders and a photo is the photo's own exposure, too.
     """
     return provenance.get("mean_exposure") is True
 

@@ -53,7 +53,7 @@ class LiveView:
         if self._count and began < self._next and trainer.step < trainer.steps:
             return
         if self._capture is None:
-            self._capture = provenance_of(trainer.scene, mean_exposure=trainer.exposures is not None)
+            self._capture = provenance_of(trainer.scene)
         try:
             data = encode_model(trainer.model, "raw", {"steps": trainer.step, **self._capture})
         except HyrfError:

@@ -204,7 +204,7 @@ def exposure_spread(scene: Scene, cache: PictureCache) -> float:
     Raises:
         HyrfDataError: a photo cannot be read.
     """
-    return float(gains_from(observe(scene, cache), len(scene.train)).mean(1).std()) * STOPS
+    return float(gains_from(observe(scene, cache), len(scene.train)).mean(1).std()) * STOPS_PER_LOG_GAIN
 
 
 def exposures_for(

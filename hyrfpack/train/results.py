@@ -139,7 +139,7 @@ def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) ->
         "steps": config.steps,
         "seed": config.seed,
         "choices": trainer.choices,
-        **provenance_of(scene, mean_exposure=trainer.exposures is not None),
+        **provenance_of(scene),
         "psnr": statistics.median(record["psnr"] for record in trainer.records[-len(trainer.records) // 10 :]),
     }
     data = hyrf_format.encode_model(model, "raw", provenance)

@@ -20,6 +20,7 @@ from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload_array
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate.metrics import decibels
+from hyrfpack.format.exposure_head import STOPS_PER_LOG_GAIN
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.ssim import photometric_loss
@@ -30,7 +31,7 @@ from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.density import DensityControl
-from hyrfpack.train.exposure import STOPS, exposures_for
+from hyrfpack.train.exposure import exposures_for
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.setup import build_model
 from hyrfpack.train.strategy import Strategy
@@ -256,9 +257,8 @@ class Trainer:
             return
         fit = self.exposures.fit_map(self.model.config.frame, self.scene.train)
         self.model.exposure = fit.map
-        self.choices["exposure_map"] = (
-            f"{len(fit.map.positions)} centers; leave-one-out error {fit.leave_one_out_error * STOPS:.2f} stops"
-        )
+        error = fit.leave_one_out_error * STOPS_PER_LOG_GAIN
+        self.choices["exposure_map"] = f"{len(fit.map.positions)} centers; leave-one-out error {error:.2f} stops"
 
     def _learnt(self) -> list[nn.Parameter]:
         """What gradients are shared of."""

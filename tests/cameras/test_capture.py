@@ -46,10 +46,8 @@ def test_what_a_model_keeps_of_a_scene_comes_back():
     assert kept_cameras(capture.cameras) == kept_cameras(photographed)
 
 
-def test_a_mean_exposure_is_told_and_nothing_where_there_is_none():
-    scene = ball_scene(5)
-    assert provenance_of(scene, mean_exposure=True) == {**provenance_of(scene), "mean_exposure": True}
-    assert has_mean_exposure(provenance_of(scene, mean_exposure=True)) and not has_mean_exposure(provenance_of(scene))
+def test_only_files_of_earlier_versions_say_that_they_have_a_mean_exposure():
+    assert has_mean_exposure({"mean_exposure": True}) and not has_mean_exposure(provenance_of(ball_scene(5)))
     assert not has_mean_exposure({"mean_exposure": "yes"})
 
 

@@ -14,6 +14,7 @@ from scenes import ball_scene
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.evaluate import Evaluation, ViewScore
+from hyrfpack.format.exposure_head import STOPS_PER_LOG_GAIN
 from hyrfpack.model.exposure import expose
 from hyrfpack.scene import Scene, View
 from hyrfpack.train import TrainConfig, budget_pilots, decisions, exposure_pilots, pilots, train
@@ -27,7 +28,6 @@ from hyrfpack.train.decisions import (
     measures_budget,
     measures_exposure,
 )
-from hyrfpack.train.exposure import STOPS
 from hyrfpack.train.exposure_pilots import measure_exposure
 from hyrfpack.train.pilots import PilotsStopped, ScenePilots
 
@@ -51,8 +51,8 @@ def short(monkeypatch) -> None:
 
 
 def scored(psnr: float, corrected: float = 0.0, apart: tuple[float, ...] = (0.0, 0.0)) -> Evaluation:
-    views = [ViewScore("view", psnr + part, None, corrected, 0.5, None, None) for part in apart]
-    return Evaluation(psnr, None, corrected, 0.5, None, None, "", 0, 0.0, views)
+    views = [ViewScore("view", psnr + part, None, corrected, 0.5, None) for part in apart]
+    return Evaluation(psnr, None, corrected, 0.5, None, "", 0, 0.0, views)
 
 
 @pytest.fixture
@@ -250,7 +250,7 @@ def relit(scene: Scene, stops: list[float]) -> Scene:
         lit = dataclasses.replace(picture, rgb=(rgb * 255).round().byte().numpy())
         return dataclasses.replace(view, load=lambda: lit)
 
-    gains = np.exp(np.resize(stops, len(scene.train)) / STOPS)
+    gains = np.exp(np.resize(stops, len(scene.train)) / STOPS_PER_LOG_GAIN)
     return dataclasses.replace(scene, train=[exposed(*pair) for pair in zip(scene.train, gains, strict=True)])
 
 
