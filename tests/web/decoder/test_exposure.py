@@ -14,7 +14,7 @@ from scenes import ball_points, small_model
 from web.scripts import run_script
 
 from hyrfpack.format import encode_model
-from hyrfpack.format.container import read_container, write_container
+from hyrfpack.format.container import MINOR, read_container, write_container
 from hyrfpack.format.exposure import exposure_section
 from hyrfpack.format.sections import EXPOSURE
 from hyrfpack.model import HybridModel
@@ -85,9 +85,8 @@ def file_with(stored: bytes, **changes: object) -> bytes:
     container = read_container(encode_model(model_with(random_map(0, 3))))
     changed = {"data": stored, "raw_length": len(stored), **changes}
     sections = [container[tag] for tag in container.entries]
-    return write_container([
-        dataclasses.replace(part, **changed) if part.type == EXPOSURE else part for part in sections
-    ])  # fmt: skip
+    replaced = [dataclasses.replace(part, **changed) if part.type == EXPOSURE else part for part in sections]
+    return write_container(replaced, minor=MINOR)
 
 
 STORED = bytes(exposure_section(random_map(0, 3)).data)
