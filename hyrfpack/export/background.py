@@ -7,7 +7,9 @@ program clears its picture with: a choice of whoever looks at it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +17,9 @@ from torch import Tensor
 
 from hyrfpack.cameras.between import small_camera
 from hyrfpack.export.bake import STRIDE, Sight, refuse_nonfinite, sights_of
+from hyrfpack.export.exposure import camera_log_gains, typical_log_gains
 from hyrfpack.model import BACKGROUND_RADIUS, Frame, HybridModel
+from hyrfpack.model.exposure import expose
 from hyrfpack.ops.background import pixel_directions, sphere_points
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.shade import encode_directions
@@ -36,8 +40,10 @@ OPACITY = 0.99  # what drawing limits it to anyway
 SPREAD = 0.7  # standard deviation, in sides of a cell
 RECEDE = 1.1  # coarser splats lie further away by this for each level, so that finer ones are drawn over them
 
+GAIN_SMOOTHING_RADIANS = math.pi / 2 / 2**COARSEST  # standard deviation; a coarse cell's side
+
 MOST_ROWS = 1024
-POINTS_AT_ONCE = 1 << 18
+POINTS_AT_ONCE, GAINS_AT_ONCE = 1 << 18, 1 << 14
 
 
 @torch_on_one_thread()
@@ -54,7 +60,8 @@ def background_splats(
     overlap to a layer that lets a hundredth of the light through, a tenth in some corners. All around, cells are
     coarse; where cameras see light come through the scene, cells are divided into four, those first whose colours
     differ most from their mean (squared differences, each weighed by the squared transmittance: what they make in the
-    pictures), until there are as many as a tenth of the model's Gaussians, but at least 1,000.
+    pictures), until there are as many as a tenth of the model's Gaussians, but at least 1,000. A model's exposure map
+    is applied as `BackgroundGains` tells.
 
     Args:
         model: on the CPU.
@@ -71,8 +78,13 @@ def background_splats(
     if not model.config.background:
         none = np.zeros((0, 3))
         return Splats(none, none, np.zeros((0, 4)), np.zeros(0), none[:, None], model.config.antialiased)
-    sums, largest = _seen(model, cameras, sights_of(model, cameras) if sights is None else sights)
+    sights = sights_of(model, cameras) if sights is None else sights
+    sums, largest = _seen(model, cameras, sights)
     directions, sides, levels, colors = _tile(sums, largest, max(LEAST_SPLATS, int(MOST_SHARE * len(model))))
+    gains = BackgroundGains.of(model, cameras, sights)
+    if gains is not None:
+        towards = torch.from_numpy(directions).float()
+        colors = expose(torch.from_numpy(colors), gains.along(towards).double()).numpy()
     radii = BACKGROUND_RADIUS * RECEDE ** (levels.max() - levels)
     count, frame = len(colors), model.config.frame
     shrink = min(1.0, largest_scale / (SPREAD * sides * radii * frame.scale).max())
@@ -96,7 +108,12 @@ def background_reach(frame: Frame) -> float:
 
 @torch_on_one_thread()
 @torch.no_grad()
-def background_picture(model: HybridModel, height: int | None = None) -> np.ndarray:
+def background_picture(
+    model: HybridModel,
+    height: int | None = None,
+    cameras: Sequence[Camera] = (),
+    sights: Sequence[Sight] | None = None,
+) -> np.ndarray:
     """The background all around, as seen from the frame's centre: an equirectangular picture.
 
     The pixel in row v and column u of H x W, W = 2 H, looks along the world direction
@@ -109,6 +126,8 @@ def background_picture(model: HybridModel, height: int | None = None) -> np.ndar
         model: with a learnt background.
         height: rows H. By default a pixel along the middle row is as wide as a cell of the finest hash grid, but there
             are at most 1,024 rows.
+        cameras: from where it was photographed, world units: an exposure map is applied as `BackgroundGains` tells.
+        sights: what `sights_of` returns for the cameras, where it is known already.
 
     Returns:
         (H, 2H, 3) float32 in [0, 1], display-referred sRGB.
@@ -128,8 +147,71 @@ def background_picture(model: HybridModel, height: int | None = None) -> np.ndar
     latitudes, longitudes = torch.meshgrid(latitudes, longitudes, indexing="ij")
     level = latitudes.cos()
     directions = torch.stack((level * longitudes.sin(), -latitudes.sin(), level * longitudes.cos()), -1)
-    colors = _sphere_colors(model, directions.reshape(-1, 3).float())
+    towards = directions.reshape(-1, 3).float()
+    colors = _sphere_colors(model, towards)
+    gains = BackgroundGains.of(model, cameras, sights)
+    if gains is not None:
+        colors = torch.cat(
+            [
+                expose(some, gains.along(there))
+                for some, there in zip(colors.split(GAINS_AT_ONCE), towards.split(GAINS_AT_ONCE), strict=True)
+            ]
+        )
     return colors.reshape(height, 2 * height, 3).numpy()
+
+
+@dataclass(frozen=True)
+class BackgroundGains:
+    """Gains of the background by the direction: of the cameras that see it there.
+
+    Log gains are means over cells of the sphere, weighted by the light that cameras see of them and, from direction d
+    to the middle c of a cell, by exp(-|d - c|^2 / (2 s^2)), s = GAIN_SMOOTHING_RADIANS. So directions that no camera
+    sees have the gains of the nearest that one does, and nowhere there is a step.
+
+    Attributes:
+        directions: (n, 3) float32 unit vectors to the middles of the cells that cameras see.
+        log_light: (n,) float32 log of the light of each cell.
+        log_gains: (n, 3) float32 mean log gains of the cells.
+    """
+
+    directions: Tensor
+    log_light: Tensor
+    log_gains: Tensor
+
+    @classmethod
+    def of(
+        cls, model: HybridModel, cameras: Sequence[Camera], sights: Sequence[Sight] | None = None
+    ) -> BackgroundGains | None:
+        """Predict the gains of a model's background by its exposure map; None for a model without one.
+
+        Args:
+            model: on the CPU.
+            cameras: from where it was photographed, world units. Without any, or where none sees light of the sphere,
+                the gains are the same in all directions, see `typical_log_gains`.
+            sights: what `sights_of` returns for the cameras, where it is known already.
+        """
+        if model.exposure is None:
+            return None
+        logs = camera_log_gains(model, model.exposure, cameras)
+        middles = cell_centers(np.arange(6 * 4**COARSEST), COARSEST)[0]
+        light, sums = np.zeros(len(middles)), np.zeros((len(middles), 3))
+        sights = sights_of(model, cameras) if sights is None else sights
+        for log, seen in zip(logs, _seen_pixels(model, cameras, sights), strict=True):
+            cells = cells_of(seen.places.double().numpy(), COARSEST)
+            received = np.bincount(cells, seen.weights, len(middles))
+            light += received
+            sums += received[:, None] * log
+        if not light.any():
+            light, sums = np.ones(len(middles)), np.tile(typical_log_gains(model.exposure, logs), (len(middles), 1))
+        lit = light > 0
+        middles, light, means = middles[lit], light[lit], sums[lit] / light[lit, None]
+        return cls(*(torch.from_numpy(some).float() for some in (middles, np.log(light), means)))
+
+    def along(self, directions: Tensor) -> Tensor:
+        """Gains (N, 3) along unit vectors (N, 3) from the sphere's centre."""
+        cosines = directions @ self.directions.T  # |d - c|^2 = 2 - 2 cos
+        weights = (cosines / GAIN_SMOOTHING_RADIANS**2 + self.log_light).softmax(1)
+        return (weights @ self.log_gains).exp()
 
 
 def _sphere_colors(model: HybridModel, directions: Tensor) -> Tensor:
@@ -143,6 +225,34 @@ def _sphere_colors(model: HybridModel, directions: Tensor) -> Tensor:
     )
     refuse_nonfinite("background", colors)
     return colors
+
+
+class _SeenPixels(NamedTuple):
+    """Where a camera sees light of the sphere.
+
+    Attributes:
+        pose: (4, 4) camera_from_local.
+        points: (n, 2) pixels of `small_camera`.
+        places: (n, 3) what they show of the sphere, local units.
+        weights: (n,) float64, squared transmittances.
+    """
+
+    pose: Tensor
+    points: Tensor
+    places: Tensor
+    weights: np.ndarray
+
+
+def _seen_pixels(model: HybridModel, cameras: Sequence[Camera], sights: Sequence[Sight]) -> Iterator[_SeenPixels]:
+    """Yield what each camera sees of the sphere, at every STRIDE-th pixel of both axes."""
+    threshold = RenderSettings().background_threshold
+    for camera, sight in zip(map(small_camera, cameras), sights, strict=True):
+        refuse_nonfinite("Gaussians", sight.passed)
+        rows, columns = torch.nonzero(sight.passed > threshold).unbind(1)
+        pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=torch.float32)
+        points = torch.stack((columns, rows), -1) * STRIDE + 0.5
+        places = sphere_points(camera_center(pose), pixel_directions(points, camera.intrinsics, pose))
+        yield _SeenPixels(pose, points, places, sight.passed[rows, columns].double().square().numpy())
 
 
 def _seen(model: HybridModel, cameras: Sequence[Camera], sights: Sequence[Sight]) -> tuple[np.ndarray, float]:
@@ -163,17 +273,12 @@ def _seen(model: HybridModel, cameras: Sequence[Camera], sights: Sequence[Sight]
 
     net = torch.from_numpy(cell_centers(np.arange(6 * 4 ** (COARSEST + 2)), COARSEST + 2)[0]).float()
     add(net, _sphere_colors(model, net), np.full(len(net), UNSEEN))
-    largest, threshold = math.inf, RenderSettings().background_threshold
-    for camera, sight in zip(map(small_camera, cameras), sights, strict=True):
-        refuse_nonfinite("Gaussians", sight.passed)
-        rows, columns = torch.nonzero(sight.passed > threshold).unbind(1)
-        if len(rows):
-            pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=torch.float32)
-            points = torch.stack((columns, rows), -1) * STRIDE + 0.5
-            colors = model.decode_background(points, camera.intrinsics, pose)
+    largest = math.inf
+    for camera, seen in zip(map(small_camera, cameras), _seen_pixels(model, cameras, sights), strict=True):
+        if len(seen.points):
+            colors = model.decode_background(seen.points, camera.intrinsics, seen.pose)
             refuse_nonfinite("background", colors)
-            places = sphere_points(camera_center(pose), pixel_directions(points, camera.intrinsics, pose))
-            add(places, colors, sight.passed[rows, columns].double().square().numpy())
+            add(seen.places, colors, seen.weights)
             narrow = math.atan(min(camera.width / camera.fx, camera.height / camera.fy) / 2)
             largest = min(largest, LARGEST_CELL * narrow)
     return sums, largest

@@ -77,7 +77,7 @@ class HybridModel(nn.Module):
     Attributes:
         precision: how GPU kernels multiply in the decoders, not stored in files: "mixed" rounds factors to bfloat16
             and adds up in float32, "float32" rounds nothing. The CPU always works in float32.
-        exposure: the exposure map, None for a model of one exposure. Only `hyrfpack.render` applies it.
+        exposure: the exposure map, None for a model of one exposure. `hyrfpack.render` and `hyrfpack.export` apply it.
     """
 
     def __init__(self, config: ModelConfig, gaussians: Gaussians, generator: torch.Generator | None = None) -> None:

@@ -62,7 +62,7 @@ def main() -> None:
     behind, picture = None, None
     if source.model.config.background:
         behind, seconds = timed(lambda: background_splats(source.model, source.fitted))
-        picture = background_picture(source.model)
+        picture = background_picture(source.model, cameras=source.fitted)
         print(f", the background as {len(behind):,} more in {seconds:.1f} s", end="")
     whole = {d: splats if behind is None else concatenate((splats, behind)) for d, splats in baked.items()}
     own = score(source, {})["model"]

@@ -1,0 +1,108 @@
+"""Local exposure of baked splats: the gains by which the colours that splats are fitted to are exposed.
+
+Splats carry no exposure map, so their colours hold what the map says of the cameras that see them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from hyrfpack.model import HybridModel
+from hyrfpack.model.exposure import ExposureMap
+from hyrfpack.parallel.pool import run_tasks
+from hyrfpack.scene import Camera
+
+if TYPE_CHECKING:
+    from hyrfpack.export.bake import Sight
+
+# Without smoothing, indoor_room loses 0.18 dB at training cameras that are not fitted; 64 neighbours gain 0.05 dB more
+# and take four times as long.
+SMOOTHING_NEIGHBORS = 16
+GAUSSIANS_PER_TASK = 1 << 16
+
+
+@dataclass(frozen=True)
+class BakeGains:
+    """Gains of the colour samples that the harmonics of Gaussians are fitted to.
+
+    Attributes:
+        cameras: (V, 3) float32, of what each camera sees: its render as photographed has these.
+        gaussians: (N, 3) float32, of each Gaussian along directions from which no camera sees it.
+    """
+
+    cameras: Tensor
+    gaussians: Tensor
+
+    @classmethod
+    def of(cls, model: HybridModel, cameras: Sequence[Camera], sights: Sequence[Sight]) -> BakeGains | None:
+        """Predict the gains of a bake's samples by the exposure map; None without a map, or where it changes nothing.
+
+        A Gaussian's log gain is the mean over the cameras and over its nearest neighbours, see `smooth_log_gains`,
+        weighted by the light that they send and receive.
+
+        Args:
+            model: on the CPU.
+            cameras: that the model is baked from, world units.
+            sights: what `sights_of` returns for these cameras.
+        """
+        if model.exposure is None:
+            return None
+        logs = camera_log_gains(model, model.exposure, cameras)
+        typical = typical_log_gains(model.exposure, logs)
+        if not (logs.any() or typical.any()):
+            return None
+        light, sums = np.zeros(len(model)), np.zeros((len(model), 3))
+        for sight, log in zip(sights, logs, strict=True):
+            index, received = sight.index.numpy(), sight.light.double().numpy()
+            light[index] += received
+            sums[index] += received[:, None] * log
+        smooth = smooth_log_gains(model.gaussians.positions.detach().numpy(), light, sums, typical)
+        return cls(*(torch.from_numpy(np.exp(some)).float() for some in (logs, smooth)))
+
+
+def camera_log_gains(model: HybridModel, exposure: ExposureMap, cameras: Sequence[Camera]) -> np.ndarray:
+    """Predict the log gains (V, 3) of cameras in world units."""
+    gains = [exposure.gains_of_pose(model.config.frame.local_pose(camera)) for camera in cameras]
+    return np.log(np.array(gains, np.float64).reshape(-1, 3))
+
+
+def typical_log_gains(exposure: ExposureMap, logs: np.ndarray) -> np.ndarray:
+    """Return the mean (3,) of the log gains (V, 3) of cameras; the map's own mean where there are no cameras."""
+    return logs.mean(0) if len(logs) else np.clip(exposure.mean, *exposure.limits).astype(np.float64)
+
+
+def smooth_log_gains(positions: np.ndarray, light: np.ndarray, sums: np.ndarray, typical: np.ndarray) -> np.ndarray:
+    """Average the log gains of Gaussians over their nearest neighbours that a camera sees, themselves included.
+
+        log g_i = sum_n sums_n / sum_n light_n        over the SMOOTHING_NEIGHBORS nearest n with light_n > 0
+
+    Args:
+        positions: (N, 3).
+        light: (N,) >= 0, that each sends to all cameras.
+        sums: (N, 3) sum over the cameras of light times log gain.
+        typical: (3,) log gains of all where no camera sees any.
+
+    Returns:
+        (N, 3) float64, finite.
+    """
+    smooth = np.broadcast_to(typical, sums.shape).copy()
+    seen = light > 0
+    if not seen.any():
+        return smooth
+    tree, weights, weighted = cKDTree(positions[seen]), light[seen], sums[seen]
+    count = min(SMOOTHING_NEIGHBORS, len(weights))
+
+    def smooth_block(block: int) -> None:
+        here = slice(block * GAUSSIANS_PER_TASK, (block + 1) * GAUSSIANS_PER_TASK)
+        _, nearest = tree.query(positions[here], k=range(1, count + 1))
+        smooth[here] = weighted[nearest].sum(1) / weights[nearest].sum(1)[:, None]
+
+    run_tasks(smooth_block, -(-len(positions) // GAUSSIANS_PER_TASK))
+    return smooth

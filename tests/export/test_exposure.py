@@ -1,0 +1,153 @@
+"""Splats of a model with an exposure map look as photographed, or have one exposure on request."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scenes import camera_at, ring, small_model
+
+from hyrfpack.export import exposure as export_exposure
+from hyrfpack.export.background import BackgroundGains, background_picture, background_splats
+from hyrfpack.export.bake import bake
+from hyrfpack.export.exposure import SMOOTHING_NEIGHBORS, smooth_log_gains
+from hyrfpack.model.exposure import ExposureMap
+from hyrfpack.splats.harmonics import BAND_0, harmonics_basis
+
+RANDOM = np.random.default_rng(0)
+LEFT, RIGHT = (RANDOM.uniform(-0.1, 0.1, (20, 3)) + (side, 0, 0) for side in (-0.6, 0.6))
+# Each sees its own half only, and its own half of the background.
+LEFT_CAMERA = camera_at((-0.6, -1.5, 0), (-0.6, 0, 0), focal=64)
+RIGHT_CAMERA = camera_at((0.6, 1.5, 0), (0.6, 0, 0), focal=64)
+LOG_GAINS = np.array([1.0, 0.8, 0.6])
+
+
+def map_over(places, log_gains, spread=0.05) -> ExposureMap:
+    """A map with these log gains (M, 3) at viewpoints (M, 3), and none far from all."""
+    places, log_gains = np.asarray(places, np.float64), np.asarray(log_gains, np.float64)
+    box = np.stack((places.min(0), places.max(0))).astype(np.float32)
+    extent = np.maximum(box[1] - box[0], 1e-6)
+    return ExposureMap(
+        box=box,
+        lengths=np.array([spread, 100.0], np.float32),
+        mean=np.zeros(3, np.float32),
+        limits=np.array([[-3] * 3, [3] * 3], np.float32),
+        steps=np.full(3, 1e-3, np.float32),
+        positions=np.round(255 * (places - box[0]) / extent).astype(np.uint8),
+        directions=np.zeros((len(places), 3), np.int8),
+        weights=np.round(1000 * log_gains).astype(np.int16),
+    )
+
+
+def gains_at(model, camera) -> np.ndarray:
+    return model.exposure.gains_of_pose(model.config.frame.local_pose(camera))
+
+
+def half_bright(positions=None, **options):
+    """Grey Gaussians, of which those at the right are photographed bright, the others dark."""
+    model = small_model(np.concatenate((LEFT, RIGHT)) if positions is None else positions, **options)
+    model.exposure = map_over([LEFT_CAMERA.position, RIGHT_CAMERA.position], [-LOG_GAINS, LOG_GAINS])
+    return model
+
+
+def exposed_grey(gains: np.ndarray) -> np.ndarray:
+    """0.5 at these gains: its odds are 1."""
+    return gains / (1 + gains)
+
+
+def base_colors(splats) -> np.ndarray:
+    return 0.5 + BAND_0 * splats.harmonics[:, 0]
+
+
+# -- colours of Gaussians --------------------------------------------------------------------------------------------
+
+
+def test_splats_seen_by_bright_photos_are_bright_and_those_seen_by_dark_photos_are_dark():
+    model, cameras = half_bright(), [LEFT_CAMERA, RIGHT_CAMERA]
+    colors = base_colors(bake(model, cameras, (0,))[0])
+    left, right = (exposed_grey(gains_at(model, camera)) for camera in cameras)
+    assert np.allclose(colors[:20], left, atol=1e-4) and np.allclose(colors[20:], right, atol=1e-4)
+    assert (left < 0.4).all() and (right > 0.6).all()
+
+
+def test_each_direction_has_the_exposure_of_the_camera_that_looks_along_it():
+    cameras = ring(2, elevation=0.0)
+    model = small_model([(0, y, 0) for y in (-0.6, -0.3, 0, 0.3, 0.6)])  # none hides another
+    model.exposure = map_over([camera.position for camera in cameras], [LOG_GAINS, -LOG_GAINS])
+    splats = bake(model, cameras, (1,))[1]
+    for camera in cameras:
+        along = torch.nn.functional.normalize(torch.from_numpy(splats.positions - camera.position), dim=1).float()
+        seen = 0.5 + torch.einsum("nk,nkc->nc", harmonics_basis(along, 1), torch.from_numpy(splats.harmonics))
+        assert np.allclose(seen, exposed_grey(gains_at(model, camera)), atol=0.01)
+
+
+def test_a_gaussian_that_no_camera_sees_has_the_exposure_of_its_neighbours():
+    model = half_bright(np.concatenate((LEFT, RIGHT, [[4.0, 0.0, 0.0]])))
+    color = base_colors(bake(model, [LEFT_CAMERA, RIGHT_CAMERA], (0,))[0])[-1]
+    assert np.allclose(color, exposed_grey(gains_at(model, RIGHT_CAMERA)), atol=1e-4)
+
+
+def test_where_no_camera_sees_any_gaussian_all_have_the_cameras_mean_exposure():
+    model = half_bright()
+    away = [camera_at(c.position, c.position * (1, 9, 1)) for c in (LEFT_CAMERA, RIGHT_CAMERA)]
+    mean = np.mean([np.log(gains_at(model, camera)) for camera in away], axis=0)
+    assert np.allclose(base_colors(bake(model, away, (0,))[0]), exposed_grey(np.exp(mean)), atol=1e-4)
+
+
+def test_without_cameras_all_have_the_maps_mean_exposure_within_its_limits():
+    model = half_bright()
+    mean, limits = np.array([0.2, -0.4, 3.0], np.float32), np.array([[-1] * 3, [1] * 3], np.float32)
+    model.exposure = replace(model.exposure, mean=mean, limits=limits)
+    assert np.allclose(base_colors(bake(model, [], (0,))[0]), exposed_grey(np.exp([0.2, -0.4, 1.0])), atol=1e-4)
+
+
+def test_smoothing_is_the_mean_over_the_nearest_that_are_seen_weighted_by_light(monkeypatch):
+    monkeypatch.setattr(export_exposure, "GAUSSIANS_PER_TASK", 64)
+    positions, light = RANDOM.normal(size=(200, 3)), RANDOM.uniform(size=200) * (RANDOM.uniform(size=200) > 0.5)
+    logs = RANDOM.normal(size=(200, 3))
+    smooth = smooth_log_gains(positions, light, light[:, None] * logs, np.zeros(3))
+    distances = np.where(light > 0, np.linalg.norm(positions[:, None] - positions, axis=2), np.inf)
+    nearest = np.argsort(distances, axis=1)[:, :SMOOTHING_NEIGHBORS]
+    expected = [np.average(logs[some], axis=0, weights=light[some]) for some in nearest]
+    assert np.allclose(smooth, expected)
+
+
+def test_one_gaussian_that_is_seen_gives_all_its_exposure():
+    smooth = smooth_log_gains(RANDOM.normal(size=(3, 3)), np.eye(3)[1], 2.0 * np.eye(3)[[0, 1, 2]], np.zeros(3))
+    assert np.allclose(smooth, [[0, 2, 0]] * 3)
+
+
+# -- the background --------------------------------------------------------------------------------------------------
+
+
+def sky_between(ahead, behind):
+    """A grey sky that one camera sees towards +y, the other towards -y, and their log gains."""
+    cameras = [camera_at((0, -0.1, 0), (0, -1, 0)), camera_at((0, 0.1, 0), (0, 1, 0))]
+    model = small_model([[0.0, 0.0, 0.5]], background=True)
+    model.exposure = map_over([camera.position for camera in cameras], [behind, ahead])
+    return model, cameras
+
+
+def test_the_background_has_the_exposure_of_the_cameras_that_see_it():
+    model, cameras = sky_between(LOG_GAINS, -LOG_GAINS)
+    splats, ways = background_splats(model, cameras), [(0, -1, 0), (0, 1, 0)]
+    directions = splats.positions / np.linalg.norm(splats.positions, axis=1, keepdims=True)
+    picture = background_picture(model, 64, cameras)
+    looked_at = {(0, -1, 0): picture[0, 0], (0, 1, 0): picture[-1, 0]}  # the top row looks along -y
+    for camera, way in zip(cameras, ways, strict=True):
+        expected = exposed_grey(gains_at(model, camera))
+        assert np.allclose(base_colors(splats)[(directions @ way).argmax()], expected, atol=0.01)
+        assert np.allclose(looked_at[way], expected, atol=0.01)
+
+
+def test_background_that_no_camera_sees_has_finite_gains_between_those_that_are_seen():
+    model, cameras = sky_between(LOG_GAINS, -LOG_GAINS)
+    gains = BackgroundGains.of(model, cameras).along(torch.eye(3)).log().numpy()
+    assert np.isfinite(gains).all() and (np.abs(gains) <= LOG_GAINS + 1e-3).all()
+
+
+def test_without_cameras_the_background_has_the_maps_mean_exposure():
+    model = small_model([[0.0, 0.0, 0.5]], background=True)
+    model.exposure = replace(map_over([[0, 0, 0]], [[0, 0, 0]]), mean=LOG_GAINS.astype(np.float32))
+    assert np.allclose(BackgroundGains.of(model, []).along(torch.eye(3)).log(), LOG_GAINS, atol=1e-5)
