@@ -2,6 +2,7 @@
 to list its options."""
 
 AS_PHOTOGRAPHED, CONSISTENT = EXPOSURES = ("as-photographed", "consistent")  # of renders
+LOCAL_EXPOSURE, _ = SPLAT_EXPOSURES = ("local", CONSISTENT)  # of splats that a model is baked to
 LAYOUTS = (  # of photos and poses: the keys of `hyrfpack.data.LAYOUTS`
     "colmap",
     "blender",

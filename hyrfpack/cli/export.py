@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from hyrfpack.choices import LOCAL_EXPOSURE, SPLAT_EXPOSURES
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
@@ -89,6 +90,14 @@ min_opacity_option = click.option(
 @min_opacity_option
 @click.option("--background/--no-background", default=True, help="Take the background along.  [default: do]")
 @click.option(
+    "--exposure",
+    type=click.Choice(SPLAT_EXPOSURES),
+    default=LOCAL_EXPOSURE,
+    show_default=True,
+    help="Of splats: local, as bright as the photos that see them, or consistent, one exposure for all. The same for a "
+    "model without an exposure map.",
+)
+@click.option(
     "--data",
     type=PATH,
     multiple=True,
@@ -108,6 +117,7 @@ def export(
     crop: tuple[float, ...] | None,
     min_opacity: float,
     background: bool,
+    exposure: str,
     spz_version: str,
     data: tuple[Path, ...],
     overwrite: bool,
@@ -155,7 +165,7 @@ def export(
         raise HyrfError(f"{splats[0]}: photos go with .hyrf files only; leave out --data, or this file")
     if data and len(data) != len(models):
         raise HyrfError(f"--data is given {len(data)} times, for {len(models)} models; give it once for each, or not")
-    check_request(kind, output, degree, crop, min_opacity, background, baked)
+    check_request(kind, output, degree, crop, min_opacity, background, baked, exposure)
     scenes = [read_scene(path, reading, describe(model)) for path, model in zip(data, files, strict=False)]
     if kind is PLAYER:
         check_folder(output, models, scenes, overwrite=overwrite, listed=len(models) > 1)
@@ -177,6 +187,7 @@ def export(
                 background=background,
                 spz_version=int(spz_version),
                 baked=baked,
+                exposure=exposure,
                 colmap=colmap,
                 overwrite=overwrite,
                 say=note,
@@ -201,6 +212,18 @@ def _how_to_write_splats(source: Path, output: Path, kind: Kind) -> str:
     )
 
 
+def _print_exposures(report: ExportReport) -> None:
+    """What local and consistent exposure of baked splats cost, as a table."""
+    photos = report.photos_by_exposure
+    head = ["exposure of baked splats, not yet written", "PSNR (dB) as photographed"]
+    rows = [
+        [f"{name}{' (in the file)' if name == report.exposure else ''}", f"{psnr:.2f}"]
+        + ([f"{photos[name]:.2f}"] if photos else [])
+        for name, psnr in report.psnr_by_exposure.items()
+    ]
+    click.echo(table(head + (["PSNR (dB), held-out photos"] if photos else []), rows))
+
+
 def _print(report: ExportReport) -> None:
     if report.native:
         click.echo(
@@ -218,6 +241,8 @@ def _print(report: ExportReport) -> None:
             f"the first row is what baking loses, the second what baking and the rounding of {ending} lose together; "
             "neither compares with photos"
         )
+    if report.psnr_by_exposure:
+        _print_exposures(report)
     behind = f", {report.background:,} of them for the background" if report.background else ""
     holds = f", {report.gaussians:,} Gaussians{behind}" if report.gaussians else ""
     cameras = f", {report.cameras:,} cameras" if report.cameras else ""

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from hyrfpack.choices import LOCAL_EXPOSURE
 from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.export.background import background_reach
 from hyrfpack.export.cameras import COLMAP_FILES
@@ -71,6 +72,7 @@ def check_request(
     min_opacity: float = 0.0,
     background: bool = True,
     baked: bool = False,
+    exposure: str = LOCAL_EXPOSURE,
 ) -> None:
     """Refuse what would fail later on: see `export`. Raises HyrfError."""
     if degree is not None and degree not in range(MAX_DEGREE + 1):
@@ -90,6 +92,7 @@ def check_request(
         "`crop`": crop is not None,
         "`min_opacity`": min_opacity > 0,
         "`background=False`": not background,
+        f"`exposure={exposure!r}`": exposure != LOCAL_EXPOSURE,
     }
     if any(asked.values()) and (kind is PLAYER or (kind is PAGE and not baked)):
         names = " and ".join(name for name, given in asked.items() if given)

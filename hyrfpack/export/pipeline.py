@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import os
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from hyrfpack.atomic import write_atomic
-from hyrfpack.checks import check_type
+from hyrfpack.checks import check_choice, check_type
+from hyrfpack.choices import CONSISTENT, LOCAL_EXPOSURE, SPLAT_EXPOSURES
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.background import background_picture, background_splats
-from hyrfpack.export.bake import bake, sights_of
+from hyrfpack.export.bake import Sight, bake, sights_of
 from hyrfpack.export.cameras import encode_transforms, write_colmap
 from hyrfpack.export.degree import choose_degree
 from hyrfpack.export.folder import player
@@ -62,6 +65,7 @@ def export(
     background: bool = True,
     spz_version: int = 3,
     baked: bool = False,
+    exposure: str = LOCAL_EXPOSURE,
     colmap: bool = False,
     overwrite: bool = True,
     say: Say = lambda sentence: None,
@@ -92,6 +96,9 @@ def export(
         background: whether the model's background goes along.
         spz_version: of ".spz", 3 (which all programs read) or 4.
         baked: a page holds splats instead of the model.
+        exposure: of splats that are baked from a model with an exposure map. "local" exposes their colours as the
+            photos that see them are, so that the splats look as photographed; "consistent" leaves the map out. The
+            same for a model without a map.
         colmap: write cameras and points into a folder, as a COLMAP model.
         overwrite: replace files that are there. Without it, they are an error. One that appears in the meantime is
             kept, too: a single file gets a free name beside it, which the report tells; in a folder it is an error.
@@ -102,6 +109,7 @@ def export(
         HyrfError: a file cannot be read or written, the options do not go together, or another call is at work in the
             folder.
         TypeError: `data` is no Scene.
+        ValueError: `exposure` is no such word.
 
     Example:
         >>> import hyrfpack
@@ -111,8 +119,9 @@ def export(
     """
     if data is not None:
         check_type("data", data, Scene)
+    check_choice("exposure", exposure, SPLAT_EXPOSURES)
     kind = kind_of(target, colmap)
-    check_request(kind, target, degree, crop, min_opacity, background, baked)
+    check_request(kind, target, degree, crop, min_opacity, background, baked, exposure)
     source = find_model(source)
     if kind is PLAYER:
         return player(source, target, data=data, overwrite=overwrite, say=say)
@@ -122,7 +131,7 @@ def export(
         check_place(target, Outputs(source, scene=data, overwrite=overwrite), colmap)
         return _export(
             source, target, kind, degree=degree, data=data, crop=crop, min_opacity=min_opacity, background=background,
-            spz_version=spz_version, baked=baked, overwrite=overwrite, say=say, report=report,
+            spz_version=spz_version, baked=baked, exposure=exposure, overwrite=overwrite, say=say, report=report,
         )  # fmt: skip
 
 
@@ -138,6 +147,7 @@ def _export(
     background: bool,
     spz_version: int,
     baked: bool,
+    exposure: str,
     overwrite: bool,
     say: Say,
     report: Report,
@@ -154,6 +164,9 @@ def _export(
     points = kind in (COLMAP, *POINTS)
     sphere = background and crop is None and read.model.config.background and not points
     check_model(read, kind, crop, min_opacity, sphere)
+    by_exposure = {LOCAL_EXPOSURE: read, CONSISTENT: _without_map(read)}
+    photographed, read = read, by_exposure[exposure]
+    compares_exposures = photographed.model.exposure is not None and crop is None and bool(read.measured)
     places = f"{len(read.fitted)} " + (
         "cameras" if read.cameras else "places around the scene, for the file keeps no cameras (`data` names photos)"
     )
@@ -172,21 +185,25 @@ def _export(
         degree = highest
     say(f"fitting colours of degree {degree} at {places}")
     sights = sights or sights_of(read.model, read.fitted, report_part(report, 0.0, 0.25))
-    fitting = report_part(report, bake_starts or 0.25, 0.4)
-    splats = chosen(bake(read.model, read.fitted, (degree,), sights, fitting)[degree], crop, min_opacity)
+    bake_as = partial(
+        _bake_scene, degree=degree, sights=sights, crop=crop, min_opacity=min_opacity, kind=kind, sphere=sphere
+    )
+    splats, count, picture = bake_as(read, report=report_part(report, bake_starts or 0.25, 0.4))
     if points:
         return _export_points(read, kind, target, splats, overwrite)
-    say(f"writing {len(splats):,} Gaussians{' and the background' if sphere else ''}")
-    report(f"writing {len(splats):,} Gaussians", 0.4)
-    count = 0
+    exposures: Shown = {}
+    if compares_exposures:
+        (other,) = set(SPLAT_EXPOSURES) - {exposure}
+        say(f"fitting colours of {other} exposure, to compare with")
+        rival, _, rival_picture = bake_as(by_exposure[other], report=report_part(report, 0.4, 0.5))
+        exposures = {exposure: (splats, picture), other: (rival, rival_picture)}
+    del bake_as, sights  # of many Gaussians and cameras they are large
+    say(f"writing {len(splats) - count:,} Gaussians{' and the background' if sphere else ''}")
+    report(f"writing {len(splats) - count:,} Gaussians", 0.5)
     if isinstance(kind, Format):
-        if sphere:
-            behind = background_splats(read.model, read.fitted, kind.largest_scale, sights)
-            splats, count = concatenate((splats, behind)), len(behind)
-        del sights  # of many Gaussians and cameras they are large
         packed, shown = _pack_splats(read, splats, Path(target), kind, spz_version)
     else:
-        packed, shown = _pack_page(read, splats, sphere, Path(target))
+        packed, shown = _pack_page(read, splats, picture, Path(target))
     written = write_atomic(target, packed, overwrite=overwrite)
     result = ExportReport(
         str(written),
@@ -195,21 +212,52 @@ def _export(
         background=count,
         degree=degree,
         chosen_by=chosen_by,
+        exposure=None if photographed.model.exposure is None else exposure,
     )
     del packed
     if crop is not None:
         say("nothing is measured, for a part of the scene was cropped")
         return result
-    return _measured(result, read, shown, kind, sphere, say, report_part(report, 0.65, 1.0))
+    measured = _measured(result, read, shown, kind, sphere, say, report_part(report, 0.65, 0.85 if exposures else 1.0))
+    if not exposures:
+        return measured
+    return _with_both_exposures(measured, photographed, exposures, sphere, report_part(report, 0.85, 1.0))
+
+
+def _without_map(read: Source) -> Source:
+    """What renders and bakes at the model's own exposure everywhere. The parameters are shared."""
+    model = copy.copy(read.model)
+    model.exposure = None
+    return replace(read, model=model)
+
+
+def _bake_scene(
+    read: Source,
+    *,
+    degree: int,
+    sights: Sequence[Sight],
+    crop: Sequence[float] | None,
+    min_opacity: float,
+    kind: Kind,
+    sphere: bool,
+    report: Report,
+) -> tuple[Splats, int, np.ndarray | None]:
+    """Splats, how many of them, the last, are the background, and the picture of it for kinds that hold one."""
+    splats = chosen(bake(read.model, read.fitted, (degree,), sights, report)[degree], crop, min_opacity)
+    if not sphere:
+        return splats, 0, None
+    if kind is PAGE:
+        return splats, 0, background_picture(read.model, cameras=read.fitted, sights=sights)
+    behind = background_splats(read.model, read.fitted, kind.largest_scale, sights)
+    return concatenate((splats, behind)), len(behind), None
 
 
 # Splats and the picture behind them: those that were to be written ("baked"), and those read back ("file").
 Shown = dict[str, tuple[Splats, np.ndarray | None]]
 
 
-def _pack_page(read: Source, splats: Splats, sphere: bool, target: Path) -> tuple[bytes, Shown]:
+def _pack_page(read: Source, splats: Splats, picture: np.ndarray | None, target: Path) -> tuple[bytes, Shown]:
     """A file's bytes, and what it shows."""
-    picture = background_picture(read.model) if sphere else None
     data = baked_page(read, splats, picture, target.stem)
     return data, {"baked": (splats, picture), "file": decode_page(data, str(target))}
 
@@ -252,6 +300,19 @@ def _measured(
         psnr=file.model,
         photos_model=scores["model"].photos,
         photos_file=file.photos,
+    )
+
+
+def _with_both_exposures(
+    result: ExportReport, read: Source, exposures: Shown, sphere: bool, report: Report
+) -> ExportReport:
+    """The result with the PSNR of splats of each exposure against the model as photographed, and against photos."""
+    scores = likeness(read.model, exposures, read.measured, sphere=sphere, report=report)
+    found = {name: scores[name] for name in SPLAT_EXPOSURES if name in scores}
+    return replace(
+        result,
+        psnr_by_exposure={name: score.model for name, score in found.items()},
+        photos_by_exposure={name: score.photos for name, score in found.items() if score.photos is not None},
     )
 
 

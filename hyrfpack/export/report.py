@@ -23,6 +23,12 @@ class ExportReport:
             file holds; None where it was not measured.
         psnr: PSNR of the file's pictures, as read back from its bytes, against the model's own.
         photos_model, photos_file: PSNR of the model's and of the file's pictures against held-out photos, if given.
+        exposure: of the splats in the file, "local" or "consistent": the model's pictures that `psnr_baked`, `psnr` and
+            `photos_model` are about have the same, as photographed or consistent. None of a model without an exposure
+            map.
+        psnr_by_exposure: PSNR of baked splats with local and with consistent exposure, before anything is rounded,
+            against the model's pictures as photographed; empty without an exposure map, or where it was not measured.
+        photos_by_exposure: the same against held-out photos, if given.
         cameras: in the file, where it is one of points or cameras.
     """
 
@@ -38,4 +44,7 @@ class ExportReport:
     psnr: float | None = None
     photos_model: float | None = None
     photos_file: float | None = None
+    exposure: str | None = None
+    psnr_by_exposure: dict[str, float] = field(default_factory=dict)
+    photos_by_exposure: dict[str, float] = field(default_factory=dict)
     cameras: int = 0

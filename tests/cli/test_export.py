@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from commands import hyrfpack, refused, succeeded
+from exposures import random_map
 from scenes import ring, small_model
 
 from hyrfpack.cameras.capture import kept_cameras
@@ -70,6 +71,22 @@ def test_photos_are_scored_if_given(model, data, tmp_path):
     form = r"against held-out photos: PSNR \d+\.\d{3} dB of the model, \d+\.\d{3} dB of the file"
     assert re.fullmatch(form, last)
     assert json.loads(succeeded(*arguments, "--test-every", 0, "--json").stdout)["photos_model"] is None
+
+
+def test_both_exposures_are_printed_and_the_one_in_the_file_is_marked(data, tmp_path):
+    mapped, cameras = small_model(POSITIONS), ring(4)
+    mapped.exposure = random_map(0, centers=4)
+    kept = {"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json()}
+    save(mapped, tmp_path / "mapped.hyrf", provenance=kept)
+    arguments = ("export", tmp_path / "mapped.hyrf", "-o", tmp_path / "a.ply", "--overwrite", "--sh-degree", 1)
+    printed = succeeded(*arguments, "--exposure", "consistent").stdout
+    report = json.loads(succeeded(*arguments, "--json").stdout)
+    assert report["exposure"] == "local" and report["photos_by_exposure"] == {}
+    rows = dict(re.findall(r"^(local|consistent \(in the file\)) +(\d+\.\d\d)$", printed, re.MULTILINE))
+    local, consistent = (f"{report['psnr_by_exposure'][word]:.2f}" for word in ("local", "consistent"))
+    assert rows == {"local": local, "consistent (in the file)": consistent} and local != consistent
+    scored = succeeded(*arguments, "--data", data).stdout
+    assert re.search(r"^local \(in the file\) +\d+\.\d\d +\d+\.\d\d$", scored, re.MULTILINE)
 
 
 def test_options_choose_what_is_written(model, tmp_path):
@@ -141,6 +158,8 @@ WRONG = {
     "no photos": (("-o", "a.ply", "--data", "none"), "none"),
     "degree of a model": (("-o", "a.html", "--sh-degree", "1"), "--baked"),
     "crop of a player": (("-o", "player", "--crop", "0,0,0,1,1,1"), "--baked"),
+    "exposure": (("-o", "a.ply", "--exposure", "even"), "'--exposure'"),
+    "exposure of a model": (("-o", "a.html", "--exposure", "consistent"), "--exposure consistent would change it"),
     "baked player": (("-o", "player", "--baked"), "--baked"),
     "COLMAP file": (("-o", "a.ply", "--colmap"), "a COLMAP model is a folder"),
     "two models": (("second.hyrf", "-o", "a.ply"), "several models make a gallery"),

@@ -5,14 +5,23 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
-from scenes import camera_at, ring, small_model
+from scenes import ball_scene, camera_at, ring, small_model
 
+import hyrfpack
+from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.paths import Viewpoint
+from hyrfpack.errors import HyrfError
 from hyrfpack.export import exposure as export_exposure
 from hyrfpack.export.background import BackgroundGains, background_picture, background_splats
 from hyrfpack.export.bake import bake
 from hyrfpack.export.exposure import SMOOTHING_NEIGHBORS, smooth_log_gains
+from hyrfpack.export.poster import model_poster
+from hyrfpack.format import load, save
 from hyrfpack.model.exposure import ExposureMap
+from hyrfpack.render import RenderSettings, render
+from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.harmonics import BAND_0, harmonics_basis
 
 RANDOM = np.random.default_rng(0)
@@ -58,6 +67,17 @@ def exposed_grey(gains: np.ndarray) -> np.ndarray:
 
 def base_colors(splats) -> np.ndarray:
     return 0.5 + BAND_0 * splats.harmonics[:, 0]
+
+
+def write(path, model, cameras):
+    save(model, path, provenance={"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json()})
+    return path
+
+
+@pytest.fixture
+def written(tmp_path):
+    """A file of `half_bright` before a background sphere."""
+    return write(tmp_path / "model.hyrf", half_bright(fields=1.0, background=True), [LEFT_CAMERA, RIGHT_CAMERA])
 
 
 # -- colours of Gaussians --------------------------------------------------------------------------------------------
@@ -151,3 +171,92 @@ def test_without_cameras_the_background_has_the_maps_mean_exposure():
     model = small_model([[0.0, 0.0, 0.5]], background=True)
     model.exposure = replace(map_over([[0, 0, 0]], [[0, 0, 0]]), mean=LOG_GAINS.astype(np.float32))
     assert np.allclose(BackgroundGains.of(model, []).along(torch.eye(3)).log(), LOG_GAINS, atol=1e-5)
+
+
+# -- files -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", [".ply", ".splat", ".html"])
+def test_an_identity_map_changes_no_byte(ending, tmp_path):
+    plain = small_model(np.concatenate((LEFT, RIGHT)), fields=1.0, background=True)
+    mapped = small_model(np.concatenate((LEFT, RIGHT)), fields=1.0, background=True)
+    mapped.exposure = map_over([LEFT_CAMERA.position], [[0, 0, 0]])
+    files = []
+    for name, model in (("plain", plain), ("mapped", mapped)):
+        source = write(tmp_path / f"{name}.hyrf", model, [LEFT_CAMERA, RIGHT_CAMERA])
+        target = tmp_path / name / f"out{ending}"
+        target.parent.mkdir()
+        hyrfpack.export(source, target, baked=ending == ".html")
+        files.append(target.read_bytes())
+    assert files[0] == files[1]
+
+
+def test_consistent_splats_are_those_of_the_model_without_its_map(written, tmp_path):
+    plain = load(written)
+    plain.exposure = None
+    bare = write(tmp_path / "plain.hyrf", plain, [LEFT_CAMERA, RIGHT_CAMERA])
+    hyrfpack.export(bare, tmp_path / "plain.ply")
+    hyrfpack.export(written, tmp_path / "consistent.ply", exposure="consistent")
+    hyrfpack.export(written, tmp_path / "local.ply")
+    files = [(tmp_path / f"{name}.ply").read_bytes() for name in ("plain", "consistent", "local")]
+    assert files[0] == files[1] != files[2]
+
+
+@pytest.mark.parametrize("ending", [".ply", ".html"])
+def test_the_report_has_the_loss_of_both_exposures_whichever_is_written(ending, written, tmp_path):
+    reports = [
+        hyrfpack.export(written, tmp_path / f"{word}{ending}", exposure=word, degree=1, baked=ending == ".html")
+        for word in ("local", "consistent")
+    ]
+    local, consistent = reports
+    assert (local.exposure, consistent.exposure) == ("local", "consistent")
+    assert local.psnr_by_exposure == pytest.approx(consistent.psnr_by_exposure)
+    assert list(local.psnr_by_exposure) == ["local", "consistent"] and local.photos_by_exposure == {}
+    assert local.psnr_by_exposure["local"] > local.psnr_by_exposure["consistent"] + 3
+    # Each file is compared with the model's pictures of its own exposure.
+    assert local.psnr_baked == local.psnr_by_exposure["local"]
+    assert consistent.psnr > consistent.psnr_by_exposure["consistent"] + 3
+
+
+def test_photos_score_both_exposures(written, tmp_path):
+    scene = ball_scene(4)
+    report = hyrfpack.export(
+        written, tmp_path / "a.ply", degree=0, data=replace(scene, train=scene.train[1:], test=scene.train[:1])
+    )
+    assert list(report.photos_by_exposure) == ["local", "consistent"]
+    assert report.photos_by_exposure["local"] == pytest.approx(report.photos_file, abs=0.01)
+
+
+def test_a_model_without_a_map_has_no_exposure_to_report(tmp_path):
+    source = write(tmp_path / "plain.hyrf", small_model(LEFT), [LEFT_CAMERA])
+    report = hyrfpack.export(source, tmp_path / "a.ply", degree=0)
+    assert (report.exposure, report.psnr_by_exposure, report.photos_by_exposure) == (None, {}, {})
+
+
+def test_a_file_without_cameras_gets_finite_splats(tmp_path):
+    save(half_bright(), tmp_path / "bare.hyrf")
+    report = hyrfpack.export(tmp_path / "bare.hyrf", tmp_path / "a.ply")
+    assert np.isfinite(read_splats(tmp_path / "a.ply").harmonics).all() and report.exposure == "local"
+
+
+@pytest.mark.parametrize("target", ["page.html", "player"])
+def test_what_holds_the_model_itself_refuses_another_exposure(target, written, tmp_path):
+    with pytest.raises(HyrfError, match="exposure='consistent'"):
+        hyrfpack.export(written, tmp_path / target, exposure="consistent")
+    assert not (tmp_path / target).exists()
+
+
+def test_an_unknown_exposure_is_refused(written, tmp_path):
+    with pytest.raises(ValueError, match="local"):
+        hyrfpack.export(written, tmp_path / "a.ply", exposure="mean")
+
+
+def test_posters_show_the_scene_as_photographed():
+    model = half_bright()
+    poster = np.asarray(model_poster(model, RIGHT_CAMERA, 32)) / 255
+    with torch.no_grad():
+        own, consistent = (
+            render(model, RIGHT_CAMERA, RenderSettings(exposure=word)).rgb.numpy()
+            for word in ("as-photographed", "consistent")
+        )
+    assert np.abs(poster - own).max() < 0.01 < np.abs(poster - consistent).max()
