@@ -214,7 +214,7 @@ def _train_in_folder(
         (phase or phases.update)("reading photos and setting up the model", 0, 0)
         trainer = ranks.agree(lambda: Trainer(scene, config, cache, device, ranks=ranks))
     for choice, reason in decisions.reasons.items():
-        trainer.choices[choice] += f": {reason}"
+        trainer.choices[choice] += f"; {reason}"
     trainer.pilots = [dataclasses.asdict(score) for score in decisions.scores]
     if resume:
         trainer.load(checkpoint)

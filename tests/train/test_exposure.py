@@ -54,6 +54,27 @@ def test_photos_that_nothing_is_known_of_have_gains_of_one_and_parts_that_share_
     assert not gains_from(Observations(photo[:9], point[:9], logits[:9]), 2).any()
 
 
+def test_two_groups_of_photos_that_two_glossy_points_connect_do_not_drift_apart():
+    """The points look a unit of logit lighter from one side; all photos have the same exposure."""
+    rng = np.random.default_rng(0)
+    seen = [(photo, 200 * (photo // 10) + row) for photo in range(20) for row in rng.choice(200, 60, replace=False)]
+    glossy = [(photo, point) for point in (400, 401) for photo in (3, 4, 13, 14)]
+    photo, point = np.array(seen + glossy).T
+    logits = rng.normal(size=(402, 3))[point] + rng.normal(0, 0.05, (len(photo), 3))
+    logits[(point >= 400) & (photo >= 10)] += 1
+
+    found = gains_from(Observations(photo, point, logits), 20)
+    assert abs(found[10:].mean() - found[:10].mean()) < 0.4
+
+    # Forty points that agree are believed.
+    shared = np.array([(photo, point) for point in range(400, 440) for photo in (3, 4, 13, 14)]).T
+    photo, point = np.concatenate((np.array(seen).T, shared), 1)
+    logits = rng.normal(size=(440, 3))[point] + rng.normal(0, 0.05, (len(photo), 3))
+    logits[photo >= 10] += 1
+    found = gains_from(Observations(photo, point, logits), 20)
+    assert found[10:].mean() - found[:10].mean() == pytest.approx(1, abs=0.05)
+
+
 def test_each_photo_is_read_once_and_what_is_masked_clipped_or_outside_is_left_out():
     scene, reads = exposed_scene(np.ones((4, 1))), []
     black, masked, see_through, usual = scene.train
@@ -163,7 +184,7 @@ def test_gains_that_are_known_are_found_and_the_model_keeps_the_mean():
 
     trainer = trained(scene, dataclasses.replace(SHORT, steps=60))
 
-    assert trainer.choices["exposure"].startswith("per-image gains: by their tracks the photos differ by 0.5")
+    assert trainer.choices["exposure"].startswith("per-image gains; by their tracks the photos differ by 0.5")
     np.testing.assert_allclose(trainer.exposures.values.detach(), centred(gains), atol=0.05)
 
 
@@ -179,7 +200,7 @@ def test_gains_are_not_learnt_by_default_even_where_photos_differ_by_a_stop():
 
 def test_gains_of_photos_without_tracks_start_at_one():
     trainer = Trainer(dataclasses.replace(exposed_scene(alternating(6)), tracks={}), SHORT)
-    assert trainer.choices["exposure"] == "per-image gains: no tracks tell of the photos"
+    assert trainer.choices["exposure"] == "per-image gains; no tracks tell of the photos"
     assert torch.equal(trainer.exposures.values, torch.zeros(6, 3))
 
 

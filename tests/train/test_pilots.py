@@ -178,7 +178,7 @@ def test_a_run_has_the_budget_that_pilots_tell_and_says_why(tmp_path, monkeypatc
     metrics = json.loads((tmp_path / "metrics.json").read_bytes())
     assert metrics["settings"]["budget_factor"] == 0.5
     reason = metrics["choices"]["max_gaussians"]
-    assert reason.startswith("2,500: 0.5 times what suits ") and reason.endswith(" steps: by a coin")
+    assert reason.startswith("2,500: 0.5 times what suits ") and reason.endswith(" steps; by a coin")
     assert f"Gaussians at most: {reason}" in capsys.readouterr().err
 
 
