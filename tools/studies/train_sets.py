@@ -3,6 +3,8 @@
     python -m tools.studies.train_sets --steps 1000                            every set below ../shared/data
     python -m tools.studies.train_sets --steps 2000 --sets mipnerf360_bonsai gerrard_hall
 
+    python -m tools.studies.train_sets --sets mipnerf360_bonsai@25              25 of its photos (`variants.py`)
+
 Scores are on held-out views (every 8th; Blender-style sets their own split) of the files as decoded from disk.
 Runs stay in --out (default runs/sets/<steps>), so a second call with --reuse only measures.
 """
@@ -19,15 +21,16 @@ from pathlib import Path
 
 import hyrfpack
 from hyrfpack.train import TrainConfig
+from tools.studies.variants import load_variant
 from tools.tables import markdown
 
 PROFILES = ("paper", "compact")
 DATA = Path(os.environ.get("HYRFPACK_DATA") or Path(__file__).parents[3] / "shared" / "data")
 
 
-def measure(folder: Path, out: Path, config: TrainConfig, reuse: bool) -> dict:
+def measure(data: Path, name: str, out: Path, config: TrainConfig, reuse: bool) -> dict:
     """Train one set, compress it with each profile that loses something, score all files."""
-    scene = hyrfpack.load_scene(folder)
+    scene = load_variant(data, name)
     if not (reuse and (out / "metrics.json").exists()):
         hyrfpack.train(scene, out, config, overwrite=True)
     trained = json.loads((out / "metrics.json").read_text())
@@ -43,7 +46,7 @@ def measure(folder: Path, out: Path, config: TrainConfig, reuse: bool) -> dict:
         packed |= {f"bytes_{profile}": path.stat().st_size, f"seconds_{profile}": seconds}
     raw = trained["evaluation"]
     return {
-        "set": folder.name,
+        "set": name,
         "steps": config.steps,
         "psnr": raw["psnr"],
         "ssim": raw["ssim"],
@@ -97,9 +100,13 @@ def study_arguments(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--sets", nargs="*", help="folder names below the data folder; default all that load")
+    parser.add_argument("--sets", nargs="*", help="below --data, or variants (`variants.py`); default all that load")
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--exposure", action=argparse.BooleanOptionalAction, help="learn per-image gains, or not (default: pilot runs)"
+    )
     parser.add_argument("--reuse", action="store_true", help="do not train again what --out already holds")
     args = parser.parse_args()
     out = args.out or Path("runs/sets") / str(args.steps)
@@ -107,9 +114,10 @@ def main() -> None:
         folder.name for folder in args.data.iterdir() if (folder / "images").exists() or (folder / "train").exists()
     )
     warnings.simplefilter("error")  # a run that warns has not passed
+    config = TrainConfig(steps=args.steps, seed=args.seed, exposure=args.exposure)
     rows = []
     for name in names:
-        rows.append(measure(args.data / name, out / name, TrainConfig(steps=args.steps), args.reuse))
+        rows.append(measure(args.data, name, out / name, config, args.reuse))
         print(table(rows[-1:]).splitlines()[-1], flush=True)
         out.mkdir(parents=True, exist_ok=True)
         (out / "table.json").write_text(json.dumps(rows, indent=1))
