@@ -1,4 +1,4 @@
-"""What a trained model keeps of its photos: cameras, viewpoint and size, and whether it has their mean exposure."""
+"""What a trained model keeps of its photos: cameras, viewpoint and size."""
 
 from __future__ import annotations
 
