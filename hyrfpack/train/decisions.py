@@ -65,6 +65,11 @@ def max_pilot_steps(scene: Scene, config: TrainConfig) -> int:
     return budget + MAX_EXPOSURE_PILOT_STEPS * measures_exposure(scene, config)
 
 
+def without_pilots(config: TrainConfig) -> Decisions:
+    """The safe defaults of what the settings leave open: no gains, the usual budget."""
+    return Decisions(dataclasses.replace(config, exposure=bool(config.exposure)), {}, [])
+
+
 def decide(
     scene: Scene,
     config: TrainConfig,
@@ -86,9 +91,7 @@ def decide(
         HyrfError: as `Trainer.run`; a photo cannot be read.
     """
     decides_exposure, decides_budget = measures_exposure(scene, config), measures_budget(scene, config)
-    settled = dataclasses.replace(config, exposure=bool(config.exposure))
-    if not (decides_exposure or decides_budget):
-        return Decisions(settled, {}, [])
+    settled = without_pilots(config).config
     reasons: dict[str, str] = {}
     scores: list[PilotScore] = []
     steps = 0
@@ -108,4 +111,4 @@ def decide(
             scores = [*scores, *pilots.scores]
     except PilotsStopped:
         return None
-    return Decisions(settled, reasons, scores)
+    return None if stop() else Decisions(settled, reasons, scores)

@@ -26,7 +26,14 @@ from hyrfpack.parallel.ranks import ALONE, Ranks
 from hyrfpack.scene import Scene, View
 from hyrfpack.train.checkpoint import saved_decisions
 from hyrfpack.train.config import TrainConfig
-from hyrfpack.train.decisions import Decisions, decide, is_budget_open, measures_budget, measures_exposure
+from hyrfpack.train.decisions import (
+    Decisions,
+    decide,
+    is_budget_open,
+    measures_budget,
+    measures_exposure,
+    without_pilots,
+)
 from hyrfpack.train.log import TrainingLog
 from hyrfpack.train.pilots import Report, is_usable
 from hyrfpack.train.progress import PhaseLine, ProgressLine
@@ -198,10 +205,9 @@ def _train_in_folder(
     if resume:
         saved = ranks.agree(lambda: _with_saved_decisions(config, checkpoint) if ranks.leads else config)
         decisions = Decisions(ranks.first(saved), {}, [])
-    else:
+    elif questions := _open_questions(scene, config):
         with PhaseLine(silent) as phases, _stop_requests() as stop:
-            if questions := _open_questions(scene, config):
-                phases.note(f"{questions} by short pilot runs, scored on training photos that they leave out")
+            phases.note(f"{questions} by short pilot runs, scored on training photos that they leave out")
             tell: Report = _ignore_step if report is None else partial(_as_step_nought, report)
             # Each does it for itself: none waits for another.
             pilots = partial(decide, scene, config, cache, device, tell, stop, phase or phases.update)
@@ -209,6 +215,8 @@ def _train_in_folder(
         if answers[0] is None or None in answers:
             return TrainResult(False, 0, None, {})
         decisions = answers[0]
+    else:
+        decisions = without_pilots(config)
     config = decisions.config
     with PhaseLine(silent) as phases:
         (phase or phases.update)("reading photos and setting up the model", 0, 0)

@@ -370,5 +370,5 @@ def test_torchrun_starts_a_run_anew_that_lost_a_process_and_it_goes_on(data, uni
     words = ("-m", "hyrfpack", "train", data, "-o", tmp_path / "run", *LONG)
     output, errors = ended(*torchrun, *words, folder=tmp_path, code=0)
     assert "200 Gaussians" in output and output.count("model.hyrf") == 1
-    assert "has ended" in errors  # else it would say little
+    assert "has ended" in errors or "closing signal" in errors  # said by the other process, or by torchrun before it
     assert model_of(tmp_path / "run") == uninterrupted

@@ -48,11 +48,11 @@ def test_short_runs_before_a_training_do_not_count_in_its_forecast(monkeypatch):
     reporter = Reporter(["training"], told.append)
     reporter.estimates |= {"pilots": 10.0, "training": 30.0, "results": 0.0}
     reporter.begin("training")
-    shown = stages._TrainingProgress(reporter, 1000)
+    shown = stages._TrainingProgress(reporter, 1000, 480)
     for step in [0] * 240 + list(range(1, 301)):
         clock[0] += 0.1
         shown.step(step, 0.1, 0.01, 500)
-    assert told[240].words == ("estimating the Gaussian budget",)
+    assert told[240].words == ("pilot runs",)
     assert told[240].share == pytest.approx(0.125)  # half of the pilots, a quarter of all
     assert told[-1].share == pytest.approx((10 + 0.3 * 30) / 40) and told[-1].left == pytest.approx(70.0, rel=0.02)
 
@@ -62,7 +62,7 @@ def test_scores_and_pictures_after_the_last_step_are_a_part_of_the_training():
     reporter = Reporter(["training"], told.append)
     reporter.estimates |= {"pilots": 0.0, "training": 30.0, "results": 10.0}
     reporter.begin("training")
-    shown = stages._TrainingProgress(reporter, 1)
+    shown = stages._TrainingProgress(reporter, 1, 0)
     shown.step(1, 0.1, 0.01, 500)
     assert told[-1].share == 0.75 and told[-1].left > 0
     shown.phase("scoring held-out photos", 1, 2)

@@ -83,7 +83,7 @@ def test_large_photos_are_made_smaller_where_the_time_is_short(posed, scene, mon
 
     plans = [planned(seconds) for seconds in (3000.0, 300.0, 100.0)]
     assert [plan.max_size for plan in plans] == [1600, 16, 8] and {plan.target_bytes for plan in plans} == {90_000}
-    assert plans[0].steps > 1000 and "pixels" in said[0]
+    assert plans[0].steps > 1000 and any("pixels" in sentence for sentence in said)
 
 
 def test_a_long_run_has_the_budget_that_the_scene_is_worth_and_a_short_one_all(posed, scene, monkeypatch):
