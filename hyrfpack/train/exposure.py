@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy.sparse import csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 from torch import Tensor, nn
 
@@ -33,9 +34,10 @@ USABLE = 8, 247  # of 255, that every pixel of it lies between
 LEAST = 10  # usable points, of a photo whose gains are told
 ROUNDS = 10  # of reweighting
 CAUCHY = 2.385  # standard deviations at which an observation counts half; 95 % efficient for normal errors
-# Observations of gains of one that each photo gets: they hold what nothing else determines. With fewer, two groups of
-# photos that two glossy points connect drift apart; with more, gains along a ring of photos shrink.
-DAMPING = 0.1
+DAMPING = 0.01  # observations of gains of one that each photo gets: they hold what nothing else determines
+MIN_SHARED_POINTS = (
+    10  # of two photos whose exposures are compared: a few glossy points must not set a whole group apart
+)
 
 
 @dataclass(frozen=True)
@@ -105,14 +107,15 @@ def gains_from(observed: Observations, photos: int) -> np.ndarray:
 
     with weights 1 / (1 + (|e| / 2.385 s)^2), iterated, and s the standard deviation of the rest by its median, so that
     occlusions and highlights hardly count. For given weights the best c_p is a mean, which leaves a sparse system of
-    the gains, solved by conjugate gradients. Photos that fewer than LEAST points tell of get 0.
+    the gains, solved by conjugate gradients. Photos that fewer than LEAST points tell of get 0. Groups of photos
+    that no two photos with MIN_SHARED_POINTS points in common connect are not compared: each keeps a mean near 0.
     """
     gains = np.zeros((photos, 3))
     known = np.bincount(observed.photo, minlength=photos) >= LEAST
     if not known.any():
         return gains
     photo, logits = observed.photo, observed.logits
-    _, point = np.unique(observed.point, return_inverse=True)
+    point = _points_of_groups(observed, photos)
     weights = np.ones(len(photo))
     for _ in range(ROUNDS):
         shares = csr_array((weights, (point, photo)), shape=(point.max() + 1, photos))
@@ -131,6 +134,15 @@ def gains_from(observed: Observations, photos: int) -> np.ndarray:
     gains[~known] = 0
     gains[known] -= gains[known].mean(0)
     return gains
+
+
+def _points_of_groups(observed: Observations, photos: int) -> np.ndarray:
+    """(K,) rows of points, where a point that several groups of photos see is another one in each of them."""
+    _, point = np.unique(observed.point, return_inverse=True)
+    sees = csr_array((np.ones(len(point)), (observed.photo, point)), shape=(photos, point.max() + 1))
+    _, group = connected_components((sees @ sees.T) >= MIN_SHARED_POINTS, directed=False)
+    _, point = np.unique(np.stack((point, group[observed.photo])), axis=1, return_inverse=True)
+    return point.ravel()
 
 
 def _means(group: np.ndarray, weights: np.ndarray, values: np.ndarray) -> np.ndarray:
