@@ -7,8 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +19,8 @@ from hyrfpack.cli.files import DEFAULT_PROFILE, PROFILES
 from hyrfpack.cli.train import PRESETS, train
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.format import load
+from hyrfpack.train.decisions import decide
+from hyrfpack.train.trainer import Trainer
 
 COMMANDS = (
     "make",
@@ -235,20 +235,38 @@ def test_video_without_ffmpeg_is_a_note_beside_the_pictures(packed, tmp_path, mo
     ],
     ids=["new", "overwriting"],
 )
-def test_an_interrupted_training_saves_exits_with_1_and_says_how_to_go_on(options, told, data, tmp_path):
-    before = signal.getsignal(signal.SIGINT)
+def test_an_interrupted_training_saves_exits_with_1_and_says_how_to_go_on(options, told, data, tmp_path, monkeypatch):
+    before, run = signal.getsignal(signal.SIGINT), Trainer.run
 
-    def interrupt_once_training_listens():
-        while signal.getsignal(signal.SIGINT) is before:
-            time.sleep(0.01)
-        os.kill(os.getpid(), signal.SIGINT)
+    def run_interrupted(trainer, *, report, **rest):
+        def report_and_interrupt(*step):
+            report(*step)
+            signal.raise_signal(signal.SIGINT)
 
-    threading.Thread(target=interrupt_once_training_listens, daemon=True).start()
-    result = hyrfpack("train", data, "-o", tmp_path, "--steps", 1_000_000, "--max-gaussians", 200, "--json", *options)
+        return run(trainer, report=report_and_interrupt, **rest)
+
+    monkeypatch.setattr(Trainer, "run", run_interrupted)
+    result = hyrfpack("train", data, "-o", tmp_path, "--steps", 100, "--max-gaussians", 200, "--json", *options)
     assert result.exit_code == 1 and isinstance(result.exception, SystemExit)
-    assert json.loads(result.stdout)["complete"] is False
+    assert json.loads(result.stdout)["complete"] is False and json.loads(result.stdout)["step"] == 1
     assert told in result.stderr
     assert (tmp_path / "checkpoint.pt").is_file() and not (tmp_path / "model.hyrf").exists()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.usefixtures("signals")
+def test_training_interrupted_during_pilot_runs_exits_with_1_and_begins_anew(data, tmp_path, monkeypatch):
+    before = signal.getsignal(signal.SIGINT)
+
+    def decide_interrupted(*arguments):
+        signal.raise_signal(signal.SIGINT)
+        return decide(*arguments)
+
+    monkeypatch.setattr("hyrfpack.train.run.decide", decide_interrupted)
+    result = hyrfpack("train", data, "-o", tmp_path, "--steps", 1_000, "--max-gaussians", 200, "--json")
+    assert result.exit_code == 1 and json.loads(result.stdout) == {"complete": False, "step": 0}
+    assert "stopped before the first step; the same command begins anew" in result.stderr
+    assert not any((tmp_path / name).exists() for name in ("checkpoint.pt", "model.hyrf"))
     assert signal.getsignal(signal.SIGINT) is before
 
 

@@ -31,9 +31,9 @@ CONFIG = TrainConfig(
     checkpoint_every=1,
     density=DensityConfig(start=0.05, stop=0.7, rounds=8, gradient=1e-5, resets=1),
 )
-# The same run in a process of its own; says each step on standard output.
+# The same run in a process of its own; says each step on standard output. Slow enough to be stopped on its way.
 CHILD = """
-import json, sys
+import json, sys, time
 from pathlib import Path
 sys.path.append(sys.argv[1])
 from scenes import ball_scene
@@ -41,7 +41,8 @@ from hyrfpack.train import Trainer, train
 from test_run import CONFIG, a_scene
 out = Path(sys.argv[2])
 if sys.argv[3] == "train":
-    result = train(a_scene(), out, CONFIG, resume=(out / "checkpoint.pt").exists(), quiet=True)
+    resume = (out / "checkpoint.pt").exists()
+    result = train(a_scene(), out, CONFIG, resume=resume, quiet=True, observer=lambda trainer: time.sleep(0.05))
     print(json.dumps({"complete": result.complete, "step": result.step, "model": result.model}))
 else:
     trainer = Trainer(a_scene(), CONFIG)
