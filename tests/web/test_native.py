@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from scenes import camera_at, moved
-from web.pages import Browser, json_of, psnr, shown
+from web.pages import Browser, json_of, psnr, shown, until
 
 from hyrfpack.format.codec import encode_model
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
@@ -333,11 +333,13 @@ def test_a_device_lost_while_a_file_comes_in_is_made_up_for(browser: Browser, tm
         "addEventListener('DOMContentLoaded', () => { const canvas = document.getElementById('view'), "
         "device = canvas.getContext('webgl2').getExtension('WEBGL_lose_context'); "
         "canvas.addEventListener('webglcontextlost', () => setTimeout(() => device.restoreContext(), 50)); "
+        "canvas.addEventListener('webglcontextrestored', () => { window.restored = true; }); "
         "setTimeout(() => device.loseContext(), 300); })"
     )
     with browser.before_every_page(script):
         browser.open(file.as_uri())
         browser.evaluate("hyrfpack.ready")
+        until(browser, "window.restored === true")  # where the file is read at once, the device is lost after that
         settled(browser)
         camera = cameras()[0]
         assert psnr(shown(browser, camera), rendered(model, camera)) > 45

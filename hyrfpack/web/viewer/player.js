@@ -233,6 +233,7 @@ export class Player extends EventTarget {
     event.preventDefault(); // else it is for ever
     countLoss(this.renderer.gl);
     this.loaded = false;
+    this.calm = false; // whoever waits for the picture waits for it to come back
     this.tell("said", "The graphics device was taken away; the picture comes back with it.");
   }
 
