@@ -19,8 +19,8 @@ from hyrfpack.cli.files import DEFAULT_PROFILE, PROFILES
 from hyrfpack.cli.train import PRESETS, train
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.format import load
+from hyrfpack.train import Trainer
 from hyrfpack.train.decisions import decide
-from hyrfpack.train.trainer import Trainer
 
 COMMANDS = (
     "make",
@@ -235,7 +235,7 @@ def test_video_without_ffmpeg_is_a_note_beside_the_pictures(packed, tmp_path, mo
     ],
     ids=["new", "overwriting"],
 )
-def test_an_interrupted_training_saves_exits_with_1_and_says_how_to_go_on(options, told, data, tmp_path, monkeypatch):
+def test_interrupted_training_saves_exits_with_1_and_says_how_to_resume(options, told, data, tmp_path, monkeypatch):
     before, run = signal.getsignal(signal.SIGINT), Trainer.run
 
     def run_interrupted(trainer, *, report, **rest):
@@ -248,14 +248,15 @@ def test_an_interrupted_training_saves_exits_with_1_and_says_how_to_go_on(option
     monkeypatch.setattr(Trainer, "run", run_interrupted)
     result = hyrfpack("train", data, "-o", tmp_path, "--steps", 100, "--max-gaussians", 200, "--json", *options)
     assert result.exit_code == 1 and isinstance(result.exception, SystemExit)
-    assert json.loads(result.stdout)["complete"] is False and json.loads(result.stdout)["step"] == 1
+    summary = json.loads(result.stdout)
+    assert (summary["complete"], summary["step"]) == (False, 1)
     assert told in result.stderr
     assert (tmp_path / "checkpoint.pt").is_file() and not (tmp_path / "model.hyrf").exists()
     assert signal.getsignal(signal.SIGINT) is before
 
 
 @pytest.mark.usefixtures("signals")
-def test_training_interrupted_during_pilot_runs_exits_with_1_and_begins_anew(data, tmp_path, monkeypatch):
+def test_training_interrupted_during_pilot_runs_exits_with_1_and_saves_nothing(data, tmp_path, monkeypatch):
     before = signal.getsignal(signal.SIGINT)
 
     def decide_interrupted(*arguments):

@@ -31,7 +31,8 @@ CONFIG = TrainConfig(
     checkpoint_every=1,
     density=DensityConfig(start=0.05, stop=0.7, rounds=8, gradient=1e-5, resets=1),
 )
-# The same run in a process of its own; says each step on standard output. Slow enough to be stopped on its way.
+# The same run in a process of its own. "train" takes at least 0.05 s a step, so that the test can stop it early;
+# "loop" prints the number of each step.
 CHILD = """
 import json, sys, time
 from pathlib import Path

@@ -339,7 +339,7 @@ def test_a_device_lost_while_a_file_comes_in_is_made_up_for(browser: Browser, tm
     with browser.before_every_page(script):
         browser.open(file.as_uri())
         browser.evaluate("hyrfpack.ready")
-        until(browser, "window.restored === true")  # where the file is read at once, the device is lost after that
+        until(browser, "window.restored === true")  # a small file may be loaded before the device is lost
         settled(browser)
         camera = cameras()[0]
         assert psnr(shown(browser, camera), rendered(model, camera)) > 45

@@ -233,7 +233,7 @@ export class Player extends EventTarget {
     event.preventDefault(); // else it is for ever
     countLoss(this.renderer.gl);
     this.loaded = false;
-    this.calm = false; // whoever waits for the picture waits for it to come back
+    this.calm = false; // the picture is not complete until the device is restored
     this.tell("said", "The graphics device was taken away; the picture comes back with it.");
   }
 
