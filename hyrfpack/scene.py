@@ -1,7 +1,7 @@
-"""What was photographed: cameras, pictures and points. Plain numpy, no torch.
+"""Cameras, pictures, views and scenes as plain numpy data, without torch.
 
 Cameras follow OpenCV: x right, y down, z forward, pixel centres at .5, poses are rigid `camera_from_world`.
-Readers in `hyrfpack.data` bring every input to this form; nothing after them knows about file layouts.
+The readers in `hyrfpack.data` convert every input to this form; later stages need not know about file layouts.
 """
 
 from __future__ import annotations
@@ -13,19 +13,21 @@ from typing import Any, TypeVar
 import numpy as np
 
 Item = TypeVar("Item")
-RIGID_TOLERANCE = 1e-3  # how far a rotation times its transpose may be from one: text files round poses
-DEFAULT_MAX_SIZE = 1600  # pixels of the longer side that larger photos are shrunk to, as 3DGS does
+# Largest allowed entry of |R R^T - I|. Text files round poses, so that rotations read from them are not exact.
+RIGID_TOLERANCE = 1e-3
+# Photos whose longer side has more pixels are shrunk to this length, as in 3DGS.
+DEFAULT_MAX_SIZE = 1600
 
 
 def rigid_pose(values: object) -> np.ndarray:
-    """A rigid transform as a (4, 4) float64 array of its own.
+    """Convert a rigid transform to a new (4, 4) float64 array and check it.
 
     Args:
         values: (4, 4) or (3, 4) numbers, an array or nested lists.
 
     Raises:
-        ValueError: it is of another shape, not finite (in float32, too), or no rotation and translation to within
-            RIGID_TOLERANCE.
+        ValueError: the shape is wrong, a number is not finite in float32, or the transform is not a rotation and a
+            translation to within RIGID_TOLERANCE.
     """
     try:
         pose = np.array(values, np.float64)
@@ -39,8 +41,8 @@ def rigid_pose(values: object) -> np.ndarray:
         if not np.isfinite(pose.astype(np.float32)).all():
             raise ValueError("the pose is not finite (NaN, Inf or beyond float32)")
     rotation = pose[:3, :3]
-    off = np.abs(rotation).max() > 2 or np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID_TOLERANCE
-    if off or np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID_TOLERANCE:
+    is_scaled = np.abs(rotation).max() > 2 or np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID_TOLERANCE
+    if is_scaled or np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID_TOLERANCE:
         raise ValueError("the pose is not rigid (its axes are scaled or skewed)")
     if np.linalg.det(rotation) < 0:
         raise ValueError("the pose mirrors the world")
@@ -49,19 +51,19 @@ def rigid_pose(values: object) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """An undistorted pinhole camera. Two are equal if all their numbers are.
+    """An undistorted pinhole camera. Two cameras are equal if all their numbers are equal.
 
     Attributes:
         width, height: picture size in pixels.
         fx, fy: focal lengths in pixels.
         cx, cy: principal point in pixels; the top-left corner of the picture is (0, 0), the centre of its first
             pixel (0.5, 0.5).
-        camera_from_world: (4, 4) float64 rigid transform, row-major, last row (0, 0, 0, 1). Nested lists will do, and
-            the last row may be left out; the camera keeps an array of its own.
+        camera_from_world: (4, 4) float64 rigid transform, row-major, last row (0, 0, 0, 1). Nested lists are accepted,
+            and the last row may be left out; the camera stores a copy.
 
     Raises:
-        ValueError: no pixels, a focal length that is not positive, a number that is not finite, or a pose that is not
-            rigid, see `rigid_pose`.
+        ValueError: the picture has no pixels, a focal length is not positive, a number is not finite, or the pose is
+            not rigid, see `rigid_pose`.
     """
 
     width: int
@@ -93,17 +95,17 @@ class Camera:
 
     @property
     def rotation(self) -> np.ndarray:
-        """(3, 3) world axes seen from the camera."""
+        """(3, 3) rotation from world to camera axes; its rows are the camera's axes in the world."""
         return self.camera_from_world[:3, :3]
 
     @property
     def position(self) -> np.ndarray:
-        """(3,) centre of projection in world units: -R^T t."""
+        """(3,) centre of projection in world coordinates: -R^T t."""
         return -self.rotation.T @ self.camera_from_world[:3, 3]
 
     @property
     def forward(self) -> np.ndarray:
-        """(3,) unit viewing direction in the world."""
+        """(3,) unit viewing direction in world coordinates."""
         return self.rotation[2]
 
     @property
@@ -114,7 +116,9 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A decoded photo, straight (not premultiplied) as it was stored. Equal to itself alone: compare its arrays.
+    """A decoded photo with straight (not premultiplied) alpha, as stored.
+
+    Two pictures are never equal unless they are the same object; compare their arrays instead.
 
     Attributes:
         rgb: (H, W, 3) uint8, display-referred sRGB.
@@ -128,11 +132,11 @@ class Picture:
 
     @property
     def nbytes(self) -> int:
-        """Bytes this picture holds in memory."""
+        """Bytes of memory that the arrays of this picture take."""
         return sum(part.nbytes for part in (self.rgb, self.alpha, self.mask) if part is not None)
 
     def composite(self, background: np.ndarray | None = None) -> np.ndarray:
-        """Lay the picture over a solid colour.
+        """Composite the picture over a solid colour.
 
         Args:
             background: (3,) RGB in [0, 1]; black when None. Ignored by opaque pictures.
@@ -152,14 +156,14 @@ class Picture:
 
 @dataclass(frozen=True)
 class View:
-    """One photo with its camera. `load` decodes the photo; nothing is read before it is called.
+    """One photo with its camera. The photo is read and decoded only when `load` is called.
 
-    Views are equal if they show the same photo: name, camera and `load` are the same.
+    Two views are equal if their name, camera and `load` are equal.
 
     Attributes:
         name: the photo's path below the picture folder, with its extension ("DSCF5565.jpg", "left/0001.png").
         camera: the camera after undistortion; its size is the size of the loaded picture.
-        load: returns the Picture, size checked against the camera.
+        load: returns the Picture, whose size has been checked against the camera.
     """
 
     name: str
@@ -169,26 +173,29 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Posed photos and what is known of the geometry. Equal to itself alone: compare its views and points.
+    """Posed photos and the points of the reconstruction.
+
+    Two scenes are never equal unless they are the same object; compare their views and points instead.
 
     Attributes:
-        path: the folder it was read from.
+        path: the folder that the scene was read from.
         layout: one of `hyrfpack.data.LAYOUTS`, "colmap" or "nerfstudio" for instance.
-        train, test: views, sorted by name; disjoint.
+        train, test: training views and held-out views, each sorted by name; disjoint.
         points: (P, 3) float64 world positions; P may be 0.
         point_colors: (P, 3) float32 RGB in [0, 1].
-        has_alpha: photos have transparent pixels (object-centred captures without a background).
+        has_alpha: whether photos have transparent pixels (object-centred captures without a background).
         notes: sentences for the user about what the reader skipped or assumed.
-        files: every file it was read from or will be: tables of poses, points, photos, masks.
-        max_size: pixels of the longer side that larger photos are shrunk to; 0 for photos as they are stored, None for
-            a scene that was not read from files.
-        tracks: by a view's name, (M,) int64 rows of `points` that the reconstruction found in that photo, ascending;
-            empty where the input does not say. A point may lie outside the picture, which undistortion crops.
-        reading: the arguments of `hyrfpack.load_scene` that read it, defaults and all, the path an absolute one; empty
-            for a scene that was not read from files.
+        files: every file that the scene was or will be read from: tables of poses, points, photos, masks.
+        max_size: photos whose longer side has more pixels are shrunk to this length; 0 if photos are loaded as stored,
+            None if the scene was not read from files.
+        tracks: maps a view's name to (M,) int64 rows of `points` that the reconstruction found in that photo, in
+            ascending order; empty if the input has no tracks. A point may lie outside the picture, because
+            undistortion crops it.
+        reading: all arguments of `hyrfpack.load_scene` that read the scene, including defaults, with an absolute path;
+            empty if the scene was not read from files.
 
     Raises:
-        ValueError: a point or its colour is not finite, or a track is of no point.
+        ValueError: a point or its colour is not finite, or a track refers to a point that does not exist.
     """
 
     path: str
@@ -220,13 +227,13 @@ class Scene:
         )
 
     def with_held_out(self, names: Collection[str]) -> Scene:
-        """The same scene with other views held out.
+        """Return the same scene with another set of held-out views.
 
         Args:
-            names: of the views to hold out.
+            names: names of the views to hold out.
 
         Raises:
-            ValueError: a name is of no view, or no view is left to train on.
+            ValueError: no view has one of the names, or no view is left for training.
         """
         if unknown := sorted(set(names) - {view.name for view in self.views}):
             raise ValueError(f"no photo is named {unknown[0]}")
@@ -237,11 +244,11 @@ class Scene:
 
     @property
     def views(self) -> list[View]:
-        """All views, sorted by name."""
+        """Training and held-out views together, sorted by name."""
         return sorted(self.train + self.test, key=lambda view: view.name)
 
 
 def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
-    """At most `count` of the items (views, say), spread over all of them, the first and the last among them."""
-    places = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
-    return [items[place] for place in places]
+    """Select at most `count` evenly spaced items (for instance views), including the first and the last."""
+    indices = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[index] for index in indices]

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from scenes import BALL_CENTERS, ball_scene, small_model
 
-from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.format import save
 from hyrfpack.splats.splats import quaternion_of
 
@@ -38,7 +38,7 @@ CALLS = {
     "export": "for name in ('a.spz', 'a.ply', 'a.sog', 'a.html'):\n"
     "    hyrfpack.export('model.hyrf', name, data=scene)\n"
     "hyrfpack.export('model.hyrf', 'colmap', data=scene, colmap=True)",
-    "bench": "from hyrfpack.measure import timing\ntiming.WARM_SECONDS = 0\n"
+    "bench": "from hyrfpack.measure import timing\ntiming.WARM_UP_SECONDS = 0\n"
     "hyrfpack.bench('model.hyrf', scene, repeats=1, only=['codec'])",
     "distill": "hyrfpack.export('model.hyrf', 'a.ply', data=scene, background=False)\n"
     "hyrfpack.distill('a.ply', 'a.hyrf', hyrfpack.DistillConfig(1, 10, 16, 4, 2))",
@@ -62,7 +62,7 @@ def folder(tmp_path_factory) -> Path:
     (tables / "images.txt").write_text("".join(images))
     points = [(number, *point, 255, 128, 0, 0) for number, point in enumerate(scene.points, start=1)]
     (tables / "points3D.txt").write_text("".join(" ".join(map(str, point)) + "\n" for point in points))
-    cameras = kept_cameras([view.camera for view in scene.train])
+    cameras = provenance_cameras([view.camera for view in scene.train])
     save(small_model(BALL_CENTERS, scale_logits=0.0), folder / "model.hyrf", provenance={"cameras": cameras})
     return folder
 

@@ -23,8 +23,8 @@ from hyrfpack.format.codec import DEFAULT_PROFILE, PROFILES
 from hyrfpack.format.container import read_container
 from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.sections import LAYERED, POSITIONS, SECTIONS
-from hyrfpack.measure.error import Error, difference
-from hyrfpack.measure.timing import take_turns
+from hyrfpack.measure.error import Error, measure_error
+from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render
 
@@ -70,8 +70,8 @@ def codec_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> I
         except HyrfError as error:
             note(f"profile '{profile}' is left out: {error}")
     names = {f"{case.setting} {case.value}": case for case in cases}
-    encoding, files = take_turns({name: case.encode for name, case in names.items()}, repeats)
-    decoding, models = take_turns({name: partial(decode_model, data) for name, data in files.items()}, repeats)
+    encoding, files = time_alternately({name: case.encode for name, case in names.items()}, repeats)
+    decoding, models = time_alternately({name: partial(decode_model, data) for name, data in files.items()}, repeats)
 
     exact, first = _pictures(subject, subject.model), f"profile {REFERENCE}"
     best = subject.scores(exact, exact)
@@ -84,11 +84,11 @@ def codec_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> I
             is_reference=name == first,
             is_default=case.is_default,
             time=encoding[name],
-            ratio=encoding[name].over(encoding[first]),
+            ratio=encoding[name].ratio_to(encoding[first]),
             parts=parameter_errors(subject.model, models[name]),
             bytes=len(files[name]),
             decode=decoding[name],
-            decode_ratio=decoding[name].over(decoding[first]),
+            decode_ratio=decoding[name].ratio_to(decoding[first]),
             **subject.losses(pictures, exact, best, f"codec, {name}"),
         )
 
@@ -104,7 +104,7 @@ def parameter_errors(before: HybridModel, after: HybridModel) -> dict[str, Error
         order = _order(old, new)
         new |= {group: new[group][order] for group in LAYERED}
     return {
-        SECTIONS[group]: difference(torch.from_numpy(new[group]), torch.from_numpy(values), SECTIONS[group])
+        SECTIONS[group]: measure_error(torch.from_numpy(new[group]), torch.from_numpy(values), SECTIONS[group])
         for group, values in old.items()
         if values.shape == new[group].shape
     }

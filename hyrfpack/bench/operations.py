@@ -10,8 +10,8 @@ from torch import Tensor
 
 from hyrfpack.bench.rows import Row
 from hyrfpack.bench.subject import Subject
-from hyrfpack.measure.error import Error, difference, relative_difference, worst
-from hyrfpack.measure.timing import take_turns
+from hyrfpack.measure.error import Error, largest_error, measure_error, measure_relative_error
+from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import HybridModel
 from hyrfpack.model.calls import (
     Call,
@@ -61,7 +61,7 @@ def rasterize_rows(subject: Subject, repeats: int, note: Callable[[str], None]) 
     for antialiased in (False, True):
         call = rasterize_call(inputs, pose, camera.intrinsics, camera.width, camera.height, antialiased=antialiased)
         name = "antialiased, " if antialiased else ""
-        yield from _compare("rasterize", name, call, RASTERIZE_WAYS, difference, repeats)
+        yield from _compare("rasterize", name, call, RASTERIZE_WAYS, measure_error, repeats)
 
 
 def hash_encode_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
@@ -70,7 +70,7 @@ def hash_encode_rows(subject: Subject, repeats: int, note: Callable[[str], None]
     for name, part in fields(subject.model):
         grid = part.grid.config
         call = hash_encode_call(coords, part.grid.table, grid.resolutions, grid.log2_table_size)
-        yield from _compare("hash_encode", f"{name}, ", call, HASH_WAYS, relative_difference, repeats)
+        yield from _compare("hash_encode", f"{name}, ", call, HASH_WAYS, measure_relative_error, repeats)
 
 
 def mlp_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
@@ -78,7 +78,7 @@ def mlp_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Ite
     model, _, pose = _one_view(subject)
     for name, part, features in decoder_inputs(model, camera_center(pose)):
         call = mlp_call(features, list(part.weights), list(part.biases))
-        yield from _compare("mlp", f"{name}, ", call, MLP_WAYS, relative_difference, repeats)
+        yield from _compare("mlp", f"{name}, ", call, MLP_WAYS, measure_relative_error, repeats)
 
 
 def _one_view(subject: Subject) -> tuple[HybridModel, Camera, Tensor]:
@@ -101,14 +101,14 @@ def _compare(
         for way in ways:
             if way.implementation == "cpu":
                 tasks[way.name]()  # compiles kernels that are not cached: not to be taken for a slow first run
-        times, results = take_turns(tasks, repeats)
+        times, results = time_alternately(tasks, repeats)
         exact = results[ways[0].name]
         for way in ways:
             what, result = f"{group}, {prefix}{setting}, {way.name}", results[way.name]
             parts = {}
             if make == call.both:
                 pairs = zip(call.wanted, result[1], exact[1], strict=True)
-                parts = {name: relative_difference(found, right, what) for name, found, right in pairs}
+                parts = {name: measure_relative_error(found, right, what) for name, found, right in pairs}
             yield Row(
                 group=group,
                 setting=prefix + setting,
@@ -116,7 +116,7 @@ def _compare(
                 is_reference=way is ways[0],
                 is_default=way.name == DEFAULT_WAY,
                 time=times[way.name],
-                ratio=times[way.name].over(times[ways[0].name]),
-                error=worst(list(parts.values())) if parts else compare(result, exact, what),
+                ratio=times[way.name].ratio_to(times[ways[0].name]),
+                error=largest_error(list(parts.values())) if parts else compare(result, exact, what),
                 parts=parts,
             )

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hyrfpack.bench.rows import Row, in_words
 from hyrfpack.bench.subject import Subject
-from hyrfpack.measure.timing import take_turns
+from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import HybridModel
 from hyrfpack.render import RenderSettings, render
 
@@ -67,8 +67,8 @@ def render_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> 
 
 def _compare(subject: Subject, setting: str, tried: dict[str, Pictures], default: str, repeats: int) -> Iterator[Row]:
     """Rows of one setting; the first value is the reference."""
-    times, results = take_turns(tried, repeats)
-    times = {value: time.each(len(subject.cameras)) for value, time in times.items()}
+    times, results = time_alternately(tried, repeats)
+    times = {value: time.per_part(len(subject.cameras)) for value, time in times.items()}
     reference = next(iter(tried))
     exact = results[reference]
     best = subject.scores(exact, exact)
@@ -80,6 +80,6 @@ def _compare(subject: Subject, setting: str, tried: dict[str, Pictures], default
             is_reference=value == reference,
             is_default=value == default,
             time=times[value],
-            ratio=times[value].over(times[reference]),
+            ratio=times[value].ratio_to(times[reference]),
             **subject.losses(pictures, exact, best, f"render, {setting} {value}"),
         )

@@ -23,7 +23,7 @@ from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.format import describe, load
-from hyrfpack.measure.error import difference
+from hyrfpack.measure.error import measure_error
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 from hyrfpack.train import TrainConfig, train
@@ -78,7 +78,7 @@ class Subject:
         psnr, ssim = self.scores(pictures, exact)
         found, right = (torch.cat([picture.flatten() for picture in many]) for many in (pictures, exact))
         drops = {"psnr_drop": best[0] - psnr, "ssim_drop": best[1] - ssim} if self.photos else {}
-        return {"error": difference(found, right, what), "psnr": psnr, "ssim": ssim, **drops}
+        return {"error": measure_error(found, right, what), "psnr": psnr, "ssim": ssim, **drops}
 
     def in_words(self) -> str:
         """What is measured on, and what quality is measured against, in one sentence."""

@@ -13,8 +13,8 @@ from hyrfpack.bench.rows import Row
 from hyrfpack.bench.subject import Subject, built_in_subject, read_subject
 from hyrfpack.checks import check_type
 from hyrfpack.errors import needs_package
-from hyrfpack.measure.machine import machine
-from hyrfpack.measure.timing import ENOUGH_SECONDS
+from hyrfpack.measure.machine import describe_machine
+from hyrfpack.measure.timing import MAX_SECONDS_PER_TASK
 from hyrfpack.scene import Scene
 
 # What is measured, in order: functions of a subject, a number of repeats, and what to call with what was left out.
@@ -102,5 +102,5 @@ def bench(
             say(f"measuring {name}")
             rows += GROUPS[name](subject, repeats, notes.append)
     if any(row.time.repeats < repeats for row in rows):
-        notes.append(f"a contender that has been measured for {ENOUGH_SECONDS:g} s gets no further turn")
-    return BenchReport(machine(), subject.in_words(), notes, rows)
+        notes.append(f"a contender that has been measured for {MAX_SECONDS_PER_TASK:g} s gets no further turn")
+    return BenchReport(describe_machine(), subject.in_words(), notes, rows)

@@ -10,7 +10,7 @@ from functools import partial
 from hyrfpack.bench.rows import Row
 from hyrfpack.bench.suite import BenchReport
 from hyrfpack.errors import HyrfError
-from hyrfpack.measure.machine import machine_line
+from hyrfpack.measure.machine import format_machine
 from hyrfpack.measure.timing import Timing
 
 PARTS = {"codec": "error of each group of parameters", "rasterize": "error of each gradient"}
@@ -64,7 +64,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 def markdown(report: BenchReport) -> dict[str, str]:
     """The tables of each group as Markdown, and under "machine" what they were measured with."""
-    about = [f"Machine: {machine_line(report.machine)}.", f"Model: {report.subject}.", *report.notes]
+    about = [f"Machine: {format_machine(report.machine)}.", f"Model: {report.subject}.", *report.notes]
     blocks = {"machine": "\n".join(f"- {sentence}" for sentence in about)}
     for table in tables(report.rows):
         ruler = ["---" if column < 3 else "--:" for column in range(len(table.header))]

@@ -1,1 +1,1 @@
-"""Where pictures are taken from: captures, viewpoints, paths, and cameras in JSON."""
+"""Cameras to render from: captures, viewpoints, paths, sampled views, and cameras in JSON."""

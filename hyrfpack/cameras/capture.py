@@ -1,4 +1,4 @@
-"""What a trained model keeps of its photos: cameras, viewpoint and size."""
+"""The capture data that a trained model stores: cameras, viewpoint and photo size."""
 
 from __future__ import annotations
 
@@ -14,30 +14,36 @@ from hyrfpack.cameras.paths import Viewpoint, orbit
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 
-KEPT = 128  # cameras that a trained model keeps
-ORBIT = 48  # cameras around a model that kept none
-COARSE = 14  # cameras that a small file keeps
-FINE = 500  # of the parts of the scene's box that they are right to, about
+MAX_STORED_CAMERAS = 128
+MAX_COARSE_CAMERAS = 14
+FALLBACK_ORBIT_CAMERAS = 48
+# The positions of coarse cameras are rounded to about the scene's scale divided by this.
+COARSE_POSE_RESOLUTION = 500
 
-# A kept camera is found among others within this part of the scene's box and this angle. Two sets of photos may share a
-# few cameras by chance: the first of many sets stands at the origin.
-_SAME_PLACE_SCALE, _SAME_DIRECTION_DEGREES = 5 / FINE, 3.0
-_MIN_FOUND_SHARE = 0.25  # of the kept cameras; with fewer, the photos are not those of training
-
-
-def kept_cameras(cameras: Sequence[Camera]) -> list[list[float]]:
-    """Up to KEPT of the cameras, evenly spread, as the "cameras" of a provenance: see `camera_to_numbers`."""
-    return [camera_to_numbers(camera) for camera in evenly_spaced(cameras, KEPT)]
+# A stored camera matches a photo's camera that differs from it by no more than these two limits.
+_MAX_MATCH_DISTANCE_SCENE_SCALES = 5 / COARSE_POSE_RESOLUTION
+_MAX_MATCH_ANGLE_DEGREES = 3.0
+# With a lower share of matched cameras, the photos are not those of training. The share is above zero because two
+# scenes may have a few cameras in common by chance: the first camera of many scenes stands at the origin.
+_MIN_MATCHED_CAMERA_SHARE = 0.25
 
 
-def provenance_of(scene: Scene) -> dict:
-    """What the provenance of a model trained on a scene keeps of it, for `Capture`.
+def provenance_cameras(cameras: Sequence[Camera]) -> list[list[float]]:
+    """Select up to MAX_STORED_CAMERAS evenly spaced cameras as the "cameras" of a provenance.
 
-    `max_size` is left out where reading the photos again with DEFAULT_MAX_SIZE gives the same pictures: a model of
-    small photos is the same file, byte for byte, whether or not there is such a limit.
+    Each camera becomes a list of numbers, see `camera_to_numbers`.
+    """
+    return [camera_to_numbers(camera) for camera in evenly_spaced(cameras, MAX_STORED_CAMERAS)]
+
+
+def scene_provenance(scene: Scene) -> dict:
+    """Collect what a trained model's provenance stores of its scene: viewpoint, cameras and `max_size`.
+
+    `Capture` reads it back. `max_size` is left out if photos read with DEFAULT_MAX_SIZE give the same pictures. So a
+    model of small photos is the same file, byte for byte, with and without a size limit.
     """
     cameras = [view.camera for view in scene.train]
-    kept: dict = {"viewpoint": Viewpoint.of(cameras).to_json(), "cameras": kept_cameras(cameras)}
+    kept: dict = {"viewpoint": Viewpoint.from_cameras(cameras).to_json(), "cameras": provenance_cameras(cameras)}
     small = all(max(view.camera.width, view.camera.height) < DEFAULT_MAX_SIZE for view in scene.views)
     needless = scene.max_size is None or (small and scene.max_size == DEFAULT_MAX_SIZE)
     if not needless:
@@ -45,45 +51,49 @@ def provenance_of(scene: Scene) -> dict:
     return kept
 
 
-def coarse(provenance: dict, scale: float) -> dict:
-    """A provenance as small files carry it: "coarse_cameras" instead of "cameras", and no more digits than it takes.
+def quantized_provenance(provenance: dict, scale: float) -> dict:
+    """Shorten a provenance for small files: round its numbers and replace "cameras" by fewer "coarse_cameras".
 
-    They are COARSE of the cameras, evenly spread, and stand where those stood to about 1 / FINE of the scene: enough to
-    look from there, not to train on. What cannot be read is left out.
+    Up to MAX_COARSE_CAMERAS evenly spaced cameras are kept. Their positions are rounded to about
+    scale / COARSE_POSE_RESOLUTION, which is precise enough to render from there, but not to train. Entries that cannot
+    be read are left out.
 
     Args:
-        scale: of the scene's box, world units.
+        provenance: the provenance of a trained model.
+        scale: longest half-axis of the scene's frame, in world units.
     """
     kept = {name: value for name, value in provenance.items() if name != "cameras"}
     with suppress(TypeError, ValueError, ArithmeticError, KeyError):
         kept["viewpoint"] = Viewpoint.from_json(provenance["viewpoint"]).to_json(rounded=True)
     with suppress(TypeError, ValueError, ArithmeticError, KeyError):
-        cameras = evenly_spaced([camera_from_numbers(numbers) for numbers in provenance["cameras"]], COARSE)
+        cameras = evenly_spaced([camera_from_numbers(numbers) for numbers in provenance["cameras"]], MAX_COARSE_CAMERAS)
         farthest = max((float(np.linalg.norm(camera.position)) for camera in cameras), default=0.0)
-        # A rotation that is rounded moves the camera by as much of its distance from the origin.
-        places = (
-            int(np.clip(np.ceil(np.log10(max(2 * farthest / scale, 1e-9) * FINE)), 4, 9)),
-            int(np.clip(np.ceil(np.log10(FINE / scale)), 0, 9)),
+        # Rounding a rotation moves the camera in proportion to its distance from the origin.
+        decimals = (
+            int(np.clip(np.ceil(np.log10(max(2 * farthest / scale, 1e-9) * COARSE_POSE_RESOLUTION)), 4, 9)),
+            int(np.clip(np.ceil(np.log10(COARSE_POSE_RESOLUTION / scale)), 0, 9)),
         )
-        kept["coarse_cameras"] = [camera_to_numbers(camera, places) for camera in cameras]
+        kept["coarse_cameras"] = [camera_to_numbers(camera, decimals) for camera in cameras]
     return kept
 
 
 def has_mean_exposure(provenance: dict) -> bool:
-    """Whether a model has its photos' mean exposure and no exposure map, as an earlier version wrote it.
+    """Whether a model was trained to its photos' mean exposure without an exposure map, by an earlier version.
 
-    What differs between its renders and a photo is the photo's own exposure, too.
+    Renders of such a model also differ from a photo by that photo's own exposure.
     """
     return provenance.get("mean_exposure") is True
 
 
 @dataclass(frozen=True)
 class Capture:
-    """How a model was photographed, by its file or by photos at hand. Nothing is read of it before it is asked for.
+    """The cameras and the viewpoint that a model was photographed with, from its file or from a scene.
+
+    Values are read from the provenance only when a property is asked for.
 
     Attributes:
-        facts: from `hyrfpack.describe`, which lies floors above: the caller asks it.
-        scene: photos of the same; without photos to train on it counts for nothing.
+        facts: the result of `hyrfpack.describe`. The caller passes it, because this module cannot import that one.
+        scene: the photos of the model, if there are any. It is ignored if it has no training views.
     """
 
     facts: dict
@@ -91,44 +101,46 @@ class Capture:
 
     @property
     def cameras(self) -> list[Camera]:
-        """Those of the photos to train on, or else those that the file keeps, coarse ones if it has no others, or else
-        an orbit about what it shows.
+        """The cameras of the capture, from the first of these sources that has any.
+
+        The sources are: the scene's training views; the cameras stored in the file; its coarse cameras; an orbit about
+        the model's viewpoint.
 
         Raises:
-            HyrfDataError: what the file says makes no sense.
+            HyrfDataError: the provenance is not valid.
         """
-        if self._photographed:
-            return self._photographed
-        if self.made_up:
-            return orbit(self.viewpoint, ORBIT)
+        if self._training_cameras:
+            return self._training_cameras
+        if self.is_synthetic:
+            return orbit(self.viewpoint, FALLBACK_ORBIT_CAMERAS)
         try:
-            return [camera_from_numbers(numbers) for numbers in self._kept or self._coarse]
+            return [camera_from_numbers(numbers) for numbers in self._stored_cameras or self._coarse_cameras]
         except (TypeError, ValueError, ArithmeticError) as error:
             raise HyrfDataError(
                 f"the cameras that the file keeps are not valid ({error!s:.160}); name the photos with `data`"
             ) from error
 
     @property
-    def made_up(self) -> bool:
-        """Whether `cameras` is an orbit, because no camera is known."""
-        return not (self._photographed or self._kept or self._coarse)
+    def is_synthetic(self) -> bool:
+        """Whether `cameras` is a generated orbit, because no camera is known."""
+        return not (self._training_cameras or self._stored_cameras or self._coarse_cameras)
 
     @property
     def is_coarse(self) -> bool:
-        """Whether `cameras` are only about where photos were taken from, see `coarse`."""
-        return bool(not (self._photographed or self._kept) and self._coarse)
+        """Whether `cameras` have rounded poses, see `quantized_provenance`."""
+        return bool(not (self._training_cameras or self._stored_cameras) and self._coarse_cameras)
 
     @property
     def viewpoint(self) -> Viewpoint:
-        """The one that the file keeps, or else one that follows from the model's frame alone.
+        """The viewpoint stored in the file, or one derived from the model's frame if the file has none.
 
         Raises:
-            HyrfDataError: what the file says makes no sense.
+            HyrfDataError: the stored viewpoint or the frame is not valid.
         """
         stored, frame = self.facts["provenance"].get("viewpoint"), self.facts["config"]["frame"]
         try:
             if stored is None:
-                return Viewpoint.of_frame(frame["center"], frame["scale"])
+                return Viewpoint.from_frame(frame["center"], frame["scale"])
             return Viewpoint.from_json(stored)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise HyrfDataError(
@@ -137,33 +149,34 @@ class Capture:
 
     @property
     def mismatch(self) -> str:
-        """One sentence if the cameras of the photos are not those that the file keeps of its training: another scene,
-        or another coordinate frame. "" where they are, and where there are no photos or the file keeps no cameras.
+        """A warning if the cameras of the scene differ from those stored in the file, otherwise "".
 
-        Names of photos are not compared: files keep none, and photos whose poses were estimated anew keep theirs.
+        They differ if the photos show another scene, or if their poses are in another coordinate frame. Without a
+        scene or without stored cameras there is no warning. Names of photos are not compared: files do not store them,
+        and photos keep their names when their poses are estimated again.
         """
         if self.scene is None:
             return ""
         views = self.scene.views
         try:
-            kept = [camera_from_numbers(numbers) for numbers in self._kept or self._coarse or ()]
-            limit = _SAME_PLACE_SCALE * float(self.facts["config"]["frame"]["scale"])
+            kept = [camera_from_numbers(numbers) for numbers in self._stored_cameras or self._coarse_cameras or ()]
+            limit = _MAX_MATCH_DISTANCE_SCENE_SCALES * float(self.facts["config"]["frame"]["scale"])
         except (TypeError, ValueError, ArithmeticError, KeyError):
             return ""
         if not (views and kept):
             return ""
-        places = np.array([view.camera.position for view in views])
+        positions = np.array([view.camera.position for view in views])
         directions = np.array([view.camera.forward for view in views])
-        least_cosine = np.cos(np.radians(_SAME_DIRECTION_DEGREES))
+        min_cosine = np.cos(np.radians(_MAX_MATCH_ANGLE_DEGREES))
         found = sum(
             bool(
                 np.any(
-                    (np.linalg.norm(places - c.position, axis=1) <= limit) & (directions @ c.forward >= least_cosine)
+                    (np.linalg.norm(positions - c.position, axis=1) <= limit) & (directions @ c.forward >= min_cosine)
                 )
             )
             for c in kept
         )
-        if found >= _MIN_FOUND_SHARE * len(kept):
+        if found >= _MIN_MATCHED_CAMERA_SHARE * len(kept):
             return ""
         return (
             f"{self.scene.path}: of the {len(kept)} cameras that the model keeps of its training, {found or 'none'} "
@@ -173,22 +186,22 @@ class Capture:
 
     @property
     def max_size(self) -> int:
-        """The `max_size` of `load_scene` that gives photos the size which the model was trained at.
+        """The `max_size` of `load_scene` at which photos have the size that the model was trained at.
 
-        DEFAULT_MAX_SIZE where the file says nothing of use.
+        It is DEFAULT_MAX_SIZE if the file does not state a valid one.
         """
         stored = self.facts["provenance"].get("max_size")
         usable = isinstance(stored, int) and not isinstance(stored, bool) and stored >= 0
         return stored if usable else DEFAULT_MAX_SIZE
 
     @property
-    def _kept(self) -> Any:
+    def _stored_cameras(self) -> Any:
         return self.facts["provenance"].get("cameras")
 
     @property
-    def _coarse(self) -> Any:
+    def _coarse_cameras(self) -> Any:
         return self.facts["provenance"].get("coarse_cameras")
 
     @property
-    def _photographed(self) -> list[Camera]:
+    def _training_cameras(self) -> list[Camera]:
         return [] if self.scene is None else [view.camera for view in self.scene.train]

@@ -1,4 +1,4 @@
-"""Cameras in JSON: every file that holds some holds them in a layout of these, and is checked here."""
+"""Read and write cameras in JSON. Every JSON layout of cameras in this package is defined and checked here."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ import numpy as np
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera, rigid_pose
 
-MAX_SIDE = 16384  # pixels; more is a mistake in the file
-LENS = ("width", "height", "fx", "fy", "cx", "cy")
+MAX_IMAGE_SIDE_PIXELS = 16384  # a larger number in a file is taken for a mistake
+INTRINSICS_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """A camera as an object of "width", "height", "fx", "fy", "cx", "cy" and "camera_from_world" (4 rows)."""
-    numbers = dict(zip(LENS, (camera.width, camera.height, *camera.intrinsics), strict=True))
+    """Convert a camera to a dictionary of its intrinsics (INTRINSICS_KEYS) and "camera_from_world" (4 rows)."""
+    numbers = dict(zip(INTRINSICS_KEYS, (camera.width, camera.height, *camera.intrinsics), strict=True))
     return {**numbers, "camera_from_world": camera.camera_from_world.tolist()}
 
 
 def camera_from_json(item: Mapping[str, Any]) -> Camera:
-    """The inverse of `camera_to_json`, for what anyone may have written.
+    """Convert an untrusted dictionary of the layout that `camera_to_json` writes to a camera.
 
-    Without "fy" it is "fx", without "cx" or "cy" that is the picture's middle; other keys are passed over.
+    "fy" defaults to "fx", and "cx" and "cy" default to the picture's centre. Other keys are ignored.
 
     Raises:
-        KeyError: something else is missing.
-        TypeError, ValueError, OverflowError: something makes no sense.
+        KeyError: another key is missing.
+        TypeError, ValueError, OverflowError: a value is not valid.
     """
     width, height, fx = _side_length(item["width"]), _side_length(item["height"]), _focal_length(item["fx"])
     fy = _focal_length(item.get("fy", fx))
@@ -39,35 +39,45 @@ def camera_from_json(item: Mapping[str, Any]) -> Camera:
     return Camera(width, height, fx, fy, cx, cy, item["camera_from_world"])
 
 
-def camera_to_numbers(camera: Camera, places: tuple[int, int] | None = None) -> list[float]:
-    """A camera as a short list: width, height, fx, fy, cx, cy and the 3 x 4 camera_from_world, rounded.
+def camera_to_numbers(camera: Camera, decimals: tuple[int, int] | None = None) -> list[float]:
+    """Convert a camera to 18 rounded numbers: width, height, fx, fy, cx, cy and the 3 x 4 camera_from_world.
 
     Args:
-        places: behind the point of rotation (4 or more: it must stay one) and translation; intrinsics get one. By
-            default all get nine digits, or six places.
+        camera: the camera.
+        decimals: decimal places of the rotation (at least 4, otherwise it is no longer rigid) and of the translation;
+            intrinsics are rounded to one place. None rounds all numbers by `round_number`.
     """
     pose = camera.camera_from_world[:3].tolist()
-    if places is None:
+    if decimals is None:
         return [
             camera.width,
             camera.height,
-            *map(rounded_number, (*camera.intrinsics, *(x for row in pose for x in row))),
+            *map(round_number, (*camera.intrinsics, *(x for row in pose for x in row))),
         ]
-    rotation, translation = places
+    rotation, translation = decimals
     rows = ([*(round(x, rotation) for x in row[:3]), round(row[3], translation)] for row in pose)
     lens = (round(number, 1) for number in camera.intrinsics)
-    return [camera.width, camera.height, *lens, *(x + 0.0 for row in rows for x in row)]  # no -0.0
+    return [
+        camera.width,
+        camera.height,
+        *lens,
+        *(x + 0.0 for row in rows for x in row),
+    ]  # adding 0.0 turns -0.0 into 0.0
 
 
 def camera_from_numbers(numbers: Sequence[Any]) -> Camera:
-    """The inverse of `camera_to_numbers`, but for the rounding. Raises what `camera_from_json` does."""
+    """Convert the numbers that `camera_to_numbers` gives to a camera.
+
+    Raises:
+        TypeError, ValueError, OverflowError: a number is missing or not valid.
+    """
     width, height, fx, fy, cx, cy, *pose = numbers
-    lens = dict(zip(LENS, (width, height, fx, fy, cx, cy), strict=True))
+    lens = dict(zip(INTRINSICS_KEYS, (width, height, fx, fy, cx, cy), strict=True))
     return camera_from_json({**lens, "camera_from_world": np.reshape(pose, (3, 4))})
 
 
 def cameras_to_json(cameras: Sequence[tuple[str, Camera]]) -> str:
-    """Named cameras as the JSON text that `cameras_from_json` reads."""
+    """Write named cameras as the JSON text that `cameras_from_json` reads."""
     return json.dumps([{"name": name, **camera_to_json(camera)} for name, camera in cameras], indent=1)
 
 
@@ -97,9 +107,9 @@ def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
     except (ValueError, RecursionError) as error:
         raise HyrfDataError(f"{path}: this is not JSON ({error}); name a JSON file of cameras") from error
     if isinstance(content, dict) and isinstance(content.get("frames"), list):
-        parse, items, shared = _from_transforms, content["frames"], content
+        parse, items, shared = _parse_transforms_frame, content["frames"], content
     elif isinstance(content, list):
-        parse, items, shared = _from_ours, content, {}
+        parse, items, shared = _parse_camera, content, {}
     else:
         raise HyrfDataError(
             f"{path}: there is neither a list of cameras nor 'frames' in it; see the help of 'hyrfpack render'"
@@ -117,7 +127,7 @@ def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
     return cameras
 
 
-def _from_ours(item: dict[str, Any], name: str) -> tuple[str, Camera]:
+def _parse_camera(item: dict[str, Any], name: str) -> tuple[str, Camera]:
     if "camera_from_world" in item or "rotation" not in item:
         return str(item.get("name", name)), camera_from_json(item)
     rotation = np.asarray(item["rotation"], np.float64).reshape(3, 3)
@@ -126,7 +136,7 @@ def _from_ours(item: dict[str, Any], name: str) -> tuple[str, Camera]:
     return str(item.get("img_name", name)), camera_from_json({**item, "camera_from_world": rigid_pose(pose)})
 
 
-def _from_transforms(item: dict[str, Any], name: str) -> tuple[str, Camera]:
+def _parse_transforms_frame(item: dict[str, Any], name: str) -> tuple[str, Camera]:
     width, height = item["w"], item["h"]
     fx = item["fl_x"] if "fl_x" in item else width / (2 * math.tan(_finite(item["camera_angle_x"]) / 2))
     world_from_camera = rigid_pose(item["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
@@ -143,9 +153,9 @@ def _finite(value: Any) -> float:
 
 
 def _side_length(value: Any) -> int:
-    """A picture side in whole pixels that can be rendered."""
-    if value != int(value) or not 1 <= value <= MAX_SIDE:
-        raise ValueError(f"a side of {value} pixels; 1 to {MAX_SIDE} can be rendered")
+    """Check that a side of a picture is a whole number of pixels that can be rendered."""
+    if value != int(value) or not 1 <= value <= MAX_IMAGE_SIDE_PIXELS:
+        raise ValueError(f"a side of {value} pixels; 1 to {MAX_IMAGE_SIDE_PIXELS} can be rendered")
     return int(value)
 
 
@@ -156,6 +166,9 @@ def _focal_length(value: Any) -> float:
     return value
 
 
-def rounded_number(number: float) -> float:
-    """A number to nine digits, or where these are not six behind the point, as with map coordinates, to six."""
+def round_number(number: float) -> float:
+    """Round a number to nine significant digits, or to six decimal places if its magnitude is 1,000 or more.
+
+    The second rule keeps the decimals of large map coordinates.
+    """
     return float(f"{number:.9g}") if abs(number) < 1000 else round(float(number), 6)

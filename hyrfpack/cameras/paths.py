@@ -1,4 +1,4 @@
-"""Where to render from when there are no photos: an orbit around what the training cameras looked at."""
+"""Viewpoints and camera paths for renders without photos: an orbit around what the training cameras looked at."""
 
 from __future__ import annotations
 
@@ -9,26 +9,33 @@ from typing import Any
 
 import numpy as np
 
-from hyrfpack.cameras.files import LENS, camera_from_json, rounded_number
+from hyrfpack.cameras.files import INTRINSICS_KEYS, camera_from_json, round_number
 from hyrfpack.scene import Camera
 
-WHOLE_CIRCLE = 270.0  # degrees of azimuth; cameras that cover more are taken to stand all around
-LEVEL_RIGHTS = 0.05  # mean squared sine of the cameras' roll up to which they count as held level
-SPREAD_RIGHTS = 0.02  # and of their heading, from which on that tells which way is up
-NARROWEST_SWING = 20.0  # degrees of an orbit about a scene photographed from nearly one direction
-SAME_WAY = 0.9  # length of the mean viewing direction from which cameras count as looking the same way
+# Cameras that cover at least this much azimuth are treated as a full circle.
+MIN_FULL_CIRCLE_DEGREES = 270.0
+# Cameras count as held level up to this mean squared sine of their roll.
+MAX_LEVEL_ROLL_MEAN_SQUARE = 0.05
+# The up axis of level cameras is known only if the mean squared sine of their headings is at least this.
+MIN_HEADING_MEAN_SQUARE = 0.02
+# A scene photographed from nearly one direction gets an arc at least this wide.
+MIN_ARC_DEGREES = 20.0
+# Cameras have a common direction if the mean of their unit viewing directions is at least this long.
+MIN_COMMON_DIRECTION_LENGTH = 0.9
 
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """What is looked at, and from where. Equal to itself alone: compare what `to_json` gives.
+    """The centre of a scene, its up direction, and a typical camera that looks at it.
+
+    Two viewpoints are never equal unless they are the same object; compare the results of `to_json` instead.
 
     Attributes:
-        center: (3,) float64, what is looked at, world units.
-        up: (3,) float64, which way is up; any length but none.
+        center: (3,) float64, the point that cameras look at, in world units.
+        up: (3,) float64, the up direction; any length above zero.
         camera: the typical camera.
-        arc: the first and the last degree of azimuth about `up`, relative to that camera, that photos cover; (0, 360)
-            when they go all around.
+        arc: the first and the last azimuth that photos cover, in degrees about `up` and relative to that camera;
+            (0, 360) if they cover the full circle.
     """
 
     center: np.ndarray
@@ -36,10 +43,14 @@ class Viewpoint:
     camera: Camera
     arc: tuple[float, float]
 
-    def checked(self) -> Viewpoint:
-        """Itself. Raises ValueError: a number is not finite or too large for cameras about it, or `up` is (0, 0, 0)."""
+    def validated(self) -> Viewpoint:
+        """Check this viewpoint and return it.
+
+        Raises:
+            ValueError: a number is not finite or too large for cameras around the centre, or `up` is (0, 0, 0).
+        """
         others = *self.camera.position, self.camera.cx, self.camera.cy, *self.arc
-        # Cameras about it shall be finite in float32.
+        # The limit keeps cameras around the centre finite in float32.
         if self.center.shape != (3,) or not (np.abs([*self.center, *others]) < 1e37).all():
             raise ValueError("a number is missing or not finite")
         if self.up.shape != (3,) or not 0 < np.linalg.norm(self.up) < np.inf:
@@ -47,14 +58,15 @@ class Viewpoint:
         return self
 
     @classmethod
-    def of(cls, cameras: Sequence[Camera]) -> Viewpoint:
-        """Sum up a capture, of at least one camera.
+    def from_cameras(cls, cameras: Sequence[Camera]) -> Viewpoint:
+        """Summarise a capture of at least one camera.
 
-        - `center`: the point nearest to all viewing axes (least squares). Where the axes are nearly parallel or
-          point away from it, as on a drive or in a room seen from its middle, a point in front of the typical camera.
-        - `up`, of unit length: the axis that the pictures' rows are level about, or where that is open (all look the
-          same way, or many are turned) the mean of the cameras' up axes, or the typical camera's own.
-        - `camera`: the one that stands nearest to the capture's median distance and height.
+        - `center`: the point nearest to all viewing axes (least squares). If the axes are nearly parallel or point
+          away from it, as on a drive or in a room seen from its middle, it is a point in front of the typical camera.
+        - `up`, of unit length: the axis about which the pictures' rows are level. If that axis is ambiguous (all
+          cameras look the same way, or many are rolled), it is the mean of the cameras' up axes, or the typical
+          camera's own.
+        - `camera`: the camera nearest to the capture's median distance and height.
         """
         positions = np.array([camera.position for camera in cameras])
         forwards = np.array([camera.forward for camera in cameras])
@@ -65,30 +77,34 @@ class Viewpoint:
             heights = offsets @ up
             radii = np.linalg.norm(offsets - np.outer(heights, up), axis=1)
             typical = _nearest_to_median(np.stack((radii, heights), axis=1))
-            arc = _arc(offsets, up, typical)
+            arc = _covered_arc(offsets, up, typical)
         else:
             typical = _nearest_to_median(positions)
             spread = float(np.median(np.linalg.norm(positions - positions[typical], axis=1)))
             center = positions[typical] + forwards[typical] * (2 * spread or 1.0)
-            up = -cameras[typical].rotation[1]  # swings sideways, whatever the camera looks at
-            arc = -NARROWEST_SWING / 2, NARROWEST_SWING / 2
+            up = -cameras[typical].rotation[1]  # so that the arc goes sideways, whatever the camera looks at
+            arc = -MIN_ARC_DEGREES / 2, MIN_ARC_DEGREES / 2
         return cls(center, up, cameras[typical], arc)
 
     @classmethod
-    def of_frame(cls, center: Sequence[float], scale: float) -> Viewpoint:
-        """A viewpoint for a model that does not say how it was photographed.
+    def from_frame(cls, center: Sequence[float], scale: float) -> Viewpoint:
+        """Derive a viewpoint from a model's frame, for a model whose file does not store one.
 
-        Looks slightly down at the frame's centre from 2.5 times its longest half-axis away, 800 x 600 with 50 degrees
-        across; up is -y, as in most reconstructions.
+        The camera looks slightly down at the frame's centre, from a distance of 2.5 times its longest half-axis. Its
+        picture is 800 x 600 with a horizontal field of view of 50 degrees. Up is -y, as in most reconstructions.
         """
         middle, up = np.asarray(center, np.float64), np.array([0.0, -1.0, 0.0])
         position = middle + 2.5 * scale * np.array([0.0, -math.sin(math.radians(20)), -math.cos(math.radians(20))])
         focal = 400 / math.tan(math.radians(25))
         camera = Camera(800, 600, focal, focal, 400.0, 300.0, look_at(position, middle, up))
-        return cls(middle, up, camera, (0.0, 360.0)).checked()
+        return cls(middle, up, camera, (0.0, 360.0)).validated()
 
     def to_json(self, rounded: bool = False) -> dict[str, Any]:
-        """A dictionary ready for JSON: the "viewpoint" of a file's provenance; `rounded`, by `rounded_number`."""
+        """Convert to a dictionary ready for JSON, the "viewpoint" of a file's provenance.
+
+        Args:
+            rounded: round all numbers by `round_number`.
+        """
         numbers = {
             "center": self.center.tolist(),
             "up": self.up.tolist(),
@@ -98,43 +114,44 @@ class Viewpoint:
             "height": self.camera.height,
             "arc": list(self.arc),
         }
-        return _rounded(numbers) if rounded else numbers
+        return _round_numbers(numbers) if rounded else numbers
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Viewpoint:
-        """The inverse of `to_json`, for what anyone may have written.
+        """Convert an untrusted dictionary of the layout that `to_json` writes to a viewpoint.
 
         Raises:
-            KeyError, TypeError, ValueError, OverflowError: it is incomplete or makes no sense.
+            KeyError: a key is missing.
+            TypeError, ValueError, OverflowError: a value is not valid.
         """
         center, up = np.array(stored["center"], np.float64), np.array(stored["up"], np.float64)
-        camera = camera_from_json({**stored, **dict(zip(LENS[2:], stored["intrinsics"], strict=True))})
+        camera = camera_from_json({**stored, **dict(zip(INTRINSICS_KEYS[2:], stored["intrinsics"], strict=True))})
         first, last = (float(value) for value in stored["arc"])
-        return cls(center, up, camera, (first, last)).checked()
+        return cls(center, up, camera, (first, last)).validated()
 
 
 def common_direction(cameras: Sequence[Camera]) -> np.ndarray | None:
-    """The direction (3,) that cameras look in, unit length, or None where they look different ways."""
+    """Return the (3,) unit direction that all cameras look in, or None if they look in different directions."""
     mean = np.mean([camera.forward for camera in cameras], axis=0)
-    agreement = np.linalg.norm(mean)
-    return mean / agreement if agreement >= SAME_WAY else None
+    length = np.linalg.norm(mean)
+    return mean / length if length >= MIN_COMMON_DIRECTION_LENGTH else None
 
 
 def orbit(viewpoint: Viewpoint, frames: int) -> list[Camera]:
-    """Cameras on a circle about a scene, all looking at its centre.
+    """Generate cameras on a circle around a scene, all looking at its centre.
 
-    The circle keeps the typical camera's distance and height. Where the photos do not stand all around, the camera
-    swings to and fro over the arc that they cover. Either way the path closes: the frame after the last is the first.
+    The circle has the typical camera's distance and height. If the photos do not cover the full circle, the camera
+    swings to and fro over the arc that they cover. The path is closed in both cases: the first frame follows the last.
 
     Args:
-        viewpoint: what to go about, and from where.
-        frames: how many cameras; at least 1.
+        viewpoint: the centre, the up direction, the typical camera and the arc.
+        frames: number of cameras; at least 1.
     """
     center, up, camera = viewpoint.center, viewpoint.up / np.linalg.norm(viewpoint.up), viewpoint.camera
     first, last = viewpoint.arc
     offset = camera.position - center
     radius = np.linalg.norm(offset - (offset @ up) * up)
-    if not radius > 1e-9 * np.linalg.norm(offset):  # straight above: the circle would be a point
+    if not radius > 1e-9 * np.linalg.norm(offset):  # straight above the centre, where the circle would be a point
         offset = offset + 0.5 * max(float(np.linalg.norm(offset)), 1e-6) * _perpendicular(up)
     turns = np.arange(frames) / frames
     if last - first >= 360:
@@ -148,7 +165,7 @@ def orbit(viewpoint: Viewpoint, frames: int) -> list[Camera]:
 
 
 def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """camera_from_world (4, 4) of a camera at `position` that looks at `target` with `up` (unit) upwards."""
+    """Return the (4, 4) camera_from_world of a camera at `position` that looks at `target`; `up` is a unit vector."""
     forward = _unit(target - position, np.array([0.0, 0.0, 1.0]))
     right = np.cross(forward, up)
     right = _unit(right, _perpendicular(forward)) if np.linalg.norm(right) > 1e-9 else _perpendicular(forward)
@@ -159,22 +176,25 @@ def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndar
 
 
 def _up_axis(rotations: np.ndarray) -> np.ndarray:
-    """Which way is up, from (N, 3, 3) camera rotations."""
+    """Estimate the (3,) unit up direction from (N, 3, 3) camera rotations."""
     rights, downs, forwards = rotations[:, 0], rotations[:, 1], rotations[:, 2]
     mean_up = _unit(-downs.sum(axis=0), np.array([0.0, -1.0, 0.0]))
-    # People hold cameras level: the cameras' right axes lie in a plane, and up is at right angles to it.
+    # People hold cameras level, so the cameras' right axes lie in a plane, and up is perpendicular to it.
     values, vectors = np.linalg.eigh(rights.T @ rights / len(rights))
-    if values[0] > LEVEL_RIGHTS or values[1] < max(SPREAD_RIGHTS, 4 * values[0]):
+    if values[0] > MAX_LEVEL_ROLL_MEAN_SQUARE or values[1] < max(MIN_HEADING_MEAN_SQUARE, 4 * values[0]):
         return mean_up
     level = vectors[:, 0]
     along = level @ mean_up
-    if abs(along) < 0.2:  # looking straight down: up is where the cameras are
+    if abs(along) < 0.2:  # the cameras look straight down, so up points from the scene to them
         along = -level @ forwards.mean(axis=0)
     return level if along > 0 else -level
 
 
 def _common_focus(positions: np.ndarray, forwards: np.ndarray) -> np.ndarray | None:
-    """The point with the least squared distance to all viewing axes, None where there is no such place to look at."""
+    """Find the point with the least squared distance to all viewing axes, None if the cameras share no such focus.
+
+    They share none if their axes are nearly parallel or if the point lies behind more than a quarter of them.
+    """
     projectors = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
     normal = projectors.mean(axis=0)
     # The smallest eigenvalue is about the mean squared sine between the axes and their mean direction.
@@ -185,49 +205,53 @@ def _common_focus(positions: np.ndarray, forwards: np.ndarray) -> np.ndarray | N
     return center if in_front.mean() > 0.75 else None
 
 
-def _arc(offsets: np.ndarray, up: np.ndarray, typical: int) -> tuple[float, float]:
-    """Degrees of azimuth that the cameras cover, relative to the typical one: all but the widest gap between two."""
+def _covered_arc(offsets: np.ndarray, up: np.ndarray, typical: int) -> tuple[float, float]:
+    """Return the first and last azimuth that cameras cover, in degrees relative to the typical camera.
+
+    The arc is the full circle without the widest gap between neighbouring cameras.
+    """
     axis = _perpendicular(up)
     side = np.cross(up, axis)
     azimuths = np.degrees(np.arctan2(offsets @ side, offsets @ axis))
     relative = np.sort((azimuths - azimuths[typical] + 180) % 360 - 180)
     gaps = np.diff(relative, append=relative[0] + 360)
     widest = int(np.argmax(gaps))
-    if 360 - gaps[widest] >= WHOLE_CIRCLE:
+    if 360 - gaps[widest] >= MIN_FULL_CIRCLE_DEGREES:
         return 0.0, 360.0
     first, last = float(relative[(widest + 1) % len(relative)]), float(relative[widest])
-    if first > 0:  # the typical camera, at 0, lies on the arc
+    if first > 0:  # the arc must contain the typical camera, which is at 0
         first -= 360
     if last < 0:
         last += 360
-    short = max(0.0, NARROWEST_SWING - (last - first)) / 2
-    return first - short, last + short
+    margin = max(0.0, MIN_ARC_DEGREES - (last - first)) / 2
+    return first - margin, last + margin
 
 
 def _nearest_to_median(rows: np.ndarray) -> int:
     return int(np.argmin(np.linalg.norm(rows - np.median(rows, axis=0), axis=1)))
 
 
-def _unit(vector: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+def _unit(vector: np.ndarray, fallback: np.ndarray) -> np.ndarray:
+    """Scale a vector to unit length; return `fallback` if it has none."""
     length = np.linalg.norm(vector)
-    return vector / length if length > 1e-12 else otherwise
+    return vector / length if length > 1e-12 else fallback
 
 
 def _perpendicular(axis: np.ndarray) -> np.ndarray:
-    """A unit vector at right angles to a unit vector."""
+    """Return a unit vector perpendicular to a unit vector."""
     return _unit(np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]), axis)
 
 
 def _rotate(vector: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
-    """Rodrigues' rotation about a unit axis, angle in radians."""
+    """Rotate a vector about a unit axis by an angle in radians (Rodrigues' formula)."""
     cosine, sine = math.cos(angle), math.sin(angle)
     return vector * cosine + np.cross(axis, vector) * sine + axis * (axis @ vector) * (1 - cosine)
 
 
-def _rounded(value: Any) -> Any:
-    """Every number of nested dictionaries and lists by `rounded_number`."""
+def _round_numbers(value: Any) -> Any:
+    """Round every number of nested dictionaries and lists by `round_number`."""
     if isinstance(value, dict):
-        return {name: _rounded(item) for name, item in value.items()}
+        return {name: _round_numbers(item) for name, item in value.items()}
     if isinstance(value, list):
-        return [_rounded(item) for item in value]
-    return rounded_number(value) if isinstance(value, float) else value
+        return [_round_numbers(item) for item in value]
+    return round_number(value) if isinstance(value, float) else value

@@ -71,7 +71,7 @@ def bench(
     from hyrfpack.bench import tables as words
     from hyrfpack.bench.figure import picture_format, plot
     from hyrfpack.format import describe
-    from hyrfpack.measure.machine import machine_line
+    from hyrfpack.measure.machine import format_machine
 
     model = None if model is None else named_model(model)
     picture_format(output)
@@ -87,7 +87,7 @@ def bench(
     if as_json:
         print_json(result.to_dict())
     else:
-        click.echo(f"{machine_line(result.machine)}\n{result.subject}")
+        click.echo(f"{format_machine(result.machine)}\n{result.subject}")
         for part in words.tables(result.rows):
             click.echo(f"\n{part.title}\n{table(part.header, part.cells)}")
         for sentence in result.notes:

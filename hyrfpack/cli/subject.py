@@ -66,7 +66,7 @@ class Subject:
         """What an orbit goes around: what the photos showed, or the middle of the splats."""
         if self.splats is not None:
             frame = self.splats.frame
-            return Viewpoint.of_frame(frame.center, frame.scale)
+            return Viewpoint.from_frame(frame.center, frame.scale)
         return Capture(self.facts or {}).viewpoint
 
     @property

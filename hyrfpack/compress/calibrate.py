@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.cameras.between import views_at_and_between
+from hyrfpack.cameras.view_sampling import sample_views
 from hyrfpack.compress.plan import make_plan, of_each_number, worth_keeping
 from hyrfpack.compress.quantize import opacity_error, quantize
 from hyrfpack.compress.sensitivity import PRUNED, Sensitivity, measure_sensitivity
@@ -125,7 +125,7 @@ class Originals:
     def of(cls, model: HybridModel, cameras: Sequence[Camera], seed: int = 1) -> Originals:
         """Of a model: half at some of its cameras, half between them."""
         count = int(np.clip(DRAWN // max(len(model), 1), FEWEST, MOST)) // 2
-        at, between = views_at_and_between(cameras, count, seed)
+        at, between = sample_views(cameras, count, seed)
         return cls.seen([*at, *between], model)
 
     @classmethod

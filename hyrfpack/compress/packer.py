@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import torch
 
-from hyrfpack.cameras.capture import Capture, coarse, has_mean_exposure
+from hyrfpack.cameras.capture import Capture, has_mean_exposure, quantized_provenance
 from hyrfpack.checks import check_type
 from hyrfpack.compress.calibrate import Originals, calibrated, foretold
 from hyrfpack.compress.distortion import LIMITS, PSNR_DROP, default_distortion
@@ -150,7 +150,7 @@ def compress(
             f"{data.path}: all photos are held out, so there is none to measure at; use a larger `test_every`"
         )
     model, provenance = load_with_provenance(source)
-    kept = coarse(provenance, model.config.frame.scale)
+    kept = quantized_provenance(provenance, model.config.frame.scale)
     if target_bytes is not None:
         check_target_bytes(target_bytes, kept, model.exposure)
     model = model.to(choose_own_device(device, ranks, say))

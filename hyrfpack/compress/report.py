@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from hyrfpack.atomic import write_atomic
-from hyrfpack.cameras.capture import Capture, coarse
+from hyrfpack.cameras.capture import Capture, quantized_provenance
 from hyrfpack.compress.calibrate import calibrated
 from hyrfpack.compress.distortion import LIMITS, default_distortion
 from hyrfpack.compress.quantize import decide
@@ -32,8 +32,8 @@ from hyrfpack.format.codec import (
 )
 from hyrfpack.format.info import describe
 from hyrfpack.lock import exclusive_folder
-from hyrfpack.measure.machine import machine, machine_line
-from hyrfpack.measure.timing import take_turns
+from hyrfpack.measure.machine import describe_machine, format_machine
+from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.render import render
@@ -131,7 +131,7 @@ def _write_report(
         shown=shown,
         amplified=amplified,
         gaussians=len(model),
-        machine=machine_line(machine()),
+        machine=format_machine(describe_machine()),
         writer=facts["writer"],
     )
     draw(findings, folder / PLOT, overwrite=overwrite)
@@ -169,7 +169,7 @@ def _distortion(facts: dict, model: HybridModel, provenance: dict) -> float:
 def _profiles(model: HybridModel, provenance: dict, done: str) -> dict[str, bytes]:
     """The model in the profiles without settings to choose, but for the one that is done."""
     files = {}
-    for profile, kept in (("raw", provenance), ("paper", coarse(provenance, model.config.frame.scale))):
+    for profile, kept in (("raw", provenance), ("paper", quantized_provenance(provenance, model.config.frame.scale))):
         with suppress(HyrfError):  # half precision does not hold every model
             if profile != done:
                 files[profile] = encode_model(model, profile, kept)
@@ -188,13 +188,15 @@ def _finer_and_coarser(
         share = f"{Fraction(factor)} of the distortion" if factor < 1 else f"{factor} times the distortion"
         quantized = decide(model, sensitivity, float(np.clip(factor * distortion, *LIMITS)))
         name = SAME if factor == 1 else f"compact, {share}"
-        files[name] = encode_model(model, "compact", coarse(provenance, model.config.frame.scale), quantized=quantized)
+        files[name] = encode_model(
+            model, "compact", quantized_provenance(provenance, model.config.frame.scale), quantized=quantized
+        )
     return files
 
 
 def _measured(files: dict[str, bytes], views: Sequence[View]) -> tuple[dict[str, Point], dict[str, HybridModel]]:
     """Decode files in turns, and score what comes out."""
-    times, decoded = take_turns({name: partial(decode_model, data) for name, data in files.items()}, TURNS)
+    times, decoded = time_alternately({name: partial(decode_model, data) for name, data in files.items()}, TURNS)
     points = {
         name: Point(name, len(data), evaluate(decoded[name], views), times[name].ms) for name, data in files.items()
     }

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from hyrfpack.cameras.between import views_at_and_between
+from hyrfpack.cameras.view_sampling import sample_views
 from hyrfpack.format.arrays import GROUPS
 from hyrfpack.format.sections import COLORS, MLPS, OPACITIES, POSITIONS, SCALES, TABLES
 from hyrfpack.model import Geometry, HybridModel, expand
@@ -91,7 +91,7 @@ def measure_sensitivity(
         HyrfError: a number of the model is NaN or infinite.
     """
     count = int(np.clip(DRAWN // max(len(model), 1), FEWEST, MOST)) // 2
-    at, between = views_at_and_between(cameras, count, seed)
+    at, between = sample_views(cameras, count, seed)
     views = [view for pair in zip(at, between, strict=True) for view in pair]
     every = max(1, round(1 / FIELD_VIEWS))
     generator = torch.Generator().manual_seed(seed)

@@ -50,7 +50,7 @@ def pack(
     say(f"measuring what each number does to pictures, at {len(taught.train)} cameras and between them")
     wanted = PACKED * added_to_each(_mse(likeness), error + room)
     sensitivity, originals = calibrated(model, taught.train, wanted, report=report_part(report, 0.0, 0.7))
-    provenance = {**provenance, "viewpoint": Viewpoint.of(taught.train).to_json()}
+    provenance = {**provenance, "viewpoint": Viewpoint.from_cameras(taught.train).to_json()}
     making = report_part(report, 0.7, 0.85)
     packer = Packer(model, provenance, sensitivity, scene=None, finetune_steps=0, prune=True, say=say, report=making)
     trial = packer.settled(wanted, originals)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from hyrfpack.cameras.between import small_camera, views_at_and_between
+from hyrfpack.cameras.view_sampling import sample_views, shrink_camera
 from hyrfpack.data import PictureCache
 from hyrfpack.distill.config import DistillConfig
 from hyrfpack.distill.start import initial_model
@@ -111,10 +111,10 @@ def _cameras(
             for count, seed in zip((taught, DECIDING * config.test_views, config.test_views), seeds, strict=True)
         )
         return train, deciding, test
-    fitting = [small_camera(camera, config.size) for camera in cameras]
+    fitting = [shrink_camera(camera, config.size) for camera in cameras]
     test = fitting[::TEST_EVERY]
     train = [camera for number, camera in enumerate(fitting) if number % TEST_EVERY] or test
-    return train, views_at_and_between(train, config.test_views, config.seed)[1], test
+    return train, sample_views(train, config.test_views, config.seed)[1], test
 
 
 def _lit(light: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.cameras.between import small_camera
+from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.export.bake import STRIDE, Sight, refuse_nonfinite, sights_of
 from hyrfpack.export.exposure import camera_log_gains, typical_log_gains
 from hyrfpack.model import BACKGROUND_RADIUS, Frame, HybridModel
@@ -232,7 +232,7 @@ class _SeenPixels(NamedTuple):
 
     Attributes:
         pose: (4, 4) camera_from_local.
-        points: (n, 2) pixels of `small_camera`.
+        points: (n, 2) pixels of `shrink_camera`.
         places: (n, 3) what they show of the sphere, local units.
         weights: (n,) float64, squared transmittances.
     """
@@ -246,7 +246,7 @@ class _SeenPixels(NamedTuple):
 def _seen_pixels(model: HybridModel, cameras: Sequence[Camera], sights: Sequence[Sight]) -> Iterator[_SeenPixels]:
     """Yield what each camera sees of the sphere, at every STRIDE-th pixel of both axes."""
     threshold = RenderSettings().background_threshold
-    for camera, sight in zip(map(small_camera, cameras), sights, strict=True):
+    for camera, sight in zip(map(shrink_camera, cameras), sights, strict=True):
         refuse_nonfinite("Gaussians", sight.passed)
         rows, columns = torch.nonzero(sight.passed > threshold).unbind(1)
         pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=torch.float32)
@@ -274,7 +274,7 @@ def _seen(model: HybridModel, cameras: Sequence[Camera], sights: Sequence[Sight]
     net = torch.from_numpy(cell_centers(np.arange(6 * 4 ** (COARSEST + 2)), COARSEST + 2)[0]).float()
     add(net, _sphere_colors(model, net), np.full(len(net), UNSEEN))
     largest = math.inf
-    for camera, seen in zip(map(small_camera, cameras), _seen_pixels(model, cameras, sights), strict=True):
+    for camera, seen in zip(map(shrink_camera, cameras), _seen_pixels(model, cameras, sights), strict=True):
         if len(seen.points):
             colors = model.decode_background(seen.points, camera.intrinsics, seen.pose)
             refuse_nonfinite("background", colors)

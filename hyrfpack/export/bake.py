@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hyrfpack.cameras.between import small_camera
+from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.exposure import BakeGains
 from hyrfpack.model import Geometry, HybridModel
@@ -150,7 +150,7 @@ def sights_of(model: HybridModel, cameras: Sequence[Camera], report: Report = no
 @torch.no_grad()  # of each thread
 def _sight(model: HybridModel, geometry: Geometry, camera: Camera) -> Sight:
     settings, positions = RenderSettings(), model.gaussians.positions.detach()
-    camera = small_camera(camera)
+    camera = shrink_camera(camera)
     pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=torch.float32)
     refuse_nonfinite("camera poses", pose)
     view = pose, camera.intrinsics, camera.width, camera.height

@@ -106,7 +106,7 @@ def convert(
     kept = kept.with_degree(min(kept.degree, form.degree, kept.degree if degree is None else degree))
     _tell_of_limits(form, splats, kept, say)
     weighted = Weighted.of(whole, str(source))
-    hints = Hints(camera=Viewpoint.of_frame(weighted.frame.center, weighted.frame.scale).camera)
+    hints = Hints(camera=Viewpoint.from_frame(weighted.frame.center, weighted.frame.scale).camera)
     report(f"writing {len(kept):,} Gaussians as {form.ending}", 0.2)
     data = form.encode(kept, hints)
     report("reading them back", 0.5)

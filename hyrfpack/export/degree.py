@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
-from hyrfpack.cameras.between import small_camera
+from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.export.bake import Sight, bake
 from hyrfpack.export.measure import likeness
 from hyrfpack.export.source import FEW, MEASURED
@@ -53,7 +53,7 @@ def choose_degree(
             del some[KEPT_BACK]
     baked = bake(model, fitted, range(highest + 1), seen, report_part(report, 0.0, 0.6))
     contenders = {str(degree): (splats, None) for degree, splats in baked.items()}
-    views = [(small_camera(camera), None) for camera in evenly_spaced(kept, MEASURED)]
+    views = [(shrink_camera(camera), None) for camera in evenly_spaced(kept, MEASURED)]
     found = likeness(model, contenders, views, sphere=False, report=report_part(report, 0.6, 1.0))
     scores = {degree: found[str(degree)].model for degree in baked}
     return lowest_as_good(scores), scores

@@ -7,8 +7,8 @@ import io
 import numpy as np
 from PIL import Image
 
-from hyrfpack.cameras.between import small_camera
 from hyrfpack.cameras.paths import Viewpoint, orbit
+from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.model import Frame, HybridModel
 from hyrfpack.render import render
@@ -23,7 +23,7 @@ MIDDLE = (1, 99)  # percentiles of splats' positions between which the scene is 
 
 def model_poster(model: HybridModel, camera: Camera, longest: int) -> Image.Image:
     """What a camera sees of a model, in a picture of at most `longest` pixels a side."""
-    return to_image(render(model, small_camera(camera, longest)).rgb)
+    return to_image(render(model, shrink_camera(camera, longest)).rgb)
 
 
 def splats_poster(splats: Splats, longest: int) -> Image.Image | None:
@@ -37,8 +37,8 @@ def splats_poster(splats: Splats, longest: int) -> Image.Image | None:
         frame = Frame.from_box(*np.percentile(splats.positions, MIDDLE, axis=0))
     except HyrfDataError:
         return None
-    camera = orbit(Viewpoint.of_frame(frame.center, frame.scale), 1)[0]
-    return to_image(draw(Drawable.of(splats, frame), small_camera(camera, longest)).rgb)
+    camera = orbit(Viewpoint.from_frame(frame.center, frame.scale), 1)[0]
+    return to_image(draw(Drawable.of(splats, frame), shrink_camera(camera, longest)).rgb)
 
 
 def encode_poster(picture: Image.Image, form: str, most: int) -> bytes:

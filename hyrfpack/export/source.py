@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hyrfpack.cameras.between import views_between
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.paths import Viewpoint, common_direction, look_at, orbit
+from hyrfpack.cameras.view_sampling import interpolate_views
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.evaluate.metrics import stated_error
 from hyrfpack.format import describe, load
@@ -75,7 +75,7 @@ class Source:
             measured = [(view.camera, view) for view in evenly_spaced(data.test, MEASURED)]
             fitted = evenly_spaced(cameras, FITTED)
             return cls(model, named, fitted, measured, _up_of(cameras, up), center, stated)
-        if capture.made_up:
+        if capture.is_synthetic:
             between = evenly_spaced(cameras[1::2], MEASURED)  # of an orbit with twice as many cameras as RING
             measured = [(camera, None) for camera in between]
             return cls(model, [], _around(viewpoint, center, up), measured, up, center, stated)
@@ -85,7 +85,7 @@ class Source:
         measured = [(camera, None) for camera in evenly_spaced(spare, MEASURED)]
         if capture.is_coarse:
             # Too few to fit harmonics to by themselves: what lies between them counts more than where they stand.
-            between = [camera for seed in range(BETWEEN) for camera in views_between(cameras, seed)]
+            between = [camera for seed in range(BETWEEN) for camera in interpolate_views(cameras, seed)]
             fitted = [*cameras, *between, *_around(viewpoint, center, up)]
         return cls(model, named, fitted, measured, _up_of(cameras, up), center, stated, capture.is_coarse)
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from hyrfpack.atomic import write_atomic
-from hyrfpack.cameras.capture import coarse
+from hyrfpack.cameras.capture import quantized_provenance
 from hyrfpack.checks import check_type
 from hyrfpack.device import choose_device
 from hyrfpack.errors import HyrfError, HyrfFormatError
@@ -218,7 +218,7 @@ def repack(
     overwrite: bool = True,
     **settings: Any,
 ) -> CompressionReport:
-    """Rewrite a `.hyrf` file with profile "raw" or "paper"; its provenance goes along, see `coarse`.
+    """Rewrite a `.hyrf` file with profile "raw" or "paper"; its provenance goes along, see `quantized_provenance`.
 
     Arguments and errors as `encode_model`, `load` and `save`.
 
@@ -229,7 +229,7 @@ def repack(
     source = find_model(source)
     Outputs(source, overwrite=overwrite).file(target)
     model, provenance = load_with_provenance(source, fraction)
-    kept = provenance if profile == "raw" else coarse(provenance, model.config.frame.scale)
+    kept = provenance if profile == "raw" else quantized_provenance(provenance, model.config.frame.scale)
     return save(model, target, profile, kept, overwrite=overwrite, **settings)
 
 

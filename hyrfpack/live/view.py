@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from time import monotonic
 
-from hyrfpack.cameras.capture import provenance_of
+from hyrfpack.cameras.capture import scene_provenance
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import encode_model
 from hyrfpack.train import Trainer
@@ -53,7 +53,7 @@ class LiveView:
         if self._count and began < self._next and trainer.step < trainer.steps:
             return
         if self._capture is None:
-            self._capture = provenance_of(trainer.scene)
+            self._capture = scene_provenance(trainer.scene)
         try:
             data = encode_model(trainer.model, "raw", {"steps": trainer.step, **self._capture})
         except HyrfError:

@@ -1,1 +1,1 @@
-"""The clock, the machine and the error: how anything here is timed, where, and how far off it is."""
+"""Measure run times and numerical errors, and describe the machine that they were measured on."""

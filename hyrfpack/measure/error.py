@@ -1,4 +1,4 @@
-"""How far numbers are off."""
+"""Largest and root mean square errors of tensors."""
 
 from __future__ import annotations
 
@@ -13,32 +13,40 @@ from hyrfpack.errors import HyrfError
 
 @dataclass(frozen=True)
 class Error:
-    """How far numbers are from what they should be: at most, and as a root mean square."""
+    """The largest and the root mean square deviation of numbers from their reference."""
 
     max: float
     rms: float
 
 
-def difference(values: Tensor, reference: Tensor, what: str) -> Error:
-    """Largest and root mean square difference of two tensors of one shape, worked out in float64.
+def measure_error(values: Tensor, reference: Tensor, what: str) -> Error:
+    """Compute the largest and the root mean square difference of two tensors of the same shape, in float64.
+
+    Args:
+        values: the tensor to measure.
+        reference: the correct values.
+        what: what is measured, for the error message.
 
     Raises:
-        HyrfError: either holds NaN or infinity; `what` says in the message what was measured.
+        HyrfError: a tensor holds NaN or infinity.
     """
     if not (torch.isfinite(values).all() and torch.isfinite(reference).all()):
         raise HyrfError(f"{what}: the result holds NaN or infinity, so there is no error to tell; check the model")
-    off = values.detach().double() - reference.detach().double()
-    if not off.numel():
+    deviation = values.detach().double() - reference.detach().double()
+    if not deviation.numel():
         return Error(0.0, 0.0)
-    return Error(float(off.abs().max()), float(off.square().mean().sqrt()))
+    return Error(float(deviation.abs().max()), float(deviation.square().mean().sqrt()))
 
 
-def relative_difference(values: Tensor, reference: Tensor, what: str) -> Error:
-    """As `difference`, over the reference's largest magnitude and over its rms; absolute where it is all zero."""
-    off, size = difference(values, reference, what), difference(reference, torch.zeros_like(reference), what)
-    return Error(off.max / (size.max or 1), off.rms / (size.rms or 1))
+def measure_relative_error(values: Tensor, reference: Tensor, what: str) -> Error:
+    """Compute errors relative to the reference: `max` to its largest magnitude, `rms` to its root mean square.
+
+    The errors are absolute if the reference is all zero. Arguments and exceptions are those of `measure_error`.
+    """
+    absolute, size = measure_error(values, reference, what), measure_error(reference, torch.zeros_like(reference), what)
+    return Error(absolute.max / (size.max or 1), absolute.rms / (size.rms or 1))
 
 
-def worst(errors: Sequence[Error]) -> Error:
-    """The largest maximum and the largest rms of several parts."""
+def largest_error(errors: Sequence[Error]) -> Error:
+    """Return the largest `max` and the largest `rms` among several errors."""
     return Error(max(error.max for error in errors), max(error.rms for error in errors))

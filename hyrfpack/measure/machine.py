@@ -1,4 +1,4 @@
-"""What a measured time belongs to."""
+"""Describe the machine that times are measured on."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ import hyrfpack
 from hyrfpack.parallel.pool import thread_count
 
 
-def machine() -> dict[str, object]:
-    """What times depend on: processor, cores in use, GPU, versions."""
+def describe_machine() -> dict[str, object]:
+    """Return what run times depend on: processor, cores in use, GPU, and versions of packages."""
     facts: dict[str, object] = {
-        "cpu": _processor(),
+        "cpu": _processor_name(),
         "cores": thread_count(),
         "python": platform.python_version(),
         "hyrfpack": hyrfpack.__version__,
-        **versions("torch", "numba", "numpy"),
+        **package_versions("torch", "numba", "numpy"),
     }
     if torch.cuda.is_available():
         facts["gpu"] = torch.cuda.get_device_name()
     return facts
 
 
-def versions(*packages: str) -> dict[str, str | None]:
-    """Of packages; None for those that are not installed."""
+def package_versions(*packages: str) -> dict[str, str | None]:
+    """Return the installed version of each package, None for those that are not installed."""
     found: dict[str, str | None] = dict.fromkeys(packages)
     for package in packages:
         with suppress(PackageNotFoundError):
@@ -36,12 +36,12 @@ def versions(*packages: str) -> dict[str, str | None]:
     return found
 
 
-def machine_line(facts: dict[str, object]) -> str:
-    """One line that names the machine."""
+def format_machine(facts: dict[str, object]) -> str:
+    """Format the result of `describe_machine` as one line."""
     return ", ".join(f"{key} {value}" for key, value in facts.items())
 
 
-def _processor() -> str:
+def _processor_name() -> str:
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

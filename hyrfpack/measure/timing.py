@@ -1,4 +1,4 @@
-"""Fair times on a machine that is not quiet: medians over repeats in which the contenders take turns."""
+"""Time tasks fairly on a busy machine: the tasks run alternately, and the median of the repeats counts."""
 
 from __future__ import annotations
 
@@ -9,16 +9,21 @@ from typing import Any
 
 import numpy as np
 
-ENOUGH_SECONDS = 3.0
-WARM_SECONDS = 0.1
+MAX_SECONDS_PER_TASK = 3.0
+WARM_UP_SECONDS = 0.1
 
-# Runs a task; returns what it returned, and its wall and processor time in seconds.
+# Runs a task; returns its result, and its wall time and processor time in seconds.
 Clock = Callable[[Callable[[], Any]], tuple[Any, float, float]]
 
 
 @dataclass(frozen=True)
 class Ratio:
-    """Of the median times of two tasks that took turns: wall, and processor (None where its clock is too coarse)."""
+    """Ratio of the median times of two tasks that ran alternately.
+
+    Attributes:
+        wall: ratio of the wall times.
+        work: ratio of the processor times; None if the processor clock is too coarse.
+    """
 
     wall: float
     work: float | None
@@ -26,13 +31,14 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Timing:
-    """How long a task takes.
+    """Run time of a task over several repeats.
 
     Attributes:
-        ms: median wall time.
-        spread_ms: interquartile range of the wall times; None when there is only one.
-        work_ms: median processor time, summed over all threads; what a busy machine distorts least.
-        repeats: how many times were measured.
+        ms: median wall time in milliseconds.
+        spread_ms: interquartile range of the wall times in milliseconds; None if there is only one.
+        work_ms: median processor time in milliseconds, summed over all threads; other programs on the machine distort
+            it least.
+        repeats: number of measured runs.
     """
 
     ms: float
@@ -40,52 +46,53 @@ class Timing:
     work_ms: float
     repeats: int
 
-    def each(self, count: int) -> Timing:
-        """The time of one out of `count` equal parts of the task."""
+    def per_part(self, count: int) -> Timing:
+        """Return the time of one of `count` equal parts of the task."""
         spread = None if self.spread_ms is None else self.spread_ms / count
         return Timing(self.ms / count, spread, self.work_ms / count, self.repeats)
 
-    def over(self, reference: Timing) -> Ratio:
-        """How many times the reference's time this is."""
+    def ratio_to(self, reference: Timing) -> Ratio:
+        """Divide this timing by that of a reference."""
         return Ratio(self.ms / reference.ms, self.work_ms / reference.work_ms if reference.work_ms else None)
 
 
-def take_turns(
+def time_alternately(
     tasks: Mapping[str, Callable[[], Any]], repeats: int, clock: Clock | None = None
 ) -> tuple[dict[str, Timing], dict[str, Any]]:
-    """Time tasks against each other: each runs once unmeasured, then all take turns.
+    """Time tasks against each other: run each once unmeasured, then measure them in turns.
 
-    A task leaves the round once it has been measured for ENOUGH_SECONDS. One whose first run alone took that long
-    is not run again: that run is its time. One that takes less than WARM_SECONDS is run unmeasured for that long at the
-    start of each turn: a slower neighbour leaves cold caches, and one core for all threads until the system spreads
-    them again, which is not the task's own time.
+    A task gets no further turn once its measured runs add up to MAX_SECONDS_PER_TASK. A task whose first run took that
+    long is not run again, and the first run counts. A task that takes less than WARM_UP_SECONDS is run unmeasured for
+    that long at the start of each turn. A slower task before it leaves cold caches and all threads on one core, which
+    would otherwise be measured too.
 
     Args:
-        tasks: by name.
+        tasks: the tasks by name.
         repeats: turns of each task; at least 1.
-        clock: another one than the processor's; it does its own warming.
+        clock: runs and times a task; None measures wall and processor time. A clock that is passed does its own
+            warm-up.
 
     Returns:
-        The timing of each task, and what its first run returned.
+        The timing of each task by name, and the result of its first run by name.
     """
     results: dict[str, Any] = {}
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in tasks}
-    quick, measure = set(), clock or _measure
+    short_tasks, measure = set(), clock or _measure
     for name, task in tasks.items():
         results[name], wall, work = measure(task)
-        if wall >= ENOUGH_SECONDS:
+        if wall >= MAX_SECONDS_PER_TASK:
             times[name].append((wall, work))
-        elif wall < WARM_SECONDS and clock is None:
-            quick.add(name)
+        elif wall < WARM_UP_SECONDS and clock is None:
+            short_tasks.add(name)
     for _ in range(repeats):
         for name, task in tasks.items():
-            if sum(wall for wall, _ in times[name]) < ENOUGH_SECONDS:
-                end = perf_counter() + WARM_SECONDS
-                while name in quick and perf_counter() < end:
+            if sum(wall for wall, _ in times[name]) < MAX_SECONDS_PER_TASK:
+                end = perf_counter() + WARM_UP_SECONDS
+                while name in short_tasks and perf_counter() < end:
                     task()
                 _, wall, work = measure(task)
                 times[name].append((wall, work))
-    return {name: _summary(measured) for name, measured in times.items()}, results
+    return {name: _summarise(measured) for name, measured in times.items()}, results
 
 
 def _measure(task: Callable[[], Any]) -> tuple[Any, float, float]:
@@ -94,7 +101,7 @@ def _measure(task: Callable[[], Any]) -> tuple[Any, float, float]:
     return result, perf_counter() - wall, process_time() - work
 
 
-def _summary(seconds: list[tuple[float, float]]) -> Timing:
+def _summarise(seconds: list[tuple[float, float]]) -> Timing:
     wall, work = 1e3 * np.array(seconds).T
     low, high = np.percentile(wall, (25, 75))
     return Timing(

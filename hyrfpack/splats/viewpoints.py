@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrfpack.cameras.between import small_camera
 from hyrfpack.cameras.paths import look_at
+from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.model import Frame
 from hyrfpack.parallel.pool import side_by_side
@@ -139,7 +139,7 @@ def coverage(drawable: Drawable, camera: Camera) -> float:
     """How much of a camera's picture splats cover, 0 to 1, from a picture of THUMBNAIL pixels."""
     every = _every(len(drawable.positions))
     # Of n times as many, each like these, the n-th power gets through.
-    seen = draw(drawable[::every], small_camera(camera, THUMBNAIL), black=True).transmittance ** every
+    seen = draw(drawable[::every], shrink_camera(camera, THUMBNAIL), black=True).transmittance ** every
     return 1 - float(seen.mean())
 
 

@@ -21,7 +21,7 @@ import torch
 
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
-from hyrfpack.cameras.capture import provenance_of
+from hyrfpack.cameras.capture import scene_provenance
 from hyrfpack.device import describe_device
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate import evaluate, picture_names
@@ -139,7 +139,7 @@ def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) ->
         "steps": config.steps,
         "seed": config.seed,
         "choices": trainer.choices,
-        **provenance_of(scene),
+        **scene_provenance(scene),
         "psnr": statistics.median(record["psnr"] for record in trainer.records[-len(trainer.records) // 10 :]),
     }
     data = hyrf_format.encode_model(model, "raw", provenance)

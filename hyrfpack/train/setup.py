@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from hyrfpack.cameras.capture import coarse, provenance_of
+from hyrfpack.cameras.capture import quantized_provenance, scene_provenance
 from hyrfpack.cameras.paths import common_direction
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.format.smallest import check_target_bytes
@@ -122,8 +122,8 @@ def check_target(scene: Scene, config: TrainConfig) -> None:
     if config.target_bytes is None or not scene.train:
         return
     preset = config.preset if config.preset != "auto" else detect_preset(scene)[0]
-    provenance = {"steps": config.steps, "seed": config.seed, **provenance_of(scene)}
-    check_target_bytes(config.target_bytes, coarse(provenance, scene_frame(scene, preset).scale))
+    provenance = {"steps": config.steps, "seed": config.seed, **scene_provenance(scene)}
+    check_target_bytes(config.target_bytes, quantized_provenance(provenance, scene_frame(scene, preset).scale))
 
 
 def table_size_for(budget: int, config: TrainConfig) -> tuple[int, str]:

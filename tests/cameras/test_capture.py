@@ -10,15 +10,15 @@ import pytest
 from scenes import ball_scene, ring
 
 from hyrfpack.cameras.capture import (
-    COARSE,
-    FINE,
-    KEPT,
-    ORBIT,
+    COARSE_POSE_RESOLUTION,
+    FALLBACK_ORBIT_CAMERAS,
+    MAX_COARSE_CAMERAS,
+    MAX_STORED_CAMERAS,
     Capture,
-    coarse,
     has_mean_exposure,
-    kept_cameras,
-    provenance_of,
+    provenance_cameras,
+    quantized_provenance,
+    scene_provenance,
 )
 from hyrfpack.cameras.paths import Viewpoint, orbit
 from hyrfpack.errors import HyrfDataError
@@ -34,35 +34,37 @@ def test_files_keep_the_layout_that_they_have_always_had():
     pose = [[0.0, 0.0, 1.0, 12345678.1234567], [0.0, 1.0, 0.0, 1 / 3], [-1.0, 0.0, 0.0, -2.0]]
     row = [800, 600, 700.123457, 650.0, 400.5, 300.0, 0.0, 0.0, 1.0, 12345678.123457]
     row += [0.0, 1.0, 0.0, 0.333333333, -1.0, 0.0, 0.0, -2.0]
-    assert json.dumps(kept_cameras([Camera(800, 600, 700.1234567, 650.0, 400.5, 300.0, pose)])) == json.dumps([row])
+    assert json.dumps(provenance_cameras([Camera(800, 600, 700.1234567, 650.0, 400.5, 300.0, pose)])) == json.dumps(
+        [row]
+    )
 
 
 def test_what_a_model_keeps_of_a_scene_comes_back():
     scene = replace(ball_scene(5), max_size=700)
-    capture = Capture(facts(**json.loads(json.dumps(provenance_of(scene)))))
+    capture = Capture(facts(**json.loads(json.dumps(scene_provenance(scene)))))
     photographed = [view.camera for view in scene.train]
-    assert capture.max_size == 700 and not capture.made_up
-    assert capture.viewpoint.to_json() == Viewpoint.of(photographed).to_json()
-    assert kept_cameras(capture.cameras) == kept_cameras(photographed)
+    assert capture.max_size == 700 and not capture.is_synthetic
+    assert capture.viewpoint.to_json() == Viewpoint.from_cameras(photographed).to_json()
+    assert provenance_cameras(capture.cameras) == provenance_cameras(photographed)
 
 
 def test_only_files_of_earlier_versions_say_that_they_have_a_mean_exposure():
-    assert has_mean_exposure({"mean_exposure": True}) and not has_mean_exposure(provenance_of(ball_scene(5)))
+    assert has_mean_exposure({"mean_exposure": True}) and not has_mean_exposure(scene_provenance(ball_scene(5)))
     assert not has_mean_exposure({"mean_exposure": "yes"})
 
 
 def test_of_many_cameras_some_are_kept():
-    assert len(kept_cameras(ring(KEPT + 9))) == KEPT
+    assert len(provenance_cameras(ring(MAX_STORED_CAMERAS + 9))) == MAX_STORED_CAMERAS
 
 
 def test_photos_come_before_the_cameras_that_are_kept_and_these_before_an_orbit():
-    scene, kept = ball_scene(5), {"cameras": kept_cameras(ring(3))}
+    scene, kept = ball_scene(5), {"cameras": provenance_cameras(ring(3))}
     assert Capture(facts(**kept), scene).cameras == [view.camera for view in scene.train]
     held_out = replace(scene, train=[], test=scene.train)
     for capture in (Capture(facts(**kept)), Capture(facts(**kept), held_out)):
-        assert len(capture.cameras) == 3 and not capture.made_up
-    assert Capture(facts()).made_up and len(Capture(facts()).cameras) == ORBIT
-    assert not Capture(facts(), scene).made_up
+        assert len(capture.cameras) == 3 and not capture.is_synthetic
+    assert Capture(facts()).is_synthetic and len(Capture(facts()).cameras) == FALLBACK_ORBIT_CAMERAS
+    assert not Capture(facts(), scene).is_synthetic
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 250.0])
@@ -73,41 +75,45 @@ def test_coarse_cameras_stand_about_where_the_cameras_stood(scale, away):
         pose = camera.camera_from_world.copy()
         pose[:3, 3] = -pose[:3, :3] @ (scale * (camera.position + away))
         cameras.append(replace(camera, camera_from_world=pose))
-    provenance = {"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json(), "seed": 3}
+    provenance = {
+        "cameras": provenance_cameras(cameras),
+        "viewpoint": Viewpoint.from_cameras(cameras).to_json(),
+        "seed": 3,
+    }
 
-    kept = json.loads(json.dumps(coarse(provenance, scale)))
+    kept = json.loads(json.dumps(quantized_provenance(provenance, scale)))
 
     capture = Capture(facts(**kept))
-    assert {*kept} == {"coarse_cameras", "viewpoint", "seed"} and capture.is_coarse and not capture.made_up
-    assert len(capture.cameras) == COARSE and coarse(kept, scale) == kept
-    for rough, exact in zip(capture.cameras, evenly_spaced(cameras, COARSE), strict=True):
-        assert np.linalg.norm(rough.position - exact.position) < 3 * scale / FINE
+    assert {*kept} == {"coarse_cameras", "viewpoint", "seed"} and capture.is_coarse and not capture.is_synthetic
+    assert len(capture.cameras) == MAX_COARSE_CAMERAS and quantized_provenance(kept, scale) == kept
+    for rough, exact in zip(capture.cameras, evenly_spaced(cameras, MAX_COARSE_CAMERAS), strict=True):
+        assert np.linalg.norm(rough.position - exact.position) < 3 * scale / COARSE_POSE_RESOLUTION
         np.testing.assert_allclose(rough.rotation, exact.rotation, atol=1e-4)
         np.testing.assert_allclose(rough.intrinsics, exact.intrinsics, atol=0.051)
-    center = capture.viewpoint.center - Viewpoint.of(cameras).center
+    center = capture.viewpoint.center - Viewpoint.from_cameras(cameras).center
     assert np.abs(center).max() < 1e-6 * scale * max(away, 1)
 
 
 def test_coarse_cameras_take_about_30_bytes_each():
     cameras = [replace(camera, fx=71.23456789, fy=71.3) for camera in ring(40)]
-    kept = coarse({"cameras": kept_cameras(cameras)}, 1.0)
-    assert len(zlib.compress(json.dumps(kept["coarse_cameras"]).encode(), 9)) < 45 * COARSE
+    kept = quantized_provenance({"cameras": provenance_cameras(cameras)}, 1.0)
+    assert len(zlib.compress(json.dumps(kept["coarse_cameras"]).encode(), 9)) < 45 * MAX_COARSE_CAMERAS
 
 
 def test_cameras_and_viewpoints_that_make_no_sense_are_left_out():
-    assert coarse({"cameras": [[1, 2]], "viewpoint": 7, "steps": 5}, 1.0) == {"viewpoint": 7, "steps": 5}
-    assert coarse({"cameras": "none", "seed": 1}, 1.0) == {"seed": 1}
-    assert coarse({}, 1.0) == {}
+    assert quantized_provenance({"cameras": [[1, 2]], "viewpoint": 7, "steps": 5}, 1.0) == {"viewpoint": 7, "steps": 5}
+    assert quantized_provenance({"cameras": "none", "seed": 1}, 1.0) == {"seed": 1}
+    assert quantized_provenance({}, 1.0) == {}
 
 
 def test_exact_cameras_come_before_coarse_ones():
-    rough = coarse({"cameras": kept_cameras(ring(3))}, 1.0)
-    capture = Capture(facts(cameras=kept_cameras(ring(5)), **rough))
+    rough = quantized_provenance({"cameras": provenance_cameras(ring(3))}, 1.0)
+    capture = Capture(facts(cameras=provenance_cameras(ring(5)), **rough))
     assert len(capture.cameras) == 5 and not capture.is_coarse
 
 
 def test_a_viewpoint_that_is_not_asked_for_is_not_looked_at():
-    assert len(Capture(facts(cameras=kept_cameras(ring(3)), viewpoint=7)).cameras) == 3
+    assert len(Capture(facts(cameras=provenance_cameras(ring(3)), viewpoint=7)).cameras) == 3
 
 
 @pytest.mark.parametrize("cameras", [7, [[1, 2, 3]], [[32, 32, 0, 1, 1, 1, *range(12)]], {"a": 1}])
@@ -134,14 +140,14 @@ def test_cameras_without_sense_are_one_sentence(cameras):
 )
 def test_a_forged_viewpoint_is_an_error_of_the_files(change):
     with pytest.raises(HyrfDataError, match="viewpoint"):
-        orbit(Capture(facts(viewpoint={**Viewpoint.of(ring(3)).to_json(), **change})).viewpoint, 2)
+        orbit(Capture(facts(viewpoint={**Viewpoint.from_cameras(ring(3)).to_json(), **change})).viewpoint, 2)
 
 
 @pytest.mark.parametrize("kind", ["all cameras", "coarse cameras"])
 def test_photos_of_training_match_what_the_model_keeps_also_with_another_split(kind):
     scene = ball_scene(20)
-    kept = provenance_of(scene)
-    capture = Capture(facts(**(kept if kind == "all cameras" else coarse(kept, 1.0))), scene)
+    kept = scene_provenance(scene)
+    capture = Capture(facts(**(kept if kind == "all cameras" else quantized_provenance(kept, 1.0))), scene)
     assert capture.mismatch == ""
     half = replace(scene, train=scene.test, test=scene.train[::2])
     assert replace(capture, scene=half).mismatch == ""
@@ -150,8 +156,8 @@ def test_photos_of_training_match_what_the_model_keeps_also_with_another_split(k
 @pytest.mark.parametrize("kind", ["all cameras", "coarse cameras"])
 def test_photos_of_another_scene_or_in_another_frame_do_not_match_what_the_model_keeps(kind):
     scene = ball_scene(20)
-    kept = provenance_of(scene)
-    model = facts(**(kept if kind == "all cameras" else coarse(kept, 1.0)))
+    kept = scene_provenance(scene)
+    model = facts(**(kept if kind == "all cameras" else quantized_provenance(kept, 1.0)))
     moved_world, turned_world = np.eye(4), np.diag([-1.0, 1.0, -1.0, 1.0])
     moved_world[0, 3] = 0.5
     for change in (moved_world, turned_world):
@@ -166,12 +172,12 @@ def test_photos_of_another_scene_or_in_another_frame_do_not_match_what_the_model
 def test_one_camera_that_two_sets_share_by_chance_does_not_make_them_match():
     scene, other = ball_scene(20), ball_scene(20, offset=(40.0, 0.0, 0.0))
     other.train[3] = replace(other.train[3], camera=scene.train[3].camera)
-    sentence = Capture(facts(**provenance_of(scene)), other).mismatch
+    sentence = Capture(facts(**scene_provenance(scene)), other).mismatch
     assert f"of the {len(scene.train)} cameras that the model keeps of its training, 1 is among" in sentence
 
 
 def test_without_photos_or_kept_cameras_there_is_no_mismatch():
     scene = ball_scene(5)
-    assert Capture(facts(**provenance_of(scene))).mismatch == ""
+    assert Capture(facts(**scene_provenance(scene))).mismatch == ""
     assert Capture(facts(), scene).mismatch == ""
     assert Capture(facts(cameras=[["damaged"]]), scene).mismatch == ""

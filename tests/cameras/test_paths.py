@@ -25,13 +25,13 @@ def ring_part(first: float, last: float, count: int = 15) -> list[Camera]:
 
 def test_typical_camera_is_no_outlier():
     odd = camera_at((40, 0, 30))
-    assert np.linalg.norm(np.array(orbit(Viewpoint.of([odd, *ring(8)]), 1)[0].position)) < 4
+    assert np.linalg.norm(np.array(orbit(Viewpoint.from_cameras([odd, *ring(8)]), 1)[0].position)) < 4
 
 
 @pytest.mark.parametrize(("first", "last"), [(-30, 60), (100, 250), (170, 200), (350, 480)])
 def test_swing_stays_on_the_arc_that_the_photos_cover(first, last):
     cameras = ring_part(first, last)
-    path = orbit(Viewpoint.of(cameras), 40)
+    path = orbit(Viewpoint.from_cameras(cameras), 40)
     middle = (first + last) / 2
     seen = (azimuths(path) - middle + 180) % 360 - 180
     assert seen.min() == pytest.approx(first - middle, abs=1)
@@ -40,13 +40,13 @@ def test_swing_stays_on_the_arc_that_the_photos_cover(first, last):
 
 def test_cameras_that_look_outwards_do_not_orbit_the_point_behind_them():
     cameras = [camera_at(camera.position, 2 * camera.position) for camera in ring(8, elevation=0.0)]
-    path = orbit(Viewpoint.of(cameras), 8)
+    path = orbit(Viewpoint.from_cameras(cameras), 8)
     assert all(camera.forward @ path[0].forward > 0.9 for camera in path)
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_one_or_two_cameras_are_enough(count):
-    path = orbit(Viewpoint.of(ring(8)[:count]), 3)
+    path = orbit(Viewpoint.from_cameras(ring(8)[:count]), 3)
     assert all(np.isfinite(camera.camera_from_world).all() for camera in path)
 
 
@@ -54,7 +54,7 @@ def test_a_real_capture_is_orbited_among_its_cameras(shared_data):
     from hyrfpack.data import load_scene
 
     cameras = [view.camera for view in load_scene(shared_data / "mipnerf360_bonsai").train]
-    path = orbit(Viewpoint.of(cameras), 12)
+    path = orbit(Viewpoint.from_cameras(cameras), 12)
     positions = np.array([camera.position for camera in cameras])
     nearest = [np.linalg.norm(positions - camera.position, axis=1).min() for camera in path]
     assert max(nearest) < 0.3 * np.ptp(positions, axis=0).max()
@@ -62,7 +62,7 @@ def test_a_real_capture_is_orbited_among_its_cameras(shared_data):
 
 def test_orbit_looks_at_the_centre_from_the_typical_distance_and_height():
     center = np.array([5.0, -7.0, 11.0])
-    path = orbit(Viewpoint.of(moved(ring(10, radius=3, height=1), center)), 24)
+    path = orbit(Viewpoint.from_cameras(moved(ring(10, radius=3, height=1), center)), 24)
     for camera in path:
         local = camera.camera_from_world @ [*center, 1]
         np.testing.assert_allclose(local[:3], (0, 0, math.sqrt(10)), atol=1e-9)
@@ -76,7 +76,7 @@ def test_orbit_looks_at_the_centre_from_the_typical_distance_and_height():
 
 def test_orbit_around_a_place_seen_from_straight_above_is_a_circle():
     above = camera_at((0, 0, 5), up=(0, 1, 0))
-    viewpoint = replace(Viewpoint.of(ring(6)), camera=above)
+    viewpoint = replace(Viewpoint.from_cameras(ring(6)), camera=above)
     positions = np.array([camera.position for camera in orbit(viewpoint, 6)])
     assert np.ptp(positions, axis=0)[:2].min() > 1
 

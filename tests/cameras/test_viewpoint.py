@@ -15,7 +15,7 @@ from hyrfpack.cameras.paths import Viewpoint, common_direction, orbit
 
 @pytest.mark.parametrize("offset", [(0, 0, 0), (1e6, -2e6, 3e5)])
 def test_cameras_around_an_object_are_summed_up_by_what_they_look_at(offset):
-    hint = Viewpoint.of(moved(ring(12), offset))
+    hint = Viewpoint.from_cameras(moved(ring(12), offset))
     np.testing.assert_allclose(hint.center, offset, atol=1e-6)
     np.testing.assert_allclose(hint.up, (0, 0, 1), atol=1e-9)
     assert hint.arc == (0.0, 360.0)
@@ -24,26 +24,26 @@ def test_cameras_around_an_object_are_summed_up_by_what_they_look_at(offset):
 
 def test_up_is_the_axis_that_cameras_are_level_about():
     on_a_part = [camera_at((3 * math.cos(a), 3 * math.sin(a), 2.5)) for a in np.linspace(0, 1.5, 9)]
-    np.testing.assert_allclose(Viewpoint.of(on_a_part).up, (0, 0, 1), atol=1e-9)
+    np.testing.assert_allclose(Viewpoint.from_cameras(on_a_part).up, (0, 0, 1), atol=1e-9)
     almost_above = [camera_at((1.7 * math.cos(a), 1.7 * math.sin(a), 9)) for a in np.linspace(0, 2.5, 9)]
-    np.testing.assert_allclose(Viewpoint.of(almost_above).up, (0, 0, 1), atol=1e-9)
+    np.testing.assert_allclose(Viewpoint.from_cameras(almost_above).up, (0, 0, 1), atol=1e-9)
 
 
 def test_hint_is_json():
-    hint = Viewpoint.of(ring(5)).to_json()
+    hint = Viewpoint.from_cameras(ring(5)).to_json()
     assert json.loads(json.dumps(hint, allow_nan=False)) == hint
 
 
 def test_cameras_that_look_the_same_way_get_a_small_swing_in_front_of_them():
     cameras = [camera_at((x, -5.0, 0.0), (x, 0.0, 0.0)) for x in np.linspace(-1, 1, 9)]
-    hint = Viewpoint.of(cameras)
+    hint = Viewpoint.from_cameras(cameras)
     assert hint.center[1] > -5
     assert hint.arc == (-10.0, 10.0)
 
 
 def test_a_file_without_a_viewpoint_is_orbited_by_its_frame():
     facts = {"provenance": {}, "config": {"frame": {"center": [1.0, 2.0, 3.0], "scale": 4.0}}}
-    assert Capture(facts).viewpoint.to_json() == Viewpoint.of_frame([1.0, 2.0, 3.0], 4.0).to_json()
+    assert Capture(facts).viewpoint.to_json() == Viewpoint.from_frame([1.0, 2.0, 3.0], 4.0).to_json()
     for camera in orbit(Capture(facts).viewpoint, 5):
         assert np.linalg.norm(camera.position - (1, 2, 3)) == pytest.approx(10)
         assert camera.position[1] < 2  # looks down: up is -y
@@ -70,7 +70,7 @@ def test_files_keep_the_layout_that_they_have_always_had():
 
 @given(camera=cameras())
 def test_a_viewpoint_survives_json_exactly(camera):
-    stored = json.dumps(Viewpoint.of([camera]).to_json())
+    stored = json.dumps(Viewpoint.from_cameras([camera]).to_json())
     assert json.dumps(Viewpoint.from_json(json.loads(stored)).to_json()) == stored
 
 

@@ -11,7 +11,7 @@ from commands import succeeded
 from scenes import small_model
 
 import hyrfpack
-from hyrfpack.cameras.capture import provenance_of
+from hyrfpack.cameras.capture import scene_provenance
 
 SENTENCE = "another coordinate frame; name the photos and poses that it was trained on"
 
@@ -20,7 +20,7 @@ SENTENCE = "another coordinate frame; name the photos and poses that it was trai
 def model(data, tmp_path) -> Path:
     """A file that says that it was trained on the set of the fixture `data`."""
     hyrfpack.save(
-        small_model([[0.0, 0.0, 0.0]]), tmp_path / "model.hyrf", provenance=provenance_of(hyrfpack.load_scene(data))
+        small_model([[0.0, 0.0, 0.0]]), tmp_path / "model.hyrf", provenance=scene_provenance(hyrfpack.load_scene(data))
     )
     return tmp_path / "model.hyrf"
 

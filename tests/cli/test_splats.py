@@ -14,7 +14,7 @@ from explicit_balls import ball
 from PIL import Image
 from scenes import ring, small_model
 
-from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.files import cameras_to_json
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.format import save
@@ -97,7 +97,7 @@ def test_depth_of_splats_is_in_world_units(files, tmp_path):
 def test_an_exported_file_scores_what_the_export_said(data, tmp_path):
     cameras = ring(4)
     positions = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
-    kept = {"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json()}
+    kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
     save(small_model(positions, fields=2.0, background=True), tmp_path / "model.hyrf", provenance=kept)
     export = ("export", tmp_path / "model.hyrf", "-o", tmp_path / "a.ply", "--data", data, "--sh-degree", 1, "--json")
     told = json.loads(succeeded(*export).stdout)

@@ -13,7 +13,7 @@ import torch
 from scenes import ball_points, small_model
 
 import hyrfpack
-from hyrfpack.cameras.capture import COARSE, coarse
+from hyrfpack.cameras.capture import MAX_COARSE_CAMERAS, quantized_provenance
 from hyrfpack.compress import compress
 from hyrfpack.compress import packer as running
 from hyrfpack.compress.distortion import default_distortion
@@ -277,8 +277,12 @@ def test_without_photos_and_cameras_it_goes_around_the_scene(trained, compact, s
 def test_provenance_goes_along_with_some_cameras(trained, compact, paper):
     before, after = describe(trained)["provenance"], describe(compact[0])["provenance"]
 
-    assert after == describe(paper)["provenance"] == coarse(before, describe(trained)["config"]["frame"]["scale"])
-    assert 0 < len(after["coarse_cameras"]) <= COARSE and "cameras" in before and "cameras" not in after
+    assert (
+        after
+        == describe(paper)["provenance"]
+        == quantized_provenance(before, describe(trained)["config"]["frame"]["scale"])
+    )
+    assert 0 < len(after["coarse_cameras"]) <= MAX_COARSE_CAMERAS and "cameras" in before and "cameras" not in after
 
 
 def test_a_compressed_file_can_be_compressed_again_and_unpacked_exactly(paper, compact, scene, tmp_path):

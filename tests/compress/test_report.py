@@ -13,7 +13,7 @@ from commands import succeeded
 from PIL import Image
 from scenes import ball_points, ball_scene, ring, small_model
 
-from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.compress import compress
 from hyrfpack.compress.calibrate import calibrated
 from hyrfpack.compress.report import amplification, write_report
@@ -70,7 +70,7 @@ def quick() -> Iterator[None]:
     """Here neither times need be fair nor sensitivities precise."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrfpack.compress.report.TURNS", 1)
-        patch.setattr("hyrfpack.measure.timing.WARM_SECONDS", 0.0)
+        patch.setattr("hyrfpack.measure.timing.WARM_UP_SECONDS", 0.0)
         patch.setattr("hyrfpack.compress.sensitivity.MOST", 24)
         yield
 
@@ -90,7 +90,7 @@ def source(scene, tmp_path_factory) -> Path:
     model = small_model(positions, color_logits=torch.from_numpy(colors) * 4 - 2, scale_logits=-2.5, fields=0.2)
     folder = tmp_path_factory.mktemp("<img src=x onerror=alert(1)>")
     path = folder / "model.hyrf"
-    save(model, path, provenance={"cameras": kept_cameras([view.camera for view in scene.train])})
+    save(model, path, provenance={"cameras": provenance_cameras([view.camera for view in scene.train])})
     return path
 
 
@@ -265,7 +265,7 @@ def test_a_raw_file_has_lost_nothing(source, tmp_path):
 
 
 def test_a_model_without_gaussians_has_a_page_without_a_curve(tmp_path):
-    save(small_model(np.zeros((0, 3))), tmp_path / "empty.hyrf", provenance={"cameras": kept_cameras(ring(2))})
+    save(small_model(np.zeros((0, 3))), tmp_path / "empty.hyrf", provenance={"cameras": provenance_cameras(ring(2))})
     _, _, page = reported(tmp_path / "empty.hyrf", tmp_path, "paper")
     assert sorted(row[0] for row in page.tables[1][1:]) == ["raw", "this file"]
 
@@ -275,7 +275,7 @@ def test_a_model_that_half_precision_cannot_hold_has_a_page_without_paper(tmp_pa
     model = small_model(positions)
     with torch.no_grad():
         model.gaussians.positions[0, 0] = 1e5
-    save(model, tmp_path / "far.hyrf", provenance={"cameras": kept_cameras(ring(2))})
+    save(model, tmp_path / "far.hyrf", provenance={"cameras": provenance_cameras(ring(2))})
     _, _, page = reported(tmp_path / "far.hyrf", tmp_path, distortion=1e-4)
     assert "paper" not in [row[0] for row in page.tables[1]]
 

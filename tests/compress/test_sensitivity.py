@@ -7,7 +7,7 @@ import pytest
 import torch
 from scenes import ball_points, ring, small_model
 
-from hyrfpack.cameras.between import views_between
+from hyrfpack.cameras.view_sampling import interpolate_views
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
@@ -28,7 +28,7 @@ def a_model() -> HybridModel:
 
 
 def looked_at_from(cameras: list[Camera]) -> list[Camera]:
-    return [*cameras, *views_between(cameras)]
+    return [*cameras, *interpolate_views(cameras)]
 
 
 @torch.no_grad()

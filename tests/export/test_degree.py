@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import ring, small_model
 
-from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
 from hyrfpack.export import degree as degrees
@@ -23,7 +23,11 @@ POSITIONS = [[0.1, 0.2, 0.3], [-0.4, 0.1, 0.0], [0.2, -0.5, 0.1], [0.0, 0.4, -0.
 def written(path, fields: float, cameras):
     """A model whose colours follow the direction if `fields` is not 0."""
     model = small_model(POSITIONS, fields=fields, direction_encoding="sh")
-    save(model, path, provenance={"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json()})
+    save(
+        model,
+        path,
+        provenance={"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()},
+    )
     return path
 
 

@@ -10,7 +10,7 @@ import torch
 from scenes import ball_scene, camera_at, ring, small_model
 
 import hyrfpack
-from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
 from hyrfpack.export import exposure as export_exposure
@@ -70,7 +70,11 @@ def base_colors(splats) -> np.ndarray:
 
 
 def write(path, model, cameras):
-    save(model, path, provenance={"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json()})
+    save(
+        model,
+        path,
+        provenance={"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()},
+    )
     return path
 
 

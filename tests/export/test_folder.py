@@ -12,7 +12,7 @@ from PIL import Image
 from scenes import ball_scene, ring, small_model
 
 import hyrfpack
-from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
@@ -25,7 +25,11 @@ PLAYER = {"README.txt", "hyrf-viewer.js", "index.html"}
 
 def write(path: Path, **provenance) -> Path:
     cameras = ring(4)
-    kept = {"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json(), **provenance}
+    kept = {
+        "cameras": provenance_cameras(cameras),
+        "viewpoint": Viewpoint.from_cameras(cameras).to_json(),
+        **provenance,
+    }
     path.parent.mkdir(parents=True, exist_ok=True)
     save(small_model(POSITIONS, fields=2.0), path, provenance=kept)
     return path
@@ -118,7 +122,7 @@ def test_a_disk_that_fills_up_leaves_no_half_file(model, tmp_path, monkeypatch):
 
 
 def test_splats_at_one_place_have_no_picture(tmp_path):
-    save(small_model(np.zeros((3, 3))), tmp_path / "m.hyrf", provenance={"cameras": kept_cameras(ring(2))})
+    save(small_model(np.zeros((3, 3))), tmp_path / "m.hyrf", provenance={"cameras": provenance_cameras(ring(2))})
     export(tmp_path / "m.hyrf", tmp_path / "a.ply", degree=0)
     player(tmp_path / "a.ply", tmp_path / "p")
     assert names(tmp_path / "p") == PLAYER | {"scene.ply"} and "poster" not in content_of(tmp_path / "p" / "index.html")

@@ -12,7 +12,7 @@ from PIL import Image
 from scenes import ball_scene, ring, small_model
 
 import hyrfpack
-from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.export import export
@@ -29,7 +29,7 @@ POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
 def model(tmp_path_factory):
     """Forty Gaussians before a background sphere, and twenty cameras around them."""
     path, cameras = tmp_path_factory.mktemp("models") / "model.hyrf", ring(20, width=96, height=64)
-    kept = {"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json()}
+    kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
     save(small_model(POSITIONS, fields=2.0, background=True, solid=(0.1, 0.2, 0.3)), path, provenance=kept)
     return path
 

@@ -14,7 +14,7 @@ import trimesh
 from scenes import ball_scene, ring, small_model, view_of
 
 import hyrfpack
-from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
@@ -51,7 +51,7 @@ def moved(camera: Camera, unit: float, center) -> Camera:
 
 def write(path, model=None, cameras=FOUR, **options):
     """A model, as training would leave it; returns its path."""
-    kept = {"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json()}
+    kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
     save(model or small_model(POSITIONS, **{"fields": 2.0, **options}), path, provenance=kept)
     return path
 

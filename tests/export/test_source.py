@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scenes import ball_scene, ring, small_model
 
-from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.source import FEW, MEASURED, Source
@@ -32,7 +32,7 @@ def written(tmp_path):
 
 def kept(count: int) -> dict:
     cameras = ring(count)
-    return {"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json()}
+    return {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
 
 
 def places(cameras) -> set[tuple[float, ...]]:
@@ -61,7 +61,7 @@ def test_of_few_cameras_none_is_spared(written):
 
 def test_a_camera_that_is_kept_is_the_one_that_was_photographed_with(written):
     cameras = ring(5, width=40, height=30)
-    source = Source.read(written({"cameras": kept_cameras(cameras)}))
+    source = Source.read(written({"cameras": provenance_cameras(cameras)}))
     for (name, back), camera in zip(source.cameras, cameras, strict=True):
         assert name.endswith(".png") and (back.width, back.height, back.fx) == (40, 30, camera.fx)
         assert np.allclose(back.camera_from_world, camera.camera_from_world, atol=1e-7)
@@ -73,7 +73,7 @@ def test_which_way_is_up_and_what_is_looked_at_come_from_the_capture(written):
     assert np.allclose(source.up, (0, 0, 1), atol=1e-6) and np.allclose(source.center, 0, atol=1e-6)
 
 
-@pytest.mark.parametrize("provenance", [None, {"viewpoint": Viewpoint.of(ring(9)).to_json()}])
+@pytest.mark.parametrize("provenance", [None, {"viewpoint": Viewpoint.from_cameras(ring(9)).to_json()}])
 def test_without_cameras_rings_around_the_scene_serve(provenance, written):
     source = Source.read(written(provenance))
     assert source.cameras == [] and source.fitted and len(source.measured) == MEASURED
@@ -114,7 +114,7 @@ BROKEN = {
 
 @pytest.mark.parametrize("what", BROKEN)
 def test_a_viewpoint_without_sense_is_one_sentence(what, written):
-    path = written({"viewpoint": BROKEN[what], "cameras": kept_cameras(ring(3))})
+    path = written({"viewpoint": BROKEN[what], "cameras": provenance_cameras(ring(3))})
     with pytest.raises(HyrfError, match=r"viewpoint [^\n]*$"):
         Source.read(path)
 
@@ -140,7 +140,7 @@ def test_up_is_against_cameras_that_look_down_and_turn(written):
         pose[:3, :3] = np.diag([1.0, -1, -1]) if number % 2 else np.diag([-1.0, 1, -1])
         pose[:3, 3] = -pose[:3, :3] @ (number - 6.0, 0.0, 3.0)
     cameras = [Camera(32, 32, 30.0, 30.0, 16.0, 16.0, pose) for pose in poses]
-    kept = {"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json()}
+    kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
     assert np.allclose(Source.read(written(kept)).up, (0, 0, 1))
-    kept["cameras"] = kept_cameras(cameras[::2])  # all the same way up: as likely a wall as the ground
+    kept["cameras"] = provenance_cameras(cameras[::2])  # all the same way up: as likely a wall as the ground
     assert np.allclose(abs(Source.read(written(kept)).up), (0, 1, 0))

@@ -9,7 +9,7 @@ import pytest
 from scenes import ball_scene
 
 from hyrfpack import compress
-from hyrfpack.cameras.capture import coarse
+from hyrfpack.cameras.capture import quantized_provenance
 from hyrfpack.compress.distortion import LIMITS
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.codec import load_with_provenance
@@ -25,7 +25,7 @@ def tiny(tmp_path_factory):
     train(scene, folder, TrainConfig(steps=3, max_gaussians=20), quiet=True)
     compress(folder / "model.hyrf", folder / "small.hyrf", data=scene, distortion=LIMITS[1])
     model, provenance = load_with_provenance(folder / "model.hyrf")
-    return folder / "small.hyrf", coarse(provenance, model.config.frame.scale)
+    return folder / "small.hyrf", quantized_provenance(provenance, model.config.frame.scale)
 
 
 def test_what_packing_reaches_is_above_the_bound_and_near_it(tiny):

@@ -264,7 +264,7 @@ def test_what_a_camera_file_says_is_quoted_in_short(tmp_path):
 @settings(max_examples=300, deadline=None)
 @given(rng=numbers)
 def test_a_forged_viewpoint_is_followed_or_refused(rng):
-    viewpoint = json.loads(json.dumps(Viewpoint.of_frame((0, 0, 0), 1.0).to_json()))
+    viewpoint = json.loads(json.dumps(Viewpoint.from_frame((0, 0, 0), 1.0).to_json()))
     node, key = rng.choice(places(viewpoint))
     node[key] = rng.choice((*HOSTILE_JSON, 1e160, [1e200] * 3, [5e-324] * 3))
 

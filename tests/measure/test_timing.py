@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from hyrfpack.measure import timing
-from hyrfpack.measure.timing import Timing, take_turns
+from hyrfpack.measure.timing import Timing, time_alternately
 
 
 class Clock:
@@ -27,14 +27,14 @@ class Clock:
 
 def test_contenders_take_turns_after_one_unmeasured_run_each(monkeypatch):
     clock = Clock(monkeypatch)
-    _, results = take_turns({"a": clock.task("a", [0.1] * 4), "b": clock.task("b", [0.1] * 4)}, 3)
+    _, results = time_alternately({"a": clock.task("a", [0.1] * 4), "b": clock.task("b", [0.1] * 4)}, 3)
     assert clock.calls == list("abababab")
     assert results == {"a": ("a", 1), "b": ("b", 2)}
 
 
 def test_median_and_interquartile_range_are_of_the_measured_runs_alone(monkeypatch):
     clock = Clock(monkeypatch)
-    timings, _ = take_turns({"a": clock.task("a", [2.0, 0.001, 0.002, 0.003, 0.004, 0.100])}, 5)
+    timings, _ = time_alternately({"a": clock.task("a", [2.0, 0.001, 0.002, 0.003, 0.004, 0.100])}, 5)
     assert timings["a"].ms == pytest.approx(3) and timings["a"].spread_ms == pytest.approx(4 - 2)
     assert timings["a"].work_ms == pytest.approx(6) and timings["a"].repeats == 5
 
@@ -42,30 +42,30 @@ def test_median_and_interquartile_range_are_of_the_measured_runs_alone(monkeypat
 def test_a_task_that_takes_long_enough_leaves_the_round(monkeypatch):
     clock = Clock(monkeypatch)
     tasks = {"slow": clock.task("slow", [1.6] * 9), "fast": clock.task("fast", [0.2] * 9)}
-    timings, _ = take_turns(tasks, 6)
+    timings, _ = time_alternately(tasks, 6)
     assert (timings["slow"].repeats, timings["fast"].repeats) == (2, 6)
 
 
 def test_a_quick_task_is_warmed_before_each_of_its_turns(monkeypatch):
-    monkeypatch.setattr(timing, "WARM_SECONDS", 0.1)
+    monkeypatch.setattr(timing, "WARM_UP_SECONDS", 0.1)
     clock = Clock(monkeypatch)
     warm = [0.03, 0.03, 0.03, 0.03]  # the fourth begins before a tenth of a second is over
     tasks = {"slow": clock.task("slow", [0.1] * 3), "quick": clock.task("quick", [0.05, *warm, 0.02, *warm, 0.01])}
-    timings, _ = take_turns(tasks, 2)
+    timings, _ = time_alternately(tasks, 2)
     assert clock.calls == ["slow", "quick", "slow", *["quick"] * 5, "slow", *["quick"] * 5]
     assert timings["quick"].ms == pytest.approx(15) and timings["quick"].repeats == 2
 
 
 def test_the_first_run_is_the_time_of_a_task_that_is_too_slow_to_repeat(monkeypatch):
     clock = Clock(monkeypatch)
-    timings, results = take_turns({"slow": clock.task("slow", [5.0])}, 7)
+    timings, results = time_alternately({"slow": clock.task("slow", [5.0])}, 7)
     assert clock.calls == ["slow"] and results["slow"] == ("slow", 1)
     assert timings["slow"] == Timing(5000, None, 10000, 1)
 
 
 def test_ratio_and_share_of_a_time():
     time = Timing(ms=30, spread_ms=3, work_ms=60, repeats=2)
-    assert time.each(3) == Timing(10, 1, 20, 2)
-    ratio = time.over(Timing(10, 1, 15, 2))
+    assert time.per_part(3) == Timing(10, 1, 20, 2)
+    ratio = time.ratio_to(Timing(10, 1, 15, 2))
     assert (ratio.wall, ratio.work) == (3, 4)
-    assert time.over(Timing(10, 1, 0, 2)).work is None
+    assert time.ratio_to(Timing(10, 1, 0, 2)).work is None

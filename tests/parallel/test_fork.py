@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np, torch
 import hyrfpack
 from hyrfpack.demo.scene import write_demo_scene
-from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.capture import provenance_cameras
 from scenes import ball_scene, small_model
 
 warnings.filterwarnings("ignore", "This process .* is multi-threaded", DeprecationWarning)
@@ -29,7 +29,7 @@ torch.set_num_threads(4)  # as on a machine with cores to spare
 scene = ball_scene(8, side=24)
 scene = replace(scene, test=scene.train[:2])
 model = small_model(np.random.default_rng(0).normal(size=(6_000, 3)) * 0.3, fields=1.0, scale_logits=-6.0)
-cameras = kept_cameras([view.camera for view in scene.train])
+cameras = provenance_cameras([view.camera for view in scene.train])
 hyrfpack.save(model, "model.hyrf", provenance={"cameras": cameras})
 write_demo_scene(Path("demo"), views=4, size=16)
 

@@ -27,7 +27,7 @@ from web.test_native import (
 )  # fmt: skip
 from web.test_sources import Site, site
 
-from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.choices import AS_PHOTOGRAPHED, CONSISTENT, EXPOSURES
 from hyrfpack.export import export
 from hyrfpack.format import encode_model, save
@@ -376,7 +376,7 @@ def test_an_exported_page_brings_the_map_and_its_poster_is_as_photographed(
     browser: Browser, tmp_path: Path, host: Site, target: str
 ):
     model, kept = mapped(200), cameras()
-    save(model, tmp_path / "model.hyrf", provenance={"cameras": kept_cameras(kept)})
+    save(model, tmp_path / "model.hyrf", provenance={"cameras": provenance_cameras(kept)})
     export(tmp_path / "model.hyrf", tmp_path / target)
     folder = tmp_path / target if target == "player" else tmp_path
     host.files = {f"/{path.name}": path.read_bytes() for path in folder.iterdir() if path.is_file()}

@@ -25,7 +25,7 @@ from rich.table import Table
 # The torch references run on torch's own threads, which would go on spinning on the cores of the kernels timed next.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from hyrfpack.measure.machine import machine, machine_line
+from hyrfpack.measure.machine import describe_machine, format_machine
 from tools.tables import cell
 
 Row = dict[str, object]
@@ -60,8 +60,8 @@ def main(arguments: list[str] | None = None) -> None:
     asked = parser.parse_args(arguments)
 
     console = Console(width=None if sys.stdout.isatty() else 200, highlight=False)
-    facts = machine()
-    console.print(machine_line(facts), markup=False)
+    facts = describe_machine()
+    console.print(format_machine(facts), markup=False)
     results = {}
     for name in asked.only or benchmarks():
         results[name] = run(name)

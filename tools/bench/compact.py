@@ -21,7 +21,7 @@ from hyrfpack.format.arrays import to_arrays, to_model
 from hyrfpack.format.codec import decode_model, encode_model
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.sections import LOGITS, TABLES
-from hyrfpack.measure.timing import take_turns
+from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.parallel import has_numba
@@ -69,13 +69,13 @@ def _bench_model(count: int, log2_table_size: int) -> list[dict]:
     def encode() -> bytes:
         return encode_model(model, "compact", quantized=quantize(plan.apply(model), plan, sensitivity))
 
-    planning, _ = take_turns({"plan": make}, REPEATS)
+    planning, _ = time_alternately({"plan": make}, REPEATS)
     encoders = {"raw": partial(encode_model, model), **{way: _with_numba(fast, encode) for way, fast in ways.items()}}
-    encoding, files = take_turns(encoders, REPEATS)
+    encoding, files = time_alternately(encoders, REPEATS)
     if len({files[way] for way in ways}) > 1:
         raise AssertionError("the bytes depend on whether there is Numba")
     decoders = {way: _with_numba(ways.get(way, True), partial(decode_model, data)) for way, data in files.items()}
-    decoding, models = take_turns(decoders, REPEATS)
+    decoding, models = time_alternately(decoders, REPEATS)
     return [
         {
             "gaussians": count,
@@ -84,7 +84,7 @@ def _bench_model(count: int, log2_table_size: int) -> list[dict]:
             "plan_ms": planning["plan"].ms if way in ways else None,
             "encode_ms": encoding[way].ms,
             "decode_ms": decoding[way].ms,
-            "decode_over_raw": decoding[way].over(decoding["raw"]).wall,
+            "decode_over_raw": decoding[way].ratio_to(decoding["raw"]).wall,
             "decode_work_ms": decoding[way].work_ms,
             "peak_over_model": _peak(decoders[way]) / sum(4 * p.numel() for p in model.parameters()),
             "rms_error": _error(models[way], model, plan if way in ways else None),

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hyrfpack.measure.error import relative_difference
-from hyrfpack.measure.timing import take_turns
+from hyrfpack.measure.error import measure_relative_error
+from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model.calls import Call, hash_encode_call, mlp_call
 from hyrfpack.ops.hash_encode import level_offsets, level_resolutions
 
@@ -41,7 +41,7 @@ def compare(call: Call, upstream: Tensor, items: int) -> list[dict]:
     exact = call.passes("reference", torch.float64, upstream=upstream)
     rows = []
     for way, task, slow, right in zip(("forward", "backward"), ours, reference, exact, strict=True):
-        times, _ = take_turns({"cpu": task, "reference": slow}, REPEATS)
+        times, _ = time_alternately({"cpu": task, "reference": slow}, REPEATS)
         # Of the backward pass the first gradient: the table's, and that of x.
         found, expected = (part if way == "forward" else part[0] for part in (task(), right()))
         rows.append(
@@ -50,8 +50,8 @@ def compare(call: Call, upstream: Tensor, items: int) -> list[dict]:
                 "ms": times["cpu"].ms,
                 "ns_an_item": 1e6 * times["cpu"].ms / items,
                 "reference_ms": times["reference"].ms,
-                "times_faster": times["reference"].over(times["cpu"]).wall,
-                "max_error": relative_difference(found, expected, way).max,
+                "times_faster": times["reference"].ratio_to(times["cpu"]).wall,
+                "max_error": measure_relative_error(found, expected, way).max,
             }
         )
     return rows

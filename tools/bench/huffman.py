@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from dahuffman import HuffmanCodec
 
-from hyrfpack.measure.timing import take_turns
+from hyrfpack.measure.timing import time_alternately
 from hyrfpack.quant import MinMaxQuantizer, huffman_decode, huffman_encode
 
 COUNT = 3_400_000
@@ -47,7 +47,7 @@ def bench() -> list[dict]:
     }
     rows = []
     for name, (ours, theirs) in tasks.items():
-        times, _ = take_turns({"ours": ours, "dahuffman": theirs}, REPEATS)
+        times, _ = time_alternately({"ours": ours, "dahuffman": theirs}, REPEATS)
         our_rate, peer_rate = COUNT / times["ours"].ms / 1e3, len(head) / times["dahuffman"].ms / 1e3
         rows.append(
             {

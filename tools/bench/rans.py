@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from hyrfpack.measure.timing import take_turns
+from hyrfpack.measure.timing import time_alternately
 from hyrfpack.parallel import has_numba
 from hyrfpack.quant import HuffmanStream, decode_integers, encode_integers, huffman_decode, huffman_encode
 from hyrfpack.quant.integers import EXTRA_BITS
@@ -87,12 +87,12 @@ def _bench_set(name: str, values: np.ndarray, contexts: np.ndarray | None) -> li
     if zstandard:
         coders["zstd-19"] = _zstd(values)
 
-    encoding, blobs = take_turns({coder: encode for coder, (encode, _, _) in coders.items()}, REPEATS)
+    encoding, blobs = time_alternately({coder: encode for coder, (encode, _, _) in coders.items()}, REPEATS)
     for coder, (_, decode, _) in coders.items():
         expected = values if coder.startswith(("ours (", "zstd")) else tokens
         if not np.array_equal(decode(blobs[coder]), expected):
             raise AssertionError(f"{coder} does not give back what it was given")
-    decoding, _ = take_turns({c: partial(decode, blobs[c]) for c, (_, decode, _) in coders.items()}, REPEATS)
+    decoding, _ = time_alternately({c: partial(decode, blobs[c]) for c, (_, decode, _) in coders.items()}, REPEATS)
     rows = [{"set": name, "symbols": count, "coder": "entropy", "bits_per_symbol": entropy, "above_entropy_%": 0.0}]
     for coder, (_, _, more_bits) in coders.items():
         bits = (8 * len(blobs[coder]) + more_bits) / count

@@ -15,7 +15,7 @@ from time import perf_counter, process_time
 import torch
 from torch import Tensor
 
-from hyrfpack.measure.error import difference, relative_difference, worst
+from hyrfpack.measure.error import largest_error, measure_error, measure_relative_error
 from hyrfpack.model.calls import cotangent, rasterize_call
 from hyrfpack.ops.rasterize import SHAPES, rasterize
 from hyrfpack.parallel.pool import thread_count
@@ -97,9 +97,11 @@ def errors(inputs: dict[str, Tensor], camera: tuple) -> dict[str, float]:
     (values, gradients), (exact, slopes) = call.both("cpu")(), call.both("reference", torch.float64)()
     pairs = zip(call.wanted, gradients, slopes, strict=True)
     return {
-        "value_error": difference(values, exact, "picture").max,
+        "value_error": measure_error(values, exact, "picture").max,
         "share_beyond_1e-5": float(((values - exact).abs() > 1e-5).double().mean()),
-        "gradient_error": worst([relative_difference(found, right, name) for name, found, right in pairs]).rms,
+        "gradient_error": largest_error(
+            [measure_relative_error(found, right, name) for name, found, right in pairs]
+        ).rms,
     }
 
 

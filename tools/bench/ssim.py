@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hyrfpack.measure.error import difference, relative_difference
-from hyrfpack.measure.timing import take_turns
+from hyrfpack.measure.error import measure_error, measure_relative_error
+from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model.calls import loss_call
 
 REPEATS = 7
@@ -25,15 +25,15 @@ def pictures(height: int, width: int) -> tuple[Tensor, Tensor]:
 def compare(image: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, float]:
     """Times of loss and gradient together, and errors against float64 (the gradient's over its largest value)."""
     call = loss_call(image, target, mask)
-    times, results = take_turns({way: call.both(way) for way in ("cpu", "reference")}, REPEATS)
+    times, results = time_alternately({way: call.both(way) for way in ("cpu", "reference")}, REPEATS)
     (value, gradients), (exact, slopes) = results["cpu"], call.both("reference", torch.float64)()
     return {
         "ms": times["cpu"].ms,
         "ns_a_pixel": 1e6 * times["cpu"].ms / image[..., 0].numel(),
         "reference_ms": times["reference"].ms,
-        "times_faster": times["reference"].over(times["cpu"]).wall,
-        "value_error": difference(value, exact, "loss").max,
-        "gradient_error": relative_difference(*gradients, *slopes, "gradient").max,
+        "times_faster": times["reference"].ratio_to(times["cpu"]).wall,
+        "value_error": measure_error(value, exact, "loss").max,
+        "gradient_error": measure_relative_error(*gradients, *slopes, "gradient").max,
     }
 
 

@@ -32,7 +32,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import torch
 
-from hyrfpack.measure.machine import machine_line
+from hyrfpack.measure.machine import format_machine
 from tools.gpu.report import machine, write
 from tools.gpu.rows import Row
 from tools.gpu.setup import Setup, find_set
@@ -105,7 +105,7 @@ def main(arguments: list[str] | None = None) -> int:
     if asked.long:
         setup = replace(setup, step_seconds=3 * setup.step_seconds, quality_seconds=3 * setup.quality_seconds)
     facts = machine(setup.torch_device)
-    print(machine_line(facts), flush=True)
+    print(format_machine(facts), flush=True)
     rows = check(asked.parts, setup, 3.0 if asked.long else 1.0)
     page = write(asked.out, facts, asdict(setup), rows)
     failed = [row for row in rows if row.get("status") == "failed"]

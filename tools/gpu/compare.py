@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.measure.error import relative_difference
+from hyrfpack.measure.error import measure_relative_error
 from hyrfpack.model.calls import Call
 
 
@@ -30,6 +30,6 @@ def within(error: float, bound: float) -> dict[str, object]:
 def relative_error(values: Tensor, exact: Tensor) -> float:
     """The rms of the difference over that of the exact numbers; infinity where a number is not finite."""
     try:
-        return relative_difference(values, exact, "").rms
+        return measure_relative_error(values, exact, "").rms
     except HyrfError:
         return float("inf")

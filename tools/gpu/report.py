@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from hyrfpack.measure.machine import machine_line, versions
+from hyrfpack.measure.machine import format_machine, package_versions
 from tools.gpu.rows import Row
 from tools.tables import cell, markdown
 
@@ -23,7 +23,7 @@ WORDS_TOLD = 2  # of a row that failed: enough to say which it is
 
 
 def machine(device: torch.device) -> dict[str, object]:
-    """What the numbers belong to: the card and its driver, versions, the commit, the day."""
+    """What the numbers belong to: the card and its driver, package_versions, the commit, the day."""
     facts: dict[str, object] = {"device": machine_name(device)}
     if device.type == "cuda":
         properties = torch.cuda.get_device_properties(device)
@@ -32,7 +32,7 @@ def machine(device: torch.device) -> dict[str, object]:
         facts["driver"] = _output("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader")
         facts["cuda or rocm"] = torch.version.cuda or torch.version.hip
     facts |= {"python": platform.python_version(), "torch": torch.__version__}
-    facts |= versions("triton", "numpy", "numba", "gsplat")
+    facts |= package_versions("triton", "numpy", "numba", "gsplat")
     facts["commit"] = _output("git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=12")
     facts["date"] = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
     return facts
@@ -60,7 +60,7 @@ def write(folder: Path, facts: dict[str, object], settings: dict[str, object], r
 
 def text(facts: dict[str, object], rows: Sequence[Row]) -> str:
     """The page: the machine, the goals, what failed, then a table for each kind of row."""
-    told = machine_line({key: value for key, value in facts.items() if key != "device" and value is not None})
+    told = format_machine({key: value for key, value in facts.items() if key != "device" and value is not None})
     lines = [f"# {facts['device']}", "", f"Written by `python -m tools.gpu.check`: {told}.", ""]
     lines += ["How to read it: [README.md](README.md).", ""]
     tables: dict[str, list[Row]] = {name: [] for name in FIRST}

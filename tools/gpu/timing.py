@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from hyrfpack.measure.timing import Clock, take_turns
+from hyrfpack.measure.timing import Clock, time_alternately
 
 # Written before each measurement: more than any L2 cache holds, so that each starts cold, and so much that the host has
 # queued a short task before it begins.
@@ -50,7 +50,7 @@ def median_ms(tasks: Mapping[str, Callable[[], object]], repeats: int, device: t
         clock = event_clock(device)
         for task in WARM_RUNS * list(tasks.values()):  # the first builds kernels
             task()
-    return {name: time.ms for name, time in take_turns(tasks, repeats, clock)[0].items()}
+    return {name: time.ms for name, time in time_alternately(tasks, repeats, clock)[0].items()}
 
 
 def event_clock(device: torch.device) -> Clock:

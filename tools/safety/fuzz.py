@@ -41,9 +41,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hyrfpack.cameras.between import small_camera
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.paths import orbit
+from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.cli.files import info
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import decode_model, describe, encode_model, load
@@ -185,7 +185,7 @@ def check_picture(model: HybridModel) -> None:
     with contextlib.suppress(HyrfError), torch.no_grad():
         facts = {"provenance": {}, "config": {"frame": vars(model.config.frame)}}
         (camera,) = orbit(Capture(facts).viewpoint, 1)
-        render(model, small_camera(camera, 16))
+        render(model, shrink_camera(camera, 16))
 
 
 def examine(number: int, seed: int, tally: Tally, folder: Path) -> None:

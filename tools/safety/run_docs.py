@@ -41,7 +41,7 @@ def cut(settings):
 cut(TrainConfig)
 cut(DistillConfig)
 start.LEAST_STEPS = start.MOST_STEPS = {steps}
-timing.WARM_SECONDS = 0
+timing.WARM_UP_SECONDS = 0
 runpy.run_path(sys.argv[1], run_name="__main__")
 """
 

@@ -26,7 +26,7 @@ import hyrfpack
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.format import encode_model, load, save
-from hyrfpack.measure.timing import take_turns
+from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import HybridModel
 from hyrfpack.render import renderer
 from hyrfpack.scene import Scene, View, evenly_spaced
@@ -107,7 +107,7 @@ def time_frames(
     def draw_full(view: View) -> None:
         hyrfpack.render(full, view.camera, decoded=decoded_full)
 
-    times = [take_turns({"this": partial(draw, v), "full": partial(draw_full, v)}, REPEATS)[0] for v in views]
+    times = [time_alternately({"this": partial(draw, v), "full": partial(draw_full, v)}, REPEATS)[0] for v in views]
     return 1000 / median(t["this"].ms for t in times), median(t["full"].ms / t["this"].ms for t in times)
 
 

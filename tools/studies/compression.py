@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 import hyrfpack
-from hyrfpack.cameras.capture import coarse
+from hyrfpack.cameras.capture import quantized_provenance
 from hyrfpack.compress.calibrate import Originals, calibrate
 from hyrfpack.compress.distortion import default_distortion
 from hyrfpack.compress.packer import Packer, Trial
@@ -60,7 +60,7 @@ class Set:
         self.name = folder.name
         self.scene = hyrfpack.load_scene(data)
         self.model, provenance = load_with_provenance(folder / "model.hyrf")
-        self.provenance = coarse(provenance, self.model.config.frame.scale)
+        self.provenance = quantized_provenance(provenance, self.model.config.frame.scale)
         self.raw = self.scores(self.model)
         self.held_out = Originals.seen([view.camera for view in evenly_spaced(self.scene.test, HELD_OUT)], self.model)
         start = time.perf_counter()

@@ -110,7 +110,7 @@ def main() -> None:
         "max_gaussians": f"{args.gaussians:,}: trained to {trained:,}, split by tools/studies/densify_model.py "
         f"in {GROWING} steps (seed {args.seed}), settled in {args.settle}",
     }
-    provenance["viewpoint"] = Viewpoint.of([view.camera for view in scene.train]).to_json()
+    provenance["viewpoint"] = Viewpoint.from_cameras([view.camera for view in scene.train]).to_json()
     written = hyrfpack.save(model, args.out / MODEL, profile="raw", provenance=provenance)
     print(f"{args.out / MODEL}: {written.bytes_after:,} bytes")
 

@@ -14,9 +14,9 @@ from web.fields.test_fields import random_model
 from web.scripts import run_script
 
 import hyrfpack
-from hyrfpack.cameras.between import small_camera
 from hyrfpack.cameras.files import camera_to_json
 from hyrfpack.cameras.paths import Viewpoint, orbit
+from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.export.bake import RIDGE, SPHERE_DIRECTIONS, SPHERE_WEIGHT, bake
 from hyrfpack.export.measure import likeness
 from hyrfpack.model import HybridModel
@@ -154,8 +154,8 @@ def test_a_file_without_cameras_is_fitted_from_rings_about_it(tmp_path: Path) ->
     splats, _ = fitted(ball_model(), None, 2, tmp_path)
 
     model = ball_model()
-    around = orbit(Viewpoint.of_frame(model.config.frame.center, model.config.frame.scale), 7)
-    views = [(small_camera(camera, 64), None) for camera in around]
+    around = orbit(Viewpoint.from_frame(model.config.frame.center, model.config.frame.scale), 7)
+    views = [(shrink_camera(camera, 64), None) for camera in around]
     assert likeness(model, {"page": (splats, None)}, views, sphere=False)["page"].model > 35
 
 

@@ -14,7 +14,7 @@ from scenes import ball_scene, camera_at, ring, small_model, view_of
 from web.scripts import run_script
 
 import hyrfpack
-from hyrfpack.cameras.capture import provenance_of
+from hyrfpack.cameras.capture import scene_provenance
 from hyrfpack.cameras.files import camera_from_json, camera_to_json
 from hyrfpack.export.pages import PAGE_CAMERAS
 from hyrfpack.export.source import Source
@@ -41,7 +41,7 @@ def photographed(cameras: list[Camera]) -> dict:
     scene = ball_scene(2)
     views = [view_of(f"{k}.png", camera, scene.train[0].load()) for k, camera in enumerate(cameras)]
     parts = {"points": scene.points, "point_colors": scene.point_colors}
-    return json.loads(json.dumps(provenance_of(Scene("made", "colmap", views, [], **parts))))
+    return json.loads(json.dumps(scene_provenance(Scene("made", "colmap", views, [], **parts))))
 
 
 def drone(count: int) -> list[Camera]:

@@ -19,7 +19,7 @@ from web.scripts import run_script
 from web.served import served
 
 import hyrfpack
-from hyrfpack.cameras.capture import kept_cameras
+from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.model import Frame, HybridModel
@@ -66,7 +66,7 @@ def cameras_about(count: int) -> list[Camera]:
 
 def saved(model: HybridModel, file: Path) -> Path:
     cameras = cameras_about(10)
-    provenance = {"cameras": kept_cameras(cameras), "viewpoint": Viewpoint.of(cameras).to_json()}
+    provenance = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
     hyrfpack.save(model, file, provenance=provenance)
     return file
 

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from scenes import ring
 
-from hyrfpack.cameras.between import LONGEST_SIDE, WIDER, small_camera, views_at_and_between, views_between
+from hyrfpack.cameras.view_sampling import (
+    INTERPOLATED_VIEW_SIZE_RATIO,
+    MAX_SMALL_VIEW_SIDE_PIXELS,
+    interpolate_views,
+    sample_views,
+    shrink_camera,
+)
 from hyrfpack.scene import Camera
 
 CAMERAS = ring(48, elevation=1.2, width=16, height=16)
@@ -14,12 +20,15 @@ def test_views_between_lie_between_neighbours_that_look_the_same_way():
     """On a ring of 48 no neighbour is farther than two places: a view is within the chord, and looks inwards too."""
     chord = 3 * 2 * np.sin(np.pi * 2 / 48)  # to the second next, of a ring of radius 3
 
-    for camera, view in zip(CAMERAS, views_between(CAMERAS), strict=True):
+    for camera, view in zip(CAMERAS, interpolate_views(CAMERAS), strict=True):
         moved = np.linalg.norm(view.position - camera.position)
         assert 0.2 * chord / 2 < moved < chord
         assert view.rotation[2] @ camera.rotation[2] > np.cos(2 * np.pi * 2 / 48)
         np.testing.assert_allclose(view.rotation @ view.rotation.T, np.eye(3), atol=1e-12)
-        assert (view.width, view.height) == (round(WIDER * camera.width), round(WIDER * camera.height))
+        assert (view.width, view.height) == (
+            round(INTERPOLATED_VIEW_SIZE_RATIO * camera.width),
+            round(INTERPOLATED_VIEW_SIZE_RATIO * camera.height),
+        )
         assert (view.fx, view.fy) == (camera.fx, camera.fy)
         assert view.cx - view.width / 2 == pytest.approx(camera.cx - camera.width / 2)
 
@@ -28,7 +37,7 @@ def test_views_between_lie_between_neighbours_that_look_the_same_way():
     ("count", "places"), [(1, [24]), (2, [12, 36]), (3, [8, 24, 40]), (48, range(48)), (99, range(48))]
 )
 def test_a_few_views_stand_in_the_middle_of_equal_parts_and_between_neighbours_among_all(count, places):
-    at, between = views_at_and_between(CAMERAS, count, seed=3)
+    at, between = sample_views(CAMERAS, count, seed=3)
 
     assert at == [CAMERAS[place] for place in places]
     chord = 3 * 2 * np.sin(np.pi * 2 / 48)
@@ -37,17 +46,17 @@ def test_a_few_views_stand_in_the_middle_of_equal_parts_and_between_neighbours_a
 
 
 def test_few_views_of_no_camera_are_none_and_of_one_it_and_itself():
-    assert views_at_and_between([], 3) == ([], [])
-    assert views_at_and_between(CAMERAS[:1], 3) == (CAMERAS[:1], CAMERAS[:1])
+    assert sample_views([], 3) == ([], [])
+    assert sample_views(CAMERAS[:1], 3) == (CAMERAS[:1], CAMERAS[:1])
 
 
 def test_one_camera_has_no_neighbour_and_stays():
-    assert views_between(CAMERAS[:1]) == CAMERAS[:1]
-    assert views_between([]) == []
+    assert interpolate_views(CAMERAS[:1]) == CAMERAS[:1]
+    assert interpolate_views([]) == []
 
 
 def test_cameras_at_one_place_have_views_between_them():
-    views = views_between([CAMERAS[0]] * 3)
+    views = interpolate_views([CAMERAS[0]] * 3)
 
     assert all(np.allclose(view.position, CAMERAS[0].position) for view in views)
     assert all(np.isfinite(view.camera_from_world).all() for view in views)
@@ -55,7 +64,7 @@ def test_cameras_at_one_place_have_views_between_them():
 
 def test_large_pictures_are_measured_in_small_ones_of_the_same_view():
     large = Camera(4000, 3000, 3500.0, 3400.0, 2100.0, 1400.0, np.eye(4))
-    small = small_camera(large)
-    assert (small.width, small.height) == (LONGEST_SIDE, LONGEST_SIDE * 3 // 4)
-    assert np.allclose(np.array(small.intrinsics) * 4000 / LONGEST_SIDE, large.intrinsics)
-    assert small_camera(small) == small
+    small = shrink_camera(large)
+    assert (small.width, small.height) == (MAX_SMALL_VIEW_SIDE_PIXELS, MAX_SMALL_VIEW_SIDE_PIXELS * 3 // 4)
+    assert np.allclose(np.array(small.intrinsics) * 4000 / MAX_SMALL_VIEW_SIDE_PIXELS, large.intrinsics)
+    assert shrink_camera(small) == small

@@ -1,0 +1,92 @@
+"""Choose the small views in which a model is rendered for measurements: at its cameras and between them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from hyrfpack.scene import Camera
+
+MAX_SMALL_VIEW_SIDE_PIXELS = 512
+# Interpolated views are wider than the photos by this factor, to include what lies just outside the photos.
+INTERPOLATED_VIEW_SIZE_RATIO = 1.4
+_NEIGHBOUR_CANDIDATES = 3
+# Cost of a rotation in the search for neighbours, in median distances to the nearest camera.
+_ROTATION_COST_PER_RADIAN = 10.0
+
+
+def sample_views(cameras: Sequence[Camera], count: int, seed: int = 0) -> tuple[list[Camera], list[Camera]]:
+    """Select at most `count` cameras that represent a capture, and interpolate one more view for each of them.
+
+    The sequence of cameras is divided into `count` equal parts, and the middle camera of each part is selected. The
+    first and the last camera are avoided: a path around the scene starts and ends there, so they represent few others.
+
+    Returns:
+        The selected cameras, and for each of them a view interpolated towards a neighbour, see `interpolate_views`.
+    """
+    count = min(count, len(cameras))
+    indices = [(2 * part + 1) * len(cameras) // (2 * count) for part in range(count)]
+    return [cameras[index] for index in indices], interpolate_views(cameras, seed, indices)
+
+
+def interpolate_views(cameras: Sequence[Camera], seed: int = 0, indices: Sequence[int] | None = None) -> list[Camera]:
+    """Interpolate between each camera and a neighbour with a similar viewing direction, in a wider picture.
+
+    Held-out photos show what lies between the training photos and just beside them, and so do these views. The
+    neighbour is drawn from the nearest cameras, the position on the way to it from 25 to 75 %.
+
+    Args:
+        cameras: all cameras; neighbours are searched among them.
+        seed: random seed for the choice of neighbours and of positions between them.
+        indices: cameras to interpolate from; None for all.
+
+    Returns:
+        One view for each index. With fewer than two cameras, the cameras themselves.
+    """
+    indices = list(range(len(cameras)) if indices is None else indices)
+    if len(cameras) < 2:
+        return [cameras[index] for index in indices]
+    rng = np.random.default_rng(seed)
+    positions = np.array([camera.position for camera in cameras])
+    rotations = Rotation.from_matrix(np.array([camera.rotation for camera in cameras]))
+    distances = np.linalg.norm(positions[indices, None] - positions, axis=2)
+    distances[np.arange(len(indices)), indices] = np.inf  # a camera is no neighbour of itself
+    unit = float(np.median(distances.min(axis=1))) or 1.0
+    views = []
+    for row, index in enumerate(indices):
+        camera = cameras[index]
+        cost = distances[row] + _ROTATION_COST_PER_RADIAN * unit * (rotations[index].inv() * rotations).magnitude()
+        other = np.argsort(cost, kind="stable")[rng.integers(min(_NEIGHBOUR_CANDIDATES, len(cameras) - 1))]
+        share = rng.uniform(0.25, 0.75)
+        rotation = Slerp((0, 1), Rotation.concatenate([rotations[index], rotations[other]]))(share).as_matrix()
+        pose = np.eye(4)
+        pose[:3, :3] = rotation
+        pose[:3, 3] = -rotation @ ((1 - share) * positions[index] + share * positions[other])
+        views.append(_widen(dataclasses.replace(camera, camera_from_world=pose)))
+    return views
+
+
+def shrink_camera(camera: Camera, max_side: int = MAX_SMALL_VIEW_SIDE_PIXELS) -> Camera:
+    """Shrink a camera's picture to at most `max_side` pixels on its longer side; the view stays the same."""
+    shrink = min(1.0, max_side / max(camera.width, camera.height))
+    width, height = max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink))
+    x, y = width / camera.width, height / camera.height
+    return dataclasses.replace(
+        camera, width=width, height=height, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y
+    )
+
+
+def _widen(camera: Camera) -> Camera:
+    """Enlarge the picture on all sides at the same focal lengths."""
+    ratio = INTERPOLATED_VIEW_SIZE_RATIO
+    width, height = round(ratio * camera.width), round(ratio * camera.height)
+    return dataclasses.replace(
+        camera,
+        width=width,
+        height=height,
+        cx=camera.cx + (width - camera.width) / 2,
+        cy=camera.cy + (height - camera.height) / 2,
+    )
