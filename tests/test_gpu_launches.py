@@ -99,7 +99,7 @@ def test_a_step_waits_four_times(asked: Asked) -> None:
 def test_all_parts_of_a_step_are_counted(asked: Asked) -> None:
     names = {name for kind, name, _ in asked if kind == "launch"}
     kernels = {"look", "activate_backward", "encode_seen", "project", "blend_backward", "look_from_nodes"}
-    kernels |= {"composite_pixels", "pull_nodes", "step_numbers"}
+    kernels |= {"composite_kernel", "grad_grid_kernel", "adam_step_kernel"}
     assert names >= kernels | {"index_add_", "searchsorted", "zeros", "arange"}
     assert {name for kind, name, _ in asked if kind == "wait"} == {"tolist", "nonzero"}
     assert of_kind(asked, "copy") > 0  # the photo, at least

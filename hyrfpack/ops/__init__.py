@@ -1,1 +1,1 @@
-"""The few hot numeric operations: each one function with a reference and faster implementations behind it."""
+"""Performance-critical numeric operations. Each is one function with a reference and faster implementations."""

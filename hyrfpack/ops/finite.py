@@ -1,4 +1,4 @@
-"""Whether numbers are finite."""
+"""Checks tensors for NaN and infinity."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from torch import Tensor
 
 
 def all_finite(values: Tensor) -> bool:
-    """Whether no number of a tensor is NaN or infinite. Waits for the device once.
+    """Return whether no element of a tensor is NaN or infinite. Synchronises with the device once.
 
-    By its extremes, which are NaN where any number is: twice as fast as asking each.
+    Tests only the minimum and the maximum, which are NaN if any element is: twice as fast as testing every element.
     """
     return not values.numel() or all(map(isfinite, torch.stack(values.detach().aminmax()).tolist()))

@@ -1,4 +1,4 @@
-"""Bringing small things to a device."""
+"""Copies small amounts of data to a device without blocking."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from torch import Tensor
 
 
 def tensor_like(numbers: Sequence[float], other: Tensor) -> Tensor:
-    """A few numbers as a tensor of another's type, on its device.
+    """Return a few numbers as a tensor with the dtype and device of `other`.
 
-    As `other.new_tensor(numbers)`, which makes the host wait for all that a GPU still has to do; this does not.
+    Equivalent to `other.new_tensor(numbers)`, which makes the host wait until the GPU has finished all queued work.
+    This function does not wait.
     """
     return torch.tensor(numbers, dtype=other.dtype).to(other.device, non_blocking=other.is_cuda)

@@ -332,7 +332,7 @@ def _pretend(name: str) -> Iterator[object]:
     target = TARGETS[name]
     capability = (9, 4) if target.backend == "hip" else divmod(target.arch, 10)
     properties = SimpleNamespace(multi_processor_count=132, name=name)
-    yield mock.patch.object(dispatch, "choose", choose)  # before an operation takes it
+    yield mock.patch.object(dispatch, "choose_implementation", choose)  # before an operation takes it
     yield mock.patch.object(torch.version, "hip", "6.4" if target.backend == "hip" else None)
     yield mock.patch.object(torch.cuda, "get_device_properties", lambda *_: properties)
     yield mock.patch.object(torch.cuda, "get_device_capability", lambda *_: capability)

@@ -1,4 +1,4 @@
-"""Activation: what Gaussians store and what the geometry field says of them, put together."""
+"""Activates Gaussians: combines their stored logits with the outputs of the geometry field."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from hyrfpack.ops.activate import reference
 from hyrfpack.ops.activate.reference import scale_bounds
-from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.dispatch import choose_implementation
 
 __all__ = ["activate_geometry", "scale_bounds"]
 
@@ -24,40 +24,40 @@ def activate_geometry(
     rule: str = "sum",
     implementation: str = "auto",
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Scales, rotations and opacities of Gaussians (HyRF eq. 6, 7), from neural (n) and explicit (e) logits.
+    """Compute scales, rotations and opacities of Gaussians (HyRF eq. 6, 7) from neural (n) and explicit (e) logits.
 
         opacity = sigmoid(a_n + a_e)      rotation = r_n + (1, 0, 0, 0)
         scale = S(p) sigmoid(s_n + s_e),  or S(p) sigmoid(s_n) sigmoid(s_e) with rule "product"
 
     Args:
-        raw: (N, 8) what the field says: a_n, s_n (3), r_n (4). In any layout.
+        raw: (N, 8) outputs of the geometry field: a_n, s_n (3), r_n (4). In any layout.
         positions: (N, 3) p, local units.
         scale_logits, opacity_logits: (N, 1) s_e and a_e.
-        half_extent: of S(p), see `scale_bounds`.
+        half_extent: half-axes of the box in the definition of S(p), see `scale_bounds`; None for S(p) = 1.
         rule: "sum" or "product".
-        implementation: "auto", "reference" or "gpu" (float32), which has no gradient of positions and is offered where
-            none is wanted.
+        implementation: "auto", "reference" or "gpu" (float32). "gpu" computes no gradient of positions and is
+            available only if none is needed.
 
     Returns:
-        Scales (N, 3) local units, quaternions (N, 4) wxyz, not normalised, and opacities (N,) in (0, 1).
+        Scales (N, 3) in local units, quaternions (N, 4) wxyz, not normalised, and opacities (N,) in (0, 1).
         Differentiable once.
 
     Raises:
-        ValueError: shapes, types or devices do not fit together, or there is no such rule.
+        ValueError: shapes, dtypes or devices do not match, or the rule is unknown.
 
     Example:
-        >>> no_say, place, logits = torch.zeros(1, 8), torch.zeros(1, 3), torch.zeros(1, 1)
-        >>> activate_geometry(no_say, place, logits, logits)
+        >>> raw, positions, logits = torch.zeros(1, 8), torch.zeros(1, 3), torch.zeros(1, 1)
+        >>> activate_geometry(raw, positions, logits, logits)
         (tensor([[0.5000, 0.5000, 0.5000]]), tensor([[1., 0., 0., 0.]]), tensor([0.5000]))
     """
     count = len(raw)
     shapes = [tuple(tensor.shape) for tensor in (raw, positions, scale_logits, opacity_logits)]
     if shapes != [(count, 8), (count, 3), (count, 1), (count, 1)] or rule not in ("sum", "product"):
         raise ValueError(f"raw, positions, scale and opacity logits are {shapes}, the rule '{rule}'")
-    wanted = torch.is_grad_enabled() and positions.requires_grad
-    available = ("reference",) if wanted else ("reference", "gpu")
+    needs_position_grad = torch.is_grad_enabled() and positions.requires_grad
+    available = ("reference",) if needs_position_grad else ("reference", "gpu")
     run: Callable[..., tuple[Tensor, Tensor, Tensor]] = reference.activate_geometry
-    if choose(implementation, available, raw, positions, scale_logits, opacity_logits) == "gpu":
+    if choose_implementation(implementation, available, raw, positions, scale_logits, opacity_logits) == "gpu":
         from hyrfpack.ops.activate import gpu
 
         run = gpu.activate_geometry

@@ -1,4 +1,4 @@
-"""Activation in Triton: one launch there and one back, where plain torch takes a dozen each way."""
+"""Implements activation in Triton: one launch forward and one backward, where plain torch takes a dozen each."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-_BLOCK = 128
+_GAUSSIANS_PER_PROGRAM = 128
 
 
 @triton.jit
-def _bound(positions, index, live, half_extent, GROWS: tl.constexpr):
-    """S(p)."""
+def _scale_bounds(positions, index, live, half_extent, HAS_HALF_EXTENT: tl.constexpr):
+    """Return the scale bounds S(p) of a block of Gaussians, see `scale_bounds`."""
     bound = tl.full(index.shape, 1.0, tl.float32)
-    if GROWS:
+    if HAS_HALF_EXTENT:
         at = positions + index * 3
         x = tl.load(at, mask=live, other=0.0) / half_extent[0]
         y = tl.load(at + 1, mask=live, other=0.0) / half_extent[1]
         z = tl.load(at + 2, mask=live, other=0.0) / half_extent[2]
         length = tl.sqrt_rn(x * x + y * y + z * z)
-        bound = tl.where(length < 1, bound, length)  # a NaN stays one
+        bound = tl.where(length < 1, bound, length)  # Unlike a maximum, this keeps NaN.
     return bound
 
 
 @triton.jit(do_not_specialize=["total", "raw_row", "raw_column"])
 def activate(
     raw, raw_row, raw_column, positions, scale_logits, opacity_logits, half_extent, total, scales, quats, opacities,
-    GROWS: tl.constexpr, SUM: tl.constexpr, BLOCK: tl.constexpr,
+    HAS_HALF_EXTENT: tl.constexpr, RULE_IS_SUM: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write scales (N, 3), quats (N, 4) and opacities (N,)."""
     index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -36,11 +36,11 @@ def activate(
     first = raw + index * raw_row
     opacity = tl.load(first, mask=live, other=0.0) + tl.load(opacity_logits + index, mask=live, other=0.0)
     tl.store(opacities + index, tl.sigmoid(opacity), mask=live)
-    bound = _bound(positions, index, live, half_extent, GROWS)
+    bound = _scale_bounds(positions, index, live, half_extent, HAS_HALF_EXTENT)
     explicit = tl.load(scale_logits + index, mask=live, other=0.0)
     for axis in tl.static_range(3):
         neural = tl.load(first + (1 + axis) * raw_column, mask=live, other=0.0)
-        share = tl.sigmoid(neural + explicit) if SUM else tl.sigmoid(neural) * tl.sigmoid(explicit)
+        share = tl.sigmoid(neural + explicit) if RULE_IS_SUM else tl.sigmoid(neural) * tl.sigmoid(explicit)
         tl.store(scales + index * 3 + axis, share * bound, mask=live)
     for part in tl.static_range(4):
         neural = tl.load(first + (4 + part) * raw_column, mask=live, other=0.0)
@@ -51,7 +51,7 @@ def activate(
 def activate_backward(
     raw, raw_row, raw_column, positions, scale_logits, half_extent, opacities, grad_scales, grad_quats, grad_opacities,
     total, grad_raw, grad_row, grad_column, grad_scale_logits, grad_opacity_logits,
-    GROWS: tl.constexpr, SUM: tl.constexpr, BLOCK: tl.constexpr,
+    HAS_HALF_EXTENT: tl.constexpr, RULE_IS_SUM: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write the gradients of raw (N, 8) and of both logits (N, 1)."""
     index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -61,21 +61,21 @@ def activate_backward(
     grad = tl.load(grad_opacities + index, mask=live, other=0.0) * opacity * (1 - opacity)
     tl.store(grad_first, grad, mask=live)
     tl.store(grad_opacity_logits + index, grad, mask=live)
-    bound = _bound(positions, index, live, half_extent, GROWS)
+    bound = _scale_bounds(positions, index, live, half_extent, HAS_HALF_EXTENT)
     explicit = tl.load(scale_logits + index, mask=live, other=0.0)
     total_grad = tl.zeros_like(explicit)
     for axis in tl.static_range(3):
         neural = tl.load(first + (1 + axis) * raw_column, mask=live, other=0.0)
         grad = tl.load(grad_scales + index * 3 + axis, mask=live, other=0.0) * bound
-        if SUM:
+        if RULE_IS_SUM:
             share = tl.sigmoid(neural + explicit)
             grad *= share * (1 - share)
             total_grad += grad
         else:
-            mine, theirs = tl.sigmoid(neural), tl.sigmoid(explicit)
-            grad *= mine * theirs
-            total_grad += grad * (1 - theirs)
-            grad *= 1 - mine
+            neural_share, explicit_share = tl.sigmoid(neural), tl.sigmoid(explicit)
+            grad *= neural_share * explicit_share
+            total_grad += grad * (1 - explicit_share)
+            grad *= 1 - neural_share
         tl.store(grad_first + (1 + axis) * grad_column, grad, mask=live)
     tl.store(grad_scale_logits + index, total_grad, mask=live)
     for part in tl.static_range(4):
@@ -84,6 +84,8 @@ def activate_backward(
 
 
 class _Activate(torch.autograd.Function):
+    """Autograd function of `activate_geometry`; gives gradients of `raw` and of both logits."""
+
     @staticmethod
     def forward(
         ctx,
@@ -99,11 +101,16 @@ class _Activate(torch.autograd.Function):
             tensor.detach().contiguous() for tensor in (positions, scale_logits, opacity_logits)
         )
         scales, quats, opacities = raw.new_empty(total, 3), raw.new_empty(total, 4), raw.new_empty(total)
-        ctx.numbers = tuple(half_extent or (1.0, 1.0, 1.0))
-        ctx.constants = {"GROWS": half_extent is not None, "SUM": rule == "sum", "BLOCK": _BLOCK, "num_warps": 4}
+        ctx.half_extent = tuple(half_extent or (1.0, 1.0, 1.0))
+        ctx.constants = {
+            "HAS_HALF_EXTENT": half_extent is not None,
+            "RULE_IS_SUM": rule == "sum",
+            "BLOCK": _GAUSSIANS_PER_PROGRAM,
+            "num_warps": 4,
+        }
         if total:
-            activate[(triton.cdiv(total, _BLOCK),)](
-                raw, *raw.stride(), positions, scale_logits, opacity_logits, ctx.numbers, total,
+            activate[(triton.cdiv(total, _GAUSSIANS_PER_PROGRAM),)](
+                raw, *raw.stride(), positions, scale_logits, opacity_logits, ctx.half_extent, total,
                 scales, quats, opacities, **ctx.constants, enable_fp_fusion=True,
             )  # fmt: skip
         ctx.save_for_backward(raw, positions, scale_logits, opacities)
@@ -114,11 +121,11 @@ class _Activate(torch.autograd.Function):
     def backward(ctx, grad_scales: Tensor, grad_quats: Tensor, grad_opacities: Tensor) -> tuple[Tensor | None, ...]:
         raw, positions, scale_logits, opacities = ctx.saved_tensors
         total = len(raw)
-        grad_raw = torch.empty_like(raw)  # laid out so where no two numbers share a place
+        grad_raw = torch.empty_like(raw)  # This has the strides of `raw`, unless elements of `raw` share memory.
         grad_scale_logits, grad_opacity_logits = raw.new_empty(total, 1), raw.new_empty(total, 1)
         if total:
-            activate_backward[(triton.cdiv(total, _BLOCK),)](
-                raw, *raw.stride(), positions, scale_logits, ctx.numbers, opacities,
+            activate_backward[(triton.cdiv(total, _GAUSSIANS_PER_PROGRAM),)](
+                raw, *raw.stride(), positions, scale_logits, ctx.half_extent, opacities,
                 grad_scales.contiguous(), grad_quats.contiguous(), grad_opacities.contiguous(), total,
                 grad_raw, *grad_raw.stride(), grad_scale_logits, grad_opacity_logits,
                 **ctx.constants, enable_fp_fusion=True,
@@ -134,5 +141,5 @@ def activate_geometry(
     half_extent: tuple[float, float, float] | None,
     rule: str,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """As `hyrfpack.ops.activate.activate_geometry`, where no gradient of positions is wanted."""
+    """Compute `hyrfpack.ops.activate.activate_geometry` without a gradient of positions."""
     return _Activate.apply(raw, positions, scale_logits, opacity_logits, half_extent, rule)

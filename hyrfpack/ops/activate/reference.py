@@ -1,4 +1,4 @@
-"""Activation in plain torch, any device and dtype: the definition of right."""
+"""Implements activation in plain torch for any device and dtype. This reference defines the correct result."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from hyrfpack.ops.transfer import tensor_like
 
 
 def scale_bounds(positions: Tensor, half_extent: tuple[float, float, float] | None) -> Tensor:
-    """S(p), (N, 1): the largest scale that a Gaussian may have at positions (N, 3), both in local units.
+    """Return the largest scale S(p), (N, 1), that Gaussians at positions p (N, 3) may have, both in local units.
 
-    S(p) = max(1, |u|) with u = p / half_extent; 1 everywhere where that is None.
+    S(p) = max(1, |u|) with u = p / half_extent; S(p) = 1 everywhere if half_extent is None.
 
     Example:
         >>> scale_bounds(torch.tensor([[0.5, 0.0, 0.0], [6.0, 0.0, 0.0]]), (2.0, 2.0, 2.0))
@@ -31,11 +31,12 @@ def activate_geometry(
     half_extent: tuple[float, float, float] | None,
     rule: str,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """As `hyrfpack.ops.activate.activate_geometry`."""
+    """Compute `hyrfpack.ops.activate.activate_geometry` with torch operations that autograd differentiates."""
     opacities = torch.sigmoid(raw[:, 0] + opacity_logits[:, 0])
     if rule == "sum":
         shares = torch.sigmoid(raw[:, 1:4] + scale_logits)
     else:
         shares = torch.sigmoid(raw[:, 1:4]) * torch.sigmoid(scale_logits)
-    no_turn = torch.eye(1, 4, dtype=raw.dtype, device=raw.device)  # made there: a copy would make the host wait
-    return shares * scale_bounds(positions, half_extent), raw[:, 4:] + no_turn, opacities
+    # The identity is created on the device, because a copy from the host would block.
+    identity = torch.eye(1, 4, dtype=raw.dtype, device=raw.device)
+    return shares * scale_bounds(positions, half_extent), raw[:, 4:] + identity, opacities

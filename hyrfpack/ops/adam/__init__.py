@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015): one step of many parameters, in place."""
+"""Adam (Kingma and Ba 2015): takes one step on many parameters in place."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.ops.adam import reference
-from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.dispatch import choose_implementation
 
 __all__ = ["adam_step"]
 
@@ -26,35 +26,37 @@ def adam_step(
     eps: float = 1e-15,
     implementation: str = "auto",
 ) -> Tensor:
-    """Take one step of Adam, without weight decay, on every tensor.
+    """Take one Adam step without weight decay on every tensor.
 
         m <- b1 m + (1 - b1) g        v <- b2 v + (1 - b2) g^2
         x <- x - rate (m / (1 - b1^step)) / (sqrt(v / (1 - b2^step)) + eps)
 
-    An element whose g^2 is not finite (a NaN, an infinity or, in float32, beyond 1.8e19) keeps its x, m and v: one
-    such number would otherwise stay in them for ever. All other elements take their step.
+    An element whose g^2 is not finite (NaN, infinity or, in float32, |g| > 1.8e19) keeps its x, m and v. Otherwise a
+    single such gradient would make m and v non-finite permanently. All other elements are updated.
 
     Args:
-        values: x of each tensor, of any shape, contiguous. Changed.
-        gradients: g of each tensor, of the same shapes, in any layout.
-        exp_avg, exp_avg_sq: m and v of each tensor, as the values; zero before the first step. Changed.
-        step: number of this step, from 1, of all tensors or of each.
-        rate: learning rate, of all tensors or of each.
+        values: x of each tensor, of any shape, contiguous. Modified in place.
+        gradients: g of each tensor, with the shapes of `values`, in any layout.
+        exp_avg, exp_avg_sq: m and v of each tensor, shaped like `values`; zero before the first step. Modified in
+            place.
+        step: number of this step, counted from 1: one for all tensors, or one per tensor.
+        rate: learning rate: one for all tensors, or one per tensor.
         betas: b1 and b2, in [0, 1).
         eps: positive.
-        implementation: "auto", "reference", "cpu" (float32; torch's fused kernel, bit by bit as
+        implementation: "auto", "reference", "cpu" (float32; torch's fused kernel, bit-identical to
             torch.optim.Adam(fused=True)) or "gpu" (float32; one launch for all tensors).
 
     Returns:
-        Bool, one for each tensor, on their device: whether any element was left out. Nothing waits for the device.
+        (tensors,) bool on the device of the tensors: whether any element of a tensor was skipped. Does not
+        synchronise with the device.
 
     Raises:
-        ValueError: lists, shapes, types, devices or layouts do not fit together, or `step` is below 1.
+        ValueError: the lists differ in length, shapes, dtypes, devices or layouts do not match, or `step` is below 1.
 
     Example:
         >>> x, m, v = torch.ones(3), torch.zeros(3), torch.zeros(3)
-        >>> broken = adam_step([x], [torch.full((3,), 2.0)], [m], [v], step=1, rate=0.1)
-        >>> x, broken
+        >>> skipped = adam_step([x], [torch.full((3,), 2.0)], [m], [v], step=1, rate=0.1)
+        >>> x, skipped
         (tensor([0.9000, 0.9000, 0.9000]), tensor([False]))
     """
     tensors = list(zip(values, gradients, exp_avg, exp_avg_sq, strict=True))
@@ -69,7 +71,9 @@ def adam_step(
         raise ValueError(f"{len(tensors)} tensors and step {step}; there must be a tensor, and steps count from 1")
     if not len(steps) == len(rates) == len(tensors):
         raise ValueError(f"{len(tensors)} tensors, {len(steps)} steps and {len(rates)} rates")
-    chosen = choose(implementation, ("reference", "cpu", "gpu"), *(tensor for group in tensors for tensor in group))
+    chosen = choose_implementation(
+        implementation, ("reference", "cpu", "gpu"), *(tensor for group in tensors for tensor in group)
+    )
     run: Callable[..., Tensor] = reference.adam_step
     if chosen == "gpu":
         from hyrfpack.ops.adam import gpu

@@ -1,4 +1,4 @@
-"""A step of Adam in torch's fused kernel: the bits of torch.optim.Adam(fused=True)."""
+"""Implements the Adam step with torch's fused kernel, bit-identical to torch.optim.Adam(fused=True)."""
 
 from __future__ import annotations
 
@@ -21,26 +21,27 @@ def adam_step(
     betas: tuple[float, float],
     eps: float,
 ) -> Tensor:
-    """As `hyrfpack.ops.adam.adam_step`."""
-    gradients = [gradient.contiguous() for gradient in gradients]  # the kernel counts through all four alike
-    broken = [not _squares_are_finite(gradient) for gradient in gradients]
-    # Torch counts the steps, in one number for each tensor, before it uses them.
-    counts = (torch.tensor(steps, dtype=torch.float32) - 1).unbind()
-    alike: dict[float, list[int]] = defaultdict(list)  # what the kernel takes together
-    for place, rate in enumerate(rates):
-        if broken[place]:
-            one = [[tensors[place]] for tensors in (values, gradients, exp_avg, exp_avg_sq)]
-            reference.adam_step(one[0], one[1], one[2], one[3], [steps[place]], [rate], betas, eps)
+    """Take the step of `hyrfpack.ops.adam.adam_step`."""
+    # The fused kernel indexes all four tensors indices_by_rate, so that the gradients must be contiguous too.
+    gradients = [gradient.contiguous() for gradient in gradients]
+    skipped = [not _squares_are_finite(gradient) for gradient in gradients]
+    # Torch increments each tensor's step number before it uses it.
+    previous_steps = (torch.tensor(steps, dtype=torch.float32) - 1).unbind()
+    indices_by_rate: dict[float, list[int]] = defaultdict(list)  # One kernel call takes tensors of one learning rate.
+    for index, rate in enumerate(rates):
+        if skipped[index]:
+            x, g, m, v = ([tensors[index]] for tensors in (values, gradients, exp_avg, exp_avg_sq))
+            reference.adam_step(x, g, m, v, [steps[index]], [rate], betas, eps)
         else:
-            alike[rate].append(place)
-    for rate, places in alike.items():
+            indices_by_rate[rate].append(index)
+    for rate, indices in indices_by_rate.items():
         adam(
-            [values[place] for place in places],
-            [gradients[place] for place in places],
-            [exp_avg[place] for place in places],
-            [exp_avg_sq[place] for place in places],
+            [values[index] for index in indices],
+            [gradients[index] for index in indices],
+            [exp_avg[index] for index in indices],
+            [exp_avg_sq[index] for index in indices],
             [],
-            [counts[place] for place in places],
+            [previous_steps[index] for index in indices],
             fused=True,
             amsgrad=False,
             beta1=betas[0],
@@ -50,11 +51,12 @@ def adam_step(
             eps=eps,
             maximize=False,
         )
-    return torch.tensor(broken)
+    return torch.tensor(skipped)
 
 
 def _squares_are_finite(gradient: Tensor) -> bool:
+    """Return whether g^2 is finite for all elements of a gradient."""
     if not gradient.numel():
         return True
-    low, high = gradient.aminmax()  # one pass; a NaN anywhere is in both
+    low, high = gradient.aminmax()  # Takes one pass; both are NaN if any element is.
     return bool((torch.maximum(-low, high) ** 2).isfinite())

@@ -1,4 +1,4 @@
-"""A step of Adam in plain torch, any device and dtype: the definition of right."""
+"""Implements the Adam step in plain torch for any device and dtype. This reference defines the correct result."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ def adam_step(
     betas: tuple[float, float],
     eps: float,
 ) -> Tensor:
-    """As `hyrfpack.ops.adam.adam_step`."""
+    """Take the step of `hyrfpack.ops.adam.adam_step`."""
     beta1, beta2 = betas
-    broken = []
+    skipped = []
     for x, g, m, v, step, rate in zip(values, gradients, exp_avg, exp_avg_sq, steps, rates, strict=True):
         correction1, correction2 = 1 - beta1**step, 1 - beta2**step
         finite = (g * g).isfinite()
-        broken.append(~finite.all())
+        skipped.append(~finite.all())
         new_m = beta1 * m + (1 - beta1) * g
         new_v = beta2 * v + (1 - beta2) * (g * g)
         new_x = x - rate / correction1 * new_m / (new_v.sqrt() / math.sqrt(correction2) + eps)
         for old, new in ((x, new_x), (m, new_m), (v, new_v)):
             old.copy_(torch.where(finite, new, old))
-    return torch.stack(broken)
+    return torch.stack(skipped)

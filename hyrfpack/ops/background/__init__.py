@@ -15,7 +15,7 @@ from hyrfpack.ops.background.reference import (
     pixel_directions,
     sphere_points,
 )
-from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.dispatch import choose_implementation
 from hyrfpack.ops.mlp import WIDEST
 from hyrfpack.ops.shade.directions import DIRECTION_FEATURES
 
@@ -94,7 +94,7 @@ def background_grid(
     wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in field)
     available = ("reference", "gpu") if fits else ("reference",)
     run: Callable[..., Tensor] = reference.background_grid
-    if choose(implementation, available, transmittance, *field) == "gpu":
+    if choose_implementation(implementation, available, transmittance, *field) == "gpu":
         from hyrfpack.ops.background import gpu
 
         run = gpu.learnable_grid if wanted else gpu.background_grid

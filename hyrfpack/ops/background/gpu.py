@@ -20,7 +20,7 @@ from torch import Tensor
 
 from hyrfpack.ops.background.reference import RADIUS, field_colors, grid_size
 from hyrfpack.ops.contraction.gpu import contract_block
-from hyrfpack.ops.gpu_pairs import unpack
+from hyrfpack.ops.gpu_pairs import unpack_pair
 from hyrfpack.ops.hash_encode.gpu import axis_vertices, level_numbers, vertex_row, whole_rows
 from hyrfpack.ops.mlp.tiles import factor, precision, product, relu_factor
 from hyrfpack.ops.poses import camera_center
@@ -99,7 +99,7 @@ def _features(x, y, z, table, levels, needed, LEVELS: tl.constexpr, HEIGHT: tl.c
             weight_x, row_x = (x1, row_x1) if corner & 1 else (1 - x1, row_x0)
             weight_y, row_y = (y1, row_y1) if corner & 2 else (1 - y1, row_y0)
             weight_z, row_z = (z1, row_z1) if corner & 4 else (1 - z1, row_z0)
-            value0, value1 = unpack(tl.load(rows + vertex_row(row_x, row_y, row_z, mask), mask=needed, other=0))
+            value0, value1 = unpack_pair(tl.load(rows + vertex_row(row_x, row_y, row_z, mask), mask=needed, other=0))
             weight = weight_x * (weight_y * weight_z)
             feature0 += weight * value0
             feature1 += weight * value1

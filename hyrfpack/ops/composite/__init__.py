@@ -1,4 +1,4 @@
-"""Compositing: a picture in front of a background that is known at a grid of its pixels."""
+"""Composites an image over a background that is given at a grid of its pixels."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from torch import Tensor
 
 from hyrfpack.ops.background import grid_size
 from hyrfpack.ops.composite import reference
-from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.dispatch import choose_implementation
 
 __all__ = ["composite"]
 
 
 def composite(rgb: Tensor, transmittance: Tensor, grid: Tensor, stride: int, *, implementation: str = "auto") -> Tensor:
-    """Fill the light that is left: C = C_fg + T B, with B interpolated linearly between the nodes of a grid.
+    """Composite an image over the background: C = C_fg + T B, with B interpolated bilinearly between grid nodes.
 
     Args:
-        rgb: (H, W, 3) C_fg, what is in front.
-        transmittance: (H, W) T, the share of light that passes it.
-        grid: (R, S, 3) B at the pixels 0, stride, 2 stride, ... of both axes, the last at or past the picture's edge,
-            as `background_grid` gives it; in any layout.
-        stride: pixels from node to node, at least 1.
-        implementation: "auto", "reference" or "gpu" (float32). On CUDA the reference's gradient adds up by atomics,
-            so that equal runs differ; that of "gpu" gathers what is each node's.
+        rgb: (H, W, 3) C_fg, the foreground, premultiplied by its alpha.
+        transmittance: (H, W) T, the transmittance of the foreground.
+        grid: (R, S, 3) B at the pixels 0, stride, 2 stride, ... of both axes, as returned by `background_grid`. The
+            last node of an axis lies at or past the image's edge. In any layout.
+        stride: pixels between neighbouring nodes, at least 1.
+        implementation: "auto", "reference" or "gpu" (float32). On CUDA the reference accumulates its gradient by
+            atomics, so that equal runs differ; "gpu" gathers each node's gradient in a fixed order.
 
     Returns:
-        (H, W, 3). Differentiable once in all three.
+        (H, W, 3). Differentiable once in `rgb`, `transmittance` and `grid`.
 
     Raises:
-        ValueError: shapes, types or devices do not fit together.
+        ValueError: shapes, dtypes or devices do not match.
 
     Example:
         >>> import torch
@@ -45,7 +45,7 @@ def composite(rgb: Tensor, transmittance: Tensor, grid: Tensor, stride: int, *, 
             f"{stride}-th pixel do not fit together"
         )
     run: Callable[..., Tensor] = reference.composite
-    if choose(implementation, ("reference", "gpu"), rgb, transmittance, grid) == "gpu":
+    if choose_implementation(implementation, ("reference", "gpu"), rgb, transmittance, grid) == "gpu":
         from hyrfpack.ops.composite import gpu
 
         run = gpu.composite

@@ -1,5 +1,7 @@
-"""Compositing in Triton: one launch there, two back. A node gathers its gradient from the pixels around it, so that
-equal runs give equal bits."""
+"""Implements compositing in Triton: one launch forward, two backward.
+
+Each node gathers its gradient from the pixels around it, so that equal runs give equal bits.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +11,17 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-_BLOCK = 256
+_ELEMENTS_PER_PROGRAM = 256  # An element is a pixel or a grid node.
 
 
 @triton.jit
-def _behind(grid, strides, channel: tl.constexpr, y, x, stride, live):
-    """A channel of the background at pixels (y, x)."""
+def _interpolate_background(grid, strides, channel: tl.constexpr, y, x, stride, live):
+    """Return one channel of the background, interpolated at pixels (y, x)."""
     row, column = y // stride, x // stride
     down, right = (y % stride).to(tl.float32) / stride, (x % stride).to(tl.float32) / stride
     at = grid + row * strides[0] + column * strides[1] + channel * strides[2]
-    below, beside = tl.where(down > 0, strides[0], 0), tl.where(right > 0, strides[1], 0)  # never past the last node
+    # Offsets are 0 at nodes, so that nothing past the last node is read.
+    below, beside = tl.where(down > 0, strides[0], 0), tl.where(right > 0, strides[1], 0)
     first, second = tl.load(at, mask=live, other=0.0), tl.load(at + beside, mask=live, other=0.0)
     third, fourth = tl.load(at + below, mask=live, other=0.0), tl.load(at + below + beside, mask=live, other=0.0)
     upper, lower = first + right * (second - first), third + right * (fourth - third)
@@ -26,39 +29,41 @@ def _behind(grid, strides, channel: tl.constexpr, y, x, stride, live):
 
 
 @triton.jit
-def _pixel(width, total, BLOCK: tl.constexpr):
-    """Pixels of this program: number, row, column, and which there are."""
+def _pixel_block(width, total, BLOCK: tl.constexpr):
+    """Return the index, row and column of this program's pixels, and a mask of those inside the image."""
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     return pixel.to(tl.int64), pixel // width, pixel % width, pixel < total
 
 
 @triton.jit(do_not_specialize=["width", "total", "row", "column", "channel", "stride"])
-def composite_pixels(
+def composite_kernel(
     rgb, transmittance, grid, row, column, channel, stride, width, total, out, BLOCK: tl.constexpr
 ):  # fmt: skip
-    """Write the picture (H, W, 3). row, column, channel: strides of the grid."""
-    pixel, y, x, live = _pixel(width, total, BLOCK)
-    passed = tl.load(transmittance + pixel, mask=live, other=0.0)
+    """Write the composited image (H, W, 3). row, column, channel: strides of the grid."""
+    pixel, y, x, live = _pixel_block(width, total, BLOCK)
+    transmitted = tl.load(transmittance + pixel, mask=live, other=0.0)
     for part in tl.static_range(3):
         front = tl.load(rgb + pixel * 3 + part, mask=live, other=0.0)
-        behind = _behind(grid, (row, column, channel), part, y, x, stride, live)
-        tl.store(out + pixel * 3 + part, front + passed * behind, mask=live)
+        background = _interpolate_background(grid, (row, column, channel), part, y, x, stride, live)
+        tl.store(out + pixel * 3 + part, front + transmitted * background, mask=live)
 
 
 @triton.jit(do_not_specialize=["width", "total", "row", "column", "channel", "stride"])
-def pull_light(grad, grid, row, column, channel, stride, width, total, grad_light, BLOCK: tl.constexpr):
-    """Write the gradient of the transmittance (H, W)."""
-    pixel, y, x, live = _pixel(width, total, BLOCK)
-    pulled = tl.zeros([BLOCK], tl.float32)
+def grad_transmittance_kernel(
+    grad, grid, row, column, channel, stride, width, total, grad_transmittance, BLOCK: tl.constexpr
+):
+    """Write the gradient by the transmittance (H, W)."""
+    pixel, y, x, live = _pixel_block(width, total, BLOCK)
+    gradient = tl.zeros([BLOCK], tl.float32)
     for part in tl.static_range(3):
-        behind = _behind(grid, (row, column, channel), part, y, x, stride, live)
-        pulled += tl.load(grad + pixel * 3 + part, mask=live, other=0.0) * behind
-    tl.store(grad_light + pixel, pulled, mask=live)
+        background = _interpolate_background(grid, (row, column, channel), part, y, x, stride, live)
+        gradient += tl.load(grad + pixel * 3 + part, mask=live, other=0.0) * background
+    tl.store(grad_transmittance + pixel, gradient, mask=live)
 
 
 @triton.jit(do_not_specialize=["height", "width", "columns", "total", "stride"])
-def pull_nodes(grad, transmittance, stride, height, width, columns, total, grad_grid, BLOCK: tl.constexpr):
-    """Write the gradient of the grid, channel by channel (3, R, S)."""
+def grad_grid_kernel(grad, transmittance, stride, height, width, columns, total, grad_grid, BLOCK: tl.constexpr):
+    """Write the gradient by the grid, planar (3, R, S)."""
     node = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = node < total
     row, column = node // columns * stride, node % columns * stride
@@ -71,10 +76,10 @@ def pull_nodes(grad, transmittance, stride, height, width, columns, total, grad_
             inside = live & (y >= 0) & (y < height) & (x >= 0) & (x < width)
             pixel = y.to(tl.int64) * width + x
             share = (1 - tl.abs(down).to(tl.float32) / stride) * (1 - tl.abs(right).to(tl.float32) / stride)
-            passed = share * tl.load(transmittance + pixel, mask=inside, other=0.0)
-            red += passed * tl.load(grad + pixel * 3, mask=inside, other=0.0)
-            green += passed * tl.load(grad + pixel * 3 + 1, mask=inside, other=0.0)
-            blue += passed * tl.load(grad + pixel * 3 + 2, mask=inside, other=0.0)
+            transmitted = share * tl.load(transmittance + pixel, mask=inside, other=0.0)
+            red += transmitted * tl.load(grad + pixel * 3, mask=inside, other=0.0)
+            green += transmitted * tl.load(grad + pixel * 3 + 1, mask=inside, other=0.0)
+            blue += transmitted * tl.load(grad + pixel * 3 + 2, mask=inside, other=0.0)
             right += 1
         down += 1
     at = grad_grid + node.to(tl.int64)
@@ -84,13 +89,15 @@ def pull_nodes(grad, transmittance, stride, height, width, columns, total, grad_
 
 
 class _Composite(torch.autograd.Function):
+    """Autograd function of `composite`."""
+
     @staticmethod
     def forward(ctx, rgb: Tensor, transmittance: Tensor, grid: Tensor, stride: int) -> Tensor:
         rgb, transmittance = rgb.detach().contiguous(), transmittance.detach().contiguous()
         picture = torch.empty_like(rgb)
-        composite_pixels[(triton.cdiv(transmittance.numel(), _BLOCK),)](
+        composite_kernel[(triton.cdiv(transmittance.numel(), _ELEMENTS_PER_PROGRAM),)](
             rgb, transmittance, grid.detach(), *grid.stride(), stride, transmittance.shape[1], transmittance.numel(),
-            picture, BLOCK=_BLOCK, num_warps=4, enable_fp_fusion=True,
+            picture, BLOCK=_ELEMENTS_PER_PROGRAM, num_warps=4, enable_fp_fusion=True,
         )  # fmt: skip
         ctx.save_for_backward(transmittance, grid)
         ctx.stride = stride
@@ -101,23 +108,23 @@ class _Composite(torch.autograd.Function):
     def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
         transmittance, grid = ctx.saved_tensors
         (height, width), (rows, columns, _), pixels = transmittance.shape, grid.shape, transmittance.numel()
-        contiguous, grad_light, grad_grid = grad.contiguous(), None, None
+        contiguous, grad_transmittance, grad_grid = grad.contiguous(), None, None
         if ctx.needs_input_grad[1]:
-            grad_light = torch.empty_like(transmittance)
-            pull_light[(triton.cdiv(pixels, _BLOCK),)](
-                contiguous, grid, *grid.stride(), ctx.stride, width, pixels, grad_light,
-                BLOCK=_BLOCK, num_warps=4, enable_fp_fusion=True,
+            grad_transmittance = torch.empty_like(transmittance)
+            grad_transmittance_kernel[(triton.cdiv(pixels, _ELEMENTS_PER_PROGRAM),)](
+                contiguous, grid, *grid.stride(), ctx.stride, width, pixels, grad_transmittance,
+                BLOCK=_ELEMENTS_PER_PROGRAM, num_warps=4, enable_fp_fusion=True,
             )  # fmt: skip
         if ctx.needs_input_grad[2]:
             grad_grid = grid.new_empty(3, rows, columns)
-            pull_nodes[(triton.cdiv(rows * columns, _BLOCK),)](
+            grad_grid_kernel[(triton.cdiv(rows * columns, _ELEMENTS_PER_PROGRAM),)](
                 contiguous, transmittance, ctx.stride, height, width, columns, rows * columns, grad_grid,
-                BLOCK=_BLOCK, num_warps=4, enable_fp_fusion=True,
+                BLOCK=_ELEMENTS_PER_PROGRAM, num_warps=4, enable_fp_fusion=True,
             )  # fmt: skip
             grad_grid = grad_grid.permute(1, 2, 0)
-        return grad, grad_light, grad_grid, None
+        return grad, grad_transmittance, grad_grid, None
 
 
 def composite(rgb: Tensor, transmittance: Tensor, grid: Tensor, stride: int) -> Tensor:
-    """As `hyrfpack.ops.composite.composite`."""
+    """Compute `hyrfpack.ops.composite.composite`."""
     return _Composite.apply(rgb, transmittance, grid, stride)

@@ -1,4 +1,4 @@
-"""Compositing in plain torch, any device and dtype: the definition of right."""
+"""Implements compositing in plain torch for any device and dtype. This reference defines the correct result."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from torch import Tensor
 
 
 def composite(rgb: Tensor, transmittance: Tensor, grid: Tensor, stride: int) -> Tensor:
-    """As `hyrfpack.ops.composite.composite`."""
+    """Compute `hyrfpack.ops.composite.composite` with torch operations that autograd differentiates."""
     height, width = transmittance.shape
-    behind = _upsample(grid.permute(2, 0, 1), stride)[:, :height, :width].permute(1, 2, 0)
-    return rgb + transmittance[..., None] * behind
+    background = _upsample(grid.permute(2, 0, 1), stride)[:, :height, :width].permute(1, 2, 0)
+    return rgb + transmittance[..., None] * background
 
 
 def _upsample(grid: Tensor, stride: int) -> Tensor:
-    """Every node of a grid (C, R, S) and stride - 1 values between it and the next, along both axes."""
+    """Insert stride - 1 interpolated values between neighbouring nodes of a grid (C, R, S), along both axes."""
     if stride == 1:
         return grid
     size = ((grid.shape[1] - 1) * stride + 1, (grid.shape[2] - 1) * stride + 1)

@@ -1,4 +1,4 @@
-"""The unit cube that holds all of space: where the hash grids live."""
+"""Contracts unbounded space into the unit cube, the domain of the hash grids."""
 
 from __future__ import annotations
 
@@ -7,36 +7,36 @@ from torch import Tensor
 
 from hyrfpack.ops.contraction import reference
 from hyrfpack.ops.contraction.reference import expand
-from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.dispatch import choose_implementation
 from hyrfpack.ops.transfer import tensor_like
 
 __all__ = ["contract", "expand"]
 
-UNIT_BOX = (1.0, 1.0, 1.0)
+UNIT_HALF_EXTENT = (1.0, 1.0, 1.0)
 
 
 def contract(
-    points: Tensor, half_extent: tuple[float, float, float] = UNIT_BOX, *, implementation: str = "auto"
+    points: Tensor, half_extent: tuple[float, float, float] = UNIT_HALF_EXTENT, *, implementation: str = "auto"
 ) -> Tensor:
     """Map points into the open unit cube.
 
-    The ball |u| <= 1 of u = p / half_extent fills the inner half; everything outside is squeezed into the shell around
-    it (mip-NeRF 360 contraction, shifted and scaled to (0, 1) as HyRF eq. 3 intends):
+    With u = p / half_extent, the ball |u| <= 1 fills the inner half of the cube. Everything outside is squeezed into
+    the shell around it (mip-NeRF 360 contraction, shifted and scaled to (0, 1) as HyRF eq. 3 intends):
 
         c(u) = 0.25 u + 0.5                          |u| <= 1
         c(u) = 0.25 (2 - 1/|u|) u/|u| + 0.5          otherwise
 
     Args:
         points: (..., 3) p, any finite value.
-        half_extent: half-axes of the box around the origin that becomes [-1, 1]^3, positive.
-        implementation: "auto", "reference" or "gpu" (float32), which has no backward pass and is offered where no
-            gradient is wanted.
+        half_extent: half-axes of the box around the origin that is scaled to [-1, 1]^3, positive.
+        implementation: "auto", "reference" or "gpu" (float32). "gpu" has no backward pass and is available only if
+            no gradient is needed.
 
     Returns:
         (..., 3) in [0, 1]. Differentiable everywhere, also at |u| = 1 (C1).
 
     Raises:
-        ValueError: the points have no three coordinates, or the implementation cannot take them.
+        ValueError: the last axis of `points` is not 3, or the implementation does not support these points.
 
     Example:
         >>> contract(torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))[:, 0]
@@ -44,9 +44,9 @@ def contract(
     """
     if not points.ndim or points.shape[-1] != 3:
         raise ValueError(f"points {tuple(points.shape)} do not end in 3 coordinates")
-    wanted = torch.is_grad_enabled() and points.requires_grad
-    if choose(implementation, ("reference",) if wanted else ("reference", "gpu"), points) == "gpu":
+    needs_grad = torch.is_grad_enabled() and points.requires_grad
+    if choose_implementation(implementation, ("reference",) if needs_grad else ("reference", "gpu"), points) == "gpu":
         from hyrfpack.ops.contraction import gpu
 
         return gpu.contract(points, half_extent)
-    return reference.contract(points if half_extent == UNIT_BOX else points / tensor_like(half_extent, points))
+    return reference.contract(points if half_extent == UNIT_HALF_EXTENT else points / tensor_like(half_extent, points))

@@ -1,4 +1,7 @@
-"""The contraction in Triton: one launch, no gradients. `contract_block` is for kernels that contract on their way."""
+"""Implements the contraction in Triton: one launch, no gradients.
+
+Other kernels call `contract_block` to contract points without storing them.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +10,12 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-_BLOCK = 256
+_POINTS_PER_PROGRAM = 256
 
 
 @triton.jit
 def contract_block(x, y, z):
-    """`reference.contract` of blocks of coordinates u."""
+    """Contract blocks of normalised coordinates u, as `reference.contract` does."""
     largest = tl.maximum(tl.maximum(tl.maximum(tl.abs(x), tl.abs(y)), tl.abs(z)), 1.0)
     a, b, c = x / largest, y / largest, z / largest
     radius = tl.maximum(tl.sqrt_rn(a * a + b * b + c * c), 1 / largest) * largest
@@ -22,7 +25,7 @@ def contract_block(x, y, z):
 
 @triton.jit(do_not_specialize=["total"])
 def contract_points(points, half_extent, total, cube, BLOCK: tl.constexpr):
-    """Points (total, 3) to the cube (total, 3); half_extent is a tuple of 3 numbers."""
+    """Contract `points` (total, 3) into `cube` (total, 3); half_extent is a tuple of 3 numbers."""
     index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live, at = index < total, points + index * 3
     x = tl.load(at, mask=live, other=0.0) / half_extent[0]
@@ -36,11 +39,11 @@ def contract_points(points, half_extent, total, cube, BLOCK: tl.constexpr):
 
 
 def contract(points: Tensor, half_extent: tuple[float, float, float]) -> Tensor:
-    """As `hyrfpack.ops.contraction.contract`, where no gradient is wanted."""
+    """Compute `hyrfpack.ops.contraction.contract` without gradients."""
     points = points.detach().contiguous()
     cube, total = torch.empty_like(points), points.numel() // 3
     if total:
-        contract_points[(triton.cdiv(total, _BLOCK),)](
-            points, tuple(half_extent), total, cube, BLOCK=_BLOCK, num_warps=4, enable_fp_fusion=True
+        contract_points[(triton.cdiv(total, _POINTS_PER_PROGRAM),)](
+            points, tuple(half_extent), total, cube, BLOCK=_POINTS_PER_PROGRAM, num_warps=4, enable_fp_fusion=True
         )
     return cube

@@ -1,4 +1,7 @@
-"""The contraction and its inverse in plain torch, any device and dtype: the definition of right."""
+"""Implements the contraction and its inverse in plain torch for any device and dtype.
+
+This reference defines the correct result.
+"""
 
 from __future__ import annotations
 
@@ -7,20 +10,20 @@ from torch import Tensor
 
 
 def contract(u: Tensor) -> Tensor:
-    """As `hyrfpack.ops.contraction.contract`, of points (..., 3) that are u already."""
-    # Divided by the largest component first: the square of 1e30 would overflow float32.
+    """Compute `hyrfpack.ops.contraction.contract` for normalised coordinates u (..., 3)."""
+    # The vector is divided by its largest component first, because the square of 1e30 would overflow float32.
     largest = u.abs().amax(-1, keepdim=True).clamp_min(1)
     radius = torch.linalg.vector_norm(u / largest, dim=-1, keepdim=True).clamp_min(1 / largest) * largest
     return 0.25 * (2 - 1 / radius) * (u / radius) + 0.5
 
 
 def expand(c: Tensor) -> Tensor:
-    """The inverse of `contract`: points (..., 3) of the cube to normalised coordinates u.
+    """Map points (..., 3) of the cube back to normalised coordinates u, the inverse of `contract`.
 
         u = y                             |y| <= 1,     y = 4 (c - 0.5)
         u = y / (|y| (2 - |y|))           otherwise
 
-    Points at or past |y| = 2, which no finite u maps to, are taken just inside: |u| stays below 2^20.
+    No finite u maps to |y| >= 2. Such points are treated as if they lay just inside, so that |u| stays below 2^20.
 
     Example:
         >>> expand(torch.tensor([[0.875, 0.5, 0.5]]))

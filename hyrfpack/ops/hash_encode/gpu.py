@@ -24,7 +24,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyrfpack.ops.gpu_pairs import unpack
+from hyrfpack.ops.gpu_pairs import unpack_pair
 from hyrfpack.ops.hash_encode.reference import PRIME_Y, PRIME_Z, level_offsets
 
 # One point a thread: no value changes threads on its way to a fetch or an atomic, and 32 registers let every thread
@@ -81,7 +81,7 @@ def encode_level(coords, axis_stride, point_stride, table, levels, out, points, 
         x, row_x = (x1, row_x1) if corner & 1 else (1 - x1, row_x0)
         y, row_y = (y1, row_y1) if corner & 2 else (1 - y1, row_y0)
         z, row_z = (z1, row_z1) if corner & 4 else (1 - z1, row_z0)
-        value0, value1 = unpack(tl.load(table + vertex_row(row_x, row_y, row_z, mask)))
+        value0, value1 = unpack_pair(tl.load(table + vertex_row(row_x, row_y, row_z, mask)))
         weight = x * (y * z)
         feature0 += weight * value0
         feature1 += weight * value1
@@ -175,7 +175,7 @@ def descend_levels(
             x, row_x = (x1, row_x1) if corner & 1 else (1 - x1, row_x0)
             y, row_y = (y1, row_y1) if corner & 2 else (1 - y1, row_y0)
             z, row_z = (z1, row_z1) if corner & 4 else (1 - z1, row_z0)
-            value0, value1 = unpack(tl.load(table + offset + vertex_row(row_x, row_y, row_z, mask)))
+            value0, value1 = unpack_pair(tl.load(table + offset + vertex_row(row_x, row_y, row_z, mask)))
             value = grad0 * value0 + grad1 * value1
             along_x += (value if corner & 1 else -value) * (y * z)
             along_y += (value if corner & 2 else -value) * (x * z)

@@ -1,11 +1,11 @@
-"""Small least-squares problems, many at once."""
+"""Solves many small least-squares problems at once."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.dispatch import choose_implementation
 from hyrfpack.ops.least_squares import reference
 
 __all__ = ["least_squares"]
@@ -22,16 +22,16 @@ def least_squares(
     *,
     implementation: str = "auto",
 ) -> Tensor:
-    """Solve many small weighted least-squares problems with some terms in common. Not differentiable.
+    """Solve many small weighted least-squares problems that share a Gram matrix. Not differentiable.
 
-    Problem n has the rows r whose index is n, and minimises
+    Problem n consists of the rows r whose index is n, and minimises
 
         sum_r w_r |b_r h - v_r|^2 + tr(h^T G h) - 2 tr(right_n^T h)
 
-    where G and `right` hold what is known of it beforehand: a ridge, rows that all problems share.
+    G and `right` add terms that are known in advance, such as a ridge or rows that all problems share.
 
     Args:
-        index: (R,) int64, the problem of each row, in any order.
+        index: (R,) int64 in [0, N), the problem of each row, in any order.
         basis: (R, K) float32 b.
         values: (R, C) float32 v.
         weights: (R,) float32 w, 0 or more.
@@ -40,7 +40,7 @@ def least_squares(
         implementation: "auto", "reference" or "cpu".
 
     Returns:
-        (N, K, C) float32 h, by normal equations in float64; NaN where these are not positive definite.
+        (N, K, C) float32 h, solved by normal equations in float64; NaN where these are not positive definite.
 
     Example:
         >>> basis, values = torch.tensor([[1.0, 0.0], [1.0, 1.0]]), torch.tensor([[3.0], [5.0]])
@@ -49,7 +49,7 @@ def least_squares(
         [3.0, 2.0]
     """
     rows = basis, values, weights
-    if choose(implementation, ("reference", "cpu"), *rows) == "cpu":
+    if choose_implementation(implementation, ("reference", "cpu"), *rows) == "cpu":
         from hyrfpack.ops.least_squares import cpu
 
         return torch.from_numpy(cpu.least_squares(*(part.contiguous().numpy() for part in (index, *rows, gram, right))))

@@ -1,6 +1,6 @@
-"""Small least-squares problems on the CPU: compiled, one after the other, so that each stays in the first cache.
+"""Solves small least-squares problems on the CPU in compiled code, one at a time, so that each stays in the L1 cache.
 
-Batched LAPACK spends most of its time between such small matrices, and batched products write them all to memory.
+For such small matrices, batched LAPACK calls are mostly overhead, and batched products write all matrices to memory.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ _kernel = compiled(fastmath={"contract", "nsz"}, error_model="numpy")
 
 @_kernel
 def least_squares(index, basis, values, weights, gram, right):
-    """As `hyrfpack.ops.least_squares.least_squares`, with arrays."""
+    """Solve the problems of `hyrfpack.ops.least_squares.least_squares`, given as arrays."""
     problems, terms, columns = right.shape
     solved = np.empty((problems, terms, columns), np.float32)
-    order, starts = _by_problem(index, problems)
+    order, starts = _group_by_problem(index, problems)
     factor, unknowns, row = np.empty((terms, terms)), np.empty((terms, columns)), np.empty(terms)
     for problem in range(problems):
         for i in range(terms):
@@ -27,8 +27,8 @@ def least_squares(index, basis, values, weights, gram, right):
                 factor[i, j] = gram[i, j]
             for c in range(columns):
                 unknowns[i, c] = right[problem, i, c]
-        for place in range(starts[problem], starts[problem + 1]):
-            at = order[place]
+        for position in range(starts[problem], starts[problem + 1]):
+            at = order[position]
             weight = np.float64(weights[at])
             for i in range(terms):
                 row[i] = basis[at, i]
@@ -47,29 +47,33 @@ def least_squares(index, basis, values, weights, gram, right):
 
 
 @_kernel
-def _by_problem(index, problems):
-    """The rows (R,) in the order of their problems, and where each problem's begin (problems + 1,)."""
+def _group_by_problem(index, problems):
+    """Group rows by problem.
+
+    Returns:
+        (R,) the row indices sorted by problem, and (problems + 1,) the position of each problem's first row therein.
+    """
     starts = np.zeros(problems + 1, np.int64)
     for at in index:
         starts[at + 1] += 1
     for problem in range(problems):
         starts[problem + 1] += starts[problem]
-    order, places = np.empty(len(index), np.int64), starts[:-1].copy()
+    order, next_positions = np.empty(len(index), np.int64), starts[:-1].copy()
     for row in range(len(index)):
-        order[places[index[row]]] = row
-        places[index[row]] += 1
+        order[next_positions[index[row]]] = row
+        next_positions[index[row]] += 1
     return order, starts
 
 
 @_kernel
 def _factorise(matrix):
-    """Cholesky: the lower triangle of a matrix becomes that of its factor."""
+    """Replace the lower triangle of a symmetric matrix by its Cholesky factor."""
     for i in range(len(matrix)):
         for j in range(i + 1):
             rest = matrix[i, j]
             for k in range(j):
                 rest -= matrix[i, k] * matrix[j, k]
-            # The root of what is not positive is NaN, and with it all that follows.
+            # If the matrix is not positive definite, the root is NaN, and so is everything computed from it.
             matrix[i, j] = math.sqrt(rest if rest > 0 else math.nan) if i == j else rest / matrix[j, j]
 
 

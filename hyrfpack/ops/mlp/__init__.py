@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.dispatch import choose_implementation
 from hyrfpack.ops.mlp import reference
 
 __all__ = ["WIDEST", "mlp"]
@@ -59,7 +59,7 @@ def mlp(
     ):
         shapes = [tuple(tensor.shape) for tensor in (x, *weights, *biases)]
         raise ValueError(f"x, weights and biases do not form layers: {shapes}")
-    chosen = choose(implementation, ("reference", "cpu", "gpu"), x, *weights, *biases)
+    chosen = choose_implementation(implementation, ("reference", "cpu", "gpu"), x, *weights, *biases)
     if chosen == "cpu":
         return _CpuMlp.apply(x, *weights, *biases)
     if chosen == "gpu" and len(weights) == 3 and max(widths[:3]) <= WIDEST and widths[3] <= 16:

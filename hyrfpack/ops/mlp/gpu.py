@@ -16,7 +16,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyrfpack.ops.dispatch import interpreting
+from hyrfpack.ops.dispatch import is_interpreting
 from hyrfpack.ops.mlp.tiles import factor, linear, load_transposed, pack, precision, product, relu_factor, sizes
 
 # Programs that stay on a processor at once, by the registers they take, and so all that are started.
@@ -122,7 +122,7 @@ def _backward_block(precision: str, device: torch.device) -> int:
 
     Matrix units that read a factor from shared memory (compute capability 9 and 10) leave registers for more.
     """
-    if interpreting():
+    if is_interpreting():
         return 32
     reads_shared = not torch.version.hip and torch.cuda.get_device_capability(device)[0] in (9, 10)
     return 32 if reads_shared and precision == "bf16" else 16

@@ -13,7 +13,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyrfpack.ops.dispatch import interpreting
+from hyrfpack.ops.dispatch import is_interpreting
 
 
 def sizes(widths: Sequence[int]) -> dict[str, int]:
@@ -31,7 +31,7 @@ def precision(mixed: bool) -> str:
     float32 is rounded by its bits.
     """
     if mixed:
-        return "rounded" if interpreting() else "bf16"
+        return "rounded" if is_interpreting() else "bf16"
     return "ieee" if torch.version.hip else "tf32x3"
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.dispatch import choose_implementation
 from hyrfpack.ops.finite import all_finite
 from hyrfpack.ops.rasterize import reference
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
@@ -109,7 +109,7 @@ def rasterize(
     if absgrad is not None and (absgrad.shape != (len(means), 2) or absgrad.dtype != means.dtype):
         raise ValueError(f"absgrad is {absgrad.dtype} {tuple(absgrad.shape)}, expected {means.dtype} {(len(means), 2)}")
 
-    chosen = choose(implementation, ("reference", "cpu", "gpu"), *inputs)
+    chosen = choose_implementation(implementation, ("reference", "cpu", "gpu"), *inputs)
     run: Callable[..., tuple] = reference.rasterize
     if chosen == "gpu":
         from hyrfpack.ops.rasterize import gpu

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.dispatch import choose_implementation
 from hyrfpack.ops.finite import all_finite
 
 
@@ -37,7 +37,7 @@ def frustum_cull(
         FloatingPointError: a position is NaN or infinite; by comparisons alone it would be left out without a word.
         ValueError: the implementation cannot take these positions.
     """
-    if choose(implementation, ("reference", "gpu"), positions) == "gpu":
+    if choose_implementation(implementation, ("reference", "gpu"), positions) == "gpu":
         from hyrfpack.ops.rasterize import gpu_cull
 
         return gpu_cull.frustum_cull(positions, pose, intrinsics, width, height, near, tolerance)

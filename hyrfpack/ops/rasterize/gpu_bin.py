@@ -14,7 +14,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyrfpack.ops.gpu_pairs import unpack
+from hyrfpack.ops.gpu_pairs import unpack_pair
 from hyrfpack.ops.rasterize.gpu_ellipse import TILE, ellipse, tile_columns, tile_rows
 from hyrfpack.ops.rasterize.gpu_project import (
     COVARIANCE,
@@ -70,10 +70,10 @@ def _list(
     owner = tl.load(order + place, mask=drawn, other=0)
     tl.store(begins + owner, at.to(tl.int32), mask=drawn)
     record = records + owner * WORDS
-    u_x, u_y = unpack(tl.load(record + U_SLOPES, mask=drawn, other=0))
-    _, log_opacity = unpack(tl.load(record + V_SLOPE_OPACITY, mask=drawn, other=0))
-    x, y = unpack(tl.load(record + MEAN, mask=drawn, other=0))
-    xx, yy = unpack(tl.load(record + COVARIANCE, mask=drawn, other=0))
+    u_x, u_y = unpack_pair(tl.load(record + U_SLOPES, mask=drawn, other=0))
+    _, log_opacity = unpack_pair(tl.load(record + V_SLOPE_OPACITY, mask=drawn, other=0))
+    x, y = unpack_pair(tl.load(record + MEAN, mask=drawn, other=0))
+    xx, yy = unpack_pair(tl.load(record + COVARIANCE, mask=drawn, other=0))
     # Any ellipse in place of none, so that none divides by zero.
     u_y, xx, yy = tl.where(drawn, u_y, 1.0), tl.where(drawn, xx, 1.0), tl.where(drawn, yy, 1.0)
     shape = ellipse(x, y, xx, yy, u_x, u_y, log_opacity)

@@ -12,7 +12,7 @@ import math
 import triton
 import triton.language as tl
 
-from hyrfpack.ops.gpu_pairs import pack
+from hyrfpack.ops.gpu_pairs import pack_pair
 from hyrfpack.ops.rasterize import reference
 from hyrfpack.ops.rasterize.gpu_ellipse import EXPONENT_MIN, TILE
 from hyrfpack.ops.rasterize.gpu_project import (
@@ -76,7 +76,8 @@ def _store_pixels(pointer, values, inside):
 def _fetch(records, owner, live):
     """A record's numbers; the opacity is nothing where not live."""
     at = records + owner.to(tl.int64) * WORDS
-    # All are loaded before the first is needed. Taken apart here, not by `unpack`: calls cost much when interpreted.
+    # All words are loaded before the first is used, so that their latencies overlap. They are unpacked inline, since
+    # calls of `unpack_pair` are slow in Triton's interpreter.
     ref, offset, slopes = tl.load(at + REFERENCE), tl.load(at + OFFSET), tl.load(at + U_SLOPES)
     opacity, color, depth = tl.load(at + V_SLOPE_OPACITY), tl.load(at + RED_GREEN), tl.load(at + BLUE_DEPTH)
     log_opacity = (opacity >> 32).to(tl.int32).to(tl.float32, bitcast=True)
@@ -198,17 +199,17 @@ def _backward_one(
     sum_green = tl.sum(weight * g_green)
     sum_blue = tl.sum(weight * g_blue)
     # Two at a time, in the order of gpu_project's SUM_U to SUM_ABS_Y.
-    tl.store(to, pack(sum_u, sum_v), mask=live)
-    tl.store(to + 1, pack(sum_uu, sum_uv), mask=live)
-    tl.store(to + 2, pack(sum_vv, sum_p), mask=live)
-    tl.store(to + 3, pack(sum_red, sum_green), mask=live)
+    tl.store(to, pack_pair(sum_u, sum_v), mask=live)
+    tl.store(to + 1, pack_pair(sum_uu, sum_uv), mask=live)
+    tl.store(to + 2, pack_pair(sum_vv, sum_p), mask=live)
+    tl.store(to + 3, pack_pair(sum_red, sum_green), mask=live)
     if ABSGRAD:
         abs_x = tl.sum(tl.abs(record[4] * pu + (record[6] * v)[None, :] * p))
         abs_y = tl.sum(tl.abs(pu))
-        tl.store(to + 4, pack(sum_blue, abs_x), mask=live)
-        tl.store(to + 5, pack(abs_y, 0.0 * abs_y), mask=live)
+        tl.store(to + 4, pack_pair(sum_blue, abs_x), mask=live)
+        tl.store(to + 5, pack_pair(abs_y, 0.0 * abs_y), mask=live)
     else:
-        tl.store(to + 4, pack(sum_blue, 0.0 * sum_blue), mask=live)
+        tl.store(to + 4, pack_pair(sum_blue, 0.0 * sum_blue), mask=live)
     return light - weight, rest
 
 

@@ -16,7 +16,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyrfpack.ops.gpu_pairs import pack
+from hyrfpack.ops.gpu_pairs import pack_pair
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import reference
 from hyrfpack.ops.rasterize.gpu_ellipse import TILE, UNIT, ellipse, tile_columns, tile_rows
@@ -326,20 +326,20 @@ def store_records(records, index, drawn, words):
     """
     reference, offset, u_slopes, v_slope_opacity, depth, mean, covariance = words
     at = records + index.to(tl.int64) * WORDS
-    tl.store(at + REFERENCE, pack(reference[0], reference[1]), mask=drawn)
-    tl.store(at + OFFSET, pack(offset[0], offset[1]), mask=drawn)
-    tl.store(at + U_SLOPES, pack(u_slopes[0], u_slopes[1]), mask=drawn)
-    tl.store(at + V_SLOPE_OPACITY, pack(v_slope_opacity[0], v_slope_opacity[1]), mask=drawn)
-    tl.store(at + MEAN, pack(mean[0], mean[1]), mask=drawn)
-    tl.store(at + COVARIANCE, pack(covariance[0], covariance[1]), mask=drawn)
+    tl.store(at + REFERENCE, pack_pair(reference[0], reference[1]), mask=drawn)
+    tl.store(at + OFFSET, pack_pair(offset[0], offset[1]), mask=drawn)
+    tl.store(at + U_SLOPES, pack_pair(u_slopes[0], u_slopes[1]), mask=drawn)
+    tl.store(at + V_SLOPE_OPACITY, pack_pair(v_slope_opacity[0], v_slope_opacity[1]), mask=drawn)
+    tl.store(at + MEAN, pack_pair(mean[0], mean[1]), mask=drawn)
+    tl.store(at + COVARIANCE, pack_pair(covariance[0], covariance[1]), mask=drawn)
 
 
 @triton.jit
 def store_colors(records, index, drawn, color, depth):
     """Write what of records depends on colours, a tuple of 3 blocks, and the depth that shares a word with one."""
     at = records + index.to(tl.int64) * WORDS
-    tl.store(at + RED_GREEN, pack(color[0], color[1]), mask=drawn)
-    tl.store(at + BLUE_DEPTH, pack(color[2], depth), mask=drawn)
+    tl.store(at + RED_GREEN, pack_pair(color[0], color[1]), mask=drawn)
+    tl.store(at + BLUE_DEPTH, pack_pair(color[2], depth), mask=drawn)
 
 
 @triton.jit

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.dispatch import choose_implementation
 from hyrfpack.ops.rasterize import SHAPES, check, rasterize
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
 
@@ -46,7 +46,7 @@ def sent_light(
     inputs = (means, quats, scales, opacities)
     view: Any = camera_from_world, intrinsics, width, height
     how: dict[str, Any] = {"near": near, "antialiased": antialiased, "transmittance_min": transmittance_min}
-    if choose(implementation, ("reference", "cpu"), *inputs) == "cpu":
+    if choose_implementation(implementation, ("reference", "cpu"), *inputs) == "cpu":
         from hyrfpack.ops.rasterize import cpu
 
         check(dict(zip(SHAPES, inputs, strict=False)), camera_from_world, width, height, near, transmittance_min)

@@ -8,7 +8,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.dispatch import choose_implementation
 from hyrfpack.ops.mlp import WIDEST
 from hyrfpack.ops.shade import reference
 from hyrfpack.ops.shade.directions import (
@@ -86,13 +86,13 @@ def check_shading(shading: Shading, count: int) -> None:
 def choose_for(
     shading: Shading, implementation: str, *tensors: Tensor, available: tuple[str, ...] = ("reference", "gpu")
 ) -> str:
-    """As `dispatch.choose`, for kernels that take these tensors and a shading."""
+    """As `dispatch.choose_implementation`, for kernels that take these tensors and a shading."""
     parameters = (shading.direction_weight, *shading.weights, *shading.biases, shading.color_logits)
     if max(weight.shape[1] for weight in shading.weights) > WIDEST:
         available = tuple(name for name in available if name != "gpu")
     if shading.mixed:
         available = tuple(name for name in available if name != "cpu")
-    return choose(implementation, available, *tensors, *parameters)
+    return choose_implementation(implementation, available, *tensors, *parameters)
 
 
 @torch.no_grad()

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.dispatch import choose_implementation
 
 FREQUENCY_OCTAVES = 4
 DIRECTION_FEATURES = {"sh": 9, "frequency": 6 * FREQUENCY_OCTAVES}
@@ -85,7 +85,7 @@ def encode_views(points: Tensor, viewpoint: Tensor, encoding: str, *, implementa
         raise ValueError(f"points {tuple(points.shape)} from {tuple(viewpoint.shape)}, encoding '{encoding}'")
     wanted = torch.is_grad_enabled() and (points.requires_grad or viewpoint.requires_grad)
     available = ("reference", "gpu") if single and not wanted else ("reference",)
-    if choose(implementation, available, points, viewpoint) == "gpu":
+    if choose_implementation(implementation, available, points, viewpoint) == "gpu":
         from hyrfpack.ops.shade import gpu_directions
 
         return gpu_directions.encode_views(points, viewpoint, encoding)

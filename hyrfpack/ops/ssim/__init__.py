@@ -1,4 +1,4 @@
-"""Structural similarity of two pictures, and the photometric loss built on it."""
+"""Computes the structural similarity of two images and the photometric loss built on it."""
 
 from __future__ import annotations
 
@@ -6,31 +6,31 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from hyrfpack.ops.dispatch import choose
+from hyrfpack.ops.dispatch import choose_implementation
 from hyrfpack.ops.ssim import reference as _reference
 
 __all__ = ["photometric_loss", "ssim"]
 
-_AVAILABLE = ("reference", "cpu", "gpu")
+_IMPLEMENTATIONS = ("reference", "cpu", "gpu")
 
 
 def ssim(image: Tensor, reference: Tensor, *, implementation: str = "auto") -> Tensor:
-    """Mean structural similarity (Wang et al. 2004) of two pictures, over all pixels and channels.
+    """Compute the mean structural similarity (Wang et al. 2004) of two images over all image_values and channels.
 
         SSIM = (2 m_x m_y + C1) (2 s_xy + C2) / ((m_x^2 + m_y^2 + C1) (s_x^2 + s_y^2 + C2))
 
     Local means m and (co)variances s are weighted by an 11x11 Gaussian window with sigma 1.5; C1 = 0.01^2,
-    C2 = 0.03^2. Outside the picture is black, as in 3D Gaussian splatting, so pictures of any size do.
+    C2 = 0.03^2. Pixels outside the image count as black, as in 3D Gaussian splatting, so any image size is valid.
 
     Args:
         image, reference: (H, W, 3) in [0, 1], at least one pixel.
-        implementation: "auto", "reference", "cpu" or "gpu" (these two: float32).
+        implementation: "auto", "reference", "cpu" or "gpu" (the last two take float32 only).
 
     Returns:
-        Scalar in [-1, 1]; 1 for equal pictures. Differentiable once, in `image` only.
+        Scalar in [-1, 1]; 1 for equal images. Differentiable once, in `image` only.
 
     Raises:
-        ValueError: shapes, types or devices do not fit together.
+        ValueError: shapes, dtypes or devices do not match.
 
     Example:
         >>> picture = torch.rand(16, 16, 3)
@@ -38,7 +38,7 @@ def ssim(image: Tensor, reference: Tensor, *, implementation: str = "auto") -> T
         1.0
     """
     _check(image, reference, None)
-    chosen = choose(implementation, _AVAILABLE, image, reference)
+    chosen = choose_implementation(implementation, _IMPLEMENTATIONS, image, reference)
     if chosen == "reference":
         return _reference.ssim(image, reference.detach())
     loss = _GpuLoss if chosen == "gpu" else _CpuLoss
@@ -53,22 +53,24 @@ def photometric_loss(
     ssim_weight: float = 0.2,
     implementation: str = "auto",
 ) -> Tensor:
-    """How far a rendered picture is from a photo: (1 - w) mean |image - target| + w (1 - mean SSIM).
+    """Compute the photometric loss between a rendered image and a photo.
 
-    Where the mask is False, `image` is first replaced by `target` (which is what windows reaching there from counted
-    pixels see), and both means leave these pixels out: neither a value nor a gradient comes from them.
+        loss = (1 - w) mean |image - target| + w (1 - mean SSIM)
+
+    Where the mask is False, `image` is replaced by `target` before SSIM is computed, so that windows of included
+    pixels see no difference there. Both means exclude these pixels: they add neither to the loss nor to its gradient.
 
     Args:
         image, target: (H, W, 3) in [0, 1], at least one pixel.
-        mask: (H, W) bool, True where the photo counts; None counts all of it.
+        mask: (H, W) bool, True for image_values to include; None includes all.
         ssim_weight: w, in [0, 1].
-        implementation: "auto", "reference", "cpu" or "gpu" (these two: float32).
+        implementation: "auto", "reference", "cpu" or "gpu" (the last two take float32 only).
 
     Returns:
-        Scalar, 0 for equal pictures and where nothing counts. Differentiable once, in `image` only.
+        Scalar; 0 if the images are equal or the mask includes no pixel. Differentiable once, in `image` only.
 
     Raises:
-        ValueError: shapes, types or devices do not fit together.
+        ValueError: shapes, dtypes or devices do not match.
 
     Example:
         >>> photo = torch.zeros(16, 16, 3)
@@ -76,7 +78,7 @@ def photometric_loss(
         0.5
     """
     _check(image, target, mask)
-    chosen = choose(implementation, _AVAILABLE, image, target)
+    chosen = choose_implementation(implementation, _IMPLEMENTATIONS, image, target)
     if chosen == "reference":
         return _reference.photometric_loss(image, target.detach(), mask, ssim_weight)
     loss = _GpuLoss if chosen == "gpu" else _CpuLoss
@@ -84,6 +86,7 @@ def photometric_loss(
 
 
 def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
+    """Raise ValueError unless the shapes match and the mask is bool."""
     if image.ndim != 3 or image.shape[2] != 3 or image.numel() == 0 or image.shape != target.shape:
         raise ValueError(f"pictures must be two equal (H, W, 3), not {tuple(image.shape)} and {tuple(target.shape)}")
     if mask is not None and (mask.shape != image.shape[:2] or mask.dtype != torch.bool):
@@ -91,7 +94,7 @@ def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
 
 
 class _CpuLoss(torch.autograd.Function):
-    """l1_weight * mean |image - target| + ssim_weight * (1 - mean SSIM); the gradient is made in the same pass."""
+    """Computes l1_weight * mean |image - target| + ssim_weight * (1 - mean SSIM) and its gradient in one pass."""
 
     @staticmethod
     def forward(
@@ -104,8 +107,12 @@ class _CpuLoss(torch.autograd.Function):
             count = max(1, 3 * int(mask.sum()))
             image = torch.where(mask[..., None], image, target)
             weights = mask[..., None].expand(shape).float().reshape(shape[0], -1).numpy()
-        pixels, wanted = (picture.detach().reshape(shape[0], -1).contiguous().numpy() for picture in (image, target))
-        loss, gradient = cpu.loss_and_gradient(pixels, wanted, weights, l1_weight / count, ssim_weight / count)
+        image_values, target_values = (
+            picture.detach().reshape(shape[0], -1).contiguous().numpy() for picture in (image, target)
+        )
+        loss, gradient = cpu.loss_and_gradient(
+            image_values, target_values, weights, l1_weight / count, ssim_weight / count
+        )
         ctx.save_for_backward(torch.from_numpy(gradient).view(shape))
         return image.new_tensor(loss)
 
@@ -117,7 +124,7 @@ class _CpuLoss(torch.autograd.Function):
 
 
 class _GpuLoss(torch.autograd.Function):
-    """As `_CpuLoss`, all on the device; the gradient is made when it is asked for."""
+    """Computes the loss of `_CpuLoss` on the GPU; the gradient is computed in the backward pass."""
 
     @staticmethod
     def forward(
@@ -127,8 +134,8 @@ class _GpuLoss(torch.autograd.Function):
 
         image, target = image.contiguous(), target.contiguous()
         mask = None if mask is None else mask.contiguous()
-        loss, derivatives, share = gpu.loss_and_derivatives(image, target, mask, l1_weight, ssim_weight)
-        ctx.save_for_backward(image, target, mask, derivatives, share)
+        loss, derivatives, inverse_count = gpu.loss_and_derivatives(image, target, mask, l1_weight, ssim_weight)
+        ctx.save_for_backward(image, target, mask, derivatives, inverse_count)
         ctx.weights = l1_weight, ssim_weight
         return loss
 
@@ -137,5 +144,5 @@ class _GpuLoss(torch.autograd.Function):
     def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
         from hyrfpack.ops.ssim import gpu
 
-        (image, target, mask, derivatives, share), (l1, ssim) = ctx.saved_tensors, ctx.weights
-        return gpu.gradient(image, target, mask, derivatives, share, l1, ssim, grad), None, None, None, None
+        (image, target, mask, derivatives, inverse_count), (l1, ssim) = ctx.saved_tensors, ctx.weights
+        return gpu.gradient(image, target, mask, derivatives, inverse_count, l1, ssim, grad), None, None, None, None

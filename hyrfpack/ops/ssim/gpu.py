@@ -1,13 +1,14 @@
-"""L1 and SSIM with their gradient in two passes over the picture, in Triton.
+"""Computes L1, SSIM and their gradient in two passes over the image, in Triton.
 
-A program owns a block of columns and walks down a strip of rows. At each row it blurs across by 11 shifted loads (which
-the first cache serves but for one) and keeps the last 11 rows so blurred in registers, which blurs them down. The first
-pass blurs the local moments so and writes the derivatives of SSIM by E[x], E[xx] and E[xy]; the second, in the backward
-pass, blurs those in the same way into the gradient (the window is symmetric, so its transpose is itself). Pixels stay
-interleaved: a neighbour is 3 floats away. Nothing comes back to the host, and sums are made in a fixed order.
+A program processes a strip of rows in a block of columns, from top to bottom. It blurs each row horizontally by 11
+shifted loads, of which the L1 cache serves all but one. It keeps the last 11 blurred rows in registers and blurs them
+vertically there. The first pass blurs the local moments and writes the derivatives of SSIM by E[x], E[xx] and E[xy].
+The second pass, in backward, blurs these derivatives in the same way into the gradient: the window is symmetric, so
+the blur is its own transpose. Pixels stay interleaved, so a horizontal neighbour is 3 floats away. Nothing is copied
+to the host, and the order of all sums is fixed.
 
-Memory: the first pass reads 2 planes of 3 floats a pixel and writes 3, the second reads 5 and writes 1: 132 bytes a
-pixel. The rows that strips share, 10 of every 34 read, come from the second cache as a rule.
+Memory: the first pass reads 2 planes of 3 floats per pixel and writes 3; the second reads 5 and writes 1. This is 132
+bytes per pixel. Strips share 10 of every 34 rows they read, which usually come from the L2 cache.
 """
 
 from __future__ import annotations
@@ -17,29 +18,31 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyrfpack.ops.ssim.reference import C1, C2, RADIUS, window
+from hyrfpack.ops.ssim.reference import C1, C2, WINDOW_RADIUS, window_weights
 
-_RADIUS, _C1, _C2 = tl.constexpr(RADIUS), tl.constexpr(C1), tl.constexpr(C2)
-_W5, _W4, _W3, _W2, _W1, _W0 = (tl.constexpr(weight) for weight in window()[: RADIUS + 1])
+_RADIUS, _C1, _C2 = tl.constexpr(WINDOW_RADIUS), tl.constexpr(C1), tl.constexpr(C2)
+_W5, _W4, _W3, _W2, _W1, _W0 = (tl.constexpr(weight) for weight in window_weights()[: WINDOW_RADIUS + 1])
 
-# A value a thread: 44 floats of window leave no registers for two. A strip of 24 rows reads 34; a higher one would read
-# fewer twice, but 800 x 800 pixels then make too few programs to hide their loads.
-_COLUMNS, _STRIP = 128, 24
-_WARPS = _COLUMNS // (64 if torch.version.hip else 32)
-_SUMMED = 1024  # partial sums read at once
-_OPTIONS = {"num_warps": _WARPS, "enable_fp_fusion": True}
+# Each thread handles one column, since the 44 floats of its window leave no registers for two. A strip of 24 rows reads
+# 34. Taller strips would read fewer rows twice, but an image of 800 x 800 pixels would then have too few programs to
+# hide the latency of their loads.
+_COLUMNS_PER_PROGRAM = 128
+_ROWS_PER_STRIP = 24
+_WARPS_PER_PROGRAM = _COLUMNS_PER_PROGRAM // (64 if torch.version.hip else 32)
+_PARTIAL_SUMS_PER_LOAD = 1024
+_LAUNCH_OPTIONS = {"num_warps": _WARPS_PER_PROGRAM, "enable_fp_fusion": True}
 
 
 @triton.jit
 def _blur(a):
-    """Weighted sum of 11 values."""
+    """Return the windowed mean of 11 values."""
     near = _W0 * a[5] + _W1 * (a[4] + a[6]) + _W2 * (a[3] + a[7])
     return near + _W3 * (a[2] + a[8]) + _W4 * (a[1] + a[9]) + _W5 * (a[0] + a[10])
 
 
 @triton.jit
-def _taps(first, column, floats, STRIDE: tl.constexpr):
-    """The 11 values of a row around each column, STRIDE apart from `first` on; 0 outside the picture."""
+def _load_window(first, column, floats, STRIDE: tl.constexpr):
+    """Load the 11 values of a row around each column, STRIDE apart, centred at `first`; 0 outside the image."""
     taps = ()
     for tap in tl.static_range(-_RADIUS, _RADIUS + 1):
         at = column + 3 * tap
@@ -48,8 +51,8 @@ def _taps(first, column, floats, STRIDE: tl.constexpr):
 
 
 @triton.jit
-def _multiply(a, b):
-    """Products of two sets of taps."""
+def _multiply_windows(a, b):
+    """Return the elementwise products of two windows."""
     products = ()
     for tap in tl.static_range(2 * _RADIUS + 1):
         products += (a[tap] * b[tap],)
@@ -58,22 +61,22 @@ def _multiply(a, b):
 
 @triton.jit
 def _moments_across(image, target, mask, row, floats, column):
-    """x, y, xx + yy and xy of a row, blurred across at each column."""
+    """Return x, y, xx + yy and xy of a row, blurred horizontally at each column."""
     start = row.to(tl.int64) * floats
-    xs = _taps(image + start + column, column, floats, 3)
-    ys = _taps(target + start + column, column, floats, 3)
+    xs = _load_window(image + start + column, column, floats, 3)
+    ys = _load_window(target + start + column, column, floats, 3)
     if mask is not None:
-        counts = _taps(mask + start // 3 + column // 3, column, floats, 1)
+        included = _load_window(mask + start // 3 + column // 3, column, floats, 1)
         taps = ()
         for tap in tl.static_range(2 * _RADIUS + 1):
-            taps += (tl.where(counts[tap] != 0, xs[tap], ys[tap]),)
+            taps += (tl.where(included[tap] != 0, xs[tap], ys[tap]),)
         xs = taps
-    squares = _blur(_multiply(xs, xs)) + _blur(_multiply(ys, ys))
-    return _blur(xs), _blur(ys), squares, _blur(_multiply(xs, ys))
+    squares = _blur(_multiply_windows(xs, xs)) + _blur(_multiply_windows(ys, ys))
+    return _blur(xs), _blur(ys), squares, _blur(_multiply_windows(xs, ys))
 
 
 @triton.jit
-def _measure(
+def _loss_kernel(
     image,
     target,
     mask,
@@ -85,9 +88,14 @@ def _measure(
     COLUMNS: tl.constexpr,
     STRIP: tl.constexpr,
 ):
-    """Sums of |x - y|, of 1 - SSIM and of what counts, and the derivatives of SSIM, over one strip of a column block.
+    """Compute partial sums of the loss and the derivatives of SSIM over one strip of a column block.
 
-    image, target (H, 3W), mask (H, W) or None, derivatives (3, H, 3W), partials (3, programs); plane is 3 H W.
+    Args:
+        image, target: (H, 3W).
+        mask: (H, W) or None.
+        derivatives: (3, H, 3W), written: derivatives of SSIM by E[x], E[xx] and E[xy].
+        partials: (3, programs), written: sums of |x - y| and of 1 - SSIM, and the number of included values.
+        plane: 3 H W.
     """
     column = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
     inside = column < floats
@@ -116,18 +124,18 @@ def _measure(
             by_x = y * (2 * a2 * scale - by_product) - 2 * x * (ssim * b2 * scale + by_square)
 
             start = row.to(tl.int64) * floats
-            counts = inside
+            included = inside
             if mask is not None:
-                counts = tl.load(mask + start // 3 + column // 3, mask=inside, other=0) != 0
+                included = tl.load(mask + start // 3 + column // 3, mask=inside, other=0) != 0
             at = derivatives + start + column
-            tl.store(at, tl.where(counts, by_x, 0.0), mask=inside)
-            tl.store(at + plane, tl.where(counts, by_square, 0.0), mask=inside)
-            tl.store(at + plane + plane, tl.where(counts, by_product, 0.0), mask=inside)
-            difference = tl.load(image + start + column, mask=counts, other=0.0)
-            difference -= tl.load(target + start + column, mask=counts, other=0.0)
+            tl.store(at, tl.where(included, by_x, 0.0), mask=inside)
+            tl.store(at + plane, tl.where(included, by_square, 0.0), mask=inside)
+            tl.store(at + plane + plane, tl.where(included, by_product, 0.0), mask=inside)
+            difference = tl.load(image + start + column, mask=included, other=0.0)
+            difference -= tl.load(target + start + column, mask=included, other=0.0)
             l1 += tl.abs(difference)
-            dissimilarity += tl.where(counts, 1 - ssim, 0.0)
-            count += tl.where(counts, 1.0, 0.0)
+            dissimilarity += tl.where(included, 1 - ssim, 0.0)
+            count += tl.where(included, 1.0, 0.0)
 
     programs = tl.num_programs(0) * tl.num_programs(1)
     at = partials + tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)
@@ -137,10 +145,10 @@ def _measure(
 
 
 @triton.jit
-def _add_up(partials, programs, l1_weight, ssim_weight, loss, share, SUMMED: tl.constexpr):
-    """The loss from the sums of all programs, and the share 1 / count that a value has in a mean; one program."""
-    lane = tl.arange(0, SUMMED)
-    l1 = tl.zeros([SUMMED], tl.float64)
+def _reduce_kernel(partials, programs, l1_weight, ssim_weight, loss, inverse_count, BLOCK: tl.constexpr):
+    """Compute the loss and 1 / count, the weight of a value in a mean, from all partial sums, in one program."""
+    lane = tl.arange(0, BLOCK)
+    l1 = tl.zeros([BLOCK], tl.float64)
     dissimilarity, count = l1, l1
     start = 0
     while start < programs:
@@ -149,20 +157,20 @@ def _add_up(partials, programs, l1_weight, ssim_weight, loss, share, SUMMED: tl.
         l1 += tl.load(partials + at, mask=inside, other=0.0)
         dissimilarity += tl.load(partials + programs + at, mask=inside, other=0.0)
         count += tl.load(partials + 2 * programs + at, mask=inside, other=0.0)
-        start += SUMMED
-    one = 1 / tl.maximum(tl.sum(count, 0), 1.0)
-    total = one * (l1_weight * tl.sum(l1, 0) + ssim_weight * tl.sum(dissimilarity, 0))
+        start += BLOCK
+    inverse = 1 / tl.maximum(tl.sum(count, 0), 1.0)
+    total = inverse * (l1_weight * tl.sum(l1, 0) + ssim_weight * tl.sum(dissimilarity, 0))
     tl.store(loss, total.to(tl.float32))
-    tl.store(share, one.to(tl.float32))
+    tl.store(inverse_count, inverse.to(tl.float32))
 
 
 @triton.jit
-def _slope(
+def _gradient_kernel(
     image,
     target,
     mask,
     derivatives,
-    share,
+    inverse_count,
     upstream,
     gradient,
     height,
@@ -173,11 +181,11 @@ def _slope(
     COLUMNS: tl.constexpr,
     STRIP: tl.constexpr,
 ):
-    """The loss's gradient by `image`, (H, 3W), over one strip of a column block."""
+    """Write the gradient of the loss by `image`, (H, 3W), over one strip of a column block."""
     column = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
     inside = column < floats
     top = tl.program_id(1) * STRIP
-    scale = tl.load(share) * tl.load(upstream)
+    scale = tl.load(inverse_count) * tl.load(upstream)
     zero = tl.zeros([COLUMNS], tl.float32)
     empty = (zero,) * 11
     by_xs, by_squares, by_products = empty, empty, empty
@@ -186,50 +194,54 @@ def _slope(
         blurred = (zero,) * 3
         if (row >= 0) & (row < height):
             at = derivatives + row.to(tl.int64) * floats + column
-            by_x, by_square = _blur(_taps(at, column, floats, 3)), _blur(_taps(at + plane, column, floats, 3))
-            blurred = by_x, by_square, _blur(_taps(at + plane + plane, column, floats, 3))
+            by_x, by_square = (
+                _blur(_load_window(at, column, floats, 3)),
+                _blur(_load_window(at + plane, column, floats, 3)),
+            )
+            blurred = by_x, by_square, _blur(_load_window(at + plane + plane, column, floats, 3))
         by_xs, by_squares = by_xs[1:] + (blurred[0],), by_squares[1:] + (blurred[1],)
         by_products = by_products[1:] + (blurred[2],)
         row -= _RADIUS
         if (row >= top) & (row < height):
             start = row.to(tl.int64) * floats
-            counts = inside
+            included = inside
             if mask is not None:
-                counts = tl.load(mask + start // 3 + column // 3, mask=inside, other=0) != 0
-            x = tl.load(image + start + column, mask=counts, other=0.0)
-            y = tl.load(target + start + column, mask=counts, other=0.0)
+                included = tl.load(mask + start // 3 + column // 3, mask=inside, other=0) != 0
+            x = tl.load(image + start + column, mask=included, other=0.0)
+            y = tl.load(target + start + column, mask=included, other=0.0)
             ssim = _blur(by_xs) + 2 * x * _blur(by_squares) + y * _blur(by_products)
             sign = tl.where(x > y, 1.0, tl.where(x < y, -1.0, 0.0))
             slope = scale * (l1_weight * sign - ssim_weight * ssim)
-            tl.store(gradient + start + column, tl.where(counts, slope, 0.0), mask=inside)
+            tl.store(gradient + start + column, tl.where(included, slope, 0.0), mask=inside)
 
 
 def _grid(image: Tensor) -> tuple[int, int]:
-    return triton.cdiv(3 * image.shape[1], _COLUMNS), triton.cdiv(image.shape[0], _STRIP)
+    """Return the launch grid: column blocks and strips of an image."""
+    return triton.cdiv(3 * image.shape[1], _COLUMNS_PER_PROGRAM), triton.cdiv(image.shape[0], _ROWS_PER_STRIP)
 
 
 def loss_and_derivatives(
     image: Tensor, target: Tensor, mask: Tensor | None, l1_weight: float, ssim_weight: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Weighted sum of the means of |image - target| and of 1 - SSIM, and what its gradient needs.
+    """Compute the weighted sum of the means of |image - target| and of 1 - SSIM, and the inputs of `gradient`.
 
     Args:
         image, target: (H, W, 3) float32, contiguous.
-        mask: (H, W) bool, contiguous, True where a pixel counts; elsewhere `image` is taken to be `target`. None
-            counts all.
+        mask: (H, W) bool, contiguous, True for pixels to include; elsewhere `image` is replaced by `target`. None
+            includes all.
         l1_weight, ssim_weight: factors of the two means.
 
     Returns:
-        The loss, a scalar; (3, H, W, 3) derivatives of each pixel's SSIM by its local means of x, xx and xy; and the
-        scalar 1 / count of a mean. All on the device.
+        The scalar loss; (3, H, W, 3) derivatives of each pixel's SSIM by its local means of x, xx and xy; and the
+        scalar 1 / count, with count the number of included values. All on the device.
     """
     height, floats = image.shape[0], 3 * image.shape[1]
     grid = _grid(image)
     programs = grid[0] * grid[1]
     derivatives = image.new_empty(3, *image.shape)
     partials = image.new_empty(3, programs)
-    loss, share = image.new_empty(()), image.new_empty(())
-    _measure[grid](
+    loss, inverse_count = image.new_empty(()), image.new_empty(())
+    _loss_kernel[grid](
         image,
         target,
         mask,
@@ -238,12 +250,14 @@ def loss_and_derivatives(
         height,
         floats,
         height * floats,
-        COLUMNS=_COLUMNS,
-        STRIP=_STRIP,
-        **_OPTIONS,
+        COLUMNS=_COLUMNS_PER_PROGRAM,
+        STRIP=_ROWS_PER_STRIP,
+        **_LAUNCH_OPTIONS,
     )
-    _add_up[(1,)](partials, programs, l1_weight, ssim_weight, loss, share, SUMMED=_SUMMED, **_OPTIONS)
-    return loss, derivatives, share
+    _reduce_kernel[(1,)](
+        partials, programs, l1_weight, ssim_weight, loss, inverse_count, BLOCK=_PARTIAL_SUMS_PER_LOAD, **_LAUNCH_OPTIONS
+    )
+    return loss, derivatives, inverse_count
 
 
 def gradient(
@@ -251,20 +265,23 @@ def gradient(
     target: Tensor,
     mask: Tensor | None,
     derivatives: Tensor,
-    share: Tensor,
+    inverse_count: Tensor,
     l1_weight: float,
     ssim_weight: float,
     upstream: Tensor,
 ) -> Tensor:
-    """The gradient by `image`, (H, W, 3), times the scalar `upstream`; the rest is as for `loss_and_derivatives`."""
+    """Compute the gradient (H, W, 3) by `image`, times the scalar `upstream`.
+
+    The other arguments are those and the results of `loss_and_derivatives`.
+    """
     height, floats = image.shape[0], 3 * image.shape[1]
     gradient = torch.empty_like(image)
-    _slope[_grid(image)](
+    _gradient_kernel[_grid(image)](
         image,
         target,
         mask,
         derivatives,
-        share,
+        inverse_count,
         upstream,
         gradient,
         height,
@@ -272,8 +289,8 @@ def gradient(
         height * floats,
         l1_weight,
         ssim_weight,
-        COLUMNS=_COLUMNS,
-        STRIP=_STRIP,
-        **_OPTIONS,
+        COLUMNS=_COLUMNS_PER_PROGRAM,
+        STRIP=_ROWS_PER_STRIP,
+        **_LAUNCH_OPTIONS,
     )
     return gradient

@@ -1,4 +1,7 @@
-"""SSIM and the photometric loss in plain torch, any device and dtype: the definition of right."""
+"""Implements SSIM and the photometric loss in plain torch for any device and dtype.
+
+This reference defines the correct result.
+"""
 
 from __future__ import annotations
 
@@ -6,28 +9,28 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-RADIUS = 5
-SIGMA = 1.5
+WINDOW_RADIUS = 5
+WINDOW_SIGMA = 1.5
 C1 = 0.01**2
 C2 = 0.03**2
 
 
-def window() -> list[float]:
-    """The 11 weights of the Gaussian window along one axis; they add up to 1."""
-    taps = torch.arange(-RADIUS, RADIUS + 1, dtype=torch.float64)
-    weights = torch.exp(-(taps**2) / (2 * SIGMA**2))
+def window_weights() -> list[float]:
+    """Return the 11 weights of the Gaussian window along one axis; they sum to 1."""
+    taps = torch.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1, dtype=torch.float64)
+    weights = torch.exp(-(taps**2) / (2 * WINDOW_SIGMA**2))
     return (weights / weights.sum()).tolist()
 
 
 def _blur(planes: Tensor) -> Tensor:
-    """Weighted mean around each pixel of (C, H, W); outside the picture is 0."""
-    weights = torch.tensor(window(), dtype=planes.dtype, device=planes.device)
-    planes = F.conv2d(planes[:, None], weights.view(1, 1, 1, -1), padding=(0, RADIUS))
-    return F.conv2d(planes, weights.view(1, 1, -1, 1), padding=(RADIUS, 0))[:, 0]
+    """Return the windowed mean around each pixel of (C, H, W); values outside the image count as 0."""
+    weights = torch.tensor(window_weights(), dtype=planes.dtype, device=planes.device)
+    planes = F.conv2d(planes[:, None], weights.view(1, 1, 1, -1), padding=(0, WINDOW_RADIUS))
+    return F.conv2d(planes, weights.view(1, 1, -1, 1), padding=(WINDOW_RADIUS, 0))[:, 0]
 
 
 def ssim_map(image: Tensor, reference: Tensor) -> Tensor:
-    """SSIM at each pixel and channel, (H, W, 3)."""
+    """Compute SSIM at each pixel and channel, (H, W, 3)."""
     x, y = image.permute(2, 0, 1), reference.permute(2, 0, 1)
     mean_x, mean_y = _blur(x), _blur(y)
     covariance = _blur(x * y) - mean_x * mean_y
@@ -37,12 +40,12 @@ def ssim_map(image: Tensor, reference: Tensor) -> Tensor:
 
 
 def ssim(image: Tensor, reference: Tensor) -> Tensor:
-    """As `hyrfpack.ops.ssim.ssim`, differentiable by autograd alone."""
+    """Compute `hyrfpack.ops.ssim.ssim` with torch operations that autograd differentiates."""
     return ssim_map(image, reference).mean()
 
 
 def photometric_loss(image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float) -> Tensor:
-    """As `hyrfpack.ops.ssim.photometric_loss`, differentiable by autograd alone."""
+    """Compute `hyrfpack.ops.ssim.photometric_loss` with torch operations that autograd differentiates."""
     if mask is None:
         mask = torch.ones(image.shape[:2], dtype=torch.bool, device=image.device)
     image = torch.where(mask[..., None], image, target)
