@@ -20,6 +20,8 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from hyrfpack.version import __version__
+
 _TOO_LATE = sys.platform == "linux" and "pycolmap" in sys.modules and "zlib" not in sys.modules
 # Before pycolmap, wherever that is loaded: its wheel for Linux exports a zlib of its own, and the system's, when it is
 # loaded second, calls into that one. Memory is corrupted then, and the process aborts at the next PNG or .spz file.
@@ -76,8 +78,6 @@ if TYPE_CHECKING:
     from hyrfpack.train import TrainConfig as TrainConfig
     from hyrfpack.train import TrainResult as TrainResult
     from hyrfpack.train import train as train
-
-__version__ = "0.1.0"
 
 # Public name -> the module that has it.
 _PUBLIC = {

@@ -1,4 +1,4 @@
-"""Where tensors live: which device to use, and bringing photos there."""
+"""The choice of a torch device, and the upload of photos to it."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from hyrfpack.ops.dispatch import has_triton
 from hyrfpack.parallel.ranks import Ranks
 from hyrfpack.scene import Picture
 
-NO_TRITON = (
+NO_TRITON_NOTE = (
     "Triton is not installed, so the GPU runs plain torch, far slower than kernels would be; install the package "
     "'triton' that fits this torch"
 )
-OLD_GPU = (
+OLD_GPU_NOTE = (
     "this GPU is of a generation before NVIDIA's Ampere, which the kernels are not made for: they run slowly; "
     "`precision='float32'` and `device='cpu'` are worth a try"
 )
-NO_METAL = (
+NO_METAL_NOTE = (
     "there are no kernels for Apple's GPU: it runs the plain torch reference, which is slow; `device='cpu'` is faster"
 )
 
@@ -30,15 +30,15 @@ NO_METAL = (
 def choose_device(
     name: str | torch.device = "auto", say: Callable[[str], None] = lambda sentence: None
 ) -> torch.device:
-    """The device of a name.
+    """Return the torch device of a name, after checking that it can be used.
 
     Args:
         name: "auto" (a CUDA or ROCm device where one is usable and Triton is installed, the CPU otherwise), "cpu",
-            "cuda" (torch's current one; ROCm too is called so) or "cuda:N", or "mps"; or a torch.device.
-        say: told in a sentence where the choice runs without kernels.
+            "cuda" (torch's current CUDA or ROCm device), "cuda:N" or "mps"; or a torch.device.
+        say: called with a sentence where the device has no kernels or runs them slowly.
 
     Returns:
-        The device; "cuda:N" is also made torch's current one, on which kernels are launched.
+        The device. "cuda:N" also becomes torch's current device, on which kernels are launched.
 
     Raises:
         HyrfError: there is no such device, or this process was forked from one that uses the GPU.
@@ -48,7 +48,7 @@ def choose_device(
     if not re.fullmatch(r"auto|cpu|mps|cuda(:[0-9]{1,3})?", name):
         raise HyrfError(f"'{name}' is not a device; use auto, cpu, cuda, cuda:N or mps")
     kind, _, number = name.partition(":")
-    # Asking for GPUs is enough to make a fork a bad one, also where there is none.
+    # Asking torch for GPUs marks later forks as bad, also on a machine without a GPU; hence the check is_available().
     if kind in ("auto", "cuda") and torch.cuda._is_in_bad_fork() and torch.cuda.is_available():
         raise HyrfError(
             "this process was forked from one that uses the GPU, and cannot use it too; start it with "
@@ -64,30 +64,34 @@ def choose_device(
                 f"device '{name}' is not there, {there}; install a GPU build of torch or use `device='cpu'`"
             )
         if not has_triton():
-            say(NO_TRITON)
+            say(NO_TRITON_NOTE)
         elif not torch.version.hip and torch.cuda.get_device_capability(name) < (8, 0):
-            say(OLD_GPU)
+            say(OLD_GPU_NOTE)
         make_current(torch.device(name))
     if kind == "mps":
         if not torch.backends.mps.is_available():
             raise HyrfError("device 'mps' is not there, torch sees no Apple GPU; use `device='cpu'`")
-        say(NO_METAL)
+        say(NO_METAL_NOTE)
     return torch.device(name)
 
 
 def choose_own_device(
     name: str | torch.device, ranks: Ranks, say: Callable[[str], None] = lambda sentence: None
 ) -> torch.device:
-    """As `choose_device`, for one of several processes: "auto" and "cuda" are another GPU for each on a machine.
+    """Choose the device of one of several processes: "auto" and "cuda" give each process on a machine its own GPU.
+
+    Args:
+        name, say: as for `choose_device`.
+        ranks: the processes, all of which call this.
 
     Raises:
-        HyrfError: on all of them, as `choose_device`, or two would have the same GPU.
+        HyrfError: on all processes, where `choose_device` fails on one, or where two would share a GPU.
     """
-    device = ranks.agree(lambda: choose_device(name, say))
-    if device.type == "cuda" and not ranks.alone:
+    device = ranks.run_on_all(lambda: choose_device(name, say))
+    if device.type == "cuda" and not ranks.is_single:
         if device.index is None:
             device = choose_device(f"cuda:{ranks.local_rank % torch.cuda.device_count()}")
-        gpus = ranks.told(str(torch.cuda.get_device_properties(device).uuid))
+        gpus = ranks.all_gather(str(torch.cuda.get_device_properties(device).uuid))
         if len(set(gpus)) < len(gpus):
             raise HyrfError(
                 f"{ranks.size} processes have {len(set(gpus))} GPUs between them, and each needs its own; start as "
@@ -97,13 +101,16 @@ def choose_own_device(
 
 
 def make_current(device: torch.device) -> None:
-    """Let kernels of this thread be launched on a GPU: each thread has a current one of its own."""
+    """Make a GPU the current device of this thread, on which its kernels are launched.
+
+    Each thread has a current device of its own.
+    """
     if device.type == "cuda" and device.index not in (None, torch.cuda.current_device()):
         torch.cuda.set_device(device)
 
 
 def describe_device(device: torch.device) -> str:
-    """What it is called, as "cuda:0 (NVIDIA H200)"."""
+    """Return the name of a device for users, such as "cpu" or "cuda:0 (NVIDIA H200)"."""
     if device.type != "cuda":
         return device.type
     number = torch.cuda.current_device() if device.index is None else device.index
@@ -111,36 +118,40 @@ def describe_device(device: torch.device) -> str:
 
 
 def upload_array(array: np.ndarray, device: torch.device) -> Tensor:
-    """An array on a device. CUDA takes it over at once; a blocking copy would also wait for what is under way there."""
+    """Copy an array to a device.
+
+    The copy to CUDA does not block, because a blocking copy would also wait for all work that is queued there.
+    """
     return torch.from_numpy(array).to(device, non_blocking=device.type == "cuda")
 
 
 def upload(picture: Picture, solid: np.ndarray | None, device: torch.device) -> tuple[Tensor, Tensor | None]:
-    """A photo over a solid colour, on a device.
+    """Composite a photo over a solid colour, as `Picture.composite` does, on a device.
 
     Args:
-        picture: decoded.
+        picture: the decoded photo.
         solid: (3,) float32 RGB in [0, 1] behind transparent pixels; None for black.
+        device: where the result is wanted.
 
     Returns:
-        (H, W, 3) float32 in [0, 1], and the (H, W) bool mask or None. As `Picture.composite`.
+        (H, W, 3) float32 in [0, 1], and the (H, W) bool mask or None.
     """
     if device.type == "cpu":
         mask = None if picture.mask is None else torch.from_numpy(picture.mask)
         return torch.from_numpy(picture.composite(solid)), mask
-    return _composite(*_sent(picture, device), solid)
+    return _composite(*_upload_bytes(picture, device), solid)
 
 
 class Photos:
-    """Photos on a device for a run that comes back to each of them, as `upload` brings them.
+    """A cache of uploaded photos for a run that uses each of them many times.
 
-    On CUDA the bytes of those that come first stay there, while they take no more than an eighth of its memory: each
-    is wanted once a round, so that no choice is better.
+    On CUDA the bytes of the first photos stay on the device until they take an eighth of its memory. A run uses each
+    photo once a round, so keeping the first ones is as good as any other choice. On other devices nothing is cached.
 
     Attributes:
-        device: theirs.
-        limit_bytes: the most that is kept.
-        nbytes: what is kept now.
+        device: the device of the photos.
+        limit_bytes: most bytes that are kept.
+        nbytes: bytes that are kept now.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -151,20 +162,20 @@ class Photos:
         self._kept: dict[str, tuple[Tensor, Tensor | None, Tensor | None]] = {}
 
     def get(self, name: str, picture: Picture, solid: np.ndarray | None) -> tuple[Tensor, Tensor | None]:
-        """As `upload`, of the picture that has this name on every call."""
+        """Return what `upload` returns for a photo; its name must stand for the same photo on every call."""
         if self.device.type != "cuda":
             return upload(picture, solid, self.device)
         sent = self._kept.get(name)
         if sent is None:
-            sent = _sent(picture, self.device)
+            sent = _upload_bytes(picture, self.device)
             if self.nbytes + picture.nbytes <= self.limit_bytes:
                 self._kept[name] = sent
                 self.nbytes += picture.nbytes
         return _composite(*sent, solid)
 
 
-def _sent(picture: Picture, device: torch.device) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """Colours, alpha and mask: bytes travel, a quarter of the floats; the arithmetic is done there."""
+def _upload_bytes(picture: Picture, device: torch.device) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    """Upload colours, alpha and mask as bytes, a quarter of the size of floats, to be composited on the device."""
     alpha = None if picture.alpha is None else upload_array(picture.alpha, device)
     mask = None if picture.mask is None else upload_array(picture.mask, device)
     return upload_array(picture.rgb, device), alpha, mask
@@ -173,7 +184,7 @@ def _sent(picture: Picture, device: torch.device) -> tuple[Tensor, Tensor | None
 def _composite(
     colors: Tensor, alphas: Tensor | None, mask: Tensor | None, solid: np.ndarray | None
 ) -> tuple[Tensor, Tensor | None]:
-    """As `Picture.composite`, from bytes."""
+    """Composite uploaded bytes over a solid colour, as `Picture.composite` does."""
     rgb = colors.float() * (1 / 255)
     if alphas is not None:
         alpha = alphas.float()[..., None] * (1 / 255)

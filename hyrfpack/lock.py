@@ -1,4 +1,4 @@
-"""Folder locks: one call at a time writes into a folder."""
+"""Folder locks, with which only one call at a time writes into a folder."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def exclusive_folder(
     Folders that are created here and are still empty at the end are removed.
 
     Args:
-        folder: to write into.
+        folder: the folder to write into.
         remedy: what the user can name instead, for the message: "another folder with --work".
         ranks: processes that work together, all of which call this. The main process holds the lock; when it is
             refused, all of them are.
@@ -43,34 +43,34 @@ def exclusive_folder(
         HyrfError: another call is at work in the folder, or the folder cannot be created.
     """
     folder = Path(folder)
-    if ranks is not None and not ranks.leads:
-        ranks.agree(lambda: None)
+    if ranks is not None and not ranks.is_main:
+        ranks.run_on_all(lambda: None)
         yield
         return
-    created = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]  # the deepest first
-    handle = _lock(folder, remedy) if ranks is None else ranks.agree(lambda: _lock(folder, remedy))
+    created = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]  # deepest first, for rmdir
+    handle = _lock(folder, remedy) if ranks is None else ranks.run_on_all(lambda: _lock(folder, remedy))
     try:
         yield
     finally:
-        with suppress(OSError):  # a folder that is not empty stays
+        with suppress(OSError):  # rmdir fails for a folder that is not empty, which stays
             for path in created:
                 path.rmdir()
         if handle is not None:
-            with suppress(OSError):  # locks are not supported there
+            with suppress(OSError):  # this file system has no locks
                 # Closing alone would leave the lock with a process that was forked meanwhile.
                 fcntl.flock(handle, fcntl.LOCK_UN)
             os.close(handle)
 
 
 def _lock(folder: Path, remedy: str) -> int | None:
-    """The descriptor that holds a folder's lock; None where a folder cannot be locked."""
+    """Create a folder, lock it and return the descriptor that holds the lock; None where it cannot be locked."""
     while True:
         make_folder(folder)
         if fcntl is None:
             return None
         try:
             handle = os.open(folder, os.O_RDONLY)
-        except FileNotFoundError:  # another call has ended and removed it
+        except FileNotFoundError:  # another call removed the folder at its end, so it is created again
             continue
         except OSError:  # a folder may be writable and not readable
             return None
@@ -82,7 +82,7 @@ def _lock(folder: Path, remedy: str) -> int | None:
                 f"{folder}: another hyrfpack command is at work in this folder; wait until it has ended, or name "
                 f"{remedy}"
             ) from None
-        except OSError:  # locks are not supported there
+        except OSError:  # this file system has no locks
             return handle
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(handle), os.stat(folder)):

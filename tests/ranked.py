@@ -23,7 +23,7 @@ import torch.distributed as dist
 
 from hyrfpack.cli import main
 from hyrfpack.errors import HyrfError
-from hyrfpack.parallel.ranks import joined
+from hyrfpack.parallel.ranks import join_processes
 
 needs_ranks = pytest.mark.skipif(
     os.name != "posix" or not dist.is_available() or not dist.is_gloo_available(),
@@ -127,7 +127,7 @@ def _rank(told: dict[str, str], telling: Any, task: Callable, arguments: tuple) 
 
 def _joined(telling: Any, work: Callable, *arguments: Any) -> None:
     try:
-        with joined() as ranks:
+        with join_processes() as ranks:
             answer = work(ranks, *arguments), None
     except HyrfError as error:
         answer = None, str(error)

@@ -14,11 +14,11 @@ import torch
 import torch.distributed as dist
 from scenes import alternating, ball_scene, exposed_scene
 
-import hyrfpack
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.parallel.ranks import Ranks, joined
+from hyrfpack.parallel.ranks import Ranks, join_processes
 from hyrfpack.scene import Picture, Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer, train
+from hyrfpack.train import trainer as trainers
 from hyrfpack.train.together import averaged, digest
 
 DENSITY = DensityConfig(start=0.05, stop=0.68, peak=0.4, excess=1.5, rounds=5, gradient=1e-5, resets=1)
@@ -67,18 +67,18 @@ def talk(ranks: Ranks) -> dict:
     weight, idle = torch.nn.Parameter(torch.zeros(2, 3)), torch.nn.Parameter(torch.zeros(2))
     weight.grad = torch.full((2, 3), float(ranks.rank))
     sums = averaged(ranks, [weight, idle], torch.tensor([1.0, ranks.rank]))
-    with joined() as again:
+    with join_processes() as again:
         pass
     return {
         "ranks": ranks,
         "again": again,
         "still there": dist.is_initialized(),
-        "told": ranks.told({"rank": ranks.rank}),
-        "first": ranks.first(("by", ranks.rank)),
-        "added": ranks.add(torch.tensor([1.0, ranks.rank])).tolist(),
-        "agreed": ranks.agree(lambda: ranks.rank * 10),
-        "refused by the last": sentence_of(lambda: ranks.agree(refuse(ranks.size - 1))),
-        "refused by all": sentence_of(lambda: ranks.agree(refuse(0))),
+        "told": ranks.all_gather({"rank": ranks.rank}),
+        "first": ranks.broadcast(("by", ranks.rank)),
+        "added": ranks.all_reduce(torch.tensor([1.0, ranks.rank])).tolist(),
+        "agreed": ranks.run_on_all(lambda: ranks.rank * 10),
+        "refused by the last": sentence_of(lambda: ranks.run_on_all(refuse(ranks.size - 1))),
+        "refused by all": sentence_of(lambda: ranks.run_on_all(refuse(0))),
         "averaged": weight.grad.tolist(),
         "averaged of idle": None if idle.grad is None else idle.grad.tolist(),
         "sums": sums.tolist(),
@@ -88,10 +88,10 @@ def talk(ranks: Ranks) -> dict:
 
 def leave(ranks: Ranks, leaver: int) -> None:
     """One ends without a word, and the others ask on."""
-    ranks.told("here")
+    ranks.all_gather("here")
     if ranks.rank == leaver:
         os._exit(0)
-    ranks.add(torch.ones(3))
+    ranks.all_reduce(torch.ones(3))
 
 
 # -- training --------------------------------------------------------------------------------------------------------
@@ -150,7 +150,7 @@ def stop_and_resume(ranks: Ranks, whole: Path, parts: Path, alone: Path) -> dict
         said[name] = result.complete, result.step, bool(result.metrics)
     said["other size"] = sentence_of(lambda: run(ranks, alone, resume=True))
     said["there already"] = sentence_of(lambda: run(ranks, whole))
-    said["checkpoint stays"] = ranks.agree((parts / "checkpoint.pt").is_file)
+    said["checkpoint stays"] = ranks.run_on_all((parts / "checkpoint.pt").is_file)
     return said
 
 
@@ -191,9 +191,9 @@ def refusals(ranks: Ranks) -> dict[str, str | None]:
         "photos": lambda: steps_of(ranks, fewer if mine else even_scene(), short),
     }
     said = {name: sentence_of(case) for name, case in cases.items()}
-    version, hyrfpack.__version__ = hyrfpack.__version__, "0.0" if mine else hyrfpack.__version__
+    version, trainers.__version__ = trainers.__version__, "0.0" if mine else trainers.__version__
     said["version"] = sentence_of(lambda: steps_of(ranks, even_scene(), short))
-    hyrfpack.__version__ = version
+    trainers.__version__ = version
     said["checkpoint"] = sentence_of(lambda: Trainer(even_scene(), short, ranks=ranks).load(Path("nowhere.pt")))
     said["none"] = sentence_of(lambda: steps_of(ranks, even_scene(), short))
     return said

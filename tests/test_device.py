@@ -122,7 +122,7 @@ def test_a_slow_choice_is_told(monkeypatch):
         choose_device("cuda", said.append)
         monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _: (7, 5))
         choose_device("cuda", said.append)
-    assert said == [devices.NO_METAL, devices.NO_TRITON, devices.OLD_GPU]
+    assert said == [devices.NO_METAL_NOTE, devices.NO_TRITON_NOTE, devices.OLD_GPU_NOTE]
 
 
 @pytest.mark.parametrize("solid", [None, np.array([0.25, 0.5, 1.0], np.float32)])
@@ -148,7 +148,9 @@ def test_photos_stay_on_a_gpu_as_far_as_they_fit(monkeypatch):
     first, second = (Picture(one, None, None) for one in rgb)
     solid = np.zeros(3, np.float32)
     sent = []
-    monkeypatch.setattr(devices, "_sent", lambda *args, send=devices._sent: sent.append(args[0]) or send(*args))
+    monkeypatch.setattr(
+        devices, "_upload_bytes", lambda *args, send=devices._upload_bytes: sent.append(args[0]) or send(*args)
+    )
     with pretended_gpu() as gpu:
         photos = devices.Photos(gpu)
         assert photos.limit_bytes == 1 << 30

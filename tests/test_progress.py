@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hyrfpack.parallel.pool import side_by_side
+from hyrfpack.parallel.pool import parallel_map
 from hyrfpack.progress import report_part, report_round, reporting
 
 
@@ -28,7 +28,7 @@ def test_rounds_follow_one_another_and_never_reach_the_end():
 
 def test_calls_of_several_threads_are_counted_once_each():
     told = []
-    assert side_by_side(reporting(abs, lambda *said: told.append(said), "drawing", 5), [-1, -2, 3, 4, -5]) == [
+    assert parallel_map(reporting(abs, lambda *said: told.append(said), "drawing", 5), [-1, -2, 3, 4, -5]) == [
         1,
         2,
         3,

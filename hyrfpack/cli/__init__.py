@@ -15,7 +15,6 @@ from typing import Any
 
 import click
 
-import hyrfpack
 from hyrfpack.cli.bench import bench
 from hyrfpack.cli.common import print_json
 from hyrfpack.cli.compare import compare
@@ -32,6 +31,7 @@ from hyrfpack.cli.view import view
 from hyrfpack.cli.views import evaluate, render
 from hyrfpack.cli.wording import with_options
 from hyrfpack.errors import HyrfError, printable
+from hyrfpack.version import __version__
 
 
 class _Commands(click.Group):
@@ -77,7 +77,7 @@ class _Commands(click.Group):
 def _tell_of_kernels() -> None:
     """Say it where the kernels that a command has compiled are lost with it."""
     kernels = sys.modules.get("hyrfpack.parallel.compiled")
-    if kernels is not None and not kernels.are_kept():
+    if kernels is not None and not kernels.can_cache_kernels():
         note(
             "compiled kernels cannot be kept, so that each run compiles them anew; name a folder for them in "
             "NUMBA_CACHE_DIR, and one for matplotlib's fonts in MPLCONFIGDIR"
@@ -102,7 +102,7 @@ class _Refusal(click.ClickException):
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
-@click.version_option(hyrfpack.__version__, prog_name="hyrfpack")
+@click.version_option(__version__, prog_name="hyrfpack")
 def main() -> None:
     """Make small .hyrf files of photos or a video: find poses, train hybrid radiance fields, compress, render, export.
 

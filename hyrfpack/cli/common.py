@@ -161,9 +161,9 @@ def device_options(command: Command) -> Command:
 def chosen_device(name: str, ranks: Ranks | None = None) -> torch.device:
     """The device of --device, with a word about it where it is slow; each of several processes has its own."""
     from hyrfpack.device import choose_own_device, describe_device
-    from hyrfpack.parallel.ranks import ALONE
+    from hyrfpack.parallel.ranks import SINGLE_PROCESS
 
-    device = choose_own_device(name, ranks or ALONE, note)
+    device = choose_own_device(name, ranks or SINGLE_PROCESS, note)
     detail(f"device: {describe_device(device)}")
     return device
 

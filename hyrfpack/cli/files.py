@@ -135,7 +135,7 @@ def compress(
             outputs.folder(report, FILES)
         return scene
 
-    scene = ranks.agree(read)
+    scene = ranks.run_on_all(read)
     with shown_progress("compress") as progress:
         result = pack(
             model,
@@ -152,7 +152,7 @@ def compress(
             report=report_part(progress, 0.0, 0.9),
             ranks=ranks,
         )
-        if not ranks.leads:
+        if not ranks.is_main:
             return
         scores = _scores(model, Path(result.file), scene, report_part(progress, 0.9, 1.0))
     written = note_rename(output, result.file)

@@ -13,8 +13,8 @@ from typing import Any, TextIO, TypeVar, cast
 
 import click
 
-import hyrfpack
 from hyrfpack.cli.wording import with_options
+from hyrfpack.version import __version__
 
 T = TypeVar("T")
 # In click's context, where all commands see them.
@@ -50,7 +50,7 @@ def _choose(ctx: click.Context, option: click.Parameter, given: bool) -> None:
 def _versions() -> str:
     from importlib.metadata import PackageNotFoundError, version
 
-    known = [f"hyrfpack {hyrfpack.__version__}", f"Python {platform.python_version()}"]
+    known = [f"hyrfpack {__version__}", f"Python {platform.python_version()}"]
     for package in _PACKAGES:
         with suppress(PackageNotFoundError):
             known.append(f"{package} {version(package)}")

@@ -26,18 +26,18 @@ def on_processes(command: Command) -> Command:
 
     @functools.wraps(command)
     def together(*args: Any, processes: int | None, **options: Any) -> Any:
-        from hyrfpack.parallel.ranks import joined, ranks_told_by
+        from hyrfpack.parallel.ranks import join_processes, ranks_from_environment
 
-        started = ranks_told_by(os.environ)
-        if processes is not None and not started.alone:
-            with _heard(started.leads):
+        started = ranks_from_environment(os.environ)
+        if processes is not None and not started.is_single:
+            with _heard(started.is_main):
                 raise click.UsageError(f"torchrun or srun has started {started.size} processes; leave out {OPTION}")
         if processes is not None and processes > 1:
             from hyrfpack.parallel.launch import launch
 
             ctx = click.get_current_context()
             ctx.exit(launch(without(arguments_of(ctx)), processes, note))
-        with joined() as ranks, _heard(ranks.leads):
+        with join_processes() as ranks, _heard(ranks.is_main):
             return command(*args, ranks=ranks, **options)
 
     with_option: Any = together

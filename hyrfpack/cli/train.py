@@ -124,7 +124,7 @@ def train(
         raise click.UsageError("--resume goes on with a run and --overwrite replaces it; give one of them")
     if None not in (settings["max_gaussians"], settings["target_bytes"]):
         raise click.UsageError("--max-gaussians and --target-size each decide how large the model is; give one of them")
-    if poses and not ranks.alone:
+    if poses and not ranks.is_single:
         raise click.UsageError("--poses is the work of one process; 'hyrfpack poses' first, then train from its folder")
     from hyrfpack.data import PictureCache
     from hyrfpack.device import describe_device
@@ -134,16 +134,16 @@ def train(
 
     place = chosen_device(device, ranks)
     try:
-        scene = ranks.agree(lambda: read_scene(data, reading))
+        scene = ranks.run_on_all(lambda: read_scene(data, reading))
     except HyrfNoPosesError:
         if not poses:
             raise
         scene = read_scene(_posed(data, out, reading["images"], resume, overwrite), {**reading, "images": None})
-    where = describe_device(place) + ("" if ranks.alone else f" in each of {ranks.size} processes")
+    where = describe_device(place) + ("" if ranks.is_single else f" in each of {ranks.size} processes")
     note(f"{scene.layout} scene: {len(scene.train)} photos to train on, {len(scene.test)} held out; on {where}")
     cache = None if cache_mb is None else PictureCache(cache_mb * 2**20 // ranks.local_size)
     config = TrainConfig(**settings)
-    with training_view(out.name, view and ranks.leads, view_port, note) as observer:
+    with training_view(out.name, view and ranks.is_main, view_port, note) as observer:
         try:
             result = run(
                 scene, out, config, resume=resume, overwrite=overwrite, cache=cache, device=place, observer=observer,
@@ -165,7 +165,7 @@ def train(
         note(f"{resuming(overwrite)} writes what is missing")
     if as_json:
         print_json({"complete": result.complete, "step": result.step, **result.metrics})
-    elif result.complete and ranks.leads:
+    elif result.complete and ranks.is_main:
         metrics = result.metrics
         click.echo(
             f"{result.model}: {metrics['gaussians']:,} Gaussians, {metrics['bytes']:,} bytes, "

@@ -109,9 +109,9 @@ def render(
     from hyrfpack.splats.draw import Drawable, draw
 
     place, settings = chosen_device(device, ranks), RenderSettings(exposure=exposure)
-    subject, scene = ranks.agree(lambda: Subject.of(model, place, precision, allow_partial)), None
+    subject, scene = ranks.run_on_all(lambda: Subject.of(model, place, precision, allow_partial)), None
     if data is not None:
-        scene = ranks.agree(lambda: read_scene(data, reading, subject.facts))
+        scene = ranks.run_on_all(lambda: read_scene(data, reading, subject.facts))
         views = split_views(scene, split)
         named = [(view.name, view.camera) for view in views]
     elif cameras is not None:
@@ -124,7 +124,7 @@ def render(
     names += [film.name] if film else []
 
     def check(replace: bool) -> None:
-        if ranks.leads:
+        if ranks.is_main:
             outputs = Outputs(subject.path, cameras, folder=subject.folder, scene=scene, overwrite=replace)
             outputs.folder(output, names)
 
@@ -137,11 +137,12 @@ def render(
         pictures = write_pictures(picture_of, named, output, overwrite=overwrite, ranks=ranks)
         return list(counted(pictures, len(ranks.share(named)), "rendering"))
 
-    ranks.agree(lambda: check(replace=True))  # whatever lies there: no folder is created where nothing may be written
+    # This first check ignores existing files. It keeps a folder from being created where nothing may be written.
+    ranks.run_on_all(lambda: check(replace=True))
     with exclusive_folder(output, ranks=ranks):  # until the video is written, too
-        ranks.agree(lambda: check(replace=overwrite))
-        parts = ranks.told(ranks.agree(write))
-        if not ranks.leads:
+        ranks.run_on_all(lambda: check(replace=overwrite))
+        parts = ranks.all_gather(ranks.run_on_all(write))
+        if not ranks.is_main:
             return
         written = [parts[place % ranks.size][place // ranks.size] for place in range(len(named))]
         if film:
@@ -220,7 +221,7 @@ def evaluate(
             outputs.folder(pictures, picture_names(views).values())
         return subject, shown, scene, views
 
-    subject, shown, scene, views = ranks.agree(read)
+    subject, shown, scene, views = ranks.run_on_all(read)
     with shown_progress("evaluate") as progress:
         scores = score(
             shown,
@@ -232,7 +233,7 @@ def evaluate(
             report=progress,
             ranks=ranks,
         )
-    if not ranks.leads:
+    if not ranks.is_main:
         return
     size = subject.bytes
     width, height = largest_picture(view.camera for view in views)

@@ -9,13 +9,13 @@ from importlib.resources import files
 
 import numpy as np
 
-import hyrfpack
 from hyrfpack.compare.curves import INK, draw_curves, keeps_times, line_style
 from hyrfpack.compare.differences import choices_that_differ, notes_that_differ, settings_that_differ
 from hyrfpack.compare.run import Run
 from hyrfpack.compare.views import ComparedView, data_address
 from hyrfpack.errors import printable
 from hyrfpack.evaluate.figures import ERROR_LIMIT, SMOOTHING, error_colors
+from hyrfpack.version import __version__
 from hyrfpack.web.player import content_policy, fill, json_text
 
 DARK_INK = "#a6acb3"  # as --dim in the style, where it is dark
@@ -38,7 +38,7 @@ def encode_comparison(
     style, script = _part("style.css"), _part("script.js")
     values = {
         "policy": content_policy(style, [script]),
-        "version": hyrfpack.__version__,
+        "version": __version__,
         "title": _escaped(f"{len(runs)} training runs: {', '.join(names)}"),
         "style": style,
         "doubts": "\n".join(f'<p class="doubt">{_escaped(sentence)}</p>' for sentence in doubts),

@@ -37,7 +37,7 @@ from hyrfpack.format.sections import (
     TABLES,
 )
 from hyrfpack.model import Decoded, HybridModel
-from hyrfpack.parallel.pool import side_by_side
+from hyrfpack.parallel.pool import parallel_map
 from hyrfpack.progress import Report, no_report, report_part, report_round
 from hyrfpack.render import render
 from hyrfpack.scene import Camera
@@ -313,4 +313,4 @@ def _pictures(model: HybridModel, cameras: Sequence[Camera], decoded: Decoded | 
     def picture(camera: Camera) -> Tensor:
         return render(model, camera, decoded=decoded).rgb
 
-    return side_by_side(picture, cameras, model.gaussians.positions.device)
+    return parallel_map(picture, cameras, model.gaussians.positions.device)

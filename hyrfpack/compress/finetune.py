@@ -26,7 +26,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import expose
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
-from hyrfpack.parallel.ranks import ALONE, Ranks
+from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.quant.steps import ONE, step_of
 from hyrfpack.render import render
 from hyrfpack.scene import Picture, View
@@ -57,7 +57,7 @@ def finetune(
     gains: Mapping[str, Tensor] | None = None,
     cache: PictureCache | None = None,
     report: Callable[[int, float], None] = lambda step, loss: None,
-    ranks: Ranks = ALONE,
+    ranks: Ranks = SINGLE_PROCESS,
 ) -> tuple[HybridModel, Plan]:
     """Fit a model's numbers to the photos as they will be decoded.
 
@@ -110,14 +110,14 @@ def finetune(
             try:
                 loss = _fit(tuned, photos, *next(pictures), gains)
             except HyrfError as refusal:
-                if ranks.alone:
+                if ranks.is_single:
                     raise
                 problem, loss = refusal, tuned.gaussians.positions.new_zeros(())
-            if not ranks.alone:
+            if not ranks.is_single:
                 said = averaged(ranks, list(tuned.parameters()), loss.new_tensor((loss, problem is not None)))
                 loss, problems = said / ranks.size
                 if problems:
-                    ranks.refuse(problem)
+                    ranks.raise_if_any(problem)
             tuned.load_state_dict(exact)
             _add_rate(tuned, quantized, LOSS_PER_ERROR * ERROR_PER_BIT * plan.distortion_per_number)
             broken = optimizer.step(step, steps)

@@ -40,7 +40,7 @@ from hyrfpack.format.run_folder import find_model
 from hyrfpack.format.smallest import check_target_bytes
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
-from hyrfpack.parallel.ranks import ALONE, Ranks
+from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Report, no_report, report_part, report_round
 from hyrfpack.scene import Scene, evenly_spaced
 
@@ -84,7 +84,7 @@ def compress(
     device: str | torch.device = "auto",
     say: Callable[[str], None] = lambda sentence: None,
     report: Report = no_report,
-    ranks: Ranks = ALONE,
+    ranks: Ranks = SINGLE_PROCESS,
     **settings: Any,
 ) -> CompressionReport:
     """Pack a `.hyrf` file into a smaller one.
@@ -131,14 +131,14 @@ def compress(
     source = find_model(source)
     # The main process alone looks, and the others wait for it: what it has written is no reason to refuse.
     outputs = Outputs(source, scene=data, overwrite=overwrite)
-    ranks.agree(lambda: outputs.file(target) if ranks.leads else None)
+    ranks.run_on_all(lambda: outputs.file(target) if ranks.is_main else None)
     if profile != "compact":
         if data is not None or finetune_steps or target_bytes or max_psnr_drop is not None or distortion:
             raise HyrfError(f"profile '{profile}' has no settings to fit to photos, sizes or losses; use 'compact'")
-        repacked = ranks.agree(
-            lambda: repack(source, target, profile, overwrite=overwrite, **settings) if ranks.leads else None
+        repacked = ranks.run_on_all(
+            lambda: repack(source, target, profile, overwrite=overwrite, **settings) if ranks.is_main else None
         )
-        return cast(CompressionReport, ranks.first(repacked))
+        return cast(CompressionReport, ranks.broadcast(repacked))
     if settings:
         raise HyrfError(f"profile 'compact' has no setting '{next(iter(settings))}'")
     if data is None and (finetune_steps or max_psnr_drop is not None):
@@ -163,7 +163,7 @@ def compress(
     encoding_starts = SEARCH_STARTS if finetune_steps or target_bytes or max_psnr_drop is not None else ENCODING_STARTS
     measuring = report_part(report, 0.0, encoding_starts)
     sensitivity, originals = calibrated(model, cameras, start, prune, measuring)
-    sensitivity = ranks.first(sensitivity)  # on GPUs those of others differ in their last bits
+    sensitivity = ranks.broadcast(sensitivity)  # on GPUs those of others differ in their last bits
     encoding = report_part(report, encoding_starts, 1.0)
     packer = Packer(model, kept, sensitivity, data, finetune_steps, prune, say, encoding, ranks=ranks)
     if target_bytes is not None:
@@ -174,8 +174,8 @@ def compress(
         aim = PSNR_DROP if distortion is None else None
         trial = packer.attempt(start, encoding) if finetune_steps else packer.settled(start, originals, aim)
         found = ""
-    written = ranks.agree(lambda: write_model(trial.data, target, overwrite=overwrite) if ranks.leads else None)
-    result = cast(CompressionReport, ranks.first(written))
+    written = ranks.run_on_all(lambda: write_model(trial.data, target, overwrite=overwrite) if ranks.is_main else None)
+    result = cast(CompressionReport, ranks.broadcast(written))
     total = sum(trial.errors.values())
     shares = {part: error / (total or 1.0) for part, error in trial.errors.items()}
     return dataclasses.replace(
@@ -214,7 +214,7 @@ class Packer:
     say: Callable[[str], None]
     report: Report = no_report
     cache: PictureCache = field(default_factory=PictureCache)
-    ranks: Ranks = ALONE
+    ranks: Ranks = SINGLE_PROCESS
 
     def attempt(self, distortion: float, report: Report = no_report) -> Trial:
         """A file that adds about so large a mean squared error to pictures."""

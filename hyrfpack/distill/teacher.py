@@ -15,7 +15,7 @@ from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.light import sent_light
-from hyrfpack.parallel.pool import side_by_side, torch_on_one_thread
+from hyrfpack.parallel.pool import parallel_map, torch_on_one_thread
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.splats.draw import Drawable, draw
@@ -64,7 +64,7 @@ def light_of(drawable: Drawable, cameras: Sequence[Camera]) -> Tensor:
         return index, light
 
     for first in range(0, len(cameras), LIT_AT_ONCE):
-        for index, sent in side_by_side(light, cameras[first : first + LIT_AT_ONCE], drawable.device):
+        for index, sent in parallel_map(light, cameras[first : first + LIT_AT_ONCE], drawable.device):
             total.index_add_(0, index, sent)
     return total / max(1, len(cameras))
 
@@ -84,7 +84,7 @@ class Sample:
     @classmethod
     def of(cls, drawable: Drawable, cameras: Sequence[Camera]) -> Sample:
         """Draw the splats once, however many models are compared with them."""
-        pictures = side_by_side(lambda camera: draw(drawable, camera).rgb.clamp(0, 1), cameras, drawable.device)
+        pictures = parallel_map(lambda camera: draw(drawable, camera).rgb.clamp(0, 1), cameras, drawable.device)
         return cls(list(cameras), pictures)
 
     @torch.no_grad()
@@ -97,4 +97,4 @@ class Sample:
             shown = render(model, self.cameras[place], decoded=decoded).rgb
             return psnr(shown.clamp(0, 1), self.pictures[place])
 
-        return side_by_side(score, range(len(self.cameras)), model.gaussians.positions.device)
+        return parallel_map(score, range(len(self.cameras)), model.gaussians.positions.device)

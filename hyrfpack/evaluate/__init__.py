@@ -23,7 +23,7 @@ from hyrfpack.evaluate.lpips import LPIPS
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
-from hyrfpack.parallel.ranks import ALONE, Ranks
+from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Report, no_report
 from hyrfpack.render import RenderSettings, apply_exposure_map, render
 from hyrfpack.render.files import file_names, save_picture
@@ -98,7 +98,7 @@ def evaluate(
     overwrite: bool = True,
     report: Report = no_report,
     warn: Callable[[str], None] | None = None,
-    ranks: Ranks = ALONE,
+    ranks: Ranks = SINGLE_PROCESS,
 ) -> Evaluation:
     """Render held-out views and score them against their photos.
 
@@ -185,7 +185,8 @@ def evaluate(
         return scores
 
     with nullcontext() if pictures is None else exclusive_folder(pictures, ranks=ranks):
-        told = sorted((row for rows in ranks.told(ranks.agree(scored)) for row in rows), key=lambda row: row[0])
+        rows_of_ranks = ranks.all_gather(ranks.run_on_all(scored))
+        told = sorted((row for rows in rows_of_ranks for row in rows), key=lambda row: row[0])
     scores = [score for _, score, _ in told if score is not None]
     if not scores:
         raise HyrfError("the masks of all views leave no pixel to score; check that white means 'use this pixel'")

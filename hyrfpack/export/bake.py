@@ -22,7 +22,7 @@ from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.light import sent_light
 from hyrfpack.ops.rasterize.reference import ALPHA_MIN
 from hyrfpack.ops.shade import Shading, encode_directions
-from hyrfpack.parallel.pool import run_tasks, side_by_side, torch_on_one_thread
+from hyrfpack.parallel.pool import parallel_map, run_tasks, torch_on_one_thread
 from hyrfpack.progress import Report, no_report, reporting
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
@@ -144,7 +144,7 @@ def sights_of(model: HybridModel, cameras: Sequence[Camera], report: Report = no
     """
     # Much of one runs on one core only.
     see = reporting(partial(_sight, model, model.decode_geometry()), report, "looking from each camera", len(cameras))
-    return side_by_side(see, cameras)
+    return parallel_map(see, cameras)
 
 
 @torch.no_grad()  # of each thread

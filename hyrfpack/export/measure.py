@@ -13,7 +13,7 @@ from torch import Tensor
 from hyrfpack.evaluate.metrics import psnr, to_8bit
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.background import pixel_directions
-from hyrfpack.parallel.pool import side_by_side
+from hyrfpack.parallel.pool import parallel_map
 from hyrfpack.progress import Report, no_report, reporting
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, View
@@ -77,7 +77,7 @@ def likeness(
         }
 
     compare = reporting(scores_at, report, "comparing pictures with the model's", len(views))
-    scores = [found for found in side_by_side(compare, views) if found]
+    scores = [found for found in parallel_map(compare, views) if found]
     return {name: _mean([found[name] for found in scores]) for name in ("model", *drawables)} if scores else {}
 
 

@@ -9,10 +9,10 @@ import zlib
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-import hyrfpack
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format.container import Container, Section
 from hyrfpack.format.sections import MAX_LAYERS, METADATA
+from hyrfpack.version import __version__
 
 CODEC_JSON, CODEC_DEFLATED = 0, 5
 MAX_BYTES = 1 << 20
@@ -88,7 +88,7 @@ class Metadata:
 
 def writer() -> str:
     """The program and its version, as files name it."""
-    return f"hyrfpack {hyrfpack.__version__}"
+    return f"hyrfpack {__version__}"
 
 
 def read_metadata(container: Container) -> Metadata:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import torch
 
-import hyrfpack
 from hyrfpack.parallel.pool import thread_count
+from hyrfpack.version import __version__
 
 
 def describe_machine() -> dict[str, object]:
@@ -19,7 +19,7 @@ def describe_machine() -> dict[str, object]:
         "cpu": _processor_name(),
         "cores": thread_count(),
         "python": platform.python_version(),
-        "hyrfpack": hyrfpack.__version__,
+        "hyrfpack": __version__,
         **package_versions("torch", "numba", "numpy"),
     }
     if torch.cuda.is_available():

@@ -1,5 +1,7 @@
-"""What work is shared among: compiled CPU kernels, the threads that run them, and processes. Knows nothing of what is
-computed."""
+"""Parallel work: compiled CPU kernels, the thread pool that runs them, and groups of processes.
+
+Nothing here knows what is computed.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +10,12 @@ from functools import cache
 
 @cache
 def has_numba() -> bool:
-    """Whether kernels can be compiled: Numba is there, and takes the numpy that is there, which importing it tells."""
+    """Return whether Numba can be imported, and so compile kernels.
+
+    Only importing it shows whether it supports the installed version of numpy.
+    """
     try:
         import numba  # noqa: F401
-    except (ImportError, OSError):  # it refuses a numpy that is too new; its compiler is a library that may not load
+    except (ImportError, OSError):  # Numba rejects a numpy that is too new, and its compiler library may fail to load
         return False
     return True

@@ -1,4 +1,4 @@
-"""Compiled kernels, kept on the disk where there is room for them."""
+"""Compiled CPU kernels, cached on disk where that is possible."""
 
 from __future__ import annotations
 
@@ -11,37 +11,38 @@ import numba
 from numba.core.caching import FunctionCache
 
 
-class _Cache(FunctionCache):
-    """Numba's cache of one function, for which a full disk is no reason to stop: the kernel is in memory already."""
+class _TolerantCache(FunctionCache):
+    """Numba's disk cache of one function, which ignores write errors: the compiled kernel is already in memory."""
 
     def save_overload(self, sig, data):
         try:
             super().save_overload(sig, data)
         except OSError:
-            # Numba writes the index before the code: it may name a file left by an older source, which would be run.
+            # Numba writes the index before the code. The index may now name a file of an older source, which would be
+            # loaded by the next process, so the index is removed.
             with suppress(OSError):
                 Path(self._cache_file._index_path).unlink()
 
 
-def are_kept() -> bool:
-    """Whether there is a folder that kernels can be kept in, from one process to the next."""
+def can_cache_kernels() -> bool:
+    """Return whether Numba finds a writable folder that keeps compiled kernels between processes."""
     try:
-        _Cache(are_kept)
+        _TolerantCache(can_cache_kernels)
     except RuntimeError:
         return False
     return True
 
 
 def compiled(**options: Any) -> Callable[[Callable], Callable]:
-    """A decorator: `numba.njit(nogil=True, **options)`, with the machine code cached on the disk.
+    """Decorate a function with `numba.njit(nogil=True, **options)` and cache its machine code on disk.
 
-    Where nothing can be kept (disk full, no folder that may be written), the kernel is compiled anew by each process.
+    Where nothing can be cached (the disk is full or no folder is writable), each process compiles the kernel again.
     """
 
     def decorate(function: Callable) -> Callable:
         kernel = numba.njit(nogil=True, **options)(function)
-        with suppress(RuntimeError):  # no folder that may be written
-            kernel._cache = _Cache(function)
+        with suppress(RuntimeError):  # Numba found no writable folder
+            kernel._cache = _TolerantCache(function)
         return kernel
 
     return decorate

@@ -1,4 +1,4 @@
-"""Starting one command as several processes on this machine, by torchrun's own launcher."""
+"""Start one command as several processes on this machine, with torchrun's launcher."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from hyrfpack.errors import HyrfError
 
 
 def launch(command: Sequence[str], processes: int, say: Callable[[str], None] = print) -> int:
-    """Run `python -m hyrfpack COMMAND ...` as so many processes that find each other, and wait for them.
+    """Run `python -m hyrfpack COMMAND ...` as several processes that form one group, and wait until all have ended.
 
-    What they print comes through. Where one ends before its time, the others are told to, and killed half a minute
-    later if they do not. Signals are passed on to them.
+    The output of the processes is passed through. When one process fails, the others are asked to stop and are killed
+    half a minute later if they still run. Signals are forwarded to all processes.
 
     Args:
-        command: words after `hyrfpack`.
-        processes: how many, 1 or more.
-        say: told which process was killed, where rank 0 has reported its own failure for that.
+        command: the arguments after `hyrfpack`.
+        processes: the number of processes, at least 1.
+        say: called with a sentence that names the killed process, unless rank 0 was killed.
 
     Returns:
-        The exit code of the first that failed, 0 where none did.
+        The exit code of the first process that failed, or 0 if none failed.
 
     Raises:
-        HyrfError: torch has no launcher here, or rank 0 was killed, which it cannot say itself.
+        HyrfError: this build of torch has no launcher, or rank 0 was killed, which it cannot report itself.
     """
     try:
         from torch.distributed.elastic.multiprocessing.api import SignalException
@@ -36,7 +36,7 @@ def launch(command: Sequence[str], processes: int, say: Callable[[str], None] = 
         raise HyrfError(
             f"this build of torch cannot start processes that talk to each other ({error}); leave out `processes`"
         ) from error
-    logging.disable()  # its reports of what the processes tell themselves
+    logging.disable()  # the launcher would repeat the errors that the processes print themselves
     config = LaunchConfig(
         min_nodes=1,
         max_nodes=1,

@@ -1,7 +1,7 @@
-"""One small pool of threads for every compiled CPU kernel.
+"""One thread pool that all compiled CPU kernels share.
 
-Kernels release the GIL, so plain Python threads run them on all cores. One pool for all of them (and not OpenMP
-inside each) keeps a second threading runtime from fighting torch's over the same cores.
+Kernels release the GIL, so plain Python threads run them on all cores. One pool for all kernels, instead of OpenMP in
+each kernel, avoids a second threading runtime that would compete with torch's for the same cores.
 """
 
 from __future__ import annotations
@@ -22,51 +22,54 @@ T = TypeVar("T")
 
 
 def thread_count() -> int:
-    """Threads to use: HYRFPACK_THREADS, else the cores this process may run on."""
-    asked = os.environ.get("HYRFPACK_THREADS", "")
-    if asked.isdigit() and int(asked) > 0:
-        return int(asked)
-    return cores()
+    """Return the number of threads to use: HYRFPACK_THREADS, or else the number of available cores."""
+    requested = os.environ.get("HYRFPACK_THREADS", "")
+    if requested.isdigit() and int(requested) > 0:
+        return int(requested)
+    return available_cores()
 
 
-def cores() -> int:
-    """Cores this process may run on."""
+def available_cores() -> int:
+    """Return the number of CPU cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-_this_thread = threading.local()
+_thread_state = threading.local()
 
 
-def _be_one_core() -> None:
-    """Each worker is one core's worth of work: neither torch nor this pool shall fan out again inside it."""
+def _limit_worker_to_one_core() -> None:
+    """Initialise a worker thread so that neither torch nor this pool starts further threads inside it."""
     torch.set_num_threads(1)
-    _this_thread.works = True
+    _thread_state.is_worker = True
 
 
 @cache
 def _executor(threads: int) -> ThreadPoolExecutor:
-    # A thread that torch has not asked for its number yet takes the one that was set last, in whatever thread: asked
-    # now, this one keeps its own.
+    # torch assigns a thread its thread count at the first query, and takes the count that any thread set last. The
+    # query here fixes the count of the calling thread before the workers set theirs to 1.
     torch.get_num_threads()
-    return ThreadPoolExecutor(threads, thread_name_prefix="hyrfpack", initializer=_be_one_core)
+    return ThreadPoolExecutor(threads, thread_name_prefix="hyrfpack", initializer=_limit_worker_to_one_core)
 
 
-def _after_fork() -> None:
-    """A forked child has none of its parent's threads: the pool starts its own; torch would wait for them for ever."""
+def _reset_threads_after_fork() -> None:
+    """Make the pool start new threads in a forked child, which has none of its parent's threads.
+
+    torch is limited to one thread there, because it would wait for its missing threads for ever.
+    """
     _executor.cache_clear()
     torch.set_num_threads(1)
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
+    os.register_at_fork(after_in_child=_reset_threads_after_fork)
 
 
 @cache
 def keep_freed_memory() -> None:
-    """Ask the C library to reuse large blocks instead of giving them back to the system (glibc only).
+    """Make the C library reuse large memory blocks instead of returning them to the system (glibc only).
 
-    A training step frees and allocates the same tens of megabytes again and again; having the system clear fresh
-    pages for them each time costs a tenth of the step.
+    Every training step frees and allocates the same tens of megabytes. If the system clears new pages for them each
+    time, a step takes 10 % longer.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
     if mallopt is not None:
@@ -77,10 +80,10 @@ def keep_freed_memory() -> None:
 
 @contextmanager
 def torch_on_one_thread() -> Iterator[None]:
-    """Keep torch from spreading single operations over threads while this pool does the work.
+    """Limit torch to one thread for each operation while the block runs, so that this pool has the cores.
 
-    The many small operations of a training step gain nothing from torch's own threads, which go on spinning after
-    each one on the cores the pool needs: with both, a step takes 3 to 10 times as long.
+    The many small operations of a training step do not run faster on torch's own threads. After each operation those
+    threads keep spinning on the cores that the pool needs: a step then takes 3 to 10 times as long.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -90,15 +93,24 @@ def torch_on_one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def run_tasks(task: Callable[[int], None], count: int, *, little: bool = False) -> None:
-    """Call task(0) ... task(count - 1) on the pool's threads and wait for all; then the first error is raised here.
+def run_tasks(task: Callable[[int], None], count: int, *, sequential: bool = False) -> None:
+    """Call task(0) ... task(count - 1) on the threads of the pool and wait until all have finished.
 
-    Tasks are pulled one by one, so uneven ones balance. Results must not depend on which thread ran what: each
-    task writes to its own place. Inside of a task, further ones run one after the other, and so do those that are so
-    `little` work all together that they are done before a thread is awake (some 50 microseconds).
+    Threads take tasks one by one, so that tasks of different length balance. The result must not depend on which
+    thread runs which task: each task writes to a place of its own. Tasks that are started inside a task run one after
+    the other in the same thread. After the first error no further task is started.
+
+    Args:
+        task: function of the task's index.
+        count: number of tasks.
+        sequential: run all tasks in the calling thread. This is faster where they take less time together than waking
+            a thread (about 50 microseconds).
+
+    Raises:
+        BaseException: the error of the failed task with the lowest index.
     """
     threads = thread_count()
-    if little or count == 1 or threads == 1 or getattr(_this_thread, "works", False):
+    if sequential or count == 1 or threads == 1 or getattr(_thread_state, "is_worker", False):
         for index in range(count):
             task(index)
         return
@@ -112,7 +124,7 @@ def run_tasks(task: Callable[[int], None], count: int, *, little: bool = False) 
                 task(index)
             except BaseException as error:
                 errors[index] = error
-                for _ in pending:  # nothing new is begun
+                for _ in pending:  # no further task is started
                     pass
 
     for future in [_executor(threads).submit(worker) for _ in range(min(threads, count))]:
@@ -122,7 +134,13 @@ def run_tasks(task: Callable[[int], None], count: int, *, little: bool = False) 
 
 
 def run_ranges(task: Callable[[int, int], None], length: int, minimum: int = 2048) -> None:
-    """Split [0, length) into contiguous ranges, a few for each thread, and call task(start, stop) on each."""
+    """Split [0, length) into contiguous ranges, up to four for each thread, and call task(start, stop) on each.
+
+    Args:
+        task: function of a range's start and stop.
+        length: number of items.
+        minimum: smallest number of items in a range, unless there are fewer.
+    """
     if length == 0:
         return
     ranges = max(1, min(4 * thread_count(), length // minimum))
@@ -130,18 +148,21 @@ def run_ranges(task: Callable[[int, int], None], length: int, minimum: int = 204
     run_tasks(lambda i: task(edges[i], edges[i + 1]), ranges)
 
 
-def side_by_side(
+def parallel_map(
     function: Callable[[S], T],
     items: Sequence[S],
     device: torch.device = torch.device("cpu"),  # noqa: B008 - a constant
 ) -> list[T]:
-    """What a function returns for each item, in their order; an item a core at a time.
+    """Call a function for each item on the threads of the pool and return the results in the order of the items.
 
     Args:
-        device: where it does its work. Any but the CPU takes one item after the other, which fill it.
+        function: called once for each item, in any order.
+        items: arguments of the calls.
+        device: the device that the function computes on. On any other than the CPU the calls run one after the other,
+            because each of them occupies the whole device.
 
     Example:
-        >>> side_by_side(abs, [-2, 3])
+        >>> parallel_map(abs, [-2, 3])
         [2, 3]
     """
     if device.type != "cpu":
@@ -156,5 +177,5 @@ def side_by_side(
 
 
 def run_jobs(jobs: dict[str, Callable[[], T]]) -> dict[str, T]:
-    """What independent jobs return; they run side by side."""
-    return dict(zip(jobs, side_by_side(lambda job: job(), list(jobs.values())), strict=True))
+    """Run independent jobs on the threads of the pool and return the result of each by its name."""
+    return dict(zip(jobs, parallel_map(lambda job: job(), list(jobs.values())), strict=True))

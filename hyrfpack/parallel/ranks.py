@@ -1,7 +1,7 @@
-"""Processes that do one piece of work together: which of them this one is, and what they tell each other.
+"""Groups of processes that do one piece of work together: the rank of this process and collective operations.
 
-torchrun or SLURM starts them, one a GPU as a rule, and says in the environment of each which it is (its rank); what
-they send goes through torch.distributed: gloo for the CPU, NCCL for CUDA. One process alone needs no network.
+torchrun or SLURM starts the processes, usually one for each GPU, and gives each its rank in the environment. They
+communicate through torch.distributed, with gloo for the CPU and NCCL for CUDA. A single process needs no network.
 """
 
 from __future__ import annotations
@@ -22,28 +22,32 @@ import torch.distributed as dist
 from torch import Tensor
 
 from hyrfpack.errors import HyrfError, reason_of
-from hyrfpack.parallel.pool import cores
+from hyrfpack.parallel.pool import available_cores
 
 Item = TypeVar("Item")
 
-# Until one that says nothing is taken to be gone: shares of work may be uneven. One that has ended is missed at once.
-PATIENCE = timedelta(minutes=30)
-PORTS = 20_000, 40_000  # that SLURM's jobs meet at, unless MASTER_PORT says where
+# A process that sends nothing for this long counts as gone. It is long because shares of work may be uneven; a process
+# that has ended is noticed at once.
+COLLECTIVE_TIMEOUT = timedelta(minutes=30)
+# Ports from which each SLURM job gets one for its rendezvous, unless MASTER_PORT names one. Job numbers decide, so that
+# two jobs on one machine do not collide.
+SLURM_PORTS = range(20_000, 40_000)
 
 
 @dataclass(frozen=True)
 class Ranks:
-    """The processes that work together, and which of them this is.
+    """A group of processes that work together, and the place of this process in it.
 
-    What all of them call, all of them have to call in the same order; each call waits for the slowest.
+    `all_reduce`, `all_gather`, `broadcast`, `run_on_all` and `raise_if_any` are collective: all processes have to call
+    them in the same order, and each call waits for the slowest process.
 
     Attributes:
-        rank, size: this one's number, from 0, and how many there are.
-        local_rank, local_size: the same among those on this machine.
-        restarts: how often their launcher has started them all anew.
+        rank, size: number of this process, from 0, and number of processes.
+        local_rank, local_size: the same among the processes on this machine.
+        restarts: how often the launcher has restarted the group.
 
     Example:
-        >>> with joined() as ranks:  # one process where nobody has started more
+        >>> with join_processes() as ranks:  # a single process, unless a launcher has started more
         ...     ranks.size, ranks.share(["a", "b", "c"])
         (1, ['a', 'b', 'c'])
     """
@@ -55,108 +59,134 @@ class Ranks:
     restarts: int = 0
 
     @property
-    def alone(self) -> bool:
-        """Whether there is no other."""
+    def is_single(self) -> bool:
+        """Whether this process is the only one of the group."""
         return self.size == 1
 
     @property
-    def leads(self) -> bool:
-        """Whether this is rank 0, which writes files and speaks for all."""
+    def is_main(self) -> bool:
+        """Whether this is the main process, rank 0, which writes files and prints for all."""
         return self.rank == 0
 
     def share(self, items: Sequence[Item]) -> list[Item]:
-        """Every `size`-th item, beginning with the `rank`-th: each is some rank's."""
+        """Return the share of this rank: every `size`-th item, starting with item number `rank`."""
         return list(items[self.rank :: self.size])
 
-    def add(self, values: Tensor) -> Tensor:
-        """Sum a tensor over all ranks, in place: of the same shape on each, and of the same bits afterwards.
+    def all_reduce(self, values: Tensor) -> Tensor:
+        """Sum a tensor over all ranks, in place, and return it.
+
+        The tensor needs the same shape on all ranks. Afterwards its bits are the same on all of them.
 
         Raises:
-            HyrfError: another process has gone.
+            HyrfError: another process has ended or does not respond.
         """
-        if not self.alone:
-            with self._all_there():
+        if not self.is_single:
+            with self._communication_errors():
                 dist.all_reduce(values)
         return values
 
-    def told(self, item: Item) -> list[Item]:
-        """What each rank has to say, by rank. Anything that can be pickled. Raises as `add`."""
-        if self.alone:
+    def all_gather(self, item: Item) -> list[Item]:
+        """Return the items of all ranks, in the order of the ranks, on each of them.
+
+        Args:
+            item: any object that can be pickled.
+
+        Raises:
+            HyrfError: another process has ended or does not respond.
+        """
+        if self.is_single:
             return [item]
         items = [item] * self.size
-        with self._all_there():
+        with self._communication_errors():
             dist.all_gather_object(items, item)
         return items
 
-    def first(self, item: Item) -> Item:
-        """What rank 0 has to say; what others give is not looked at. Raises as `add`."""
-        if self.alone:
+    def broadcast(self, item: Item) -> Item:
+        """Return the item of rank 0 on all ranks; the items of other ranks are ignored.
+
+        Args:
+            item: any object that can be pickled.
+
+        Raises:
+            HyrfError: another process has ended or does not respond.
+        """
+        if self.is_single:
             return item
-        items = [item if self.leads else None]
-        with self._all_there():
+        items = [item if self.is_main else None]
+        with self._communication_errors():
             dist.broadcast_object_list(items, src=0)
         return cast(Item, items[0])
 
-    def agree(self, work: Callable[[], Item]) -> Item:
-        """What some work comes to that each rank does for itself. Where one cannot do it, none goes on.
+    def run_on_all(self, work: Callable[[], Item]) -> Item:
+        """Run a function on every rank and return this rank's result, if it succeeded on all of them.
 
         Raises:
-            HyrfError: of the first rank that could not do it, on all of them.
+            HyrfError: the function raised one on some rank; all ranks raise the error of the lowest such rank.
         """
-        if self.alone:
+        if self.is_single:
             return work()
         result, problem = None, None
         try:
             result = work()
         except HyrfError as error:
             problem = error
-        self.refuse(problem)
+        self.raise_if_any(problem)
         return cast(Item, result)
 
-    def refuse(self, problem: HyrfError | None) -> None:
-        """Raise the problem of the first rank that has one on all of them."""
-        problems = self.told(None if problem is None else str(problem))
-        those = [rank for rank, sentence in enumerate(problems) if sentence]
-        if problem is not None and len(those) == self.size:
-            raise problem  # what all meet is told as by one
-        if those:
-            raise HyrfError(f"process {those[0]} of {self.size}: {problems[those[0]]}") from problem
+    def raise_if_any(self, problem: HyrfError | None) -> None:
+        """Raise an error on all ranks if any of them has one: that of the lowest such rank.
+
+        Args:
+            problem: the error of this rank, or None.
+
+        Raises:
+            HyrfError: some rank has an error.
+        """
+        problems = self.all_gather(None if problem is None else str(problem))
+        failed = [rank for rank, sentence in enumerate(problems) if sentence]
+        if problem is not None and len(failed) == self.size:
+            raise problem  # an error of all processes reads as that of a single one
+        if failed:
+            raise HyrfError(f"process {failed[0]} of {self.size}: {problems[failed[0]]}") from problem
 
     @contextmanager
-    def _all_there(self) -> Iterator[None]:
+    def _communication_errors(self) -> Iterator[None]:
+        """Turn an error of torch.distributed in the block into a HyrfError."""
         try:
             yield
-        except RuntimeError as error:  # all of torch.distributed's are
+        except RuntimeError as error:  # the type of all errors of torch.distributed
             if isinstance(error, (torch.OutOfMemoryError, NotImplementedError)):
                 raise
-            reason = re.sub(r"\[\S*/\S*:\d+\] ", "", reason_of(error, 300))  # where in gloo's source it is said
+            reason = re.sub(r"\[\S*/\S*:\d+\] ", "", reason_of(error, 300))  # less the location in gloo's source
             raise HyrfError(
                 f"one of the {self.size} processes has ended or says nothing any more ({reason}); see what it said, "
                 "and whether memory was short"
             ) from error
 
 
-ALONE = Ranks()
+SINGLE_PROCESS = Ranks()
 
 
 @contextmanager
-def joined(environment: Mapping[str, str] | None = None) -> Iterator[Ranks]:
-    """Meet the other processes that torchrun or SLURM's srun has started; without any, there is nothing to do.
+def join_processes(environment: Mapping[str, str] | None = None) -> Iterator[Ranks]:
+    """Connect to the other processes that torchrun or SLURM's srun has started, while the block runs.
 
-    On each machine they share its cores (HYRFPACK_THREADS of each is set, unless it is already).
+    A process that was started without a launcher is a group of its own. The processes on one machine share its cores:
+    HYRFPACK_THREADS of each is set, unless it is set already.
 
     Args:
-        environment: that tells of them; None for the process's own.
+        environment: environment variables that describe the group; None for those of this process.
 
     Raises:
-        HyrfError: what it tells makes no sense, they do not find each other, or torch was built without this.
+        HyrfError: the environment is contradictory, the processes do not find each other, or torch was built without
+            gloo.
     """
     environment = os.environ if environment is None else environment
-    ranks = ranks_told_by(environment)
-    if ranks.alone:
+    ranks = ranks_from_environment(environment)
+    if ranks.is_single:
         yield ranks
         return
-    if dist.is_initialized():  # by whoever calls this as a library
+    if dist.is_initialized():  # by the program that uses this library
         yield ranks
         return
     if not (dist.is_available() and dist.is_gloo_available()):
@@ -165,18 +195,21 @@ def joined(environment: Mapping[str, str] | None = None) -> Iterator[Ranks]:
             "or start one process"
         )
     if "TORCHELASTIC_RUN_ID" in environment:
-        _stop_with_launcher()
-    os.environ.setdefault("HYRFPACK_THREADS", str(max(1, cores() // ranks.local_size)))
-    address, port = meeting_point(environment)
+        _stop_when_launcher_ends()
+    os.environ.setdefault("HYRFPACK_THREADS", str(max(1, available_cores() // ranks.local_size)))
+    address, port = rendezvous_address(environment)
     devices = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and dist.is_nccl_available() else "gloo"
     try:
         if "TORCHELASTIC_RUN_ID" in environment:
-            # torchrun's own store, which remembers what those said that were started before.
-            store = dist.PrefixStore(f"start {ranks.restarts}", dist.TCPStore(address, port, None, False, PATIENCE))
-            dist.init_process_group(devices, timeout=PATIENCE, store=store, rank=ranks.rank, world_size=ranks.size)
+            # This is torchrun's own store. It still holds the keys of processes before a restart, hence the prefix.
+            tcp_store = dist.TCPStore(address, port, None, False, COLLECTIVE_TIMEOUT)
+            store = dist.PrefixStore(f"start {ranks.restarts}", tcp_store)
+            dist.init_process_group(
+                devices, timeout=COLLECTIVE_TIMEOUT, store=store, rank=ranks.rank, world_size=ranks.size
+            )
         else:
             where = f"tcp://{address}:{port}"
-            dist.init_process_group(devices, where, timeout=PATIENCE, rank=ranks.rank, world_size=ranks.size)
+            dist.init_process_group(devices, where, timeout=COLLECTIVE_TIMEOUT, rank=ranks.rank, world_size=ranks.size)
     except (RuntimeError, ValueError) as error:
         hint = "set MASTER_PORT to a free one" if "EADDRINUSE" in str(error) else "see whether all were started"
         raise HyrfError(
@@ -189,10 +222,10 @@ def joined(environment: Mapping[str, str] | None = None) -> Iterator[Ranks]:
         dist.destroy_process_group()
 
 
-def _stop_with_launcher() -> None:
-    """Be asked to stop when torchrun's launcher is killed, which then can tell nobody.
+def _stop_when_launcher_ends() -> None:
+    """Send SIGTERM to this process once torchrun's launcher is gone: a killed launcher cannot stop its processes.
 
-    Looked for, because Linux's own signal of a parent's death comes once for each of the parent's threads.
+    A thread polls for this, because Linux sends its parent-death signal once for each thread of the parent.
     """
     launcher = os.getppid()
 
@@ -204,30 +237,30 @@ def _stop_with_launcher() -> None:
     Thread(target=watch, daemon=True).start()
 
 
-def ranks_told_by(environment: Mapping[str, str]) -> Ranks:
-    """The processes that an environment tells of: torchrun's words, else those of a step of SLURM's srun.
+def ranks_from_environment(environment: Mapping[str, str]) -> Ranks:
+    """Return the group that environment variables describe: those of torchrun, or else those of a step of SLURM's srun.
 
-    A job's own script under SLURM is one process, however many tasks the job may have.
+    The batch script of a SLURM job is a single process, however many tasks the job has.
 
     Raises:
-        HyrfError: it tells only half, or what makes no sense.
+        HyrfError: a variable is missing, or they contradict each other.
 
     Example:
-        >>> ranks_told_by({"RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "2"})
+        >>> ranks_from_environment({"RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "2"})
         Ranks(rank=1, size=2, local_rank=1, local_size=2, restarts=0)
     """
     if "RANK" in environment or "WORLD_SIZE" in environment:
-        rank, size = _count("RANK", environment), _count("WORLD_SIZE", environment)
-        local_rank = _count("LOCAL_RANK", environment, rank)
-        local_size = _count("LOCAL_WORLD_SIZE", environment, size)
-        restarts = _count("TORCHELASTIC_RESTART_COUNT", environment, 0)
+        rank, size = _read_count("RANK", environment), _read_count("WORLD_SIZE", environment)
+        local_rank = _read_count("LOCAL_RANK", environment, rank)
+        local_size = _read_count("LOCAL_WORLD_SIZE", environment, size)
+        restarts = _read_count("TORCHELASTIC_RESTART_COUNT", environment, 0)
     elif "SLURM_STEP_NUM_TASKS" in environment and "SLURM_PROCID" in environment:
-        rank, size = _count("SLURM_PROCID", environment), _count("SLURM_STEP_NUM_TASKS", environment)
-        local_rank = _count("SLURM_LOCALID", environment, rank)
-        local_size = min(size, _tasks_here(environment, size))
-        restarts = _count("SLURM_RESTART_COUNT", environment, 0)
+        rank, size = _read_count("SLURM_PROCID", environment), _read_count("SLURM_STEP_NUM_TASKS", environment)
+        local_rank = _read_count("SLURM_LOCALID", environment, rank)
+        local_size = min(size, _tasks_on_this_machine(environment, size))
+        restarts = _read_count("SLURM_RESTART_COUNT", environment, 0)
     else:
-        return ALONE
+        return SINGLE_PROCESS
     if not (0 <= rank < size and 0 <= local_rank < local_size <= size):
         raise HyrfError(
             f"the environment speaks of process {rank} of {size}, number {local_rank} of {local_size} on this machine, "
@@ -236,40 +269,45 @@ def ranks_told_by(environment: Mapping[str, str]) -> Ranks:
     return Ranks(rank, size, local_rank, local_size, restarts)
 
 
-def meeting_point(environment: Mapping[str, str]) -> tuple[str, int]:
-    """Address and port at which rank 0 waits for the others.
+def rendezvous_address(environment: Mapping[str, str]) -> tuple[str, int]:
+    """Return the address and port at which rank 0 waits for the other processes.
 
-    MASTER_ADDR and MASTER_PORT where they are set; else the first machine of SLURM's step, and a port by its job.
+    They are MASTER_ADDR and MASTER_PORT where these are set. Otherwise the address is the first machine of the SLURM
+    step, and the port follows from the numbers of the job and the step.
 
     Example:
-        >>> meeting_point({"SLURM_STEP_NODELIST": "gpu[07-09]", "SLURM_JOB_ID": "41"})
+        >>> rendezvous_address({"SLURM_STEP_NODELIST": "gpu[07-09]", "SLURM_JOB_ID": "41"})
         ('gpu07', 20328)
     """
     address = environment.get("MASTER_ADDR")
     if address is None:
-        # "gpu[07-09,12]-ib,cpu3": up to the first comma outside of brackets, and of each bracket the first number.
+        # Of "gpu[07-09,12]-ib,cpu3", take what is before the first comma outside of brackets, and the first number of
+        # each bracket.
         first = re.match(r"(?:[^,\[]|\[[^\]]*\])+", environment.get("SLURM_STEP_NODELIST", "127.0.0.1"))
         address = re.sub(r"\[([^\],-]+)[^\]]*\]", r"\1", first[0]) if first else "127.0.0.1"
-    low, high = PORTS
-    job = _count("SLURM_JOB_ID", environment, 0) * 8 + _count("SLURM_STEP_ID", environment, 0)
-    return address, _count("MASTER_PORT", environment, low + job % (high - low))
+    job = _read_count("SLURM_JOB_ID", environment, 0) * 8 + _read_count("SLURM_STEP_ID", environment, 0)
+    return address, _read_count("MASTER_PORT", environment, SLURM_PORTS[job % len(SLURM_PORTS)])
 
 
-def _tasks_here(environment: Mapping[str, str], otherwise: int) -> int:
-    """Tasks of a SLURM step on this machine: "2(x3),1" is two on each of three machines, and one on a fourth."""
+def _tasks_on_this_machine(environment: Mapping[str, str], default: int) -> int:
+    """Return the number of tasks of a SLURM step on this machine, or `default` where SLURM does not give it.
+
+    SLURM writes "2(x3),1" for two tasks on each of three machines, and one on a fourth.
+    """
     counts = [
         int(tasks)
         for tasks, times in re.findall(r"(\d+)(?:\(x(\d+)\))?", environment.get("SLURM_STEP_TASKS_PER_NODE", ""))
         for _ in range(int(times or 1))
     ]
-    machine = _count("SLURM_NODEID", environment, 0)
-    return counts[machine] if machine < len(counts) else otherwise
+    machine = _read_count("SLURM_NODEID", environment, 0)
+    return counts[machine] if machine < len(counts) else default
 
 
-def _count(name: str, environment: Mapping[str, str], otherwise: int | None = None) -> int:
+def _read_count(name: str, environment: Mapping[str, str], default: int | None = None) -> int:
+    """Return an environment variable as a whole number, or `default` where it is not set."""
     text = environment.get(name)
-    if text is None and otherwise is not None:
-        return otherwise
+    if text is None and default is not None:
+        return default
     if text is None or not re.fullmatch("[0-9]{1,15}", text):
         raise HyrfError(
             f"the environment variable {name} is {'missing' if text is None else repr(text)}, where the number of a "

@@ -17,7 +17,7 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import PICTURES
-from hyrfpack.parallel.ranks import ALONE, Ranks
+from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.render.renderer import RenderSettings, render
 from hyrfpack.scene import Camera
 
@@ -30,7 +30,7 @@ def render_files(
     depth: bool = False,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     overwrite: bool = True,
-    ranks: Ranks = ALONE,
+    ranks: Ranks = SINGLE_PROCESS,
 ) -> Iterator[Path]:
     """Render named cameras to `folder/<name>.png`, sub-folders kept; yields each path once it is written.
 
@@ -83,7 +83,7 @@ def write_pictures(
     folder: str | os.PathLike[str],
     *,
     overwrite: bool = True,
-    ranks: Ranks = ALONE,
+    ranks: Ranks = SINGLE_PROCESS,
 ) -> Iterator[Path]:
     """Write what `draw` shows of named cameras into a folder that the caller has locked; see `render_files`."""
     named = list(zip(file_names([name for name, _ in cameras]), cameras, strict=True))

@@ -11,7 +11,7 @@ from hyrfpack.cameras.paths import look_at
 from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.model import Frame
-from hyrfpack.parallel.pool import side_by_side
+from hyrfpack.parallel.pool import parallel_map
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.splats import Splats
@@ -124,7 +124,7 @@ def viewpoints(
     for _ in range(TRIED):
         ends = [_inside(weighted, rng) if inside else _outside(weighted, rng) for _ in range(count)]
         cameras = [_camera(place, target, size, FIELD_OF_VIEW[inside]) for place, target in ends]
-        for share, camera in zip(side_by_side(covered, cameras, drawable.device), cameras, strict=True):
+        for share, camera in zip(parallel_map(covered, cameras, drawable.device), cameras, strict=True):
             if share >= COVERED:
                 found.append(camera)
             else:
@@ -151,13 +151,13 @@ def surrounds(weighted: Weighted, drawable: Drawable) -> bool:
     """Whether there are places in the box with room around them and splats all around."""
     rng = np.random.default_rng(0)
     places = [_inside(weighted, rng)[0] for _ in range(PLACES)]
-    clutter = np.array(side_by_side(lambda place: weighted.clutter(place, ROOMY), places))
+    clutter = np.array(parallel_map(lambda place: weighted.clutter(place, ROOMY), places))
     seen = []
     for index in np.argsort(clutter, kind="stable")[:CLEAREST]:
         if clutter[index] <= CLUTTER:
             axes = np.concatenate((np.eye(3), -np.eye(3)))
             cameras = [_camera(places[index], places[index] + axis * weighted.radius, THUMBNAIL, 90.0) for axis in axes]
-            shares = side_by_side(lambda camera: coverage(drawable, camera), cameras, drawable.device)
+            shares = parallel_map(lambda camera: coverage(drawable, camera), cameras, drawable.device)
             seen.append(np.mean(shares))
     return len(seen) > 0 and float(np.median(seen)) >= ENCLOSED
 

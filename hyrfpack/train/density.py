@@ -14,7 +14,7 @@ from torch import Tensor
 from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.ops.transfer import tensor_like
-from hyrfpack.parallel.ranks import ALONE, Ranks
+from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.render import Rendering
 from hyrfpack.scene import Camera
 from hyrfpack.train.config import DensityConfig
@@ -52,7 +52,7 @@ class DensityControl:
         initial: int,
         seed: int,
         device: torch.device | None = None,
-        ranks: Ranks = ALONE,
+        ranks: Ranks = SINGLE_PROCESS,
     ) -> None:
         self.ranks = ranks
         self.config = config
@@ -112,7 +112,7 @@ class DensityControl:
     @torch.no_grad()
     def _round(self, step: int, model: HybridModel, optimizer: Optimizer) -> None:
         for name in COLLECTED:
-            self.ranks.add(getattr(self, name))
+            self.ranks.all_reduce(getattr(self, name))
         explicit = model.gaussians
         geometry = model.decode_geometry()
         bounds = model.scale_bounds(explicit.positions)
@@ -135,7 +135,7 @@ class DensityControl:
         # What two share is each one's half.
         self.squares[cloned] /= 2
         self.squares = FADING * torch.cat((self.squares[keep], self.squares[cloned], self.squares[split.repeat(2)] / 2))
-        if not self.ranks.leads:  # what came before is summed once
+        if not self.ranks.is_main:  # what came before is summed once
             self.squares.zero_()
         self.clear(len(model))
 

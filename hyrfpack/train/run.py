@@ -22,7 +22,7 @@ from hyrfpack.evaluate import picture_names
 from hyrfpack.format.run_folder import CHECKPOINT, METRICS, MODEL
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
-from hyrfpack.parallel.ranks import ALONE, Ranks
+from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.scene import Scene, View
 from hyrfpack.train.checkpoint import saved_decisions
 from hyrfpack.train.config import TrainConfig
@@ -94,7 +94,7 @@ def train(
     phase: Phase | None = None,
     observer: Observer | None = None,
     log: Path | str | None = None,
-    ranks: Ranks = ALONE,
+    ranks: Ranks = SINGLE_PROCESS,
 ) -> TrainResult:
     """Train a model on a scene and leave everything about the run in a folder.
 
@@ -127,9 +127,9 @@ def train(
             processes rank 0's is called. Its time does not count as training time.
         log: a file that gets a line of JSON every few steps, and TensorBoard's files beside it where that is
             installed; see `hyrfpack.train.log.TrainingLog`. A resumed run adds to it.
-        ranks: processes that train together, from `hyrfpack.parallel.ranks.joined`: all call this with the same scene
-            and settings. Rank 0 alone writes and speaks, and returns metrics. When their launcher starts them anew,
-            as torchrun does after one has ended, they go on from the checkpoint if there is one.
+        ranks: processes that train together, from `hyrfpack.parallel.ranks.join_processes`: all call this with the
+            same scene and settings. Only rank 0 writes, prints and returns metrics. When the launcher restarts the
+            processes, as torchrun does after one has ended, they resume from the checkpoint if there is one.
 
     Raises:
         HyrfError: another call is at work in the folder, the folder holds another run, training cannot start or go on,
@@ -152,7 +152,7 @@ def train(
     check_type("config", config, TrainConfig)
     check_target(scene, config)
     # Whatever lies there: no folder is created where nothing may be written.
-    ranks.agree(lambda: _check_outputs(out, scene, overwrite=True) if ranks.leads else None)
+    ranks.run_on_all(lambda: _check_outputs(out, scene, overwrite=True) if ranks.is_main else None)
     with exclusive_folder(out, ranks=ranks):
         return _train_in_folder(
             scene, out, config, resume=resume, overwrite=overwrite, cache=cache, device=device, quiet=quiet,
@@ -179,13 +179,13 @@ def _train_in_folder(
     """As `train`, in a folder that this call holds."""
     checkpoint = out / CHECKPOINT
     device = choose_own_device(device, ranks)
-    resume = ranks.first(resume or (ranks.restarts > 0 and is_begun(out)))
+    resume = ranks.broadcast(resume or (ranks.restarts > 0 and is_begun(out)))
     replace = resume or overwrite
     cache = cache or PictureCache(memory_bytes() // 4 // ranks.local_size)
-    silent = quiet or report is not None or not ranks.leads
+    silent = quiet or report is not None or not ranks.is_main
 
     def check(config: TrainConfig, phase: Phase) -> TrainingRecord | None:
-        if not ranks.leads:
+        if not ranks.is_main:
             return None
         record = read_record(out) if resume or not overwrite else None
         _prepare(out, scene, config, record, resume, overwrite)
@@ -197,21 +197,21 @@ def _train_in_folder(
 
     with PhaseLine(silent) as phases:
         tell_phase = phase or phases.update
-        record = ranks.first(ranks.agree(partial(check, config, tell_phase)))
+        record = ranks.broadcast(ranks.run_on_all(partial(check, config, tell_phase)))
     if record is not None:
         return _complete(record, scene, out, config, device, phase, silent, log, ranks)
-    if overwrite and not resume and ranks.leads:
+    if overwrite and not resume and ranks.is_main:
         (out / RECORD).unlink(missing_ok=True)  # of the earlier run: this one is not to be taken for it
     if resume:
-        saved = ranks.agree(lambda: _with_saved_decisions(config, checkpoint) if ranks.leads else config)
-        decisions = Decisions(ranks.first(saved), {}, [])
+        saved = ranks.run_on_all(lambda: _with_saved_decisions(config, checkpoint) if ranks.is_main else config)
+        decisions = Decisions(ranks.broadcast(saved), {}, [])
     elif questions := _open_questions(scene, config):
         with PhaseLine(silent) as phases, _stop_requests() as stop:
             phases.note(f"{questions} by short pilot runs, scored on training photos that they leave out")
             tell: Report = _ignore_step if report is None else partial(_as_step_nought, report)
             # Each does it for itself: none waits for another.
             pilots = partial(decide, scene, config, cache, device, tell, stop, phase or phases.update)
-            answers = ranks.told(ranks.agree(pilots))
+            answers = ranks.all_gather(ranks.run_on_all(pilots))
         if answers[0] is None or None in answers:
             return TrainResult(False, 0, None, {})
         decisions = answers[0]
@@ -220,13 +220,14 @@ def _train_in_folder(
     config = decisions.config
     with PhaseLine(silent) as phases:
         (phase or phases.update)("reading photos and setting up the model", 0, 0)
-        trainer = ranks.agree(lambda: Trainer(scene, config, cache, device, ranks=ranks))
+        trainer = ranks.run_on_all(lambda: Trainer(scene, config, cache, device, ranks=ranks))
     for choice, reason in decisions.reasons.items():
         trainer.choices[choice] += f"; {reason}"
     trainer.pilots = [dataclasses.asdict(score) for score in decisions.scores]
     if resume:
         trainer.load(checkpoint)
-    elif ranks.leads and not ranks.alone:  # one of an earlier run is not what to go on from, should we be started anew
+    elif ranks.is_main and not ranks.is_single:
+        # Restarted processes resume from the checkpoint that they find, which must not be that of an earlier run.
         checkpoint.unlink(missing_ok=True)
     with ExitStack() as stack:
         with (
@@ -237,7 +238,7 @@ def _train_in_folder(
             for choice in decisions.reasons:
                 line.note(f"{CHOICE_LABELS[choice]}: {trainer.choices[choice]}")
             written = None
-            if log is not None and ranks.leads:
+            if log is not None and ranks.is_main:
                 written = stack.enter_context(
                     TrainingLog(Path(log), trainer.steps, trainer.step, device, line.note, replace)
                 )
@@ -246,11 +247,11 @@ def _train_in_folder(
             def tell_all(trainer: Trainer, loss: float, mse: float) -> None:
                 for tell in told:
                     tell(trainer.step, loss, mse, len(trainer.model))
-                if observer is not None and ranks.leads:
+                if observer is not None and ranks.is_main:
                     observer(trainer)
 
             complete = trainer.run(checkpoint=checkpoint, report=tell_all, stop=stop, warn=line.note, overwrite=replace)
-        if not complete or not ranks.leads:
+        if not complete or not ranks.is_main:
             if written:
                 written.end(complete=complete, step=trainer.step)
             return TrainResult(complete, trainer.step, out / MODEL if complete else None, {})
@@ -299,7 +300,7 @@ def _complete(
     ranks: Ranks,
 ) -> TrainResult:
     """Compute and write what is missing beside a finished model; rank 0 does."""
-    if not ranks.leads:
+    if not ranks.is_main:
         return TrainResult(True, record.step, out / MODEL, {})
     with PhaseLine(silent) as phases, ExitStack() as stack:
         phases.note("the model is trained already; its scores and pictures are computed now")

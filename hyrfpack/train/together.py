@@ -65,7 +65,7 @@ def averaged(ranks: Ranks, parameters: Sequence[nn.Parameter], numbers: Tensor) 
         (tensor([3.]), tensor([1., 1.]))
     """
     gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
-    flat = ranks.add(torch.cat([*(gradient.reshape(-1) for gradient in gradients), numbers]))
+    flat = ranks.all_reduce(torch.cat([*(gradient.reshape(-1) for gradient in gradients), numbers]))
     *means, sums = flat.split([*(parameter.numel() for parameter in parameters), len(numbers)])
     for parameter, mean in zip(parameters, means, strict=True):
         parameter.grad = mean.div_(ranks.size).view_as(parameter)
@@ -78,7 +78,7 @@ def check_settings(ranks: Ranks, settings: Mapping[str, object]) -> None:
     Raises:
         HyrfTrainingError: a rank was started with others than rank 0; the first such one and what differs are named.
     """
-    first, *others = ranks.told(settings)
+    first, *others = ranks.all_gather(settings)
     for rank, theirs in enumerate(others, 1):
         if different := sorted(name for name in first.keys() | theirs.keys() if first.get(name) != theirs.get(name)):
             raise HyrfTrainingError(

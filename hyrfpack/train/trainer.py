@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-import hyrfpack
 from hyrfpack.choices import CONSISTENT
 from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload_array
@@ -25,7 +24,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
-from hyrfpack.parallel.ranks import ALONE, Ranks
+from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
@@ -36,6 +35,7 @@ from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.setup import build_model
 from hyrfpack.train.strategy import Strategy
 from hyrfpack.train.together import Told, averaged, check_settings, digest, to_tell
+from hyrfpack.version import __version__
 
 RECORDS = 200  # points on the training curve
 
@@ -79,7 +79,7 @@ class Trainer:
         device: torch.device = torch.device("cpu"),  # noqa: B008 - a constant
         model: HybridModel | None = None,
         strategy: Strategy | None = None,
-        ranks: Ranks = ALONE,
+        ranks: Ranks = SINGLE_PROCESS,
     ) -> None:
         """Set up a run.
 
@@ -151,7 +151,7 @@ class Trainer:
                 on or has gone.
         """
         every = self.config.checkpoint_every or max(1, self.steps // 20)
-        check_settings(self.ranks, {**self._settings(), "versions": (hyrfpack.__version__, torch.__version__)})
+        check_settings(self.ranks, {**self._settings(), "versions": (__version__, torch.__version__)})
         keep_freed_memory()
         with closing(self.cache.stream(self._order())) as views, torch_on_one_thread():
             while self.step < self.steps:
@@ -164,7 +164,7 @@ class Trainer:
                 if complete:
                     self._fit_exposure_map()
                 report(self, loss, mse)
-                stopped = (stop() if self.ranks.alone else stopped) and not complete
+                stopped = (stop() if self.ranks.is_single else stopped) and not complete
                 if checkpoint and (stopped or (self.step % every == 0 and not complete)):
                     try:
                         self.save(checkpoint, overwrite=overwrite or self.saved is not None)
@@ -173,7 +173,8 @@ class Trainer:
                             raise
                         warn(f"{error}; training goes on, without the checkpoint of step {self.step:,}")
                 if stopped:
-                    self.ranks.told(None)  # none leaves before the checkpoint is written: the others would be ended
+                    # The launcher ends all processes once one has left, so all wait until the checkpoint is written.
+                    self.ranks.all_gather(None)
                     return False
         return True
 
@@ -190,12 +191,12 @@ class Trainer:
                 view, picture = next(views)
             loss, error = self._gradients(view, picture)
         except HyrfError as refusal:
-            if self.ranks.alone:
+            if self.ranks.is_single:
                 raise
             problem = refusal
             loss = error = torch.zeros((), device=self.device)
         said = torch.stack((loss, error))
-        if not self.ranks.alone:
+        if not self.ranks.is_single:
             with self._timed("exchange"):
                 mine = to_tell(loss, error, stop=stop(), problem=problem is not None)
                 said = averaged(self.ranks, self._learnt(), mine)
@@ -210,9 +211,9 @@ class Trainer:
             # All that the host wants to know of this step, in one wait for the device.
             numbers = torch.cat((said, broken)).tolist()
         said_numbers, flags = numbers[: len(said)], numbers[len(said) :]
-        told = Told(*said_numbers) if self.ranks.alone else Told.of(said_numbers, self.ranks.size)
+        told = Told(*said_numbers) if self.ranks.is_single else Told.of(said_numbers, self.ranks.size)
         if told.problem:
-            self.ranks.refuse(problem)
+            self.ranks.raise_if_any(problem)
         if not np.isfinite(told.loss):
             self._refuse("the loss is not finite", self._nonfinite_parameters())
         if any(flags):
@@ -220,7 +221,7 @@ class Trainer:
         with self._timed("density"):
             before = self.model.gaussians.positions
             self.strategy.act(self.step, self.model, self.optimizer)
-            if not self.ranks.alone and self.model.gaussians.positions is not before:
+            if not self.ranks.is_single and self.model.gaussians.positions is not before:
                 self._stay_alike()
         return told.loss, told.error, told.stop
 
@@ -271,8 +272,8 @@ class Trainer:
 
     def _stay_alike(self) -> None:
         """See that all ranks still hold the same numbers after Gaussians came and went; else take those of rank 0."""
-        if len(set(self.ranks.told(digest(self.model.parameters())))) > 1:
-            self._restore(self.ranks.first(self._tensors()))
+        if len(set(self.ranks.all_gather(digest(self.model.parameters())))) > 1:
+            self._restore(self.ranks.broadcast(self._tensors()))
 
     def _record(self, loss: float, mse: float) -> None:
         """Keep what the step came to for the curve, unless all of its photo is masked."""
@@ -316,7 +317,7 @@ class Trainer:
     def _settings(self) -> dict:
         views = [[view.name, view.camera.width, view.camera.height] for view in self.scene.train]
         chosen = {"exposure": self.exposures is not None, "model": self.model.config.to_dict()}
-        if not self.ranks.alone:
+        if not self.ranks.is_single:
             chosen["processes"] = self.ranks.size
         return {**self.config.to_dict(), "views": views, "strategy": type(self.strategy).__qualname__, **chosen}
 
@@ -345,8 +346,8 @@ class Trainer:
         Raises:
             HyrfError: the file cannot be written, or not without `overwrite`.
         """
-        collected = self.ranks.told(_on_cpu(self.strategy.state_dict()))
-        if not self.ranks.leads:
+        collected = self.ranks.all_gather(_on_cpu(self.strategy.state_dict()))
+        if not self.ranks.is_main:
             self.saved = self.step
             return
         tensors = self._tensors()
@@ -369,8 +370,10 @@ class Trainer:
         Raises:
             HyrfTrainingError: as `load_checkpoint`.
         """
-        saved = self.ranks.agree(lambda: load_checkpoint(path, self._settings()) if self.ranks.leads else ({}, {}))
-        tensors, progress = self.ranks.first(saved)
+        saved = self.ranks.run_on_all(
+            lambda: load_checkpoint(path, self._settings()) if self.ranks.is_main else ({}, {})
+        )
+        tensors, progress = self.ranks.broadcast(saved)
         self._restore(tensors)
         self.strategy.load_state_dict(_under(_collected_by(self.ranks.rank), tensors))
         self.step, self.records = progress["step"], progress["records"]

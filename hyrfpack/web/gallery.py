@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from urllib.parse import quote, urlencode
 
-import hyrfpack
+from hyrfpack.version import __version__
 from hyrfpack.web.bundle import part
 from hyrfpack.web.player import content_policy, fill, meta_tags
 
@@ -48,7 +48,7 @@ def encode_gallery(title: str, cards: Sequence[Card], player: str) -> bytes:
     tags = meta_tags(title, f"{len(cards)} scenes in 3D", posters[0] if posters else None)
     values = {
         "policy": content_policy(style, fetches="'self'"),
-        "version": hyrfpack.__version__,
+        "version": __version__,
         "title": html.escape(title),
         "meta": tags,
         "style": style,

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 
-import hyrfpack
+from hyrfpack.version import __version__
 from hyrfpack.web.bundle import bare_script, bundle, digest, part
 
 SCRIPTS = ("boot.js", "element.js", "main.js", "worker.js", "worker_model.js")
@@ -85,7 +85,7 @@ def player_page(
     blocks = (base64.b64encode(view[at : at + BLOCK]).decode() for at in range(0, len(view), BLOCK))
     values = {
         "policy": content_policy(style, [script, main], fetches),
-        "version": hyrfpack.__version__,
+        "version": __version__,
         "title": html.escape(title),
         "meta": meta_tags(title, description, image),
         "style": style,
@@ -140,7 +140,7 @@ def encode_readme(title: str, entry: str, index: str, *, element: str | None = N
         element: name of a file that <hyrf-viewer>, whose script lies there, too, may show; None without that script.
     """
     line = f'  <script src="hyrf-viewer.js"></script> <hyrf-viewer src="{element}"></hyrf-viewer>\n' if element else ""
-    values = {"title": title, "version": hyrfpack.__version__, "entry": entry, "index": index, "element": line}
+    values = {"title": title, "version": __version__, "entry": entry, "index": index, "element": line}
     return fill(part("hosted/README.txt"), values).encode()
 
 

@@ -10,7 +10,7 @@ import threading
 import pytest
 import torch
 
-from hyrfpack.parallel.pool import run_jobs, run_tasks, side_by_side
+from hyrfpack.parallel.pool import parallel_map, run_jobs, run_tasks
 
 
 @pytest.fixture(autouse=True)
@@ -19,19 +19,19 @@ def two_threads(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_results_come_in_the_order_of_the_items_and_by_the_names_of_the_jobs() -> None:
-    assert side_by_side(lambda number: number**2, list(range(50))) == [number**2 for number in range(50)]
+    assert parallel_map(lambda number: number**2, list(range(50))) == [number**2 for number in range(50)]
     assert run_jobs({name: name.upper for name in "cab"}) == {"c": "C", "a": "A", "b": "B"}
-    assert side_by_side(abs, []) == []
+    assert parallel_map(abs, []) == []
 
 
 def test_two_items_are_worked_on_at_once() -> None:
     both = threading.Barrier(2, timeout=30)
-    side_by_side(lambda _: both.wait(), [0, 1])
+    parallel_map(lambda _: both.wait(), [0, 1])
 
 
 def test_a_gpu_takes_one_item_after_the_other() -> None:
     threads = []
-    side_by_side(lambda _: threads.append(threading.current_thread()), [0, 1, 2], torch.device("cuda"))
+    parallel_map(lambda _: threads.append(threading.current_thread()), [0, 1, 2], torch.device("cuda"))
     assert threads == 3 * [threading.current_thread()]
 
 
@@ -43,7 +43,7 @@ def test_tasks_of_tasks_run_where_they_are_and_wait_for_no_one() -> None:
         run_tasks(lambda _: names.append(threading.current_thread().name), 4)
         return {threading.current_thread().name, *names}
 
-    assert all(len(names) == 1 for names in side_by_side(nested, list(range(8))))
+    assert all(len(names) == 1 for names in parallel_map(nested, list(range(8))))
 
 
 def test_the_first_error_is_raised() -> None:
@@ -52,11 +52,11 @@ def test_the_first_error_is_raised() -> None:
             raise ValueError(f"{number}")
 
     with pytest.raises(ValueError, match="3"):
-        side_by_side(fail, list(range(6)))
+        parallel_map(fail, list(range(6)))
 
 
 def test_torch_does_not_fan_out_inside_of_a_task() -> None:
-    assert side_by_side(lambda _: torch.get_num_threads(), [0, 1]) == [1, 1]
+    assert parallel_map(lambda _: torch.get_num_threads(), [0, 1]) == [1, 1]
 
 
 def test_torch_keeps_its_threads_outside_of_tasks() -> None:

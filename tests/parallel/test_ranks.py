@@ -19,7 +19,7 @@ from ranked import free_port, needs_ranks, together, told_by_torchrun
 from hyrfpack import device as devices
 from hyrfpack.device import choose_own_device
 from hyrfpack.errors import HyrfError
-from hyrfpack.parallel.ranks import ALONE, Ranks, joined, meeting_point, ranks_told_by
+from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks, join_processes, ranks_from_environment, rendezvous_address
 
 SRUN = {
     "SLURM_STEP_NUM_TASKS": "7",
@@ -37,33 +37,36 @@ SRUN = {
 
 
 def test_where_nobody_has_started_others_there_is_one_process():
-    assert ranks_told_by({}) == ranks_told_by({"LOCAL_RANK": "3", "MASTER_PORT": "x"}) == ALONE == Ranks()
-    assert ALONE.alone and ALONE.leads
+    others = {"LOCAL_RANK": "3", "MASTER_PORT": "x"}
+    assert ranks_from_environment({}) == ranks_from_environment(others) == SINGLE_PROCESS == Ranks()
+    assert SINGLE_PROCESS.is_single and SINGLE_PROCESS.is_main
 
 
 def test_torchrun_tells_who_this_is():
     told = {**told_by_torchrun(5, 8, 1), "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "4", "TORCHELASTIC_RESTART_COUNT": "2"}
-    assert ranks_told_by(told) == Ranks(5, 8, 1, 4, 2)
-    assert not ranks_told_by(told).leads and not ranks_told_by(told).alone
+    assert ranks_from_environment(told) == Ranks(5, 8, 1, 4, 2)
+    assert not ranks_from_environment(told).is_main and not ranks_from_environment(told).is_single
 
 
 def test_rank_and_size_alone_are_those_of_one_machine():
-    assert ranks_told_by({"RANK": "1", "WORLD_SIZE": "3"}) == Ranks(1, 3, 1, 3)
+    assert ranks_from_environment({"RANK": "1", "WORLD_SIZE": "3"}) == Ranks(1, 3, 1, 3)
 
 
 def test_srun_tells_who_this_is():
-    assert ranks_told_by(SRUN) == Ranks(5, 7, 1, 2)
-    assert ranks_told_by({**SRUN, "SLURM_PROCID": "6", "SLURM_LOCALID": "0", "SLURM_NODEID": "3"}) == Ranks(6, 7, 0, 1)
-    assert ranks_told_by({**SRUN, "SLURM_RESTART_COUNT": "1"}).restarts == 1
+    assert ranks_from_environment(SRUN) == Ranks(5, 7, 1, 2)
+    last = {**SRUN, "SLURM_PROCID": "6", "SLURM_LOCALID": "0", "SLURM_NODEID": "3"}
+    assert ranks_from_environment(last) == Ranks(6, 7, 0, 1)
+    assert ranks_from_environment({**SRUN, "SLURM_RESTART_COUNT": "1"}).restarts == 1
 
 
 def test_torchruns_word_goes_before_that_of_slurm():
-    assert ranks_told_by({**SRUN, "RANK": "0", "WORLD_SIZE": "2"}) == Ranks(0, 2, 0, 2)
+    assert ranks_from_environment({**SRUN, "RANK": "0", "WORLD_SIZE": "2"}) == Ranks(0, 2, 0, 2)
 
 
 def test_a_jobs_own_script_is_one_process_however_many_tasks_it_may_have():
     script = {"SLURM_JOB_ID": "41", "SLURM_NTASKS": "8", "SLURM_PROCID": "0", "SLURM_LOCALID": "0"}
-    assert ranks_told_by({**script, "SLURM_TASKS_PER_NODE": "4(x2)", "SLURM_JOB_NODELIST": "gpu[1-2]"}) == ALONE
+    script |= {"SLURM_TASKS_PER_NODE": "4(x2)", "SLURM_JOB_NODELIST": "gpu[1-2]"}
+    assert ranks_from_environment(script) == SINGLE_PROCESS
 
 
 @given(st.lists(st.integers(1, 6), min_size=1, max_size=8), st.data())
@@ -83,7 +86,7 @@ def test_slurms_counts_tell_how_many_are_on_this_machine(tasks, data):
         "SLURM_NODEID": str(machine),
         "SLURM_STEP_TASKS_PER_NODE": ",".join(words),
     }
-    assert ranks_told_by(told) == Ranks(sum(tasks[:machine]), sum(tasks), 0, tasks[machine])
+    assert ranks_from_environment(told) == Ranks(sum(tasks[:machine]), sum(tasks), 0, tasks[machine])
 
 
 @pytest.mark.parametrize(
@@ -111,7 +114,7 @@ def test_slurms_counts_tell_how_many_are_on_this_machine(tasks, data):
 )
 def test_an_environment_that_makes_no_sense_is_one_sentence(told):
     with pytest.raises(HyrfError, match=r"environment.*unset RANK and WORLD_SIZE") as refusal:
-        ranks_told_by(told)
+        ranks_from_environment(told)
     assert "\n" not in str(refusal.value)
 
 
@@ -119,8 +122,8 @@ def test_an_environment_that_makes_no_sense_is_one_sentence(told):
 
 
 def test_torchrun_says_where_to_meet():
-    assert meeting_point({"MASTER_ADDR": "node1", "MASTER_PORT": "29500"}) == ("node1", 29500)
-    assert meeting_point({**SRUN, "MASTER_ADDR": "node1", "MASTER_PORT": "29500"}) == ("node1", 29500)
+    assert rendezvous_address({"MASTER_ADDR": "node1", "MASTER_PORT": "29500"}) == ("node1", 29500)
+    assert rendezvous_address({**SRUN, "MASTER_ADDR": "node1", "MASTER_PORT": "29500"}) == ("node1", 29500)
 
 
 @pytest.mark.parametrize(
@@ -135,25 +138,25 @@ def test_torchrun_says_where_to_meet():
     ],
 )
 def test_processes_of_srun_meet_on_the_first_machine(machines, first):
-    assert meeting_point({"SLURM_STEP_NODELIST": machines})[0] == first
+    assert rendezvous_address({"SLURM_STEP_NODELIST": machines})[0] == first
 
 
 def test_without_a_word_they_meet_on_this_machine():
-    assert meeting_point({})[0] == "127.0.0.1"
+    assert rendezvous_address({})[0] == "127.0.0.1"
 
 
 @given(st.integers(0, 2**32), st.integers(0, 6))
 def test_the_port_is_a_jobs_own_and_one_that_anybody_may_open(job, step):
     told = {"SLURM_JOB_ID": str(job), "SLURM_STEP_ID": str(step)}
-    port = meeting_point(told)[1]
-    others = [meeting_point({**told, "SLURM_JOB_ID": str(job + more)})[1] for more in (1, 2, 3)]
-    others += [meeting_point({**told, "SLURM_STEP_ID": str(step + 1)})[1]]
-    assert 1024 < port < 2**16 and port not in others and port == meeting_point(told)[1]
+    port = rendezvous_address(told)[1]
+    others = [rendezvous_address({**told, "SLURM_JOB_ID": str(job + more)})[1] for more in (1, 2, 3)]
+    others += [rendezvous_address({**told, "SLURM_STEP_ID": str(step + 1)})[1]]
+    assert 1024 < port < 2**16 and port not in others and port == rendezvous_address(told)[1]
 
 
 def test_a_port_that_is_no_number_is_one_sentence():
     with pytest.raises(HyrfError, match="MASTER_PORT is 'http'"):
-        meeting_point({"MASTER_PORT": "http"})
+        rendezvous_address({"MASTER_PORT": "http"})
 
 
 # -- meeting ---------------------------------------------------------------------------------------------------------
@@ -172,11 +175,12 @@ def no_network(monkeypatch) -> None:
 )
 def test_one_process_meets_nobody(told):
     before = dict(os.environ)
-    with joined(told) as ranks:
-        assert ranks.alone and ranks.leads
+    with join_processes(told) as ranks:
+        assert ranks.is_single and ranks.is_main
         values = torch.tensor([1.0, 2.0])
-        assert ranks.add(values) is values and values.tolist() == [1.0, 2.0]
-        assert ranks.told("word") == ["word"] and ranks.first("word") == "word" and ranks.agree(lambda: 3) == 3
+        assert ranks.all_reduce(values) is values and values.tolist() == [1.0, 2.0]
+        assert ranks.all_gather("word") == ["word"] and ranks.broadcast("word") == "word"
+        assert ranks.run_on_all(lambda: 3) == 3
     assert dict(os.environ) == before
 
 
@@ -184,7 +188,7 @@ def test_one_process_meets_nobody(told):
 def test_a_torch_without_gloo_is_one_sentence(monkeypatch):
     monkeypatch.setattr(dist, "is_gloo_available", lambda: False)
     with pytest.raises(HyrfError, match=f"torch {torch.__version__}.* without gloo.*one process".replace("+", r"\+")):
-        with joined(told_by_torchrun(0, 2, free_port())):
+        with join_processes(told_by_torchrun(0, 2, free_port())):
             pass
 
 
@@ -196,7 +200,7 @@ def test_a_port_that_is_taken_is_one_sentence_that_says_what_to_do(monkeypatch):
         taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(HyrfError, match=rf"process 0 of 2 .*127.0.0.1:{port}.*set MASTER_PORT to a free one"):
-            with joined(told_by_torchrun(0, 2, port)):
+            with join_processes(told_by_torchrun(0, 2, port)):
                 pass
     assert not dist.is_initialized()
 
@@ -280,10 +284,10 @@ class Pretended(Ranks):
 
     others: tuple[object, ...] = ()
 
-    def told(self, item):
+    def all_gather(self, item):
         return [item, *self.others]
 
-    def refuse(self, problem):
+    def raise_if_any(self, problem):
         if problem is not None:
             raise problem
 
@@ -320,4 +324,4 @@ def test_processes_share_the_cpu():
 
 @pytest.mark.usefixtures("two_gpus")
 def test_one_process_has_the_current_gpu():
-    assert choose_own_device("cuda", ALONE) == torch.device("cuda")
+    assert choose_own_device("cuda", SINGLE_PROCESS) == torch.device("cuda")

@@ -18,7 +18,7 @@ from ranked import Ended, needs_ranks, together
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.ops.ssim import photometric_loss
-from hyrfpack.parallel.ranks import ALONE
+from hyrfpack.parallel.ranks import SINGLE_PROCESS
 from hyrfpack.render import render
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, Trainer
@@ -106,9 +106,9 @@ def test_one_process_keeps_its_gradients_and_its_settings():
     weight = torch.nn.Parameter(torch.zeros(3, 2))
     weight.grad = torch.arange(6.0).view(3, 2)
     expected = weight.grad.clone()
-    assert averaged(ALONE, [weight], torch.tensor([2.0, 5.0])).tolist() == [2.0, 5.0]
+    assert averaged(SINGLE_PROCESS, [weight], torch.tensor([2.0, 5.0])).tolist() == [2.0, 5.0]
     assert torch.equal(weight.grad, expected)
-    check_settings(ALONE, {"seed": 1})
+    check_settings(SINGLE_PROCESS, {"seed": 1})
 
 
 def test_a_digest_is_of_every_bit():
@@ -186,9 +186,8 @@ def test_exposures_are_learnt_together_also_where_both_have_the_same_photo(both)
 @pytest.mark.parametrize(("size", "steps"), [(1, 7), (2, 4), (3, 3), (7, 1), (8, 1)])
 def test_steps_count_views_and_all_ranks_see_the_order_of_one(size, steps):
     config = dataclasses.replace(work.EVEN, steps=7)
-    trainers = [
-        Trainer(work.even_scene(), config, ranks=dataclasses.replace(ALONE, rank=r, size=size)) for r in range(size)
-    ]
+    ranks = [dataclasses.replace(SINGLE_PROCESS, rank=rank, size=size) for rank in range(size)]
+    trainers = [Trainer(work.even_scene(), config, ranks=rank) for rank in ranks]
     orders = [[view.name for view in trainer._order()] for trainer in trainers]
     assert {trainer.steps for trainer in trainers} == {steps}
     together = [name for step in zip(*orders, strict=True) for name in step]

@@ -173,7 +173,7 @@ def encode(coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_tab
         mask = _mask(resolutions[level], log2_table_size)
         _encode(planes, tables[level], resolutions[level], mask, start, stop, out[2 * level : 2 * level + 2])
 
-    run_tasks(task, parts * len(resolutions), little=points < _FEW)
+    run_tasks(task, parts * len(resolutions), sequential=points < _FEW)
     return features.T
 
 
@@ -189,7 +189,7 @@ def grad_table(
         mask = _mask(resolutions[level], log2_table_size)
         _scatter(planes, grads[2 * level : 2 * level + 2], resolutions[level], mask, levels[level])
 
-    run_tasks(task, len(resolutions), little=planes.shape[1] < _FEW)
+    run_tasks(task, len(resolutions), sequential=planes.shape[1] < _FEW)
     return result
 
 
