@@ -44,7 +44,7 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
         HyrfDataError: there is no such file, or it is none of these, or it is damaged.
     """
     path = Path(path)
-    if path.name == sog.META:
+    if path.name == sog.META_NAME:
         path = path.parent
     extension = path.suffix.lower()
     try:
@@ -61,15 +61,15 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
 def _loose_sog(folder: Path) -> dict[str, bytes]:
     """The files of a SOG that is not bundled, by name: meta.json and the pictures that it names."""
     names = os.listdir(folder)
-    if sog.META not in names:
+    if sog.META_NAME not in names:
         splats = sorted(name for name in names if name.lower().endswith(READ))
         advice = f"name {splats[0]} in it" if splats else "name another"
         raise HyrfDataError(
-            f"{folder}: a folder is read as a loose SOG, {sog.META} with its pictures, and this one holds "
+            f"{folder}: a folder is read as a loose SOG, {sog.META_NAME} with its pictures, and this one holds "
             f"{_listed(names)}; {advice}"
         )
-    files = {sog.META: _bytes_of(folder / sog.META)}
-    for name in sog.picture_names(files[sog.META], str(folder)):
+    files = {sog.META_NAME: _bytes_of(folder / sog.META_NAME)}
+    for name in sog.picture_names(files[sog.META_NAME], str(folder)):
         files[name] = _bytes_of(folder / name)
     return files
 

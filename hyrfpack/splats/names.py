@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 SPLATS_SUFFIXES = (".ply", ".splat", ".spz", ".sog")  # of the files that `hyrfpack.splats.files.read_splats` takes
-SOG_META = "meta.json"  # of a SOG that is not bundled: a folder of pictures, and this beside them
+SOG_META_NAME = "meta.json"  # of a SOG that is not bundled: a folder of pictures, and this beside them
 
 
 def is_splats(path: str | os.PathLike[str]) -> bool:
@@ -16,13 +16,13 @@ def is_splats(path: str | os.PathLike[str]) -> bool:
     It does if it has one of SPLATS_SUFFIXES, or is the folder, or the meta.json, of a SOG that is not bundled.
     """
     path = Path(path)
-    return path.suffix.lower() in SPLATS_SUFFIXES or path.name == SOG_META or _is_sog_folder(path)
+    return path.suffix.lower() in SPLATS_SUFFIXES or path.name == SOG_META_NAME or _is_sog_folder(path)
 
 
 def _is_sog_folder(path: Path) -> bool:
     """Whether a meta.json in the folder speaks of positions, as that of a SOG does; other programs write such files."""
     try:
-        content = json.loads((path / SOG_META).read_bytes())
+        content = json.loads((path / SOG_META_NAME).read_bytes())
     except (OSError, ValueError, RecursionError):
         return False
     return isinstance(content, dict) and "means" in content
@@ -31,7 +31,7 @@ def _is_sog_folder(path: Path) -> bool:
 def splats_folder(path: str | os.PathLike[str]) -> Path | None:
     """Return the folder of a SOG that is not bundled, named by itself or by its meta.json; None for a file."""
     path = Path(path)
-    folder = path.parent if path.name == SOG_META else path
+    folder = path.parent if path.name == SOG_META_NAME else path
     return folder if folder.is_dir() else None
 
 

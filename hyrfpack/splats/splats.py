@@ -47,7 +47,7 @@ class Splats:
             values = getattr(self, name)
             if values.shape != shape:
                 raise ValueError(f"{name} has shape {values.shape}; {shape} is needed")
-            with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused; NaN may signal
+            with np.errstate(over="ignore", invalid="ignore"):  # infinite results are rejected below; NaN may signal
                 values = np.ascontiguousarray(values, np.float64 if name == "positions" else np.float32)
             if not np.isfinite(values).all():
                 raise ValueError(f"{name} must be finite")

@@ -52,19 +52,19 @@ class Format(Kind):
 
 def _usd(extension: usd.Extension) -> Format:
     encode, decode = partial(usd.encode, extension=extension), partial(usd.decode, extension=extension)
-    return Format(ending=f".{extension}", encode=encode, decode=decode, package=usd.PACKAGE)
+    return Format(ending=f".{extension}", encode=encode, decode=decode, package=usd.REQUIRED_PACKAGE)
 
 
 _ROWS = (
     Format(ending=".ply", encode=ply.encode, decode=ply.decode, read=True),
-    Format(ending=".splat", encode=splat.encode, decode=splat.decode, read=True, degree=splat.DEGREE),
+    Format(ending=".splat", encode=splat.encode, decode=splat.decode, read=True, degree=splat.MAX_HARMONICS_DEGREE),
     Format(
         ending=".spz",
         encode=spz.encode,
         decode=spz.decode,
         read=True,
-        farthest=spz.FARTHEST,
-        largest_scale=spz.LARGEST_SCALE,
+        farthest=spz.MAX_COORDINATE,
+        largest_scale=spz.MAX_SCALE,
         antialiased=True,
     ),
     Format(ending=".glb", encode=gltf.encode, decode=gltf.decode),

@@ -27,7 +27,7 @@ from scipy.special import expit
 from torch import Tensor
 
 from hyrfpack.quant.morton import morton_codes
-from hyrfpack.splats.formats.palette import build_palette, nearest
+from hyrfpack.splats.formats.palette import build_palette, find_nearest_entries
 from hyrfpack.splats.splats import Splats, normalized_quats
 
 LOGIT_TAIL = 7.0  # opacities beyond are cut, 1e-3 from 1; the rasteriser cuts alpha at 0.99
@@ -96,7 +96,7 @@ def _kmeans_of_gsplat(clusters: int) -> Iterator[None]:
             rows = np.ascontiguousarray(columns.numpy().T)
             entries = build_palette(rows, np.ones(len(rows)), clusters)
             self.centroids = torch.from_numpy(entries.T.copy())
-            return torch.from_numpy(nearest(rows, entries)[0])
+            return torch.from_numpy(find_nearest_entries(rows, entries)[0])
 
     module = ModuleType("torchpq.clustering")
     module.KMeans = KMeans

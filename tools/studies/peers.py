@@ -188,7 +188,7 @@ def through(ending: str, hints: Hints, splats: Splats) -> tuple[int, Splats]:
 def runs_of(peer: str, degree: int) -> dict[str, RoundTrip]:
     """What can be set in a peer's files, by name."""
     if peer == "SPZ":
-        return {f"version {v}": partial(through, ".spz", Hints(spz_version=v)) for v in spz.VERSIONS}
+        return {f"version {v}": partial(through, ".spz", Hints(spz_version=v)) for v in spz.WRITTEN_VERSIONS}
     if peer == "SOG":
         return {"": partial(through, ".sog", NO_HINTS)}
     if not degree:  # there is nothing to cluster

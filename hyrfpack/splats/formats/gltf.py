@@ -1,7 +1,7 @@
-"""glTF 2.0 binary files (.glb) with the extension KHR_gaussian_splatting, as Khronos ratified it.
+"""glTF 2.0 binary files (.glb) with the ratified Khronos extension KHR_gaussian_splatting.
 
-Layout: a header of 12 bytes, a JSON chunk, a binary chunk. One node, one mesh, one primitive of points. Its
-attributes lie in the binary chunk one after the other, all N splats of each:
+A file is a header of 12 bytes, a JSON chunk and a binary chunk. We write one node with one mesh and one primitive of
+points. The binary chunk holds one attribute after the other, each for all N splats:
 
     POSITION                                    float32 x 3   relative to the node's translation
     KHR_gaussian_splatting:ROTATION             float32 x 4   unit quaternion xyzw
@@ -10,8 +10,8 @@ attributes lie in the binary chunk one after the other, all N splats of each:
     KHR_gaussian_splatting:SH_DEGREE_l_COEF_n   float32 x 3   RGB; n = m + l, Condon-Shortley phase
     COLOR_0                                     uint8 x 4     linear RGB and opacity, for viewers that draw points
 
-Smaller types are allowed for rotation, scale and opacity; they would save 3 % of a file of degree 3. Harmonics,
-which are most of it, have to be float32.
+The extension allows smaller types for rotation, scale and opacity. They would save only 3 % of a file of degree 3,
+because most of its bytes are harmonics, which have to be float32.
 """
 
 from __future__ import annotations
@@ -26,50 +26,54 @@ from typing import Any
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.splats.formats.checked import checked_splats
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
+from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.harmonics import MAX_DEGREE, terms_of
 from hyrfpack.splats.placement import local_origin, local_positions, matrices_of, placed, rotation_of, upright_rotation
 from hyrfpack.splats.splats import Splats, concatenate, quaternion_of
 
-EXTENSION = "KHR_gaussian_splatting"
+SPLATTING_EXTENSION = "KHR_gaussian_splatting"
 GLTF_UP = (0.0, 1.0, 0.0)
-_HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
-_JSON, _BIN = 0x4E4F534A, 0x004E4942
-_POINTS, _VERTICES = 0, 34962  # primitive mode, and the target of buffer views
-_TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5126: np.float32}  # by component type
-_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_HEADER_STRUCT = struct.Struct("<4sII")
+_CHUNK_HEADER_STRUCT = struct.Struct("<II")
+_JSON_CHUNK_TYPE = 0x4E4F534A
+_BINARY_CHUNK_TYPE = 0x004E4942
+_POINTS_MODE = 0
+_ARRAY_BUFFER_TARGET = 34962
+_DTYPE_BY_COMPONENT_TYPE = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5126: np.float32}
+_WIDTH_BY_ACCESSOR_TYPE = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _MAX_NODES = 10_000
-_MIN_BYTES = 16  # of one splat: less, and the file shows the same data again and again
-_MAX_BYTES = (1 << 32) - 1  # lengths are uint32
+# A file with fewer bytes per splat repeats the same data, and would unpack to far more than its size.
+_MIN_BYTES_PER_SPLAT = 16
+_MAX_FILE_BYTES = (1 << 32) - 1  # because lengths in the file are uint32
 
 
 def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
-    """Splats as a .glb file.
+    """Encode splats as a .glb file.
 
-    The numbers stay in the input's axes and units. The node turns them to glTF's axes, where y is up; where the scene
-    lies far from the origin compared to its size, the node's translation carries the distance, so that float32
-    positions stay exact to a millionth of the scene's size. Same splats, same bytes.
+    The stored numbers keep the input's axes and units. The node's rotation turns them to glTF's axes, where y is up.
+    Where the scene lies far from the origin compared to its size, the node's translation holds that distance, so that
+    float32 positions stay exact to a millionth of the scene's size. The same splats give the same bytes.
 
     Args:
-        splats: at least one.
-        hints: which way is up in the scene.
+        splats: at least one splat.
+        hints: `up` is used.
 
     Raises:
-        HyrfDataError: there are none, or they do not fit into float32 or into 4 GiB.
+        HyrfDataError: there are no splats, or they do not fit into float32 or into 4 GiB.
     """
     if not len(splats):
         raise HyrfDataError("there is no Gaussian, and glTF has no form for nothing; export at least one")
     origin, turn = local_origin(splats.positions), upright_rotation(hints.up, np.array(GLTF_UP))
     attributes = {"POSITION": local_positions(splats, origin)}
     attributes["COLOR_0"] = linear_colors(splats)
-    attributes[f"{EXTENSION}:ROTATION"] = splats.quats[:, [1, 2, 3, 0]]
-    attributes[f"{EXTENSION}:SCALE"] = splats.scales
-    attributes[f"{EXTENSION}:OPACITY"] = splats.opacities[:, None]
+    attributes[f"{SPLATTING_EXTENSION}:ROTATION"] = splats.quats[:, [1, 2, 3, 0]]
+    attributes[f"{SPLATTING_EXTENSION}:SCALE"] = splats.scales
+    attributes[f"{SPLATTING_EXTENSION}:OPACITY"] = splats.opacities[:, None]
     for term, semantic in enumerate(_harmonics_semantics(splats.degree)):
         attributes[semantic] = splats.harmonics[:, term]
 
-    accessors, views, parts = _packed(list(attributes.values()))
+    accessors, views, parts = _pack_attributes(list(attributes.values()))
     binary = sum(map(len, parts))
     positions = attributes["POSITION"]
     accessors[0].update(min=positions.min(axis=0).tolist(), max=positions.max(axis=0).tolist())
@@ -80,9 +84,9 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
         node["translation"] = (turn @ origin).tolist()
     primitive = {
         "attributes": {semantic: number for number, semantic in enumerate(attributes)},
-        "mode": _POINTS,
+        "mode": _POINTS_MODE,
         "extensions": {
-            EXTENSION: {
+            SPLATTING_EXTENSION: {
                 "kernel": "ellipse",
                 "colorSpace": "srgb_rec709_display",
                 "projection": "perspective",
@@ -92,7 +96,7 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     }
     content = {
         "asset": {"version": "2.0", "generator": "hyrfpack"},
-        "extensionsUsed": [EXTENSION],
+        "extensionsUsed": [SPLATTING_EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [node],
@@ -103,39 +107,43 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     }
     text = json.dumps(content, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    length = _HEADER.size + 2 * _CHUNK.size + len(text) + binary
-    if length > _MAX_BYTES:
+    length = _HEADER_STRUCT.size + 2 * _CHUNK_HEADER_STRUCT.size + len(text) + binary
+    if length > _MAX_FILE_BYTES:
         raise HyrfDataError(
             f"{len(splats):,} Gaussians of degree {splats.degree} come to {length:,} bytes and a .glb file holds "
-            f"{_MAX_BYTES:,}; lower `degree`"
+            f"{_MAX_FILE_BYTES:,}; lower `degree`"
         )
-    head = _HEADER.pack(b"glTF", 2, length) + _CHUNK.pack(len(text), _JSON) + text
-    return b"".join((head, _CHUNK.pack(binary, _BIN), *parts))
+    head = _HEADER_STRUCT.pack(b"glTF", 2, length) + _CHUNK_HEADER_STRUCT.pack(len(text), _JSON_CHUNK_TYPE) + text
+    return b"".join((head, _CHUNK_HEADER_STRUCT.pack(binary, _BINARY_CHUNK_TYPE), *parts))
 
 
 def decode(data: bytes, name: str, *, upright: bool = False) -> Splats:
-    """The splats in a .glb file: what `encode` wrote, or others in the ratified form, floats or smaller integers.
+    """Decode a .glb file: one that `encode` wrote, or any other in the ratified form, with floats or smaller integers.
 
-    All splats of the file's scene, one node after the other, scaled and moved as their nodes say. `antialiased` is
-    False: glTF does not say.
+    The result holds all splats of the file's default scene, one node after the other, transformed by their nodes.
+    `antialiased` is False, because glTF does not store it.
 
     Args:
-        data: the file.
-        name: what error messages call it.
-        upright: give them in glTF's axes, y up. Otherwise they are turned back about the origin by the rotation of the
-            first node with splats: for a file of ours that gives the axes and numbers `encode` was given.
+        data: the file's bytes.
+        name: the file's name in error messages.
+        upright: return the splats in glTF's axes, with y up. Otherwise they are rotated back about the origin by the
+            rotation of the first node with splats. For a file from `encode` that restores the original axes.
 
     Raises:
-        HyrfDataError: the bytes are no such file, are damaged, or need what is not read here (buffers in other
-            files, sparse or compressed data, other kernels).
+        HyrfDataError: the bytes are not such a file, are damaged, or need features that are not supported (buffers in
+            other files, sparse or compressed data, other kernels).
     """
-    content, binary = _chunks(data, name)
+    content, binary = _read_chunks(data, name)
     try:
-        found = list(_nodes_with_splats(content, name))
+        found = list(_find_splat_primitives(content, name))
         if not found:
-            raise HyrfDataError(f"{name}: there are no Gaussian splats in it ({EXTENSION}); name another file")
-        counts = [integer(_item(content, "accessors", item["attributes"]["POSITION"])["count"]) for _, item in found]
-        if sum(max(count, 0) for count in counts) * _MIN_BYTES > len(data):
+            raise HyrfDataError(
+                f"{name}: there are no Gaussian splats in it ({SPLATTING_EXTENSION}); name another file"
+            )
+        counts = [
+            integer(_get_item(content, "accessors", item["attributes"]["POSITION"])["count"]) for _, item in found
+        ]
+        if sum(max(count, 0) for count in counts) * _MIN_BYTES_PER_SPLAT > len(data):
             raise HyrfDataError(f"{name}: its nodes show the same splats many times; export each once")
         turn = np.eye(3) if upright else rotation_of(found[0][0], name)[1].T
         parts = [
@@ -148,65 +156,67 @@ def decode(data: bytes, name: str, *, upright: bool = False) -> Splats:
     return concatenate(parts)
 
 
-def _packed(arrays: list[np.ndarray]) -> tuple[list[dict[str, Any]], list[dict[str, Any]], list[bytes]]:
-    """Accessors, buffer views and bytes of arrays (N, width), one after the other; integers are normalised."""
+def _pack_attributes(arrays: list[np.ndarray]) -> tuple[list[dict[str, Any]], list[dict[str, Any]], list[bytes]]:
+    """Return the accessors, buffer views and bytes of arrays (N, width); integers are marked as normalised."""
     accessors, parts, offset = [], [], 0
     views: list[dict[str, Any]] = []
     for values in arrays:
-        kind = next(kind for kind, width in _WIDTHS.items() if width == values.shape[1])
-        component = next(number for number, dtype in _TYPES.items() if dtype == values.dtype)
+        kind = next(kind for kind, width in _WIDTH_BY_ACCESSOR_TYPE.items() if width == values.shape[1])
+        component = next(number for number, dtype in _DTYPE_BY_COMPONENT_TYPE.items() if dtype == values.dtype)
         accessor = {"bufferView": len(views), "componentType": component, "count": len(values), "type": kind}
         accessors.append({**accessor, "normalized": True} if values.dtype.kind == "u" else accessor)
         parts.append(values.astype(values.dtype.newbyteorder("<"), copy=False).tobytes())
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(parts[-1]), "target": _VERTICES})
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(parts[-1]), "target": _ARRAY_BUFFER_TARGET})
         offset += len(parts[-1])
     return accessors, views, parts
 
 
 def _harmonics_semantics(degree: int) -> list[str]:
-    return [f"{EXTENSION}:SH_DEGREE_{band}_COEF_{n}" for band in range(degree + 1) for n in range(2 * band + 1)]
+    return [
+        f"{SPLATTING_EXTENSION}:SH_DEGREE_{band}_COEF_{n}" for band in range(degree + 1) for n in range(2 * band + 1)
+    ]
 
 
 def linear_colors(splats: Splats) -> np.ndarray:
-    """(N, 4) uint8: colours of degree 0 as linear RGB, for that is what glTF's COLOR_0 means, and opacities."""
+    """Return the colours of degree 0 as linear RGB, which glTF's COLOR_0 means, with the opacities: (N, 4) uint8."""
     srgb = splats.base_colors
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     return np.round(255 * np.column_stack((linear, splats.opacities))).astype(np.uint8)
 
 
-def _chunks(data: bytes, name: str) -> tuple[dict[str, Any], memoryview]:
-    """The parsed JSON and the binary chunk, empty where there is none."""
-    if len(data) < _HEADER.size + _CHUNK.size or data[:4] != b"glTF":
+def _read_chunks(data: bytes, name: str) -> tuple[dict[str, Any], memoryview]:
+    """Return the parsed JSON and the binary chunk, which is empty where the file has none."""
+    if len(data) < _HEADER_STRUCT.size + _CHUNK_HEADER_STRUCT.size or data[:4] != b"glTF":
         raise HyrfDataError(f"{name}: this is not a .glb file; check the path")
-    _, version, length = _HEADER.unpack_from(data)
+    _, version, length = _HEADER_STRUCT.unpack_from(data)
     if version != 2 or length != len(data):
         raise HyrfDataError(
             f"{name}: it says version {version} and {length:,} bytes, but version 2 is read and it has {len(data):,}; "
             "export it again"
         )
     chunks: dict[int, memoryview] = {}
-    offset = _HEADER.size
+    offset = _HEADER_STRUCT.size
     while offset < len(data):
-        if offset + _CHUNK.size > len(data):
+        if offset + _CHUNK_HEADER_STRUCT.size > len(data):
             raise HyrfDataError(f"{name}: it ends within the head of a chunk; the file is damaged")
-        size, kind = _CHUNK.unpack_from(data, offset)
-        offset += _CHUNK.size
+        size, kind = _CHUNK_HEADER_STRUCT.unpack_from(data, offset)
+        offset += _CHUNK_HEADER_STRUCT.size
         if offset + size > len(data):
             raise HyrfDataError(f"{name}: a chunk of {size:,} bytes goes past the end; the file is damaged")
         chunks.setdefault(kind, memoryview(data)[offset : offset + size])
         offset += size
     try:
-        content = json.loads(bytes(chunks.get(_JSON, memoryview(b""))))
+        content = json.loads(bytes(chunks.get(_JSON_CHUNK_TYPE, memoryview(b""))))
     except (ValueError, RecursionError) as error:
         raise HyrfDataError(f"{name}: its JSON cannot be read ({str(error):.120}); the file is damaged") from error
     if not isinstance(content, dict):
         raise HyrfDataError(f"{name}: its JSON is not an object; the file is damaged")
-    return content, chunks.get(_BIN, memoryview(b""))
+    return content, chunks.get(_BINARY_CHUNK_TYPE, memoryview(b""))
 
 
-def _nodes_with_splats(content: dict[str, Any], name: str) -> Iterator[tuple[np.ndarray, dict[str, Any]]]:
-    """World transform (4, 4) and primitive of all splats in the default scene, depth first."""
-    scene = _item(content, "scenes", content.get("scene", 0))
+def _find_splat_primitives(content: dict[str, Any], name: str) -> Iterator[tuple[np.ndarray, dict[str, Any]]]:
+    """Yield the world transform (4, 4) and the primitive of all splats in the default scene, depth first."""
+    scene = _get_item(content, "scenes", content.get("scene", 0))
     waiting = [(number, np.eye(4)) for number in reversed(scene.get("nodes", []))]
     visited: set[int] = set()
     while waiting:
@@ -214,22 +224,22 @@ def _nodes_with_splats(content: dict[str, Any], name: str) -> Iterator[tuple[np.
         if number in visited or len(visited) >= _MAX_NODES:
             raise HyrfDataError(f"{name}: its nodes form no tree, or more than {_MAX_NODES:,}; export it again")
         visited.add(number)
-        node = _item(content, "nodes", number)
+        node = _get_item(content, "nodes", number)
         matrix = above @ _local_transform(node)
         waiting += [(child, matrix) for child in reversed(node.get("children", []))]
         if "mesh" in node:
-            for primitive in _item(content, "meshes", node["mesh"])["primitives"]:
-                if EXTENSION in primitive.get("extensions", {}):
+            for primitive in _get_item(content, "meshes", node["mesh"])["primitives"]:
+                if SPLATTING_EXTENSION in primitive.get("extensions", {}):
                     yield matrix, primitive
 
 
 def _local_transform(node: dict[str, Any]) -> np.ndarray:
-    """(4, 4), column vectors, of a node's matrix or its translation, rotation and scale."""
+    """Return a node's transform (4, 4) for column vectors, from its matrix or its translation, rotation and scale."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
     quat = np.array([[w, x, y, z]])
-    rotation = matrices_of(quat / (math.hypot(*quat[0]) or 1))[0]  # as the norm, but its squares cannot overflow
+    rotation = matrices_of(quat / (math.hypot(*quat[0]) or 1))[0]  # hypot, because its squares cannot overflow
     matrix = np.eye(4)
     matrix[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)), np.float64)
     matrix[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64)
@@ -237,7 +247,7 @@ def _local_transform(node: dict[str, Any]) -> np.ndarray:
 
 
 def _read_primitive(content: dict[str, Any], binary: memoryview, primitive: dict[str, Any], name: str) -> Splats:
-    extension, attributes = primitive["extensions"][EXTENSION], primitive["attributes"]
+    extension, attributes = primitive["extensions"][SPLATTING_EXTENSION], primitive["attributes"]
     kernel, space = extension.get("kernel"), extension.get("colorSpace")
     if kernel != "ellipse" or space != "srgb_rec709_display" or extension.get("extensions"):
         raise HyrfDataError(
@@ -246,35 +256,38 @@ def _read_primitive(content: dict[str, Any], binary: memoryview, primitive: dict
         )
 
     def read(semantic: str, width: int) -> np.ndarray:
-        return _accessor(content, binary, _item(content, "accessors", attributes[semantic]), width, name)
+        return _read_accessor(content, binary, _get_item(content, "accessors", attributes[semantic]), width, name)
 
-    own = [f"{EXTENSION}:SH_DEGREE_{band}_COEF_0" in attributes for band in range(MAX_DEGREE + 1)]
-    degree = own.index(False) - 1 if False in own else MAX_DEGREE
-    positions, scales = read("POSITION", 3), read(f"{EXTENSION}:SCALE", 3)
+    has_degree = [f"{SPLATTING_EXTENSION}:SH_DEGREE_{band}_COEF_0" in attributes for band in range(MAX_DEGREE + 1)]
+    degree = has_degree.index(False) - 1 if False in has_degree else MAX_DEGREE
+    positions, scales = read("POSITION", 3), read(f"{SPLATTING_EXTENSION}:SCALE", 3)
     if (scales < 0).any():
         raise HyrfDataError(
             f"{name}: there are negative scales, for it follows a draft with logarithms; export it again"
         )
-    quats, opacities = read(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]], read(f"{EXTENSION}:OPACITY", 1)[:, 0]
+    quats, opacities = (
+        read(f"{SPLATTING_EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]],
+        read(f"{SPLATTING_EXTENSION}:OPACITY", 1)[:, 0],
+    )
     harmonics = np.empty((len(positions), terms_of(degree), 3), np.float32)
     for term, semantic in enumerate(_harmonics_semantics(degree)):
         harmonics[:, term] = read(semantic, 3)
-    return checked_splats(name, positions, scales, quats, opacities, harmonics)
+    return build_valid_splats(name, positions, scales, quats, opacities, harmonics)
 
 
-def _accessor(content: dict[str, Any], binary: memoryview, accessor: dict, width: int, name: str) -> np.ndarray:
-    """(count, width) float32, integers normalised where the accessor says so."""
+def _read_accessor(content: dict[str, Any], binary: memoryview, accessor: dict, width: int, name: str) -> np.ndarray:
+    """Read an accessor as (count, width) float32; integers are normalised where the accessor says so."""
     if "sparse" in accessor or "bufferView" not in accessor:
         raise HyrfDataError(f"{name}: sparse or absent data is not read; export it plainly")
-    view = _item(content, "bufferViews", accessor["bufferView"])
-    buffer = _item(content, "buffers", view["buffer"])
+    view = _get_item(content, "bufferViews", accessor["bufferView"])
+    buffer = _get_item(content, "buffers", view["buffer"])
     if integer(view["buffer"]) != 0 or "uri" in buffer or view.get("extensions"):
         raise HyrfDataError(f"{name}: only plain data within the .glb file is read; pack it into one file")
-    dtype = np.dtype(_TYPES[accessor["componentType"]])
+    dtype = np.dtype(_DTYPE_BY_COMPONENT_TYPE[accessor["componentType"]])
     count, size = integer(accessor["count"]), width * dtype.itemsize
     start, length = integer(view.get("byteOffset", 0)), integer(view["byteLength"])
     offset, stride = integer(accessor.get("byteOffset", 0)), integer(view.get("byteStride", size))
-    if _WIDTHS[accessor["type"]] != width:
+    if _WIDTH_BY_ACCESSOR_TYPE[accessor["type"]] != width:
         raise HyrfDataError(f"{name}: an attribute is {accessor['type']!r:.20}, not of width {width}; export it again")
     within = min(start, length, offset, count) >= 0 and start + length <= len(binary) and stride >= size
     if not within or (count and offset + stride * (count - 1) + size > length):
@@ -286,8 +299,8 @@ def _accessor(content: dict[str, Any], binary: memoryview, accessor: dict, width
     return values.astype(np.float32)
 
 
-def _item(content: dict[str, Any], key: str, number: int) -> dict[str, Any]:
-    """content[key][number], where a list would also take numbers from its end."""
+def _get_item(content: dict[str, Any], key: str, number: int) -> dict[str, Any]:
+    """Return content[key][number], and raise IndexError for negative numbers, which a list would accept."""
     if integer(number) < 0:
         raise IndexError(f"{key} {number}")
     return content[key][number]

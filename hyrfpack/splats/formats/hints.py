@@ -1,4 +1,4 @@
-"""What is told to a format's `encode` beside the splats: few formats want any of it."""
+"""Optional information that a format's `encode` takes besides the splats; few formats use any of it."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from hyrfpack.scene import Camera
 
 @dataclass(frozen=True)
 class Hints:
-    """Formats that have no use for a hint ignore it.
+    """Optional information for encoders. A format ignores what it cannot store.
 
     Attributes:
-        up: (3,) unit vector in the world: which way is up in the scene (glTF, USD).
-        camera: to look from first (USD).
-        spz_version: 3, one gzip stream, which most programs read, or 4, streams of zstd: smaller and faster (SPZ).
+        up: (3,) unit vector in world axes that points up in the scene (used by glTF and USD).
+        camera: the initial camera of the file (used by USD), or None.
+        spz_version: version of an SPZ file. 3 is one gzip stream, which most programs read; 4 is several zstd streams,
+            smaller and faster.
     """
 
     up: np.ndarray = field(default_factory=lambda: np.array([0.0, -1.0, 0.0]))

@@ -1,8 +1,14 @@
-"""PLY as 3D Gaussian Splatting writes it: the format that every program reads and that loses nothing.
+"""PLY files in the layout of the 3D Gaussian Splatting reference code: lossless, and read by every program.
 
-One element `vertex` of floats: x y z, nx ny nz (0), f_dc_0..2 (harmonics of degree 0, RGB), f_rest_0.. (higher ones,
-channel after channel: all of red, all of green, all of blue), opacity (its logit), scale_0..2 (natural logarithms),
-rot_0..3 (quaternion wxyz).
+The one element `vertex` holds floats:
+
+    x y z          position
+    nx ny nz       0
+    f_dc_0..2      harmonics of degree 0, RGB
+    f_rest_0..     higher harmonics, one channel after the other: all of red, all of green, all of blue
+    opacity        logit of the opacity
+    scale_0..2     natural logarithms of the scales
+    rot_0..3       quaternion wxyz
 """
 
 from __future__ import annotations
@@ -15,22 +21,28 @@ from scipy.special import expit
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.ply import columns, read_elements, read_header
 from hyrfpack.splats.formats import compressed_ply
-from hyrfpack.splats.formats.checked import checked_splats
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
+from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.harmonics import MAX_DEGREE, terms_of
 from hyrfpack.splats.splats import Splats
 
-_POSITION, _COLOR, _SCALE = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2"), ("scale_0", "scale_1", "scale_2")
-_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
-_NEEDED = (*_POSITION, *_COLOR, "opacity", *_SCALE, *_ROTATION)
+_POSITION_PROPERTIES = ("x", "y", "z")
+_COLOR_PROPERTIES = ("f_dc_0", "f_dc_1", "f_dc_2")
+_SCALE_PROPERTIES = ("scale_0", "scale_1", "scale_2")
+_ROTATION_PROPERTIES = ("rot_0", "rot_1", "rot_2", "rot_3")
+_REQUIRED_PROPERTIES = (*_POSITION_PROPERTIES, *_COLOR_PROPERTIES, "opacity", *_SCALE_PROPERTIES, *_ROTATION_PROPERTIES)
 
-# Logarithms and logits of what has none. In float32 exp and the logistic function of the first are 0, the latter of the
-# second is 1, so even these come back exactly.
-_LEAST, _MOST = -104.0, 20.0
+# Written for scales and opacities of 0, whose logarithm and logit are infinite. In float32, exp(-104) and
+# sigmoid(-104) are 0, so that these values are read back exactly.
+_MIN_LOG_OR_LOGIT = -104.0
+# Written for opacities of 1: in float32, sigmoid(20) is 1.
+_MAX_LOGIT = 20.0
 
 
 def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
-    """Splats as a binary little-endian PLY file. Everything is stored as float32; `antialiased` is not stored.
+    """Encode splats as a binary little-endian PLY file.
+
+    Everything is stored as float32; `antialiased` is not stored.
 
     Raises:
         HyrfDataError: a position is too large for float32.
@@ -38,7 +50,17 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     if np.abs(splats.positions).max(initial=0) > np.finfo(np.float32).max:
         raise HyrfDataError("a Gaussian lies farther from the origin than PLY's numbers reach; move the scene there")
     rest = 3 * (terms_of(splats.degree) - 1)
-    names = (*_POSITION, "nx", "ny", "nz", *_COLOR, *_rest_names(rest), "opacity", *_SCALE, *_ROTATION)
+    names = (
+        *_POSITION_PROPERTIES,
+        "nx",
+        "ny",
+        "nz",
+        *_COLOR_PROPERTIES,
+        *_higher_harmonics_properties(rest),
+        "opacity",
+        *_SCALE_PROPERTIES,
+        *_ROTATION_PROPERTIES,
+    )
     with np.errstate(divide="ignore"):
         opacities = splats.opacities.astype(np.float64)
         logits = np.log(opacities) - np.log1p(-opacities)
@@ -48,8 +70,8 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     table[:, 6:9] = splats.harmonics[:, 0]
     for column, (channel, term) in enumerate(product(range(3), range(1, splats.harmonics.shape[1])), 9):
         table[:, column] = splats.harmonics[:, term, channel]
-    table[:, -8] = np.clip(logits, _LEAST, _MOST)
-    table[:, -7:-4] = np.maximum(scales, _LEAST)
+    table[:, -8] = np.clip(logits, _MIN_LOG_OR_LOGIT, _MAX_LOGIT)
+    table[:, -7:-4] = np.maximum(scales, _MIN_LOG_OR_LOGIT)
     table[:, -4:] = splats.quats
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(splats)}"]
     header += [f"property float {name}" for name in names] + ["end_header\n"]
@@ -57,56 +79,61 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
 
 
 def decode(data: bytes, name: str) -> Splats:
-    """Splats of a PLY file of either kind, this one or `compressed_ply`. Errors as `decode_plain` and its `decode`."""
+    """Decode a PLY file, plain or compressed. Raises the errors of `decode_plain` and `compressed_ply.decode`."""
     packed = compressed_ply.is_compressed(read_header(data, name))
     return compressed_ply.decode(data, name) if packed else decode_plain(data, name)
 
 
 def decode_plain(data: bytes, name: str) -> Splats:
-    """Splats of a PLY file, binary or in text, with its properties in any order, of any type.
+    """Decode an uncompressed PLY file, binary or text, with properties of any type in any order.
 
-    Other properties and elements are skipped; normals may be absent. Harmonics end at degree 3. Opacities may be
-    infinite (0 and 1), and scales minus infinite (0): some programs write that.
+    Other properties and elements are skipped; normals may be absent. Harmonics beyond degree 3 are dropped. Some
+    programs write infinite opacity logits and scales of minus infinity; these become opacities of 0 or 1, and scales
+    of 0.
 
     Args:
-        data: the file.
-        name: what messages call it.
+        data: the file's bytes.
+        name: the file's name in error messages.
 
     Raises:
-        HyrfDataError: it is no PLY file, holds no Gaussians, or is damaged.
+        HyrfDataError: the file is not a PLY file, holds no Gaussians, or is damaged.
     """
     header = read_header(data, name)
     vertex = header.elements.get("vertex")
-    have = vertex.properties if vertex else {}
-    missing = [label for label in _NEEDED if not have.get(label)]
+    properties = vertex.properties if vertex else {}
+    missing = [label for label in _REQUIRED_PROPERTIES if not properties.get(label)]
     if missing:
         shown = ", ".join(missing[:4]) + (f" and {len(missing) - 4} more" if len(missing) > 4 else "")
         raise HyrfDataError(
             f"{name}: this PLY file holds no Gaussians, for its vertices have no {shown}; give one that a program for "
             "3D Gaussian Splatting wrote"
         )
-    rest = sum(label.startswith("f_rest_") for label in have)
+    rest = sum(label.startswith("f_rest_") for label in properties)
     terms = rest // 3 + 1
-    if terms not in (1, 4, 9, 16, 25) or rest % 3 or not all(have.get(label) for label in _rest_names(rest)):
+    if (
+        terms not in (1, 4, 9, 16, 25)
+        or rest % 3
+        or not all(properties.get(label) for label in _higher_harmonics_properties(rest))
+    ):
         raise HyrfDataError(
             f"{name}: {rest} properties f_rest_ fit no degree of harmonics; 0, 9, 24, 45 or 72 of them do, "
             "counted from 0"
         )
     rows = read_elements(data, header, {"vertex"}, name)["vertex"]
     harmonics = np.empty((len(rows), min(terms, terms_of(MAX_DEGREE)), 3), np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused; NaN may signal
-        harmonics[:, 0] = columns(rows, _COLOR)
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite results are rejected below; NaN may signal
+        harmonics[:, 0] = columns(rows, _COLOR_PROPERTIES)
         for channel, term in product(range(3), range(1, harmonics.shape[1])):
             harmonics[:, term, channel] = rows[f"f_rest_{channel * (terms - 1) + term - 1}"]
-        return checked_splats(
+        return build_valid_splats(
             name,
-            columns(rows, _POSITION),
-            np.exp(columns(rows, _SCALE).astype(np.float64)),
-            columns(rows, _ROTATION),
+            columns(rows, _POSITION_PROPERTIES),
+            np.exp(columns(rows, _SCALE_PROPERTIES).astype(np.float64)),
+            columns(rows, _ROTATION_PROPERTIES),
             expit(rows["opacity"].astype(np.float64)),
             harmonics,
         )
 
 
-def _rest_names(count: int) -> list[str]:
+def _higher_harmonics_properties(count: int) -> list[str]:
     return [f"f_rest_{index}" for index in range(count)]

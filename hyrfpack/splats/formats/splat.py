@@ -1,11 +1,11 @@
-"""The .splat format of antimatter15's viewer: 32 bytes a Gaussian and nothing else.
+"""The .splat format of antimatter15's viewer: records of 32 bytes, one for each Gaussian, without a header.
 
     position   3 float32
     scale      3 float32, linear
     colour     4 bytes: red, green, blue as 0.5 + Y00 k of the harmonics k of degree 0, and the opacity, all times 255
     rotation   4 bytes: quaternion wxyz, q * 128 + 128
 
-Little-endian. Higher harmonics cannot be stored: colours are the same from all sides.
+Numbers are little-endian. Higher harmonics cannot be stored, so colours do not depend on the direction.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from __future__ import annotations
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.splats.formats.checked import checked_splats
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
+from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.harmonics import BAND_0
 from hyrfpack.splats.splats import Splats
 
-DEGREE = 0  # of the harmonics
-_RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
+MAX_HARMONICS_DEGREE = 0
+_RECORD_DTYPE = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 
 
 def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
-    """Splats as a .splat file, without their higher harmonics and `antialiased`.
+    """Encode splats as a .splat file, without their higher harmonics and `antialiased`.
 
-    Gaussians come in the order of opacity times volume, largest first (equal ones as they were): viewers draw the file
-    while it loads, and so the first bytes show the most.
+    Gaussians are sorted by opacity times volume, largest first; equal ones keep their order. Viewers draw a file while
+    it loads, so the first bytes should show as much as possible.
 
     Raises:
         HyrfDataError: a position is too large for float32.
@@ -35,34 +35,34 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
         raise HyrfDataError("a Gaussian lies farther from the origin than .splat's numbers reach; move the scene there")
     order = np.argsort(-splats.opacities * np.prod(splats.scales, axis=1, dtype=np.float64), kind="stable")
     colors = splats.base_colors
-    records = np.empty(len(splats), _RECORD)
+    records = np.empty(len(splats), _RECORD_DTYPE)
     records["position"] = splats.positions[order]
     records["scale"] = splats.scales[order]
-    records["color"] = _to_bytes(np.column_stack((colors, splats.opacities)) * 255)[order]
-    records["rotation"] = _to_bytes(splats.quats * 128 + 128)[order]
+    records["color"] = _round_to_bytes(np.column_stack((colors, splats.opacities)) * 255)[order]
+    records["rotation"] = _round_to_bytes(splats.quats * 128 + 128)[order]
     return records.tobytes()
 
 
 def decode(data: bytes, name: str) -> Splats:
-    """Splats of a .splat file.
+    """Decode a .splat file.
 
     Args:
-        data: the file.
-        name: what messages call it.
+        data: the file's bytes.
+        name: the file's name in error messages.
 
     Raises:
-        HyrfDataError: its length is no multiple of 32, or a number is not finite, or a scale negative.
+        HyrfDataError: the length is not a multiple of 32, a number is not finite, or a scale is negative.
     """
-    if len(data) % _RECORD.itemsize:
+    if len(data) % _RECORD_DTYPE.itemsize:
         raise HyrfDataError(
             f"{name}: {len(data):,} bytes are not a whole number of Gaussians of 32 bytes; this is not a .splat file, "
             "or it is truncated"
         )
-    records = np.frombuffer(data, _RECORD)
+    records = np.frombuffer(data, _RECORD_DTYPE)
     if (records["scale"] < 0).any():
         raise HyrfDataError(f"{name}: a scale is negative; this is not a .splat file, or it is damaged")
     colors = records["color"] / np.float32(255)
-    return checked_splats(
+    return build_valid_splats(
         name,
         records["position"],
         records["scale"],
@@ -72,5 +72,5 @@ def decode(data: bytes, name: str) -> Splats:
     )
 
 
-def _to_bytes(values: np.ndarray) -> np.ndarray:
+def _round_to_bytes(values: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)

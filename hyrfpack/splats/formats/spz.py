@@ -1,20 +1,25 @@
-"""Niantic's SPZ (https://github.com/nianticlabs/spz), versions 1 to 4: about a tenth of a PLY's bytes.
+"""Niantic's SPZ (https://github.com/nianticlabs/spz), versions 1 to 4: files of about a tenth of a PLY's bytes.
 
-Every attribute is a section of its own, a few bytes for each Gaussian, in this order:
+Every attribute has its own section, with a few bytes for each Gaussian, in this order:
 
-    positions   3 x 24 bit   fixed point with `fractional bits`, little-endian (version 1: 3 float16)
+    positions   3 x 24 bits  fixed point with the header's number of fractional bits, little-endian (version 1:
+                             3 float16)
     opacities   1 byte       o * 255
     colours     3 bytes      (0.5 + 0.15 k) * 255 of the harmonics k of degree 0
     scales      3 bytes      (ln s + 10) * 16
     rotations   4 bytes      smallest three, see `_pack_quats` (before version 3: 3 bytes, (q + 1) * 127.5 of x, y, z)
-    harmonics   3 (K - 1)    (k + 1) * 128 of the degrees from 1, one basis function after the other, RGB each
+    harmonics   3 (K - 1)    (k + 1) * 128 of degrees 1 and up, one basis function after the other, RGB each
 
-Before them stands a header of 16 bytes: "NGSP", version, count (all uint32), degree, fractional bits, flags, and 0.
-Up to version 3 the whole is one gzip stream. Version 4 has a plain header of 32 bytes, whose last byte of the 16 counts
-streams and which goes on with the place of the table of contents (uint32) and 12 zeros; perhaps extensions; the table,
-of each stream's stored and raw length (uint64); and then each section that is not empty as a stream of zstd.
+A header of 16 bytes comes first: "NGSP", version, count (all uint32), degree, fractional bits, flags and 0 (one byte
+each). Up to version 3, header and sections are one gzip stream.
 
-Axes are RUB: files turn our numbers 180 degrees about x, which other programs undo when they write a PLY.
+Version 4 is not compressed as a whole. Its header of 32 bytes starts with the same 16 bytes, whose last is the number
+of streams, and goes on with the offset of the table of contents (uint32) and 12 zero bytes. Then come optional
+extensions, and the table of contents with the stored and the raw length of each stream (uint64 each). Then each section
+that is not empty follows as a zstd stream.
+
+Axes are RUB (right, up, back): files hold our numbers rotated by 180 degrees about x. Other programs undo that rotation
+when they write a PLY.
 """
 
 from __future__ import annotations
@@ -27,103 +32,114 @@ import zstandard
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.parallel.pool import run_tasks
-from hyrfpack.splats.formats.checked import checked_splats
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
-from hyrfpack.splats.formats.smallest_three import with_largest, without_largest
+from hyrfpack.splats.formats.smallest_three import drop_largest, restore_largest
+from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.harmonics import MAX_DEGREE, harmonics_rotation, terms_of
 from hyrfpack.splats.splats import Splats
 
-VERSIONS = (3, 4)  # that are written
+WRITTEN_VERSIONS = (3, 4)
 
 _MAGIC = b"NGSP"
-_GZIP = b"\x1f\x8b"
-_HEADER = struct.Struct("<4sIIBBBB")
-_TABLE_PLACE = struct.Struct("<I12x")
-_STREAM = struct.Struct("<QQ")
-_ANTIALIASED, _EXTENDED, _TREE = 0x01, 0x02, 0x80  # flags
+_GZIP_MAGIC = b"\x1f\x8b"
+_HEADER_STRUCT = struct.Struct("<4sIIBBBB")
+_TABLE_OFFSET_STRUCT = struct.Struct("<I12x")
+_STREAM_LENGTHS_STRUCT = struct.Struct("<QQ")
+_ANTIALIASED_FLAG = 0x01
+_EXTENSIONS_FLAG = 0x02
+_LOD_TREE_FLAG = 0x80
 
-_FRACTIONAL_BITS = range(1, 24)  # that every reader we know accepts
-FARTHEST = (1 << 22) - 1  # units from the origin along an axis that a position may lie
+_FRACTIONAL_BITS_RANGE = range(1, 24)  # because all readers that we know accept these
+MAX_COORDINATE = (1 << 22) - 1  # world units
 
-# Kept of each byte of harmonics. Pictures of two models then lie 48 and 51 dB from those before. With all 8 bits it is
-# 51 and 53 dB, in files larger by 33 and 16 %; with the usual choice, 5 for degree 1 and 4 above, 38 and 45 dB, in
-# files smaller by 22 and 11 %.
-_HARMONICS_BITS = 6
-_HIGHEST_DEGREE = 4  # in files; ours end at MAX_DEGREE
+# With 6 of 8 bits, pictures of two models have 48 and 51 dB against those before. With all 8 bits it is 51 and 53 dB,
+# in files larger by 33 and 16 %. With the usual choice (5 bits for degree 1, 4 above) it is 38 and 45 dB, in files
+# smaller by 22 and 11 %.
+_KEPT_HARMONICS_BITS = 6
+_MAX_FILE_DEGREE = 4  # of files that are read; splats in memory end at MAX_DEGREE
 
-_PIECE = 1 << 22  # bytes that a thread deflates
+_DEFLATE_PIECE_BYTES = 1 << 22
 
-# Sections far smaller than what they unpack to are a trap; real scenes do not even reach 20.
-_FREE_BYTES = 1 << 26
-_HIGHEST_RATIO = 100
+# A file whose sections unpack to far more than their size could exhaust memory. Real scenes do not even reach a ratio
+# of 20.
+_UNCHECKED_CONTENT_BYTES = 1 << 26
+_MAX_COMPRESSION_RATIO = 100
 
-_FLIPS = np.array([1.0, -1.0, -1.0])  # half a turn about x: RDF <-> RUB, its own inverse
+_AXIS_SIGNS = np.array([1.0, -1.0, -1.0])  # half a turn about x, between RDF and RUB; it is its own inverse
 _SQRT_2 = np.sqrt(2.0)
 
-# What each byte stands for.
-_BYTES = np.arange(256, dtype=np.float64)
-_OPACITY_OF = np.float32(_BYTES / 255)
-_COLOR_OF = np.float32((_BYTES / 255 - 0.5) / 0.15)
-_SCALE_OF = np.float32(np.exp(_BYTES / 16 - 10))
-LARGEST_SCALE = float(_SCALE_OF[-1])  # of what is stored, units
-_HARMONICS_OF = np.float32((_BYTES - 128) / 128)
-_AXIS_OF = np.float32(_BYTES / 127.5 - 1)
+# The tables below map each byte to the number that it means.
+_BYTE_VALUES = np.arange(256, dtype=np.float64)
+_OPACITY_BY_BYTE = np.float32(_BYTE_VALUES / 255)
+_COLOR_BY_BYTE = np.float32((_BYTE_VALUES / 255 - 0.5) / 0.15)
+_SCALE_BY_BYTE = np.float32(np.exp(_BYTE_VALUES / 16 - 10))
+MAX_SCALE = float(_SCALE_BY_BYTE[-1])  # world units
+_HARMONIC_BY_BYTE = np.float32((_BYTE_VALUES - 128) / 128)
+_QUAT_COMPONENT_BY_BYTE = np.float32(_BYTE_VALUES / 127.5 - 1)
 
 
 def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
-    """Splats as an SPZ file.
+    """Encode splats as an SPZ file, including `antialiased`.
 
-    What is lost: positions are rounded to multiples of 2^-b, b the most fractional bits up to 23 with which the
-    farthest coordinate fits (so to 1/4,194,304 of it or finer, or else to 2^-23); scales to steps of 6 %, from 4.5e-5
-    to 379 units, and what lies outside to these; opacities to 1/255; quaternions to 1/723; harmonics of degree 0 to
-    1/38, from -3.3 to 3.3; higher ones to 1/32, from -1 to 1.
+    The format rounds
+
+    - positions to multiples of 2^-b, with b the most fractional bits, at most 23, that the farthest coordinate allows:
+      to 1/4,194,304 of that coordinate or finer, or else to 2^-23;
+    - scales to steps of 6 %, clamped to 4.5e-5 to 379 units;
+    - opacities to 1/255 and quaternions to 1/723;
+    - harmonics of degree 0 to 1/38, clamped to -3.3 to 3.3, and higher ones to 1/32, clamped to -1 to 1.
 
     Args:
-        splats: what to store; `antialiased` too.
-        hints: the version, one of VERSIONS.
+        splats: the splats.
+        hints: `spz_version`, one of WRITTEN_VERSIONS, is used.
 
     Raises:
-        ValueError: another version.
-        HyrfDataError: positions are too far from the origin (4,194,303 units).
+        ValueError: the version is another.
+        HyrfDataError: a position is too far from the origin (more than 4,194,303 units).
     """
     version = hints.spz_version
-    if version not in VERSIONS:
-        raise ValueError(f"SPZ version {version} cannot be written; choose one of {VERSIONS}")
-    bits = _fractional_bits(splats.positions)
+    if version not in WRITTEN_VERSIONS:
+        raise ValueError(f"SPZ version {version} cannot be written; choose one of {WRITTEN_VERSIONS}")
+    bits = _choose_fractional_bits(splats.positions)
     signs = _harmonics_signs(splats.degree).astype(np.float32)
     sections = (
-        _pack_positions(splats.positions * _FLIPS, bits),
-        _to_bytes(splats.opacities * 255),
-        _to_bytes(splats.harmonics[:, 0] * (0.15 * 255) + 127.5),
-        _to_bytes((np.log(np.maximum(splats.scales, np.float32(1e-30))) + 10) * 16),
+        _pack_positions(splats.positions * _AXIS_SIGNS, bits),
+        _round_to_bytes(splats.opacities * 255),
+        _round_to_bytes(splats.harmonics[:, 0] * (0.15 * 255) + 127.5),
+        _round_to_bytes((np.log(np.maximum(splats.scales, np.float32(1e-30))) + 10) * 16),
         _pack_quats(splats.quats),
         _pack_harmonics(splats.harmonics[:, 1:] * signs[1:, None]),
     )
     contents = [section.tobytes() for section in sections]
-    flags = _ANTIALIASED if splats.antialiased else 0
+    flags = _ANTIALIASED_FLAG if splats.antialiased else 0
     if version == 3:
-        header = _HEADER.pack(_MAGIC, version, len(splats), splats.degree, bits, flags, 0)
-        return _gzip([header, *contents])
+        header = _HEADER_STRUCT.pack(_MAGIC, version, len(splats), splats.degree, bits, flags, 0)
+        return _compress_gzip([header, *contents])
     contents = [content for content in contents if content]
-    header = _HEADER.pack(_MAGIC, version, len(splats), splats.degree, bits, flags, len(contents))
+    header = _HEADER_STRUCT.pack(_MAGIC, version, len(splats), splats.degree, bits, flags, len(contents))
     streams = [zstandard.ZstdCompressor(level=9).compress(content) for content in contents]
-    table = [_STREAM.pack(len(stream), len(content)) for stream, content in zip(streams, contents, strict=True)]
-    return b"".join((header, _TABLE_PLACE.pack(_HEADER.size + _TABLE_PLACE.size), *table, *streams))
+    table = [
+        _STREAM_LENGTHS_STRUCT.pack(len(stream), len(content))
+        for stream, content in zip(streams, contents, strict=True)
+    ]
+    return b"".join(
+        (header, _TABLE_OFFSET_STRUCT.pack(_HEADER_STRUCT.size + _TABLE_OFFSET_STRUCT.size), *table, *streams)
+    )
 
 
 def decode(data: bytes, name: str) -> Splats:
-    """Splats of an SPZ file of version 1 to 4. Harmonics of degree 4 are left out, extensions skipped.
+    """Decode an SPZ file of version 1 to 4. Harmonics of degree 4 and extensions are dropped.
 
     Args:
-        data: the file.
-        name: what messages call it.
+        data: the file's bytes.
+        name: the file's name in error messages.
 
     Raises:
-        HyrfDataError: it is no SPZ file, damaged, of a newer version, or holds coarse copies of its Gaussians (a tree
-            for levels of detail).
+        HyrfDataError: the bytes are not an SPZ file, are damaged, have a newer version, or hold a tree of coarse
+            copies of the Gaussians for levels of detail.
     """
-    if data[:2] == _GZIP:
-        unpacked = _gunzip(data, name)
+    if data[:2] == _GZIP_MAGIC:
+        unpacked = _read_gzip(data, name)
     elif data[:4] == _MAGIC:
         unpacked = _read_streams(data, name)
     else:
@@ -135,34 +151,38 @@ def decode(data: bytes, name: str) -> Splats:
     degree = min(degree, MAX_DEGREE)
     signs = _harmonics_signs(degree).astype(np.float32)
     terms = np.empty((count, terms_of(degree), 3), np.float32)
-    terms[:, 0] = _COLOR_OF[colors.reshape(count, 3)]
-    np.multiply(_HARMONICS_OF[rest], signs[1:, None], out=terms[:, 1:])
-    with np.errstate(invalid="ignore"):  # positions of version 1 may be NaN, which is refused
-        return checked_splats(
+    terms[:, 0] = _COLOR_BY_BYTE[colors.reshape(count, 3)]
+    np.multiply(_HARMONIC_BY_BYTE[rest], signs[1:, None], out=terms[:, 1:])
+    with np.errstate(invalid="ignore"):  # positions of version 1 may be NaN, which is rejected below
+        return build_valid_splats(
             name,
-            _unpack_positions(positions, bits, version) * _FLIPS,
-            _SCALE_OF[scales.reshape(count, 3)],
+            _unpack_positions(positions, bits, version) * _AXIS_SIGNS,
+            _SCALE_BY_BYTE[scales.reshape(count, 3)],
             _unpack_quats(quats, version),
-            _OPACITY_OF[opacities],
+            _OPACITY_BY_BYTE[opacities],
             terms,
-            bool(flags & _ANTIALIASED),
+            bool(flags & _ANTIALIASED_FLAG),
         )
 
 
 # --- containers -------------------------------------------------------------------------------------------------------
 
-_Unpacked = tuple[int, int, int, int, list[bytes]]  # version, degree, fractional bits, flags, the six sections
+_UnpackedFile = tuple[int, int, int, int, list[bytes]]  # version, degree, fractional bits, flags, the six sections
 
 
 def _section_lengths(version: int, count: int, degree: int) -> list[int]:
-    """Raw bytes of each section."""
+    """Return the number of raw bytes of each section."""
     each = (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * (terms_of(degree) - 1))
     return [count * length for length in each]
 
 
 def _read_header(header: bytes, versions: range, stored: int, name: str) -> tuple[int, int, int, int, int]:
-    """Version, count, degree, fractional bits and flags of a header whose sections come from `stored` bytes."""
-    magic, version, count, degree, bits, flags, _ = _HEADER.unpack(header)
+    """Read and check a header whose sections come from `stored` bytes.
+
+    Returns:
+        The version, count, degree, fractional bits and flags.
+    """
+    magic, version, count, degree, bits, flags, _ = _HEADER_STRUCT.unpack(header)
     if magic != _MAGIC:
         raise HyrfDataError(f"{name}: this is not an SPZ file, for its contents do not start with 'NGSP'")
     if version not in versions:
@@ -170,30 +190,34 @@ def _read_header(header: bytes, versions: range, stored: int, name: str) -> tupl
             f"{name}: this is SPZ version {version}, and versions 1 to 3 (gzip) and 4 (plain header) can be read; "
             "export it as one of these"
         )
-    if degree > _HIGHEST_DEGREE or bits > 31:
+    if degree > _MAX_FILE_DEGREE or bits > 31:
         raise HyrfDataError(
             f"{name}: its header says harmonics of degree {degree} and {bits} fractional bits, and 4 and 31 are the "
             "most; the file is damaged"
         )
-    if flags & _TREE:
+    if flags & _LOD_TREE_FLAG:
         raise HyrfDataError(
             f"{name}: this SPZ file holds a tree of coarse copies for levels of detail; export it without them"
         )
     length = sum(_section_lengths(version, count, degree))
-    if length > _FREE_BYTES and length > _HIGHEST_RATIO * stored:
+    if length > _UNCHECKED_CONTENT_BYTES and length > _MAX_COMPRESSION_RATIO * stored:
         raise HyrfDataError(
             f"{name}: its header says {count:,} Gaussians, far more than {stored:,} bytes can hold; the file is damaged"
         )
     return version, count, degree, bits, flags
 
 
-def _gzip(contents: list[bytes]) -> bytes:
-    """One gzip member without name and time: the same bytes at any hour, on any system.
+def _compress_gzip(contents: list[bytes]) -> bytes:
+    """Compress contents as one gzip member without name and time, so that the bytes are the same on any system.
 
-    It is deflated in pieces, at once and each by itself. Codes then fit their section: at level 5 it is as small as the
-    whole would be at level 6, in half the time.
+    Pieces are deflated independently, in parallel, so that the codes of each piece fit its section. At level 5 the
+    result is as small as one stream at level 6, in half the time.
     """
-    pieces = [content[at : at + _PIECE] for content in contents for at in range(0, len(content), _PIECE)]
+    pieces = [
+        content[at : at + _DEFLATE_PIECE_BYTES]
+        for content in contents
+        for at in range(0, len(content), _DEFLATE_PIECE_BYTES)
+    ]
     deflated = [b""] * len(pieces)
 
     def deflate(index: int) -> None:
@@ -206,48 +230,48 @@ def _gzip(contents: list[bytes]) -> bytes:
     for content in contents:
         checksum = zlib.crc32(content, checksum)
     ending = struct.pack("<II", checksum, sum(map(len, contents)) & 0xFFFFFFFF)
-    return b"".join((_GZIP, b"\x08\0\0\0\0\0\0\xff", *deflated, ending))
+    return b"".join((_GZIP_MAGIC, b"\x08\0\0\0\0\0\0\xff", *deflated, ending))
 
 
-def _gunzip(data: bytes, name: str) -> _Unpacked:
-    """Sections of versions 1 to 3. Never unpacks more than the header's count needs."""
+def _read_gzip(data: bytes, name: str) -> _UnpackedFile:
+    """Read the sections of a file of version 1 to 3. Unpacks no more bytes than the header's count needs."""
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
-        header = stream.decompress(data, _HEADER.size)
-        if len(header) < _HEADER.size:
+        header = stream.decompress(data, _HEADER_STRUCT.size)
+        if len(header) < _HEADER_STRUCT.size:
             raise HyrfDataError(f"{name}: the file ends within its header; it is truncated")
         version, count, degree, bits, flags = _read_header(header, range(1, 4), len(data), name)
         lengths = _section_lengths(version, count, degree)
         content = stream.decompress(stream.unconsumed_tail, sum(lengths) + 1)
     except zlib.error as error:
         raise HyrfDataError(f"{name}: its gzip stream is damaged ({error}); fetch or export it again") from error
-    more = len(content) > sum(lengths)
-    if len(content) < sum(lengths) or not (stream.eof or more):
+    has_more = len(content) > sum(lengths)
+    if len(content) < sum(lengths) or not (stream.eof or has_more):
         raise HyrfDataError(f"{name}: the file ends before its {count:,} Gaussians do; it is truncated")
-    if more and not flags & _EXTENDED:
+    if has_more and not flags & _EXTENSIONS_FLAG:
         raise HyrfDataError(f"{name}: the file goes on after its {count:,} Gaussians; it is damaged")
     ends = np.cumsum([0, *lengths])
     sections = [content[start:end] for start, end in zip(ends[:-1], ends[1:], strict=True)]
     return version, degree, bits, flags, sections
 
 
-def _read_streams(data: bytes, name: str) -> _Unpacked:
-    """Sections of version 4."""
-    if len(data) < _HEADER.size + _TABLE_PLACE.size:
+def _read_streams(data: bytes, name: str) -> _UnpackedFile:
+    """Read the sections of a file of version 4."""
+    if len(data) < _HEADER_STRUCT.size + _TABLE_OFFSET_STRUCT.size:
         raise HyrfDataError(f"{name}: the file ends within its header; it is truncated")
-    version, count, degree, bits, flags = _read_header(data[: _HEADER.size], range(4, 5), len(data), name)
-    streams = data[_HEADER.size - 1]
-    (table,) = _TABLE_PLACE.unpack_from(data, _HEADER.size)
+    version, count, degree, bits, flags = _read_header(data[: _HEADER_STRUCT.size], range(4, 5), len(data), name)
+    streams = data[_HEADER_STRUCT.size - 1]
+    (table,) = _TABLE_OFFSET_STRUCT.unpack_from(data, _HEADER_STRUCT.size)
     lengths = _section_lengths(version, count, degree)
     if streams != sum(length > 0 for length in lengths):
         raise HyrfDataError(
             f"{name}: {streams} streams do not fit harmonics of degree {degree} and {count:,} Gaussians; "
             "the file is damaged"
         )
-    place = table + streams * _STREAM.size
-    if table < _HEADER.size + _TABLE_PLACE.size or place > len(data):
+    place = table + streams * _STREAM_LENGTHS_STRUCT.size
+    if table < _HEADER_STRUCT.size + _TABLE_OFFSET_STRUCT.size or place > len(data):
         raise HyrfDataError(f"{name}: its table of contents lies outside of the file; it is damaged or truncated")
-    sections, entries = [], _STREAM.iter_unpack(data[table:place])
+    sections, entries = [], _STREAM_LENGTHS_STRUCT.iter_unpack(data[table:place])
     for length in lengths:
         stored, raw = next(entries) if length else (0, 0)
         if raw != length:
@@ -257,13 +281,13 @@ def _read_streams(data: bytes, name: str) -> _Unpacked:
             )
         if stored > len(data) - place:
             raise HyrfDataError(f"{name}: the file ends before its {count:,} Gaussians do; it is truncated")
-        sections.append(_decompress(data[place : place + stored], length, name))
+        sections.append(_decompress_zstd(data[place : place + stored], length, name))
         place += stored
     return version, degree, bits, flags, sections
 
 
-def _decompress(stream: bytes, length: int, name: str) -> bytes:
-    """The `length` bytes of a stream of zstd. Never unpacks more."""
+def _decompress_zstd(stream: bytes, length: int, name: str) -> bytes:
+    """Decompress a zstd stream of exactly `length` bytes. Unpacks no more than one byte beyond these."""
     if not length:
         return b""
     try:
@@ -279,18 +303,18 @@ def _decompress(stream: bytes, length: int, name: str) -> bytes:
 # --- attributes -------------------------------------------------------------------------------------------------------
 
 
-def _to_bytes(values: np.ndarray) -> np.ndarray:
+def _round_to_bytes(values: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-def _fractional_bits(positions: np.ndarray) -> int:
-    """The most that leave the farthest coordinate in 24 bits."""
+def _choose_fractional_bits(positions: np.ndarray) -> int:
+    """Return the largest number of fractional bits with which the farthest coordinate fits into 24 bits."""
     farthest = np.abs(positions).max(initial=0)
-    for bits in reversed(_FRACTIONAL_BITS):
+    for bits in reversed(_FRACTIONAL_BITS_RANGE):
         if np.rint(farthest * 2**bits) < 1 << 23:
             return bits
     raise HyrfDataError(
-        f"a Gaussian lies {farthest:,.0f} units from the origin, and SPZ reaches {FARTHEST:,}; "
+        f"a Gaussian lies {farthest:,.0f} units from the origin, and SPZ reaches {MAX_COORDINATE:,}; "
         "export another format (PLY)"
     )
 
@@ -301,46 +325,49 @@ def _pack_positions(positions: np.ndarray, bits: int) -> np.ndarray:
 
 
 def _unpack_positions(packed: np.ndarray, bits: int, version: int) -> np.ndarray:
-    """(N, 3) float64."""
+    """Unpack positions into (N, 3) float64."""
     if version == 1:
         return packed.view("<f2").reshape(-1, 3).astype(np.float64)
     padded = np.zeros((len(packed) // 3, 4), np.uint8)
     padded[:, 1:] = packed.reshape(-1, 3)
-    return (padded.view("<i4").reshape(-1, 3) >> 8) * 2.0**-bits  # the shift brings the sign along
+    return (padded.view("<i4").reshape(-1, 3) >> 8) * 2.0**-bits  # the arithmetic shift extends the sign
 
 
 def _pack_quats(quats: np.ndarray) -> np.ndarray:
-    """Quaternions (N, 4) wxyz as (N,) uint32: in the 2 high bits which of x, y, z, w is largest, then the other three
-    in this order: a sign and 9 bits of the magnitude, of which 511 is sqrt(1/2)."""
-    largest, others = without_largest(quats[:, [1, 2, 3, 0]] * np.array([1, -1, -1, 1], np.float32))
+    """Pack quaternions (N, 4) wxyz into (N,) uint32 by the smallest-three encoding.
+
+    The 2 high bits hold the index of the largest of x, y, z, w. The other three follow in this order, each as a sign
+    bit and 9 bits of magnitude, of which 511 means sqrt(1/2).
+    """
+    largest, others = drop_largest(quats[:, [1, 2, 3, 0]] * np.array([1, -1, -1, 1], np.float32))
     sizes = np.minimum(np.rint(np.abs(others) * (511 * _SQRT_2)), 511).astype(np.uint32)
     codes = sizes | (others < 0).astype(np.uint32) << 9
     return (largest.astype(np.uint32) << 30 | codes[:, 0] << 20 | codes[:, 1] << 10 | codes[:, 2]).astype("<u4")
 
 
 def _unpack_quats(packed: np.ndarray, version: int) -> np.ndarray:
-    """(N, 4) float32 wxyz."""
+    """Unpack quaternions into (N, 4) float32 wxyz."""
     if version >= 3:
         words = packed.view("<u4")
         codes = words[:, None] >> np.array([20, 10, 0], np.uint32)
         sizes = (codes & 511).astype(np.float32) * np.float32(1 / (511 * _SQRT_2))
         others = np.where(codes & 512, -sizes, sizes)
-        quats = with_largest(words >> 30, others)
+        quats = restore_largest(words >> 30, others)
     else:
-        others = _AXIS_OF[packed.reshape(-1, 3)]
-        quats = with_largest(np.full(len(others), 3), others)
-    return quats[:, [3, 0, 1, 2]] * np.array([1, 1, -1, -1], np.float32)  # of xyzw
+        others = _QUAT_COMPONENT_BY_BYTE[packed.reshape(-1, 3)]
+        quats = restore_largest(np.full(len(others), 3), others)
+    return quats[:, [3, 0, 1, 2]] * np.array([1, 1, -1, -1], np.float32)  # from xyzw
 
 
 def _pack_harmonics(harmonics: np.ndarray) -> np.ndarray:
-    """(N, K - 1, 3) bytes with zeros in the low bits, so that gzip and zstd find fewer different ones."""
-    values = harmonics * np.float32(2 ** (_HARMONICS_BITS - 1))
+    """Pack harmonics into bytes (N, K - 1, 3) with zero low bits, which gzip and zstd compress better."""
+    values = harmonics * np.float32(2 ** (_KEPT_HARMONICS_BITS - 1))
     np.rint(values, out=values)
-    values *= 2 ** (8 - _HARMONICS_BITS)
+    values *= 2 ** (8 - _KEPT_HARMONICS_BITS)
     values += 128
     return np.clip(values, 0, 255, out=values).astype(np.uint8)
 
 
 def _harmonics_signs(degree: int) -> np.ndarray:
-    """(K,) what the half turn does to each of the harmonics: the sign changes, or not."""
-    return np.rint(np.diagonal(harmonics_rotation(np.diag(_FLIPS), degree)))
+    """Return the sign (K,), 1 or -1, by which the half turn about x multiplies each harmonic."""
+    return np.rint(np.diagonal(harmonics_rotation(np.diag(_AXIS_SIGNS), degree)))

@@ -1,11 +1,12 @@
-"""OpenUSD (.usda, .usdc, .usdz) with UsdVol's ParticleField3DGaussianSplat, through usd-core.
+"""OpenUSD files (.usda, .usdc, .usdz) with UsdVol's ParticleField3DGaussianSplat, through usd-core.
 
-    /World              Xform, the default prim: turns the input's axes so that up is up
-    /World/Gaussians    ParticleField3DGaussianSplat, moved to where the scene lies
-    /World/Camera       looks as one of the photos did, if a camera is given
+    /World              Xform, the default prim: rotates the input's axes so that the scene is upright
+    /World/Gaussians    ParticleField3DGaussianSplat, translated to the scene's origin
+    /World/Camera       the camera of one of the photos, if one is given
 
-All arrays are float. Half twins exist and would nearly halve the file at a loss of a tenth of an 8-bit level, but
-checkers ask for the float ones, and half has no room for the scales of scenes in very small or large units.
+All arrays are float32. The schema also has float16 attributes, which would nearly halve the file at a loss of a tenth
+of an 8-bit level. But checkers ask for the float32 ones, and float16 cannot hold the scales of scenes in very small or
+very large units.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ import numpy as np
 
 from hyrfpack.errors import HyrfDataError, needs_package
 from hyrfpack.scene import Camera
-from hyrfpack.splats.formats.checked import checked_splats
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
+from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.harmonics import MAX_DEGREE, terms_of
 from hyrfpack.splats.placement import local_origin, local_positions, matrices_of, placed, rotation_of, upright_rotation
 from hyrfpack.splats.splats import Splats
@@ -31,28 +32,33 @@ if TYPE_CHECKING:
 
 Extension = Literal["usda", "usdc", "usdz"]
 EXTENSIONS: tuple[Extension, ...] = get_args(Extension)
-PACKAGE = "pxr", "usd-core"
-_SPLATS = "ParticleField3DGaussianSplat"
-_APERTURE = 36.0  # width of the film; USD counts focal lengths and film in tenths of a scene unit, only ratios matter
-_NEAR, _FAR = 0.01, 1.1  # clipping: times the median depth, and times the largest reach
-_ALIGNMENT = 64  # of files within .usdz
-_MAX_BYTES = (1 << 32) - 1  # of a .usdz: its zip has no 64-bit form
+REQUIRED_PACKAGE = "pxr", "usd-core"
+_SPLATS_TYPE_NAME = "ParticleField3DGaussianSplat"
+# In tenths of a scene unit, like USD's focal lengths. Only its ratio to the focal length matters.
+_HORIZONTAL_APERTURE = 36.0
+# The clipping range of the camera: near plane over median depth, far plane over the largest reach of a splat.
+_NEAR_MEDIAN_DEPTH_RATIO = 0.01
+_FAR_MAX_REACH_RATIO = 1.1
+_USDZ_ALIGNMENT_BYTES = 64
+_MAX_USDZ_BYTES = (1 << 32) - 1  # because a .usdz is a zip without 64-bit lengths
 
 
 def encode(
     splats: Splats, hints: Hints = NO_HINTS, *, extension: Extension = "usdc", meters_per_unit: float = 1.0
 ) -> bytes:
-    """Splats as a USD file.
+    """Encode splats as a USD file.
 
-    The numbers stay in the input's axes and units; transforms turn them upright and, where the scene lies far from the
-    origin compared to its size, move them there. Same splats, same version of usd-core, same bytes.
+    The stored numbers keep the input's axes and units. Transforms turn the scene upright and, where it lies far from
+    the origin compared to its size, translate it there. The same splats and the same version of usd-core give the same
+    bytes.
 
     Args:
-        splats: any number; scales of 0 become the smallest above it, as the schema's checkers want.
-        hints: which way is up in the scene, and a camera to look from first. USD's z is up where that is nearer to the
-            world's z than to its y, otherwise USD's y.
-        extension: "usda" is text, "usdc" binary, "usdz" an uncompressed package of the latter.
-        meters_per_unit: how long a world unit is.
+        splats: any number of splats. Scales of 0 become the smallest normal float32, because the schema's checkers
+            require positive scales.
+        hints: `up` and `camera` are used. The file's up axis is z where `up` is nearer to the world's z than to its y,
+            otherwise y.
+        extension: "usda" is text, "usdc" binary, "usdz" an uncompressed package of a binary file.
+        meters_per_unit: length of a world unit in metres.
 
     Raises:
         HyrfError: usd-core is missing.
@@ -70,7 +76,7 @@ def encode(
     stage.SetDefaultPrim(world.GetPrim())
     Usd.ModelAPI(world).SetKind(Kind.Tokens.component)
     turn = upright_rotation(hints.up, np.array([0.0, 0.0, 1.0] if z_up else [0.0, 1.0, 0.0]))
-    _transform(world, turn, np.zeros(3))
+    _add_transform(world, turn, np.zeros(3))
     _add_splats(stage, splats)
     if hints.camera is not None:
         _add_camera(stage, hints.camera, splats)
@@ -80,24 +86,25 @@ def encode(
         path = Path(folder, "scene.usdc")
         stage.GetRootLayer().Export(str(path))
         binary = path.read_bytes()
-    return binary if extension == "usdc" else _package(binary, path.name)
+    return binary if extension == "usdc" else _pack_usdz(binary, path.name)
 
 
 def decode(data: bytes, name: str, extension: Extension, *, upright: bool = False) -> Splats:
-    """The splats in a USD file such as `encode` writes: float arrays, one field of splats, nothing in other files.
+    """Decode a USD file like those of `encode`: float32 arrays, one field of splats, no references to other files.
 
-    It measures what a file holds. usd-core parses the bytes, so this is no safer with hostile ones than usd-core is.
+    It serves to measure the loss of an export. usd-core parses the bytes, so this function is no safer with hostile
+    files than usd-core is.
 
     Args:
-        data: the file.
-        name: what error messages call it.
+        data: the file's bytes.
+        name: the file's name in error messages.
         extension: as in `encode`.
-        upright: give them in the file's axes. Otherwise they are turned back about the origin, which for a file of ours
-            gives the axes and numbers `encode` was given.
+        upright: return the splats in the file's axes. Otherwise they are rotated back about the origin. For a file from
+            `encode` that restores the original axes.
 
     Raises:
         HyrfError: usd-core is missing.
-        HyrfDataError: the bytes are no such file.
+        HyrfDataError: the bytes are not such a file.
     """
     with needs_package("usd-core", f"{name}: reading it"):
         from pxr import Sdf, Tf, Usd
@@ -110,17 +117,19 @@ def decode(data: bytes, name: str, extension: Extension, *, upright: bool = Fals
             if layer is None or layer.GetCompositionAssetDependencies():
                 raise HyrfDataError(f"{name}: this is not a USD file, or it needs others; flatten it into one")
             stage = Usd.Stage.Open(layer)
-            fields = [prim for prim in stage.Traverse() if prim.GetTypeName() == _SPLATS]
+            fields = [prim for prim in stage.Traverse() if prim.GetTypeName() == _SPLATS_TYPE_NAME]
             if len(fields) != 1:
-                raise HyrfDataError(f"{name}: it holds {len(fields)} {_SPLATS}, and one is read; name another file")
+                raise HyrfDataError(
+                    f"{name}: it holds {len(fields)} {_SPLATS_TYPE_NAME}, and one is read; name another file"
+                )
             return _read_splats(fields[0], name, upright)
         except Tf.ErrorException as error:
             reason = str(error).strip().splitlines()[-1:] or ["no reason given"]
             raise HyrfDataError(f"{name}: usd-core cannot read it ({reason[0]:.160}); export it again") from error
 
 
-def _transform(prim: UsdGeom.Xformable, rotation: np.ndarray, translation: np.ndarray) -> None:
-    """Give a prim a rotation (3, 3) and a translation (3,), unless they do nothing."""
+def _add_transform(prim: UsdGeom.Xformable, rotation: np.ndarray, translation: np.ndarray) -> None:
+    """Add a rotation (3, 3) and a translation (3,) to a prim, unless they are the identity."""
     from pxr import Gf
 
     matrix = np.eye(4)
@@ -136,12 +145,12 @@ def _add_splats(stage: Usd.Stage, splats: Splats) -> None:
     positions = local_positions(splats, origin)
     scales = np.maximum(splats.scales, np.finfo(np.float32).tiny)
     field = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/World/Gaussians")
-    _transform(field, np.eye(3), origin)
+    _add_transform(field, np.eye(3), origin)
     field.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(positions))
     field.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(np.ascontiguousarray(splats.quats[:, [1, 2, 3, 0]])))
     field.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(scales))
     field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(splats.opacities))
-    field.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(_extent(positions, scales, splats.quats)))
+    field.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(_compute_extent(positions, scales, splats.quats)))
     field.CreateRadianceSphericalHarmonicsDegreeAttr(splats.degree)
     harmonics = field.CreateRadianceSphericalHarmonicsCoefficientsAttr(
         Vt.Vec3fArray.FromNumpy(splats.harmonics.reshape(-1, 3))
@@ -149,49 +158,49 @@ def _add_splats(stage: Usd.Stage, splats: Splats) -> None:
     primvar = UsdGeom.Primvar(harmonics)
     primvar.SetInterpolation(UsdGeom.Tokens.vertex)
     primvar.SetElementSize(terms_of(splats.degree))
-    # USD takes colours for linear unless told otherwise.
+    # USD takes colours as linear unless a colour space is named.
     colors = Usd.ColorSpaceAPI.Apply(field.GetPrim())
     colors.CreateColorSpaceNameAttr(Gf.ColorSpaceNames.SRGBRec709)
-    # The fallbacks of the schema, said aloud: what the pictures of the training were drawn with.
+    # These are the schema's defaults, written explicitly because training renders with them.
     field.CreateProjectionModeHintAttr(UsdVol.Tokens.perspective)
     field.CreateSortingModeHintAttr(UsdVol.Tokens.zDepth)
 
 
-def _extent(positions: np.ndarray, scales: np.ndarray, quats: np.ndarray) -> np.ndarray:
-    """(2, 3) float32: corners of the box about all ellipsoids of three standard deviations."""
+def _compute_extent(positions: np.ndarray, scales: np.ndarray, quats: np.ndarray) -> np.ndarray:
+    """Return the corners (2, 3) float32 of the box around all ellipsoids of three standard deviations."""
     if not len(positions):
         return np.zeros((2, 3), np.float32)
-    # An ellipsoid reaches along an axis as far as that row of rotation times scales is long.
+    # The reach of an ellipsoid along an axis is the length of that row of rotation times scales.
     half = 3 * np.linalg.norm(matrices_of(quats) * scales[:, None], axis=2)
     return np.stack(((positions - half).min(axis=0), (positions + half).max(axis=0)))
 
 
 def _add_camera(stage: Usd.Stage, camera: Camera, splats: Splats) -> None:
-    """OpenCV's camera as USD's, which looks along -z with y up."""
+    """Add a camera, converted from OpenCV's axes to USD's, which look along -z with y up."""
     from pxr import Gf, UsdGeom
 
     prim = UsdGeom.Camera.Define(stage, "/World/Camera")
-    _transform(prim, camera.rotation.T * (1, -1, -1), camera.position)
-    focal = _APERTURE * camera.fx / camera.width
+    _add_transform(prim, camera.rotation.T * (1, -1, -1), camera.position)
+    focal = _HORIZONTAL_APERTURE * camera.fx / camera.width
     prim.CreateFocalLengthAttr(focal)
-    prim.CreateHorizontalApertureAttr(_APERTURE)
+    prim.CreateHorizontalApertureAttr(_HORIZONTAL_APERTURE)
     prim.CreateVerticalApertureAttr(focal * camera.height / camera.fy)
     prim.CreateHorizontalApertureOffsetAttr(focal * (camera.width / 2 - camera.cx) / camera.fx)
     prim.CreateVerticalApertureOffsetAttr(focal * (camera.cy - camera.height / 2) / camera.fy)
     depths = (splats.positions - camera.position) @ camera.forward
     reach = np.linalg.norm(splats.positions - camera.position, axis=1) + 3 * splats.scales.max(axis=1)
     if (depths > 0).any():
-        near = _NEAR * float(np.median(depths[depths > 0]))
-        prim.CreateClippingRangeAttr(Gf.Vec2f(near, max(_FAR * float(reach.max()), 2 * near)))
+        near = _NEAR_MEDIAN_DEPTH_RATIO * float(np.median(depths[depths > 0]))
+        prim.CreateClippingRangeAttr(Gf.Vec2f(near, max(_FAR_MAX_REACH_RATIO * float(reach.max()), 2 * near)))
 
 
-def _package(binary: bytes, name: str) -> bytes:
-    """A .usdz with one file: a zip without compression, each file at a multiple of 64 bytes, no time."""
+def _pack_usdz(binary: bytes, name: str) -> bytes:
+    """Pack one file into a .usdz: a zip without compression or time stamps, with files aligned to 64 bytes."""
     info = zipfile.ZipInfo(name)  # dated 1980
-    header = 30 + len(name) + 4  # of the file within the zip, with the head of its extra field
-    padding = -header % _ALIGNMENT
+    header = 30 + len(name) + 4  # bytes of the local file header, with the header of its extra field
+    padding = -header % _USDZ_ALIGNMENT_BYTES
     info.extra = (0x1986).to_bytes(2, "little") + padding.to_bytes(2, "little") + bytes(padding)
-    if len(binary) + 2 * header + 512 > _MAX_BYTES:
+    if len(binary) + 2 * header + 512 > _MAX_USDZ_BYTES:
         raise HyrfDataError(f"the scene comes to {len(binary):,} bytes, too many for .usdz; write .usdc")
     package = io.BytesIO()
     with zipfile.ZipFile(package, "w", zipfile.ZIP_STORED) as archive:
@@ -226,6 +235,6 @@ def _read_splats(prim: Usd.Prim, name: str, upright: bool) -> Splats:
     matrix = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())).T
     turn = np.eye(3) if upright else rotation_of(matrix, name)[1].T
     try:
-        return placed(checked_splats(name, **splats), matrix, turn, name)
+        return placed(build_valid_splats(name, **splats), matrix, turn, name)
     except ValueError as error:
         raise HyrfDataError(f"{name}: {error}; export it again") from error

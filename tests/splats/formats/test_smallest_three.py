@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hyrfpack.splats.formats.smallest_three import with_largest, without_largest
+from hyrfpack.splats.formats.smallest_three import drop_largest, restore_largest
 from hyrfpack.splats.splats import normalized_quats
 
 
@@ -9,18 +9,18 @@ from hyrfpack.splats.splats import normalized_quats
 @pytest.mark.parametrize("sign", [1, -1])
 def test_the_largest_is_left_out_and_made_positive(largest, sign):
     quats = np.insert([0.1, -0.2, 0.3], largest, 0.86**0.5)[None]
-    number, others = without_largest(sign * quats)
+    number, others = drop_largest(sign * quats)
     assert number == [largest] and np.array_equal(others, [[0.1, -0.2, 0.3]])
-    assert np.allclose(with_largest(number, others), quats)
+    assert np.allclose(restore_largest(number, others), quats)
 
 
 def test_rotations_come_back_in_their_precision():
     quats = normalized_quats(np.random.default_rng(0).normal(size=(1000, 4)))
-    largest, others = without_largest(quats)
-    back = with_largest(largest, others)
+    largest, others = drop_largest(quats)
+    back = restore_largest(largest, others)
     assert back.dtype == np.float32 and np.abs(others).max() <= 0.5**0.5 + 1e-7
     assert np.allclose(np.abs((back * quats).sum(1)), 1, atol=1e-6)
 
 
 def test_no_rotations_are_rotations_too():
-    assert with_largest(*without_largest(np.zeros((0, 4)))).shape == (0, 4)
+    assert restore_largest(*drop_largest(np.zeros((0, 4)))).shape == (0, 4)

@@ -17,7 +17,7 @@ from PIL import Image
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats import sog
-from hyrfpack.splats.formats.palette import build_palette, nearest
+from hyrfpack.splats.formats.palette import build_palette, find_nearest_entries
 from hyrfpack.splats.harmonics import terms_of
 from hyrfpack.splats.splats import Splats, normalized_quats
 
@@ -156,7 +156,7 @@ def test_a_palette_finds_separate_clusters() -> None:
     centers = rng.normal(size=(20, 45)).astype(np.float32)
     rows = centers[np.repeat(np.arange(20), 50)] + rng.normal(0, 0.01, (1000, 45)).astype(np.float32)
     palette = build_palette(rows, np.ones(1000), 40)
-    labels, distances = nearest(rows, palette)
+    labels, distances = find_nearest_entries(rows, palette)
     brute = ((rows[:, None].astype(float) - palette) ** 2).sum(2)
     np.testing.assert_allclose(distances, brute.min(1), atol=1e-4)
     np.testing.assert_allclose(np.take_along_axis(brute, labels[:, None], 1)[:, 0], brute.min(1), atol=1e-4)

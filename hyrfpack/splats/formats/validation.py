@@ -1,4 +1,4 @@
-"""The door through which numbers of a foreign file become Splats."""
+"""Validation of the numbers that decoders read from foreign files, before they become Splats."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.splats import Splats, normalized_quats
 
 
-def checked_splats(
+def build_valid_splats(
     name: str,
     positions: np.ndarray,
     scales: np.ndarray,
@@ -17,18 +17,21 @@ def checked_splats(
     harmonics: np.ndarray,
     antialiased: bool = False,
 ) -> Splats:
-    """Splats of decoded numbers, of which nothing is known but the shapes.
+    """Build Splats from decoded arrays and raise an error for numbers that are not finite.
+
+    Only the shapes of the arrays have to be right.
 
     Args:
-        name: what messages call the file.
+        name: the file's name in error messages.
         positions, scales, opacities, harmonics: as in Splats.
-        quats: (N, 4) wxyz of any length; brought to unit length, and to no rotation where that is impossible.
+        quats: (N, 4) wxyz quaternions of any length. They are normalised; a quaternion of length 0 becomes the
+            identity rotation.
         antialiased: as in Splats.
 
     Raises:
-        HyrfDataError: a number is not finite in the precision that Splats keep.
+        HyrfDataError: a number is not finite in the precision that Splats store.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused; NaN may signal
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite results are rejected below; NaN may signal
         positions = np.asarray(positions, np.float64)
         scales, quats, opacities, harmonics = (
             np.asarray(values, np.float32) for values in (scales, quats, opacities, harmonics)
