@@ -1,36 +1,38 @@
-// Bits of varying number, packed one after another: the lowest bit of a value first, into the lowest free bit.
+// Reads packed values of different bit widths. Each value is stored from its lowest bit on, into the lowest free bit.
 
-import { needSound } from "./errors.js";
+import { assertValid } from "./errors.js";
 
-/** Most bits that are read at once. */
-export const MOST_BITS_AT_ONCE = 24;
+/** The maximum number of bits that one call of `BitReader.take` may read. */
+export const MAX_BITS_PER_READ = 24;
 
+/** Reads unsigned values from packed bits, from the first to the last. */
 export class BitReader {
   /**
-   * @param {Uint8Array} data the packed bytes, no more and no fewer
-   * @param {number} bits of all values together
-   * @throws {DamagedData} there are more or fewer bytes than that takes, or the bits left over are not zero
+   * @param {Uint8Array} data exactly the packed bytes
+   * @param {number} bits the sum of the bit widths of all values
+   * @throws {DamagedData} the number of bytes does not fit `bits`, or the unused bits at the end are not zero
    */
   constructor(data, bits) {
-    needSound(data.length === Math.ceil(bits / 8), `it has ${data.length} bytes where ${bits} bits are announced`);
-    needSound(bits % 8 === 0 || data[data.length - 1] >> bits % 8 === 0, "bits after its last value are not zero");
+    assertValid(data.length === Math.ceil(bits / 8), `it has ${data.length} bytes where ${bits} bits are announced`);
+    assertValid(bits % 8 === 0 || data[data.length - 1] >> bits % 8 === 0, "bits after its last value are not zero");
     this.data = data;
-    this.place = 0;
-    this.held = 0; // bits that were read and not taken
-    this.count = 0; // how many
+    this.offset = 0;
+    this.pending = 0; // bits that were read from `data` but not returned yet
+    this.count = 0; // the number of pending bits
   }
 
   /**
-   * The next value.
-   * @param {number} bits at most MOST_BITS_AT_ONCE; together with those before no more than there are
+   * Reads the next value.
+   * @param {number} bits its width, at most MAX_BITS_PER_READ; the widths of all calls add up to at most `bits` of the
+   *   constructor
    */
   take(bits) {
     while (this.count < bits) {
-      this.held |= this.data[this.place++] << this.count;
+      this.pending |= this.data[this.offset++] << this.count;
       this.count += 8;
     }
-    const value = this.held & ((1 << bits) - 1);
-    this.held >>>= bits;
+    const value = this.pending & ((1 << bits) - 1);
+    this.pending >>>= bits;
     this.count -= bits;
     return value;
   }

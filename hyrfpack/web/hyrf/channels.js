@@ -1,23 +1,25 @@
-// Codec 7 (docs/format.md 3.4): numbers along the list of Gaussians, predicted from those that are decoded before.
+// Codec 7 (docs/format.md 3.4): channels of numbers in the order of the Gaussians. Each number is predicted from
+// numbers of the same channel that were decoded before it.
 
-import { needSound } from "./errors.js";
+import { assertValid } from "./errors.js";
 import { decodeIntegers } from "./integers.js";
-import { FIXED_ONE, STEP_OF_CODE } from "./steps.js";
+import { FIXED_POINT_ONE, STEP_BY_CODE } from "./steps.js";
 
 /** @typedef {import("./lattice.js").LatticePoints} LatticePoints */
 
 const BASIS_BYTES = 36;
-const LARGEST_BASIS = 1 + 2 ** -10;
-const CHANNEL_HEADER = 10;
-const LARGEST_MEAN = 4096;
-const LARGEST_WEIGHT = 16;
-const LARGEST_DIFFERENCE = 2 ** 39;
-const MOST_STEPS_OF_DIFFERENCE = 2 ** 30;
+const MAX_BASIS_ENTRY = 1 + 2 ** -10;
+const CHANNEL_HEADER_BYTES = 10;
+const MAX_ABS_MEAN = 4096;
+const MAX_PREDICTION_WEIGHT = 16;
+const MAX_DIFFERENCE_UNITS = 2 ** 39; // a unit is 1 / FIXED_POINT_ONE
+const MAX_DIFFERENCE_STEPS = 2 ** 30;
 
 /**
+ * Decodes a section of 1 or 3 channels.
  * @param {Uint8Array} data
- * @param {LatticePoints} points
- * @param {number} columns 3, in a basis, or 1
+ * @param {LatticePoints} points the positions of the same Gaussians
+ * @param {number} columns 1, or 3 for channels that are coordinates in an orthonormal basis
  * @returns {Float32Array} (columns N), row by row
  * @throws {DamagedData}
  */
@@ -26,10 +28,10 @@ export const decodeChannels = (data, points, columns) => {
   let rest = data;
   const basis = [1];
   if (columns === 3) {
-    needSound(data.length >= BASIS_BYTES, "it ends within its basis");
+    assertValid(data.length >= BASIS_BYTES, "it ends within its basis");
     const view = new DataView(data.buffer, data.byteOffset, BASIS_BYTES);
     for (let i = 0; i < 9; i++) basis[i] = view.getFloat32(4 * i, true);
-    needSound(basis.every((number) => Math.abs(number) <= LARGEST_BASIS), "its basis is not orthonormal");
+    assertValid(basis.every((number) => Math.abs(number) <= MAX_BASIS_ENTRY), "its basis is not orthonormal");
     rest = data.subarray(BASIS_BYTES);
   }
   const channels = [];
@@ -38,7 +40,7 @@ export const decodeChannels = (data, points, columns) => {
     channels.push(numbers);
     rest = rest.subarray(size);
   }
-  needSound(rest.length === 0, `${rest.length} bytes follow its last channel`);
+  assertValid(rest.length === 0, `${rest.length} bytes follow its last channel`);
   if (columns === 1) return new Float32Array(channels[0]);
   const joined = new Float32Array(3 * count);
   const [first, second, third] = channels;
@@ -50,41 +52,42 @@ export const decodeChannels = (data, points, columns) => {
 };
 
 /**
- * @param {Uint8Array} data that begins with the channel
+ * Decodes the channel at the start of `data`.
+ * @param {Uint8Array} data
  * @param {LatticePoints} points
- * @returns {{numbers: Float64Array, size: number}} the numbers (N), and the bytes they took
+ * @returns {{numbers: Float64Array, size: number}} the numbers (N), and how many bytes the channel takes
  */
 const decodeChannel = (data, { classes, count }) => {
-  needSound(data.length >= CHANNEL_HEADER, "it ends within the header of a channel");
+  assertValid(data.length >= CHANNEL_HEADER_BYTES, "it ends within the header of a channel");
   const view = new DataView(data.buffer, data.byteOffset, data.length);
-  const mean = view.getFloat32(0, true), weight = data[4], kinds = data[9];
-  const start = CHANNEL_HEADER + kinds, size = start + view.getUint32(5, true);
-  needSound(Math.abs(mean) <= LARGEST_MEAN && weight <= LARGEST_WEIGHT, "the header of a channel cannot be");
-  needSound(size <= data.length, "it ends within a channel");
+  const mean = view.getFloat32(0, true), weight = data[4], classCount = data[9];
+  const start = CHANNEL_HEADER_BYTES + classCount, size = start + view.getUint32(5, true);
+  assertValid(Math.abs(mean) <= MAX_ABS_MEAN && weight <= MAX_PREDICTION_WEIGHT, "the header of a channel cannot be");
+  assertValid(size <= data.length, "it ends within a channel");
   let largestClass = 0;
   for (let i = 0; i < count; i++) if (classes[i] > largestClass) largestClass = classes[i];
-  needSound(kinds > largestClass, "a class of points has no step size");
+  assertValid(classCount > largestClass, "a class of points has no step size");
 
   const differences = decodeIntegers(data.subarray(start, size), count, classes, true);
-  const steps = Float64Array.from(data.subarray(CHANNEL_HEADER, start), (code) => STEP_OF_CODE[code]);
-  const limits = steps.map((step) => Math.min(Math.floor(LARGEST_DIFFERENCE / step), MOST_STEPS_OF_DIFFERENCE));
+  const steps = Float64Array.from(data.subarray(CHANNEL_HEADER_BYTES, start), (code) => STEP_BY_CODE[code]);
+  const limits = steps.map((step) => Math.min(Math.floor(MAX_DIFFERENCE_UNITS / step), MAX_DIFFERENCE_STEPS));
   const values = new Float64Array(count);
   for (let i = 0; i < count; i++) {
-    const kind = classes[i];
-    needSound(Math.abs(differences[i]) <= limits[kind], "a channel holds a difference that is too large");
-    values[i] = differences[i] * steps[kind];
+    const pointClass = classes[i];
+    assertValid(Math.abs(differences[i]) <= limits[pointClass], "a channel holds a difference that is too large");
+    values[i] = differences[i] * steps[pointClass];
   }
-  if (weight > 0) predictAlong(values, weight);
-  for (let i = 0; i < count; i++) values[i] = values[i] / FIXED_ONE + mean;
+  if (weight > 0) addPredictions(values, weight);
+  for (let i = 0; i < count; i++) values[i] = values[i] / FIXED_POINT_ONE + mean;
   return { numbers: values, size };
 };
 
 /**
- * Add to each value what its neighbours predict, coarse distances first.
- * @param {Float64Array} values integers below 2^45
- * @param {number} weight
+ * Adds to each difference the prediction from its neighbours, in place, from the largest distance to the smallest.
+ * @param {Float64Array} values integers below 2^45; differences before, values after
+ * @param {number} weight of the prediction, in units of 1/16 of the mean of both neighbours
  */
-const predictAlong = (values, weight) => {
+const addPredictions = (values, weight) => {
   const count = values.length;
   let distance = 1;
   while (2 * distance < count) distance *= 2;

@@ -1,4 +1,4 @@
-// CRC-32 as zlib, gzip and PNG have it.
+// The CRC-32 of zlib, gzip and PNG (polynomial 0xedb88320).
 
 const CRC_TABLE = Uint32Array.from({ length: 256 }, (_, byte) => {
   for (let bit = 0; bit < 8; bit++) byte = byte & 1 ? (byte >>> 1) ^ 0xedb88320 : byte >>> 1;
@@ -6,6 +6,7 @@ const CRC_TABLE = Uint32Array.from({ length: 256 }, (_, byte) => {
 });
 
 /**
+ * Computes the CRC-32 of bytes.
  * @param {Uint8Array} bytes
  * @returns {number} 0 to 2^32 - 1
  */

@@ -1,6 +1,6 @@
-// What a reader says of files that it cannot read.
+// The errors of the reader, and functions that format their messages.
 
-/** A file was refused; the message is one sentence for its user. */
+/** The file cannot be read. The message is one sentence for the user. */
 export class HyrfFormatError extends Error {
   /** @param {string} message */
   constructor(message) {
@@ -9,40 +9,47 @@ export class HyrfFormatError extends Error {
   }
 }
 
-/** Bytes of a section cannot be what a writer made. Who reads the section says which one it is. */
+/** The bytes of a section are invalid. The caller that knows the section's name turns it into a HyrfFormatError. */
 export class DamagedData extends Error {}
 
 /**
- * @param {string} what
+ * Throws the error for a damaged file.
+ * @param {string} what the reason
  * @returns {never}
  */
-export const damagedFile = (what) => {
+export const rejectDamaged = (what) => {
   throw new HyrfFormatError(`The file is damaged: ${what}; fetch or write it again.`);
 };
 
 /**
- * @param {string} what
+ * Throws the error for a file that needs a newer reader.
+ * @param {string} what the reason
  * @returns {never}
  */
-export const newerFile = (what) => {
+export const rejectNewer = (what) => {
   throw new HyrfFormatError(`The file is newer than this reader: ${what}; update the reader.`);
 };
 
 /**
- * Throw DamagedData unless something holds.
+ * Throws DamagedData unless a condition holds.
  * @param {boolean} holds
- * @param {string} what
+ * @param {string} what the reason
  */
-export const needSound = (holds, what) => {
+export const assertValid = (holds, what) => {
   if (!holds) throw new DamagedData(what);
 };
 
-/** Text out of a file for a message: short, on one line, and in ASCII.
- * @param {string} text */
+/**
+ * Quotes text from a file for a message: at most 40 characters, on one line, in ASCII.
+ * @param {string} text
+ */
 export const quotedText = (text) =>
   JSON.stringify(text.slice(0, 40)).replace(/[^ -~]/g, (letter) => {
     return `\\u${letter.charCodeAt(0).toString(16).padStart(4, "0")}`;
   });
 
-/** @param {number} number */
+/**
+ * Formats a number with commas between groups of three digits.
+ * @param {number} number
+ */
 export const groupedDigits = (number) => number.toLocaleString("en-US");

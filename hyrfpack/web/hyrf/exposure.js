@@ -1,44 +1,48 @@
-// The exposure map of a model (section EXPO, codec 9): log gains of any viewpoint.
+// The exposure map of a model (section EXPO, codec 9), which predicts the log gains of any viewpoint.
 
-import { needSound } from "./errors.js";
+import { assertValid } from "./errors.js";
 
 /**
- * `box`: least and largest position of the training cameras (6 numbers, local units); `lengths`: of the kernel, in local
- * units and in units of the sphere of directions; `mean`: log gains far from all centers; `limits`: lowest and highest log
- * gains (6 numbers). Of each center: position in local units, direction, log gains that the kernel weights.
+ * An exposure map. `box`: smallest and largest coordinates of the training cameras (6 numbers, local units); `lengths`:
+ * the kernel's length scales for positions (local units) and for directions (unit vectors); `mean`: log gains far from
+ * all centers; `limits`: lowest and highest log gains (6 numbers). Each center has a position in local units, a viewing
+ * direction, and the log gains that the kernel weights.
  * @typedef {{
  *   box: Float32Array, lengths: Float32Array, mean: Float32Array, limits: Float32Array,
  *   centers: {position: number[], direction: number[], weight: number[]}[],
  * }} ExposureMap
  */
 
-const HEAD_BYTES = 84, HEAD_FLOATS = 20, CENTER_BYTES = 12;
+const EXPOSURE_HEADER_BYTES = 84;
+const EXPOSURE_HEADER_FLOATS = 20;
+const BYTES_PER_CENTER = 12;
 const MAX_CENTERS = 64;
 const MAX_LOG_GAIN = 8;
 const MAX_POSITION_CODE = 255, MAX_DIRECTION_CODE = 127;
 const AXES = [0, 1, 2];
 
 /**
- * Codec 9.
+ * Decodes an exposure map (codec 9).
  * @param {Uint8Array} data
- * @param {number} rawLength decoded bytes by the table of contents
+ * @param {number} rawLength the section's decoded bytes by the table of contents
  * @returns {ExposureMap}
+ * @throws {DamagedData}
  */
 export const decodeExposure = (data, rawLength) => {
   const count = data[0], { length } = data;
-  const isWhole = length === HEAD_BYTES + CENTER_BYTES * count && length === rawLength;
-  needSound(isWhole && count <= MAX_CENTERS, `its ${length} bytes are no exposure map`);
-  needSound(!(data[1] | data[2] | data[3]), "its reserved bytes are not zero");
+  const isWhole = length === EXPOSURE_HEADER_BYTES + BYTES_PER_CENTER * count && length === rawLength;
+  assertValid(isWhole && count <= MAX_CENTERS, `its ${length} bytes are no exposure map`);
+  assertValid(!(data[1] | data[2] | data[3]), "its reserved bytes are not zero");
   const view = new DataView(data.buffer, data.byteOffset, length);
-  const numbers = Float32Array.from({ length: HEAD_FLOATS }, (_, k) => view.getFloat32(4 + 4 * k, true));
-  needSound(numbers.every(Number.isFinite), "it holds numbers that are not finite");
+  const numbers = Float32Array.from({ length: EXPOSURE_HEADER_FLOATS }, (_, k) => view.getFloat32(4 + 4 * k, true));
+  assertValid(numbers.every(Number.isFinite), "it holds numbers that are not finite");
   const lengths = numbers.subarray(0, 2), box = numbers.subarray(2, 8), mean = numbers.subarray(8, 11);
   const limits = numbers.subarray(11, 17), steps = numbers.subarray(17);
   const isLimited = limits.every((value) => Math.abs(value) <= MAX_LOG_GAIN);
   const isOrdered = AXES.every((axis) => box[axis] <= box[3 + axis] && limits[axis] <= limits[3 + axis]);
-  needSound(isLimited && isOrdered && lengths.every((value) => value > 0), "its numbers are out of range");
+  assertValid(isLimited && isOrdered && lengths.every((value) => value > 0), "its numbers are out of range");
   const centers = Array.from({ length: count }, (_, center) => {
-    const at = HEAD_BYTES + CENTER_BYTES * center;
+    const at = EXPOSURE_HEADER_BYTES + BYTES_PER_CENTER * center;
     return {
       position: AXES.map((axis) => box[axis] + (data[at + axis] / MAX_POSITION_CODE) * (box[3 + axis] - box[axis])),
       direction: AXES.map((axis) => view.getInt8(at + 3 + axis) / MAX_DIRECTION_CODE),
@@ -49,12 +53,13 @@ export const decodeExposure = (data, rawLength) => {
 };
 
 /**
- * The log gains of a viewpoint, in float64:
+ * Computes the log gains of a viewpoint, in float64:
  *
- *     clip(mean + sum over centers of weight / (1 + |x' - position|^2 / lengths[0]^2 + |f - direction|^2 / lengths[1]^2))
+ *     clip(mean + sum over centers of weight / (1 + |x' - position|^2 / lengths[0]^2 + |f - direction|^2 /
+ *     lengths[1]^2))
  *
- * with x' the point of `box` that is nearest to the viewpoint and f its viewing direction. A channel y of the picture is
- * shown as g y / (1 + (g - 1) y) with g = exp(log gain).
+ * where x' is the point of `box` nearest to the viewpoint and f its viewing direction. A channel y of the picture is
+ * displayed as g y / (1 + (g - 1) y) with g = exp(log gain).
  * @param {ExposureMap} exposure
  * @param {ArrayLike<number>} position 3 numbers, local units
  * @param {ArrayLike<number>} direction 3 numbers, unit length
@@ -74,9 +79,9 @@ export const logGains = ({ box, lengths, mean, limits, centers }, position, dire
 };
 
 /**
- * A value between the axis' numbers of the first and of the last three.
+ * Clamps a value to the bounds of an axis.
  * @param {number} value
- * @param {Float32Array} pair
+ * @param {Float32Array} pair 6 numbers: the lower bounds of three axes, then the upper bounds
  * @param {number} axis
  */
 const clampPair = (value, pair, axis) => Math.min(Math.max(value, pair[axis]), pair[3 + axis]);

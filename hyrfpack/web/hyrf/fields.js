@@ -1,35 +1,40 @@
-// The two fields of a model on the CPU, as docs/format.md has them (2.3, 2.4, 2.7): hash grids read by small decoders.
-// Numbers come in and go out as float32; every sum between is of float64.
+// Evaluates the two fields of a model on the CPU: hash grids with small decoders (docs/format.md 2.3, 2.4, 2.7).
+// Inputs and outputs are float32; all sums are computed in float64.
 
-import { HASH_Y, HASH_Z, decoderLayout, gridLevels } from "./grids.js";
+import { HASH_FACTOR_Y, HASH_FACTOR_Z, decoderLayout, gridLevels } from "./grids.js";
 
-const FIELD_ROWS = 256; // places that go through a field together: what a level or a layer needs stays in the cache
-const LAYER_LANES = 8; // outputs of a layer that are added up together
+// Positions are evaluated in batches of this size, so that the data of a level or a layer stays in the cache.
+const ROWS_PER_BATCH = 256;
+// Outputs of a layer are computed in groups of this size, so that one pass over the inputs serves all of a group.
+const OUTPUTS_PER_GROUP = 8;
 
 /**
- * A layer of a decoder as `runLayer` wants it: inputs, outputs, and these filled up to whole LAYER_LANES; room for
- * inputs that are not 0.
+ * A layer of a decoder in the order that `runLayer` reads. `width` is the number of outputs, `stride` that number
+ * rounded up to a multiple of OUTPUTS_PER_GROUP; `index` and `value` are buffers for the inputs that are not 0.
  * @typedef {{inputs: number, width: number, stride: number, weights: Float64Array, biases: Float64Array,
  *   index: Int32Array, value: Float64Array}} Layer
  *
- * A field made ready: `first` takes a place's features, `turned` a direction; and room for FIELD_ROWS of all between.
+ * A field that is prepared for evaluation. The decoder's first layer is split in two: `first` reads the features of a
+ * position, `directional` the encoded direction. The Float64Arrays are buffers for ROWS_PER_BATCH rows: contracted
+ * positions (`places`), distances from the frame's centre but at least 1 (`radii`), hash features, encoded directions
+ * (`encoded`), and the outputs of the three layers.
  * @typedef {{levels: import("./grids.js").GridLevel[], table: Float32Array, encoding: string,
- *   first: Layer, turned: Layer, middle: Layer, last: Layer,
- *   places: Float64Array, growths: Float64Array, features: Float64Array, seen: Float64Array,
- *   hidden: Float64Array, deeper: Float64Array, shapes: Float64Array}} ReadyField
+ *   first: Layer, directional: Layer, middle: Layer, last: Layer,
+ *   places: Float64Array, radii: Float64Array, features: Float64Array, encoded: Float64Array,
+ *   hidden: Float64Array, hidden2: Float64Array, outputs: Float64Array}} PreparedField
  *
  * @typedef {import("./index.js").Model} Model
  * @typedef {import("./grids.js").FieldName} FieldName
  */
 
 /**
- * Of each model its fields, made ready once.
- * @type {WeakMap<Model, Record<FieldName, ReadyField>>}
+ * The prepared fields of each model, kept for later calls.
+ * @type {WeakMap<Model, Record<FieldName, PreparedField>>}
  */
-const fieldsOf = new WeakMap();
+const preparedFields = new WeakMap();
 
 /**
- * What of Gaussians `start` to `stop` does not depend on the view.
+ * Evaluates the geometry field: opacities, scales and rotations of Gaussians `start` to `stop`.
  * @param {Model} model
  * @param {number} start
  * @param {number} stop
@@ -37,25 +42,25 @@ const fieldsOf = new WeakMap();
  *   local units; 4 n, wxyz of unit length
  */
 export function decodeGeometry(model, start, stop) {
-  const { geometry } = readyFields(model), { scale_rule: rule, scale_grows: grows } = model.config;
-  const { opacityLogits, scaleLogits } = model, { places, growths, shapes } = geometry;
+  const { geometry } = getPreparedFields(model), { scale_rule: rule, scale_grows: grows } = model.config;
+  const { opacityLogits, scaleLogits } = model, { places, radii, outputs } = geometry;
   const opacities = new Float32Array(stop - start);
   const scales = new Float32Array(3 * (stop - start)), quats = new Float32Array(4 * (stop - start));
-  for (let first = start; first < stop; first += FIELD_ROWS) {
-    const rows = Math.min(FIELD_ROWS, stop - first);
-    contractPlaces(model, model.positions, first, rows, places, growths);
-    encodePlaces(geometry, rows);
+  for (let first = start; first < stop; first += ROWS_PER_BATCH) {
+    const rows = Math.min(ROWS_PER_BATCH, stop - first);
+    contractPositions(model, model.positions, first, rows, places, radii);
+    encodePositions(geometry, rows);
     runLayer(geometry.first, geometry.features, geometry.first.inputs, false, rows, geometry.hidden);
-    runRest(geometry, rows, shapes);
+    runLaterLayers(geometry, rows, outputs);
     for (let row = 0; row < rows; row++) {
-      const i = first + row, at = i - start, raw = row * geometry.last.stride, largest = grows ? growths[row] : 1;
-      opacities[at] = sigmoid(shapes[raw] + opacityLogits[i]);
+      const i = first + row, at = i - start, raw = row * geometry.last.stride, largest = grows ? radii[row] : 1;
+      opacities[at] = sigmoid(outputs[raw] + opacityLogits[i]);
       for (let axis = 0; axis < 3; axis++) {
-        const neural = shapes[raw + 1 + axis], own = scaleLogits[i];
+        const neural = outputs[raw + 1 + axis], own = scaleLogits[i];
         const part = rule === "sum" ? sigmoid(neural + own) : sigmoid(neural) * sigmoid(own);
         scales[3 * at + axis] = largest * part;
       }
-      const w = shapes[raw + 4] + 1, x = shapes[raw + 5], y = shapes[raw + 6], z = shapes[raw + 7];
+      const w = outputs[raw + 4] + 1, x = outputs[raw + 5], y = outputs[raw + 6], z = outputs[raw + 7];
       const length = Math.sqrt(w * w + x * x + y * y + z * z);
       const inverse = length === 0 ? 0 : 1 / length;
       quats[4 * at] = length === 0 ? 1 : w * inverse;
@@ -68,19 +73,19 @@ export function decodeGeometry(model, start, stop) {
 }
 
 /**
- * Of the colour decoder's first layer what does not depend on the view, before its ReLU, for `colorsAlong`.
+ * Evaluates the view-independent part of the colour decoder's first layer, before its ReLU, for `colorsAlong`.
  * @param {Model} model
  * @param {number} start
  * @param {number} stop
  * @returns {Float32Array} `config.hidden` numbers for each Gaussian
  */
 export function firstLayers(model, start, stop) {
-  const { radiance } = readyFields(model), { width, stride } = radiance.first;
+  const { radiance } = getPreparedFields(model), { width, stride } = radiance.first;
   const layers = new Float32Array((stop - start) * width);
-  for (let first = start; first < stop; first += FIELD_ROWS) {
-    const rows = Math.min(FIELD_ROWS, stop - first);
-    contractPlaces(model, model.positions, first, rows, radiance.places, radiance.growths);
-    encodePlaces(radiance, rows);
+  for (let first = start; first < stop; first += ROWS_PER_BATCH) {
+    const rows = Math.min(ROWS_PER_BATCH, stop - first);
+    contractPositions(model, model.positions, first, rows, radiance.places, radiance.radii);
+    encodePositions(radiance, rows);
     runLayer(radiance.first, radiance.features, radiance.first.inputs, false, rows, radiance.hidden);
     for (let row = 0, at = (first - start) * width; row < rows; row++, at += width) {
       for (let k = 0; k < width; k++) layers[at + k] = radiance.hidden[row * stride + k];
@@ -90,12 +95,12 @@ export function firstLayers(model, start, stop) {
 }
 
 /**
- * Colours of Gaussians `start` to `stop`.
+ * Evaluates the colours of Gaussians `start` to `stop` along given directions.
  * @param {Model} model
  * @param {Float32Array} layers from `firstLayers`, of the same Gaussians
  * @param {number} start
  * @param {number} stop
- * @param {Float32Array} directions 3 n: along which each is seen, from the eye to it, unit length
+ * @param {Float32Array} directions 3 n: unit vectors from the viewpoint to each Gaussian
  * @returns {Float32Array} 3 n in [0, 1]
  */
 export function colorsAlong(model, layers, start, stop, directions) {
@@ -104,100 +109,106 @@ export function colorsAlong(model, layers, start, stop, directions) {
 }
 
 /**
- * The same of any of these Gaussians, each as often as it is named.
+ * Evaluates colours of selected Gaussians along given directions. A Gaussian may be selected more than once.
  * @param {Model} model
  * @param {Float32Array} layers from `firstLayers`
- * @param {number} start the first of the Gaussians that `layers` are of
- * @param {Int32Array} rows n: which of them, counted from there
+ * @param {number} start the first Gaussian of `layers`
+ * @param {Int32Array} rows n: the selected Gaussians, counted from `start`
  * @param {Float32Array} directions 3 n or more
- * @param {Float32Array} colors 3 n or more, to be written
+ * @param {Float32Array} colors 3 n or more, overwritten
  * @returns {Float32Array} `colors`
  */
 export function colorsOfRows(model, layers, start, rows, directions, colors) {
-  const { radiance } = readyFields(model), { colorLogits } = model;
-  const { hidden, shapes, last, first: { width, stride } } = radiance;
-  for (let first = 0; first < rows.length; first += FIELD_ROWS) {
-    const count = Math.min(FIELD_ROWS, rows.length - first);
+  const { radiance } = getPreparedFields(model), { colorLogits } = model;
+  const { hidden, outputs, last, first: { width, stride } } = radiance;
+  for (let first = 0; first < rows.length; first += ROWS_PER_BATCH) {
+    const count = Math.min(ROWS_PER_BATCH, rows.length - first);
     encodeDirections(radiance, directions, first, count);
-    runLayer(radiance.turned, radiance.seen, radiance.turned.inputs, false, count, hidden);
+    runLayer(radiance.directional, radiance.encoded, radiance.directional.inputs, false, count, hidden);
     for (let row = 0; row < count; row++) {
       for (let k = 0, at = rows[first + row] * width; k < width; k++) hidden[row * stride + k] += layers[at + k];
     }
-    runRest(radiance, count, shapes);
+    runLaterLayers(radiance, count, outputs);
     for (let row = 0, at = 3 * first; row < count; row++) {
       const own = 3 * (start + rows[first + row]);
-      for (let c = 0; c < 3; c++) colors[at++] = sigmoid(shapes[row * last.stride + c] + colorLogits[own + c]);
+      for (let c = 0; c < 3; c++) colors[at++] = sigmoid(outputs[row * last.stride + c] + colorLogits[own + c]);
     }
   }
   return colors;
 }
 
 /**
- * Colours of the background sphere.
+ * Evaluates the colours of the background sphere.
  * @param {Model} model
- * @param {Float32Array} places 3 n: on the sphere, local units
- * @param {Float32Array} directions 3 n: along which they are seen, unit length
+ * @param {Float32Array} places 3 n: points on the sphere, local units
+ * @param {Float32Array} directions 3 n: unit vectors from the viewpoint to these points
  * @returns {Float32Array} 3 n in [0, 1]
  */
 export function backgroundColors(model, places, directions) {
-  const { radiance } = readyFields(model), { hidden, shapes, last } = radiance;
-  const count = directions.length / 3, colors = new Float32Array(3 * count), turned = new Float64Array(hidden.length);
-  for (let first = 0; first < count; first += FIELD_ROWS) {
-    const rows = Math.min(FIELD_ROWS, count - first);
+  const { radiance } = getPreparedFields(model), { hidden, outputs, last } = radiance;
+  const count = directions.length / 3, colors = new Float32Array(3 * count);
+  const directional = new Float64Array(hidden.length);
+  for (let first = 0; first < count; first += ROWS_PER_BATCH) {
+    const rows = Math.min(ROWS_PER_BATCH, count - first);
     encodeDirections(radiance, directions, first, rows);
-    runLayer(radiance.turned, radiance.seen, radiance.turned.inputs, false, rows, turned);
-    contractPlaces(model, places, first, rows, radiance.places, radiance.growths);
-    encodePlaces(radiance, rows);
+    runLayer(radiance.directional, radiance.encoded, radiance.directional.inputs, false, rows, directional);
+    contractPositions(model, places, first, rows, radiance.places, radiance.radii);
+    encodePositions(radiance, rows);
     runLayer(radiance.first, radiance.features, radiance.first.inputs, false, rows, hidden);
-    for (let k = 0; k < rows * radiance.first.stride; k++) hidden[k] += turned[k];
-    runRest(radiance, rows, shapes);
+    for (let k = 0; k < rows * radiance.first.stride; k++) hidden[k] += directional[k];
+    runLaterLayers(radiance, rows, outputs);
     for (let row = 0, at = 3 * first; row < rows; row++) {
-      for (let c = 0; c < 3; c++) colors[at++] = sigmoid(shapes[row * last.stride + c]);
+      for (let c = 0; c < 3; c++) colors[at++] = sigmoid(outputs[row * last.stride + c]);
     }
   }
   return colors;
 }
 
-/** @param {number} logit */
+/**
+ * The logistic function, 1 / (1 + e^-x).
+ * @param {number} logit
+ */
 const sigmoid = (logit) => 1 / (1 + Math.exp(-logit));
 
-// --- fields made ready -----------------------------------------------------------------------------------------------
+// --- prepared fields -------------------------------------------------------------------------------------------------
 
 /**
+ * Returns the prepared fields of a model, and prepares them in the first call.
  * @param {Model} model
- * @returns {Record<FieldName, ReadyField>}
+ * @returns {Record<FieldName, PreparedField>}
  */
-function readyFields(model) {
-  const made = fieldsOf.get(model);
-  if (made) return made;
-  const fields = { geometry: readyField(model, "geometry"), radiance: readyField(model, "radiance") };
-  fieldsOf.set(model, fields);
+function getPreparedFields(model) {
+  const prepared = preparedFields.get(model);
+  if (prepared) return prepared;
+  const fields = { geometry: prepareField(model, "geometry"), radiance: prepareField(model, "radiance") };
+  preparedFields.set(model, fields);
   return fields;
 }
 
 /**
+ * Arranges a field's decoder for `runLayer` and allocates its buffers.
  * @param {Model} model
  * @param {FieldName} which
- * @returns {ReadyField}
+ * @returns {PreparedField}
  */
-function readyField(model, which) {
+function prepareField(model, which) {
   const { table, decoder } = model[which], [one, two, three] = decoderLayout(model.config, which);
   const levels = gridLevels(model.config[which]), features = 2 * levels.length;
   const first = packLayer(decoder, one, 0, features, true);
-  const turned = packLayer(decoder, one, features, one.inputs, false);
+  const directional = packLayer(decoder, one, features, one.inputs, false);
   const middle = packLayer(decoder, two, 0, two.inputs, true), last = packLayer(decoder, three, 0, three.inputs, true);
-  const room = (/** @type {number} */ width) => new Float64Array(width * FIELD_ROWS);
+  const allocate = (/** @type {number} */ width) => new Float64Array(width * ROWS_PER_BATCH);
   return {
-    levels, table, first, turned, middle, last,
+    levels, table, first, directional, middle, last,
     encoding: model.config.direction_encoding,
-    places: room(3), growths: room(1), features: room(features), seen: room(turned.inputs),
-    hidden: room(first.stride), deeper: room(middle.stride), shapes: room(last.stride),
+    places: allocate(3), radii: allocate(1), features: allocate(features), encoded: allocate(directional.inputs),
+    hidden: allocate(first.stride), hidden2: allocate(middle.stride), outputs: allocate(last.stride),
   };
 }
 
 /**
- * Columns `from` to `to` of a layer's matrix: the weights of LAYER_LANES outputs side by side, input after input, and
- * zeros for outputs that fill up the last lanes. Without `biased` biases are zeros.
+ * Copies columns `from` to `to` of a layer's matrix into groups: for each input, the weights of OUTPUTS_PER_GROUP
+ * outputs are adjacent. The last group is padded with zeros. Unless `biased`, all biases are zero.
  * @param {Float32Array} decoder
  * @param {import("./grids.js").DecoderLayer} layer
  * @param {number} from
@@ -206,12 +217,12 @@ function readyField(model, which) {
  * @returns {Layer}
  */
 function packLayer(decoder, { inputs, outputs, matrix, bias }, from, to, biased) {
-  const stride = LAYER_LANES * Math.ceil(outputs / LAYER_LANES), width = to - from;
+  const stride = OUTPUTS_PER_GROUP * Math.ceil(outputs / OUTPUTS_PER_GROUP), width = to - from;
   const weights = new Float64Array(stride * width), biases = new Float64Array(stride);
   for (let o = 0; o < outputs; o++) {
-    const lane = o % LAYER_LANES, group = o - lane;
+    const lane = o % OUTPUTS_PER_GROUP, group = o - lane;
     for (let i = 0; i < width; i++) {
-      weights[group * width + i * LAYER_LANES + lane] = decoder[matrix + o * inputs + from + i];
+      weights[group * width + i * OUTPUTS_PER_GROUP + lane] = decoder[matrix + o * inputs + from + i];
     }
     if (biased) biases[o] = decoder[bias + o];
   }
@@ -219,37 +230,37 @@ function packLayer(decoder, { inputs, outputs, matrix, bias }, from, to, biased)
   return { inputs: width, width: outputs, stride, weights, biases, index, value };
 }
 
-// --- places ----------------------------------------------------------------------------------------------------------
+// --- positions -------------------------------------------------------------------------------------------------------
 
 /**
- * Local positions into the grids' unit cube, and how far out they lie: max(1, |u|).
+ * Maps local positions into the unit cube of the hash grids (the contraction of docs/format.md 2.3).
  * @param {Model} model
  * @param {Float32Array} positions
  * @param {number} first
  * @param {number} rows
- * @param {Float64Array} places
- * @param {Float64Array} growths
+ * @param {Float64Array} places receives the contracted positions
+ * @param {Float64Array} radii receives max(1, |u|) of each position u in units of the half extents
  */
-function contractPlaces(model, positions, first, rows, places, growths) {
+function contractPositions(model, positions, first, rows, places, radii) {
   const [hx, hy, hz] = model.config.frame.half_extent;
   for (let row = 0, from = 3 * first, at = 0; row < rows; row++, from += 3, at += 3) {
     const x = positions[from] / hx, y = positions[from + 1] / hy, z = positions[from + 2] / hz;
     const radius = Math.sqrt(x * x + y * y + z * z);
-    const growth = radius <= 1 ? 1 : radius; // so NaN goes on
+    const growth = radius <= 1 ? 1 : radius; // a NaN radius stays NaN
     const factor = (0.25 * (2 - 1 / growth)) / growth;
     places[at] = factor * x + 0.5;
     places[at + 1] = factor * y + 0.5;
     places[at + 2] = factor * z + 0.5;
-    growths[row] = growth;
+    radii[row] = growth;
   }
 }
 
 /**
- * Hash features of `places`, one level after the other, so that a level's rows stay in the cache.
- * @param {ReadyField} field
+ * Interpolates the hash features of `places`. The outer loop is over levels, so that a level's rows stay in the cache.
+ * @param {PreparedField} field
  * @param {number} rows
  */
-function encodePlaces({ levels, table, places, features }, rows) {
+function encodePositions({ levels, table, places, features }, rows) {
   const wide = 2 * levels.length;
   for (let level = 0; level < levels.length; level++) {
     const { resolution, rows: tableRows, first, dense } = levels[level];
@@ -264,8 +275,8 @@ function encodePlaces({ levels, table, places, features }, rows) {
         z0 = resolution * resolution;
         a = y0, b = y0 + 1, c = y1, d = y1 + 1, e = y0 + z0, f = e + 1, g = y1 + z0, h = g + 1;
       } else {
-        y0 = Math.imul(y, HASH_Y), y1 = (y0 + HASH_Y) | 0;
-        z0 = Math.imul(z, HASH_Z), z1 = (z0 + HASH_Z) | 0;
+        y0 = Math.imul(y, HASH_FACTOR_Y), y1 = (y0 + HASH_FACTOR_Y) | 0;
+        z0 = Math.imul(z, HASH_FACTOR_Z), z1 = (z0 + HASH_FACTOR_Z) | 0;
         const next = x + 1;
         a = (x ^ y0 ^ z0) & mask, b = (next ^ y0 ^ z0) & mask, c = (x ^ y1 ^ z0) & mask, d = (next ^ y1 ^ z0) & mask;
         e = (x ^ y0 ^ z1) & mask, f = (next ^ y0 ^ z1) & mask, g = (x ^ y1 ^ z1) & mask, h = (next ^ y1 ^ z1) & mask;
@@ -287,53 +298,56 @@ function encodePlaces({ levels, table, places, features }, rows) {
 // --- directions ------------------------------------------------------------------------------------------------------
 
 /**
- * @param {ReadyField} field
+ * Encodes directions `first` to `first + rows` into the buffer `encoded`.
+ * @param {PreparedField} field
  * @param {Float32Array} directions
- * @param {number} first of them
+ * @param {number} first
  * @param {number} rows
  */
-function encodeDirections({ encoding, seen }, directions, first, rows) {
+function encodeDirections({ encoding, encoded }, directions, first, rows) {
   const encode = encoding === "sh" ? encodeHarmonics : encodeFrequencies;
   for (let row = 0, from = 3 * first; row < rows; row++, from += 3) {
-    encode(seen, row, directions[from], directions[from + 1], directions[from + 2]);
+    encode(encoded, row, directions[from], directions[from + 1], directions[from + 2]);
   }
 }
 
 /**
- * @param {Float64Array} seen
+ * Writes the real spherical harmonics of degree 0 to 2 of a direction as a row of `encoded`.
+ * @param {Float64Array} encoded
  * @param {number} row
  * @param {number} x
  * @param {number} y
  * @param {number} z
  */
-function encodeHarmonics(seen, row, x, y, z) {
+function encodeHarmonics(encoded, row, x, y, z) {
   const at = 9 * row;
-  seen[at] = 0.28209479177387814;
-  seen[at + 1] = 0.4886025119029199 * y;
-  seen[at + 2] = 0.4886025119029199 * z;
-  seen[at + 3] = 0.4886025119029199 * x;
-  seen[at + 4] = 1.0925484305920792 * x * y;
-  seen[at + 5] = 1.0925484305920792 * y * z;
-  seen[at + 6] = 0.31539156525252005 * (3 * z * z - 1);
-  seen[at + 7] = 1.0925484305920792 * x * z;
-  seen[at + 8] = 0.5462742152960396 * (x * x - y * y);
+  encoded[at] = 0.28209479177387814;
+  encoded[at + 1] = 0.4886025119029199 * y;
+  encoded[at + 2] = 0.4886025119029199 * z;
+  encoded[at + 3] = 0.4886025119029199 * x;
+  encoded[at + 4] = 1.0925484305920792 * x * y;
+  encoded[at + 5] = 1.0925484305920792 * y * z;
+  encoded[at + 6] = 0.31539156525252005 * (3 * z * z - 1);
+  encoded[at + 7] = 1.0925484305920792 * x * z;
+  encoded[at + 8] = 0.5462742152960396 * (x * x - y * y);
 }
 
 /**
- * Sines and cosines of pi, 2 pi, 4 pi and 8 pi times x, y, z: the higher ones by doubling.
- * @param {Float64Array} seen
+ * Writes the sines and cosines of pi, 2 pi, 4 pi and 8 pi times x, y, z as a row of `encoded`. Higher octaves are
+ * computed by the double-angle formulas.
+ * @param {Float64Array} encoded
  * @param {number} row
  * @param {number} x
  * @param {number} y
  * @param {number} z
  */
-function encodeFrequencies(seen, row, x, y, z) {
+function encodeFrequencies(encoded, row, x, y, z) {
   for (let axis = 0; axis < 3; axis++) {
     const phase = Math.PI * (axis === 0 ? x : axis === 1 ? y : z);
     let sine = Math.sin(phase), cosine = Math.cos(phase);
     for (let octave = 0, at = 24 * row + axis; octave < 4; octave++, at += 3) {
-      seen[at] = sine;
-      seen[at + 12] = cosine;
+      encoded[at] = sine;
+      encoded[at + 12] = cosine;
       const twice = 2 * sine;
       sine = twice * cosine;
       cosine = 1 - twice * (twice / 2);
@@ -344,36 +358,37 @@ function encodeFrequencies(seen, row, x, y, z) {
 // --- decoders --------------------------------------------------------------------------------------------------------
 
 /**
- * The second and third layer, from `field.hidden` before its ReLU.
- * @param {ReadyField} field
+ * Runs the second and third layer of a decoder on `field.hidden`, the first layer's outputs before their ReLU.
+ * @param {PreparedField} field
  * @param {number} rows
  * @param {Float64Array} outputs
  */
-function runRest(field, rows, outputs) {
-  runLayer(field.middle, field.hidden, field.first.stride, true, rows, field.deeper);
-  runLayer(field.last, field.deeper, field.middle.stride, true, rows, outputs);
+function runLaterLayers(field, rows, outputs) {
+  runLayer(field.middle, field.hidden, field.first.stride, true, rows, field.hidden2);
+  runLayer(field.last, field.hidden2, field.middle.stride, true, rows, outputs);
 }
 
 /**
- * One layer of a decoder, without the ReLU after it. Inputs of 0 are left out: after a ReLU it is half of them.
+ * Runs one layer of a decoder, without the ReLU after it. Inputs of 0 are skipped: after a ReLU they are about half.
  * @param {Layer} layer
  * @param {Float64Array} from inputs
- * @param {number} apart from one row of them to the next
- * @param {boolean} rectified whether they go through a ReLU
+ * @param {number} apart the distance between rows of inputs
+ * @param {boolean} rectified whether a ReLU is applied to the inputs
  * @param {number} rows
  * @param {Float64Array} to outputs
  */
 function runLayer({ inputs, stride, weights, biases, index, value }, from, apart, rectified, rows, to) {
-  const groupSize = inputs * LAYER_LANES;
+  const groupSize = inputs * OUTPUTS_PER_GROUP;
   for (let row = 0; row < rows; row++) {
     let used = 0;
     for (let i = 0, at = row * apart; i < inputs; i++, at++) {
       const number = from[at];
       if (rectified ? number <= 0 : number === 0) continue; // NaN is neither
-      index[used] = i * LAYER_LANES;
+      index[used] = i * OUTPUTS_PER_GROUP;
       value[used++] = number;
     }
-    for (let first = 0, group = 0, out = row * stride; first < stride; first += LAYER_LANES, out += LAYER_LANES) {
+    for (let first = 0, group = 0; first < stride; first += OUTPUTS_PER_GROUP) {
+      const out = row * stride + first;
       let a = biases[first], b = biases[first + 1], c = biases[first + 2], d = biases[first + 3];
       let e = biases[first + 4], f = biases[first + 5], g = biases[first + 6], h = biases[first + 7];
       for (let k = 0; k < used; k++) {

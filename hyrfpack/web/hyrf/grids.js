@@ -1,34 +1,38 @@
-// Shapes that follow from a model's configuration: hash grids (docs/format.md 2.3) and decoders (2.4).
+// Computes the shapes of hash grids (docs/format.md 2.3) and decoders (2.4) from a model's configuration.
 
 /**
  * A hash grid, as the metadata has it.
  * @typedef {{log2_table_size: number, levels: number, base: number, finest: number}} Grid
  *
- * A level of a hash grid: vertices an axis, rows of the table, the first of them, and whether each vertex has its own.
+ * A level of a hash grid: `resolution` is the number of vertices along an axis; `rows` and `first` are the number of
+ * its table rows and the first of them; `dense` says whether each vertex has a row of its own.
  * @typedef {{resolution: number, rows: number, first: number, dense: boolean}} GridLevel
  *
- * A layer of a decoder: where its matrix (outputs x inputs, row by row) and its bias begin in the decoder's numbers.
+ * A layer of a decoder. `matrix` and `bias` are the offsets of its matrix (outputs x inputs, row by row) and its bias
+ * in the decoder's numbers.
  * @typedef {{inputs: number, outputs: number, matrix: number, bias: number}} DecoderLayer
  *
- * What decides a decoder's shape.
+ * The part of a configuration that determines a decoder's shape.
  * @typedef {{geometry: Grid, radiance: Grid, hidden: number, direction_encoding: string}} DecoderConfig
  *
  * @typedef {"geometry" | "radiance"} FieldName
  */
 
-/** Numbers of a row of a hash table. */
-export const ROW_FEATURES = 2;
-
-/** Numbers that each encoding makes of a direction.
- * @type {Record<string, number>} */
-export const DIRECTION_FEATURES = { sh: 9, frequency: 24 };
-
-/** Factors of y and z in the spatial hash, as signed 32-bit numbers: Math.imul wraps around as the hash wants. */
-export const HASH_Y = 2654435761 | 0;
-export const HASH_Z = 805459861;
+/** The number of features in a row of a hash table. */
+export const FEATURES_PER_ROW = 2;
 
 /**
- * The levels of a grid, in the order of the table.
+ * The number of features of an encoded direction, by encoding.
+ * @type {Record<string, number>}
+ */
+export const FEATURES_PER_DIRECTION = { sh: 9, frequency: 24 };
+
+/** Factors of y and z in the spatial hash, as signed 32-bit integers, because Math.imul wraps modulo 2^32. */
+export const HASH_FACTOR_Y = 2654435761 | 0;
+export const HASH_FACTOR_Z = 805459861;
+
+/**
+ * Returns the levels of a grid in the order of its table.
  * @param {Grid} grid
  * @returns {GridLevel[]}
  */
@@ -46,20 +50,20 @@ export const gridLevels = ({ log2_table_size, levels, base, finest }) => {
 };
 
 /**
- * Rows of a grid's whole table.
+ * Returns the number of rows of a grid's table.
  * @param {Grid} grid
  */
 export const tableRows = (grid) => gridLevels(grid).reduce((sum, { rows }) => sum + rows, 0);
 
 /**
- * The three layers of a field's decoder.
+ * Returns the three layers of a field's decoder.
  * @param {DecoderConfig} config
  * @param {FieldName} which
  * @returns {DecoderLayer[]}
  */
 export const decoderLayout = (config, which) => {
-  const directions = which === "radiance" ? DIRECTION_FEATURES[config.direction_encoding] : 0;
-  const widths = [config[which].levels * ROW_FEATURES + directions, config.hidden, config.hidden];
+  const directions = which === "radiance" ? FEATURES_PER_DIRECTION[config.direction_encoding] : 0;
+  const widths = [config[which].levels * FEATURES_PER_ROW + directions, config.hidden, config.hidden];
   let place = 0;
   return [config.hidden, config.hidden, which === "radiance" ? 3 : 8].map((outputs, layer) => {
     const inputs = widths[layer], matrix = place, bias = matrix + inputs * outputs;
@@ -69,7 +73,7 @@ export const decoderLayout = (config, which) => {
 };
 
 /**
- * How many numbers a field's decoder has.
+ * Returns how many numbers a field's decoder has.
  * @param {DecoderConfig} config
  * @param {FieldName} which
  */

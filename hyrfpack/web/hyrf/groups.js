@@ -1,10 +1,11 @@
-// Codec 8 (docs/format.md 3.5): numbers in groups that share a step. Who decodes knows which number is in which group.
+// Codec 8 (docs/format.md 3.5): numbers in groups that share a quantisation step. The groups follow from the
+// configuration and the positions, so that they are not stored.
 
-import { needSound } from "./errors.js";
-import { HASH_Y, HASH_Z, ROW_FEATURES, decoderLayout, gridLevels, tableRows } from "./grids.js";
+import { assertValid } from "./errors.js";
+import { FEATURES_PER_ROW, HASH_FACTOR_Y, HASH_FACTOR_Z, decoderLayout, gridLevels, tableRows } from "./grids.js";
 import { decodeIntegers } from "./integers.js";
-import { CENTER_BITS } from "./lattice.js";
-import { FIXED_ONE, STEP_OF_CODE } from "./steps.js";
+import { CENTER_BITS_PER_AXIS } from "./lattice.js";
+import { FIXED_POINT_ONE, STEP_BY_CODE } from "./steps.js";
 
 /**
  * @typedef {import("./grids.js").Grid} Grid
@@ -12,17 +13,17 @@ import { FIXED_ONE, STEP_OF_CODE } from "./steps.js";
  * @typedef {import("./grids.js").FieldName} FieldName
  * @typedef {import("./lattice.js").LatticePoints} LatticePoints
  *
- * The group of each row of numbers, how many groups there may be, and how many numbers a row has.
+ * Groups of numbers: `index` is the group of each row, `count` the number of groups, `width` the numbers of a row.
  * @typedef {{index: Uint16Array, count: number, width: number}} NumberGroups
  */
 
-const GROUP_MODELS = 8;
-const LARGEST_SYMBOL = 2 ** 24;
-const USE_CLASSES = 16;
-const MOST_COUNTED = 65536; // points whose reading of the tables counts
+const GROUP_MODEL_COUNT = 8;
+const MAX_ABS_SYMBOL = 2 ** 24;
+const USE_CLASSES_PER_LEVEL = 16;
+const MAX_COUNTED_POINTS = 65536; // of a layer with more points, every n-th is counted
 
 /**
- * The numbers of a decoder: a group for each output of a layer, then one for the biases.
+ * Returns the groups of a decoder's numbers: for each layer, a group for each output and then one for the biases.
  * @param {DecoderConfig} config
  * @param {FieldName} which
  * @returns {NumberGroups}
@@ -41,7 +42,7 @@ export const decoderGroups = (config, which) => {
 };
 
 /**
- * The rows of a table by level, and by how often points read them.
+ * Returns the groups of a table's rows: by level, and by how often points read them.
  * @param {Grid} grid
  * @param {LatticePoints} points of the first layer
  * @returns {NumberGroups}
@@ -55,22 +56,22 @@ export const tableGroups = (grid, points) => {
     countUses(level, points, uses);
     for (let row = 0; row < level.rows; row++) {
       const digits = 32 - Math.clz32(uses[row]);
-      index[level.first + row] = USE_CLASSES * k + ((digits + 1) >> 1);
+      index[level.first + row] = USE_CLASSES_PER_LEVEL * k + ((digits + 1) >> 1);
     }
   });
-  return { index, count: USE_CLASSES * levels.length, width: ROW_FEATURES };
+  return { index, count: USE_CLASSES_PER_LEVEL * levels.length, width: FEATURES_PER_ROW };
 };
 
 /**
- * Count how many corners of the points' cells read each row of a level.
+ * Counts how many corners of the points' cells read each row of a level.
  * @param {import("./grids.js").GridLevel} level
  * @param {LatticePoints} points
- * @param {Uint32Array} uses of each row, added to
+ * @param {Uint32Array} uses the counts of each row, incremented
  */
 const countUses = ({ resolution, rows, dense }, { centers, count }, uses) => {
-  const stride = 3 * Math.max(1, Math.ceil(count / MOST_COUNTED));
-  const cells = resolution - 1, unit = 2 ** CENTER_BITS;
-  const factorY = dense ? resolution : HASH_Y, factorZ = dense ? resolution * resolution : HASH_Z;
+  const stride = 3 * Math.max(1, Math.ceil(count / MAX_COUNTED_POINTS));
+  const cells = resolution - 1, unit = 2 ** CENTER_BITS_PER_AXIS;
+  const factorY = dense ? resolution : HASH_FACTOR_Y, factorZ = dense ? resolution * resolution : HASH_FACTOR_Z;
   for (let i = 0; i < 3 * count; i += stride) {
     const x = Math.floor((centers[i] * cells) / unit);
     const y = Math.imul(Math.floor((centers[i + 1] * cells) / unit), factorY);
@@ -83,21 +84,22 @@ const countUses = ({ resolution, rows, dense }, { centers, count }, uses) => {
 };
 
 /**
+ * Decodes numbers in groups.
  * @param {Uint8Array} data
  * @param {NumberGroups} groups
  * @returns {Float32Array}
  * @throws {DamagedData}
  */
 export const decodeGroups = (data, { index, count, width }) => {
-  needSound(data.length >= 8, "it ends within its header");
+  assertValid(data.length >= 8, "it ends within its header");
   const view = new DataView(data.buffer, data.byteOffset, 8);
   const modelsAt = 8 + view.getUint32(0, true), symbolsAt = modelsAt + view.getUint32(4, true);
-  needSound(symbolsAt <= data.length, "the lengths of its parts do not fit its bytes");
+  assertValid(symbolsAt <= data.length, "the lengths of its parts do not fit its bytes");
   const codes = decodeIntegers(data.subarray(8, modelsAt), count, null, false);
-  needSound(codes.every((code) => code <= 255), "a step size is out of range");
+  assertValid(codes.every((code) => code <= 255), "a step size is out of range");
   const used = codes.reduce((sum, code) => sum + (code ? 1 : 0), 0);
   const chosen = decodeIntegers(data.subarray(modelsAt, symbolsAt), used, null, false);
-  needSound(chosen.every((model) => model < GROUP_MODELS), "a model is out of range");
+  assertValid(chosen.every((model) => model < GROUP_MODEL_COUNT), "a model is out of range");
   let place = 0;
   const models = codes.map((code) => (code ? chosen[place++] : 0));
 
@@ -112,13 +114,13 @@ export const decodeGroups = (data, { index, count, width }) => {
   const symbols = decodeIntegers(data.subarray(symbolsAt), contexts.length, contexts, true);
 
   const numbers = new Float32Array(index.length * width);
-  const steps = Float64Array.from(codes, (code) => STEP_OF_CODE[code] / FIXED_ONE);
+  const steps = Float64Array.from(codes, (code) => STEP_BY_CODE[code] / FIXED_POINT_ONE);
   place = 0;
   for (let row = 0; row < index.length; row++) {
     if (!codes[index[row]]) continue;
     for (let column = 0; column < width; column++) {
       const symbol = symbols[place++];
-      needSound(symbol >= -LARGEST_SYMBOL && symbol <= LARGEST_SYMBOL, "a number is out of range");
+      assertValid(symbol >= -MAX_ABS_SYMBOL && symbol <= MAX_ABS_SYMBOL, "a number is out of range");
       numbers[row * width + column] = symbol * steps[index[row]];
     }
   }

@@ -1,28 +1,28 @@
-// A model as plain splats: the colours that its radiance field gives each Gaussian, fitted by spherical harmonics. For
-// browsers that cannot evaluate the field while the view moves, and for programs that know splats alone.
+// Converts a model to explicit splats: spherical harmonics are fitted to the colours of its radiance field. Browsers
+// that cannot evaluate the field while the view moves need them, and so do programs that read splats only.
 
 import { HyrfFormatError } from "./errors.js";
 import { colorsAlong, colorsOfRows, decodeGeometry, firstLayers } from "./fields.js";
-import { cameraPlace } from "./viewpoint.js";
+import { cameraPosition } from "./viewpoint.js";
 
-/** Harmonics beside the first, by degree. */
-export const OTHER_HARMONICS = [0, 3, 8, 15];
-/** The first: 1 / (2 sqrt(pi)), the same in all directions. */
-export const BAND_0 = 0.28209479177387814;
+/** The number of harmonics of degree 1 and higher, by the largest degree. */
+export const HIGHER_HARMONICS_BY_DEGREE = [0, 3, 8, 15];
+/** The harmonic of degree 0, which is constant: 1 / (2 sqrt(pi)). */
+export const SH_BAND_0 = 0.28209479177387814;
 
-const SPHERE_DIRECTIONS = 32;
-const SPHERE_WEIGHT = 3e-3; // of all these together, against 1 for all cameras
-const RIDGE = 1e-5;
-const FITTED_ROWS = 256; // Gaussians that are fitted together
-const SEEN_FROM = 0.01; // local units: what is nearer to a camera it does not see
-const SEEN_BESIDE = 0.3; // nor what lies so much of half the picture's size outside of it
-const SAMPLED = 4; // blocks, spread over all, that tell how large harmonics are
-const CUT_PART = 1e-4; // part of them that may be larger than what can be stored
-const COARSE_SHARE = 0.1; // of the time, about, until there is a first result
+const SPHERE_DIRECTION_COUNT = 32;
+const SPHERE_TOTAL_WEIGHT = 3e-3; // the weights of all cameras add up to 1
+const RIDGE_WEIGHT = 1e-5;
+const GAUSSIANS_PER_BLOCK = 256; // fitted together, so that the data of a block stays in the cache
+const MIN_VISIBLE_DEPTH_LOCAL = 0.01;
+const PICTURE_MARGIN_RATIO = 0.3; // Gaussians this far outside the picture count as visible, in halves of its size
+const RANGE_SAMPLE_BLOCKS = 4;
+const CLIPPED_RATIO = 1e-4; // the share of harmonics that are clipped, so that the others get fine steps
+const COARSE_TIME_RATIO = 0.1; // measured: the coarse result takes about this share of the time
 
 /**
- * Explicit splats. A place of the world is `center` + `unit` times one of theirs; axes are the world's. Seen along the
- * unit vector d the colour is max(0, `colors` + sum over k > 0 of Y_k(d) harmonic_k).
+ * Explicit splats. World coordinates are `center` + `unit` times theirs; the axes are the world's. The colour along the
+ * unit vector d is max(0, `colors` + sum over k > 0 of Y_k(d) harmonic_k).
  * @typedef {{
  *   count: number,
  *   degree: number,
@@ -36,37 +36,38 @@ const COARSE_SHARE = 0.1; // of the time, about, until there is a first result
  *   colors: Float32Array,
  *   harmonics: Uint8Array,
  *   range: number,
- * }} Splats of each of which there are: the position and the scales (standard deviations) in page units; the rotation,
- *   wxyz of unit length; the opacity in [0, 1]; the colour; of every further harmonic RGB, (byte - 128) / 128 * range
+ * }} Splats For each Gaussian: position and scales (standard deviations) in units of `unit`; the rotation, wxyz of unit
+ *   length; the opacity in [0, 1]; the colour; RGB of each higher harmonic, (byte - 128) / 128 * range
  *
- * A camera in a model's local units: where it stands, its rotation and translation, bounds of x / z and y / z of what
- * it draws, by how much squares of its pictures are larger than those of angles, and the pixels of a picture.
+ * A camera in a model's local units. `bounds` are the least and largest x / z and y / z that count as visible, `focal`
+ * is the product of both focal lengths in pixels, `area` the picture's number of pixels.
  * @typedef {{place: number[], rows: number[][], translation: number[], bounds: number[], focal: number, area: number}}
- *   LocalEye
+ *   LocalCamera
  *
  * @typedef {import("./index.js").Model} Model
  */
 
 /**
- * A model as splats, with shapes and opacities of its own. For each Gaussian, over the cameras v that see it, colours
- * minimise
+ * Converts a model to splats. Shapes and opacities are the model's. The colours of each Gaussian minimise, over the
+ * cameras v that see it,
  *
- *     sum_v w_v |f(d_v) - color(d_v)|^2 + SPHERE_WEIGHT mean_s |f(d_s) - color(d_s)|^2 + RIDGE sum_{k > 0} |h_k|^2
+ *     sum_v w_v |f(d_v) - color(d_v)|^2 + s mean_s |f(d_s) - color(d_s)|^2 + r sum_{k > 0} |h_k|^2
  *
- * with w_v the area that it has in their pictures, sum_v w_v = 1, and directions d_s that cover the sphere evenly. What
- * hides behind what is not asked.
+ * where s is SPHERE_TOTAL_WEIGHT, r is RIDGE_WEIGHT, w_v is proportional to its area in their pictures, sum_v w_v = 1,
+ * and the directions d_s cover the sphere evenly. Occlusion is ignored.
  *
  * @param {Model} model
- * @param {import("./viewpoint.js").Camera[]} viewpoints from where it is looked at, world units; none: the sphere alone
+ * @param {import("./viewpoint.js").Camera[]} viewpoints cameras in world units; if empty, only the sphere is fitted
  * @param {number} degree of the harmonics, 0 to 3
- * @param {(progress: {done: number, splats: Splats, coarse: boolean}) => unknown} [report] told how it goes, and waited
- *   for: the part `done`, and the splats as they are. Once, if there is a Gaussian, `coarse` is true: then all of them
- *   are there, with the colours that the first viewpoint sees. What it throws ends the work.
+ * @param {(progress: {done: number, splats: Splats, coarse: boolean}) => unknown} [report] called and awaited after
+ *   each block, with the fraction `done` and the splats so far. `coarse` is true once, if there is a Gaussian: all
+ *   Gaussians are there then, with their colours from the first viewpoint. An exception that it throws ends the
+ *   conversion.
  * @returns {Promise<Splats>}
- * @throws {HyrfFormatError} a number that comes out is NaN or infinite
+ * @throws {HyrfFormatError} a resulting number is NaN or infinite
  */
 export async function fitHarmonics(model, viewpoints, degree, report = () => {}) {
-  const { count, config } = model, { center, scale } = config.frame, others = OTHER_HARMONICS[degree];
+  const { count, config } = model, { center, scale } = config.frame, higher = HIGHER_HARMONICS_BY_DEGREE[degree];
   /** @type {Splats} */
   const splats = {
     count, degree,
@@ -78,50 +79,51 @@ export async function fitHarmonics(model, viewpoints, degree, report = () => {})
     quats: new Float32Array(4 * count),
     opacities: new Float32Array(count),
     colors: new Float32Array(3 * count),
-    harmonics: new Uint8Array(3 * others * count).fill(128),
+    harmonics: new Uint8Array(3 * higher * count).fill(128),
     range: 1,
   };
-  const eyes = viewpoints.map((camera) => localEye(camera, config.frame));
-  for (let start = 0; start < count; start += FITTED_ROWS) {
-    const stop = Math.min(start + FITTED_ROWS, count);
-    shapeBlock(model, splats, eyes, start, stop);
-    await report({ done: (COARSE_SHARE * stop) / count, splats, coarse: stop === count });
+  const cameras = viewpoints.map((camera) => toLocalCamera(camera, config.frame));
+  for (let start = 0; start < count; start += GAUSSIANS_PER_BLOCK) {
+    const stop = Math.min(start + GAUSSIANS_PER_BLOCK, count);
+    decodeBlock(model, splats, cameras, start, stop);
+    await report({ done: (COARSE_TIME_RATIO * stop) / count, splats, coarse: stop === count });
   }
   const fit = new HarmonicsFit(degree);
-  splats.range = fit.range(model, splats, eyes);
-  for (let start = 0; start < count; start += FITTED_ROWS) {
-    const stop = Math.min(start + FITTED_ROWS, count);
-    fit.block(model, splats, eyes, start, stop, (i) => fit.store(splats, i));
-    await report({ done: COARSE_SHARE + ((1 - COARSE_SHARE) * stop) / count, splats, coarse: false });
+  splats.range = fit.range(model, splats, cameras);
+  for (let start = 0; start < count; start += GAUSSIANS_PER_BLOCK) {
+    const stop = Math.min(start + GAUSSIANS_PER_BLOCK, count);
+    fit.block(model, splats, cameras, start, stop, (i) => fit.store(splats, i));
+    await report({ done: COARSE_TIME_RATIO + ((1 - COARSE_TIME_RATIO) * stop) / count, splats, coarse: false });
   }
   return splats;
 }
 
 /**
- * The largest harmonic to be stored, so that almost none is cut and steps are fine.
- * @param {number[]} sizes of many of them
+ * Chooses the largest magnitude of harmonics that can be stored: a high quantile, so that few are clipped and steps are
+ * fine.
+ * @param {number[]} sizes the magnitudes of a sample of harmonics
  * @returns {number}
  */
-export function storedRange(sizes) {
+export function chooseHarmonicsRange(sizes) {
   const ordered = Float64Array.from(sizes).sort();
-  return ordered[Math.floor((1 - CUT_PART) * ordered.length)] || 1;
+  return ordered[Math.floor((1 - CLIPPED_RATIO) * ordered.length)] || 1;
 }
 
 /**
- * Shapes of a block of Gaussians, and their colours from the first viewpoint.
+ * Decodes the shapes of a block of Gaussians, and their colours from the first viewpoint.
  * @param {Model} model
  * @param {Splats} splats
- * @param {LocalEye[]} eyes
+ * @param {LocalCamera[]} cameras
  * @param {number} start
  * @param {number} stop
  */
-function shapeBlock(model, splats, eyes, start, stop) {
+function decodeBlock(model, splats, cameras, start, stop) {
   const { opacities, scales, quats } = decodeGeometry(model, start, stop);
-  const eye = eyes[0]?.place ?? [0, 0, 0], directions = new Float32Array(3 * (stop - start));
-  for (let i = start; i < stop; i++) aimFrom(eye, splats.positions, i, directions, i - start);
+  const eye = cameras[0]?.place ?? [0, 0, 0], directions = new Float32Array(3 * (stop - start));
+  for (let i = start; i < stop; i++) writeDirection(eye, splats.positions, i, directions, i - start);
   const colors = colorsAlong(model, firstLayers(model, start, stop), start, stop, directions);
-  needFinite("shape", opacities, scales, quats);
-  needFinite("colour", colors);
+  requireFinite("shape", opacities, scales, quats);
+  requireFinite("colour", colors);
   splats.opacities.set(opacities, start);
   splats.scales.set(scales, 3 * start);
   splats.quats.set(quats, 4 * start);
@@ -129,10 +131,12 @@ function shapeBlock(model, splats, eyes, start, stop) {
 }
 
 /**
- * @param {string} what
+ * Throws an error unless all numbers are finite.
+ * @param {string} what the numbers' name in the message
  * @param {...Float32Array} arrays
+ * @throws {HyrfFormatError}
  */
-function needFinite(what, ...arrays) {
+function requireFinite(what, ...arrays) {
   if (arrays.every((array) => array.every(Number.isFinite))) return;
   throw new HyrfFormatError(`The ${what} of a Gaussian is not a finite number: the model is broken; train it again.`);
 }
@@ -140,34 +144,34 @@ function needFinite(what, ...arrays) {
 // --- views -----------------------------------------------------------------------------------------------------------
 
 /**
- * A camera in the model's local units.
+ * Converts a camera to the model's local units.
  * @param {import("./viewpoint.js").Camera} camera
  * @param {{center: number[], scale: number}} frame
- * @returns {LocalEye}
+ * @returns {LocalCamera}
  */
-function localEye(camera, { center, scale }) {
+function toLocalCamera(camera, { center, scale }) {
   const { fx, fy, cx, cy, width, height, camera_from_world: pose } = camera;
   const translation = [0, 1, 2].map((r) => {
     const [a, b, c, d] = pose[r];
     return (a * center[0] + b * center[1] + c * center[2] + d) / scale;
   });
-  const place = cameraPlace(camera).map((value, k) => (value - center[k]) / scale);
-  const wide = (SEEN_BESIDE * width) / 2, high = (SEEN_BESIDE * height) / 2;
+  const place = cameraPosition(camera).map((value, k) => (value - center[k]) / scale);
+  const wide = (PICTURE_MARGIN_RATIO * width) / 2, high = (PICTURE_MARGIN_RATIO * height) / 2;
   const bounds = [(-wide - cx) / fx, (width + wide - cx) / fx, (-high - cy) / fy, (height + high - cy) / fy];
   return { place, rows: pose.slice(0, 3), translation, bounds, focal: fx * fy, area: width * height };
 }
 
 /**
- * The area, in pixels, that Gaussian i has in the picture of an eye, as far as it is drawn there; 0 where it is not.
- * @param {LocalEye} eye
+ * Estimates the area, in pixels, of Gaussian i in a camera's picture; 0 where the camera does not draw it.
+ * @param {LocalCamera} eye
  * @param {Splats} splats
  * @param {number} i
  * @returns {number}
  */
-function seenArea({ rows: [right, down, forward], translation: [tx, ty, tz], bounds, focal, area }, splats, i) {
+function visibleArea({ rows: [right, down, forward], translation: [tx, ty, tz], bounds, focal, area }, splats, i) {
   const { positions, scales } = splats, x = positions[3 * i], y = positions[3 * i + 1], z = positions[3 * i + 2];
   const depth = forward[0] * x + forward[1] * y + forward[2] * z + tz;
-  if (!(depth > SEEN_FROM)) return 0;
+  if (!(depth > MIN_VISIBLE_DEPTH_LOCAL)) return 0;
   const across = (right[0] * x + right[1] * y + right[2] * z + tx) / depth;
   if (!(across > bounds[0] && across < bounds[1])) return 0;
   const along = (down[0] * x + down[1] * y + down[2] * z + ty) / depth;
@@ -178,14 +182,14 @@ function seenArea({ rows: [right, down, forward], translation: [tx, ty, tz], bou
 }
 
 /**
- * The unit vector from an eye to Gaussian i, as the row `to` of `directions`.
+ * Writes the unit vector from an eye to Gaussian i to row `to` of `directions`.
  * @param {number[]} eye
  * @param {Float32Array} positions
  * @param {number} i
  * @param {Float32Array} directions
  * @param {number} to
  */
-function aimFrom(eye, positions, i, directions, to) {
+function writeDirection(eye, positions, i, directions, to) {
   const x = positions[3 * i] - eye[0], y = positions[3 * i + 1] - eye[1], z = positions[3 * i + 2] - eye[2];
   const length = Math.max(Math.sqrt(x * x + y * y + z * z), 1e-12);
   directions[3 * to] = x / length;
@@ -195,73 +199,79 @@ function aimFrom(eye, positions, i, directions, to) {
 
 // --- least squares ---------------------------------------------------------------------------------------------------
 
+/** Fits harmonics by least squares, one Gaussian after the other. */
 class HarmonicsFit {
   /** @param {number} degree */
   constructor(degree) {
     const terms = (degree + 1) ** 2;
     this.degree = degree;
     this.terms = terms;
-    this.sphere = sphereDirections(SPHERE_DIRECTIONS);
-    this.sphereBasis = new Float64Array(SPHERE_DIRECTIONS * terms);
+    this.sphere = fibonacciDirections(SPHERE_DIRECTION_COUNT);
+    this.sphereBasis = new Float64Array(SPHERE_DIRECTION_COUNT * terms);
     this.basis = new Float64Array(terms);
-    this.matrix = new Float64Array(terms * terms); // the lower half
+    this.matrix = new Float64Array(terms * terms); // symmetric; only its lower half is used
     this.right = new Float64Array(terms * 3);
-    this.start = new Float64Array(terms * terms); // of the matrix: what is the same for all Gaussians
-    for (let k = 1; k < terms; k++) this.start[k * terms + k] = RIDGE;
-    for (let s = 0; s < SPHERE_DIRECTIONS; s++) {
+    this.start = new Float64Array(terms * terms); // the part of the matrix that all Gaussians share
+    for (let k = 1; k < terms; k++) this.start[k * terms + k] = RIDGE_WEIGHT;
+    for (let s = 0; s < SPHERE_DIRECTION_COUNT; s++) {
       const [x, y, z] = this.sphere.subarray(3 * s, 3 * s + 3);
-      fillBasis(degree, x, y, z, this.basis);
+      evaluateBasis(degree, x, y, z, this.basis);
       this.sphereBasis.set(this.basis, s * terms);
-      addSquare(this.start, this.basis, terms, SPHERE_WEIGHT / SPHERE_DIRECTIONS);
+      addOuterProduct(this.start, this.basis, terms, SPHERE_TOTAL_WEIGHT / SPHERE_DIRECTION_COUNT);
     }
   }
 
   /**
-   * How large harmonics have to be stored, by a sample of all.
+   * Chooses the range of the stored harmonics from a sample of blocks.
    * @param {Model} model
    * @param {Splats} splats
-   * @param {LocalEye[]} eyes
+   * @param {LocalCamera[]} cameras
    * @returns {number}
    */
-  range(model, splats, eyes) {
-    const last = Math.ceil(model.count / FITTED_ROWS) - 1, sizes = /** @type {number[]} */ ([]);
-    for (const block of new Set(Array.from({ length: SAMPLED }, (_, k) => Math.floor((k * last) / (SAMPLED - 1))))) {
-      const start = Math.max(block, 0) * FITTED_ROWS, stop = Math.min(start + FITTED_ROWS, model.count);
-      this.block(model, splats, eyes, start, stop, () => {
+  range(model, splats, cameras) {
+    const last = Math.ceil(model.count / GAUSSIANS_PER_BLOCK) - 1, sizes = /** @type {number[]} */ ([]);
+    const sampled = Array.from({ length: RANGE_SAMPLE_BLOCKS }, (_, k) => {
+      return Math.floor((k * last) / (RANGE_SAMPLE_BLOCKS - 1));
+    });
+    for (const block of new Set(sampled)) {
+      const start = Math.max(block, 0) * GAUSSIANS_PER_BLOCK, stop = Math.min(start + GAUSSIANS_PER_BLOCK, model.count);
+      this.block(model, splats, cameras, start, stop, () => {
         for (let k = 3; k < 3 * this.terms; k++) sizes.push(Math.abs(this.right[k]));
       });
     }
-    return storedRange(sizes);
+    return chooseHarmonicsRange(sizes);
   }
 
   /**
-   * Fit the colours of Gaussians `start` to `stop`, whose shapes are known; `keep` is called with the number of each.
+   * Fits the colours of Gaussians `start` to `stop`, whose shapes are decoded. `keep` is called with each Gaussian's
+   * number while `right` has its coefficients.
    * @param {Model} model
    * @param {Splats} splats
-   * @param {LocalEye[]} eyes
+   * @param {LocalCamera[]} cameras
    * @param {number} start
    * @param {number} stop
    * @param {(i: number) => void} keep
    */
-  block(model, splats, eyes, start, stop, keep) {
-    const most = (eyes.length + SPHERE_DIRECTIONS) * (stop - start);
-    const rows = new Int32Array(most), weights = new Float64Array(most), directions = new Float32Array(3 * most);
+  block(model, splats, cameras, start, stop, keep) {
+    const capacity = (cameras.length + SPHERE_DIRECTION_COUNT) * (stop - start);
+    const rows = new Int32Array(capacity), weights = new Float64Array(capacity);
+    const directions = new Float32Array(3 * capacity);
     const ends = new Int32Array(stop - start);
     let used = 0;
     for (let i = start; i < stop; i++) {
       const own = used;
       let sum = 0;
-      for (const eye of eyes) {
-        const area = seenArea(eye, splats, i);
+      for (const eye of cameras) {
+        const area = visibleArea(eye, splats, i);
         if (area === 0) continue;
-        aimFrom(eye.place, splats.positions, i, directions, used);
+        writeDirection(eye.place, splats.positions, i, directions, used);
         weights[used++] = area;
         sum += area;
       }
       for (let k = own; k < used; k++) weights[k] /= sum;
       directions.set(this.sphere, 3 * used);
-      weights.fill(SPHERE_WEIGHT / SPHERE_DIRECTIONS, used, used + SPHERE_DIRECTIONS);
-      used += SPHERE_DIRECTIONS;
+      weights.fill(SPHERE_TOTAL_WEIGHT / SPHERE_DIRECTION_COUNT, used, used + SPHERE_DIRECTION_COUNT);
+      used += SPHERE_DIRECTION_COUNT;
       rows.fill(i - start, own, used);
       ends[i - start] = used;
     }
@@ -274,7 +284,8 @@ class HarmonicsFit {
   }
 
   /**
-   * Coefficients, as `right`, from rows `from` to `to` of directions, weights and colours; the sphere's are the last.
+   * Computes the coefficients `right` from rows `from` to `to` of directions, weights and colours. The sphere's rows
+   * are the last ones.
    * @param {Float32Array} directions
    * @param {Float64Array} weights
    * @param {Float32Array} colors
@@ -282,14 +293,14 @@ class HarmonicsFit {
    * @param {number} to
    */
   solve(directions, weights, colors, from, to) {
-    const { degree, terms, basis, matrix, right, sphereBasis } = this, sphere = to - SPHERE_DIRECTIONS;
+    const { degree, terms, basis, matrix, right, sphereBasis } = this, sphere = to - SPHERE_DIRECTION_COUNT;
     matrix.set(this.start);
     right.fill(0);
     for (let row = from; row < to; row++) {
       const weight = weights[row];
       if (row < sphere) {
-        fillBasis(degree, directions[3 * row], directions[3 * row + 1], directions[3 * row + 2], basis);
-        addSquare(matrix, basis, terms, weight);
+        evaluateBasis(degree, directions[3 * row], directions[3 * row + 1], directions[3 * row + 2], basis);
+        addOuterProduct(matrix, basis, terms, weight);
       } else {
         for (let k = 0; k < terms; k++) basis[k] = sphereBasis[(row - sphere) * terms + k];
       }
@@ -305,27 +316,27 @@ class HarmonicsFit {
   }
 
   /**
-   * The coefficients found last, as those of Gaussian i.
+   * Stores the coefficients `right` as those of Gaussian i.
    * @param {Splats} splats
    * @param {number} i
    */
   store({ colors, harmonics, range }, i) {
-    const { right, terms } = this, others = 3 * (terms - 1);
-    for (let c = 0; c < 3; c++) colors[3 * i + c] = 0.5 + BAND_0 * right[c];
-    for (let k = 0; k < others; k++) {
-      harmonics[others * i + k] = Math.max(0, Math.min(255, Math.round(128 + (128 / range) * right[3 + k])));
+    const { right, terms } = this, higher = 3 * (terms - 1);
+    for (let c = 0; c < 3; c++) colors[3 * i + c] = 0.5 + SH_BAND_0 * right[c];
+    for (let k = 0; k < higher; k++) {
+      harmonics[higher * i + k] = Math.max(0, Math.min(255, Math.round(128 + (128 / range) * right[3 + k])));
     }
   }
 }
 
 /**
- * To the lower half of a matrix, the products of a vector's elements, times a weight.
+ * Adds weight v v^T to the lower half of a matrix.
  * @param {Float64Array} matrix
  * @param {Float64Array} vector
  * @param {number} size
  * @param {number} weight
  */
-function addSquare(matrix, vector, size, weight) {
+function addOuterProduct(matrix, vector, size, weight) {
   for (let row = 0; row < size; row++) {
     const factor = weight * vector[row];
     for (let column = 0, at = row * size; column <= row; column++) matrix[at + column] += factor * vector[column];
@@ -333,8 +344,8 @@ function addSquare(matrix, vector, size, weight) {
 }
 
 /**
- * Solve A x = b for three right sides by A = L L^T; both are overwritten, by L and x. A is symmetric, its lower half
- * given, and positive definite.
+ * Solves A x = b for three right-hand sides by Cholesky decomposition, A = L L^T. A must be symmetric and positive
+ * definite; only its lower half is read. L overwrites A, x overwrites b.
  * @param {Float64Array} matrix
  * @param {Float64Array} right
  * @param {number} size
@@ -362,10 +373,10 @@ function solveCholesky(matrix, right, size) {
 }
 
 /**
- * Unit vectors spread evenly over the sphere: points of a Fibonacci lattice.
+ * Returns unit vectors that cover the sphere evenly: the points of a Fibonacci lattice.
  * @param {number} count
  */
-function sphereDirections(count) {
+function fibonacciDirections(count) {
   const directions = new Float32Array(3 * count);
   for (let k = 0; k < count; k++) {
     const height = 1 - (2 * k + 1) / count, angle = Math.PI * (1 + Math.sqrt(5)) * k;
@@ -376,15 +387,15 @@ function sphereDirections(count) {
 }
 
 /**
- * Real spherical harmonics with the Condon-Shortley phase, as files of splats have them, up to a degree.
+ * Evaluates the real spherical harmonics with the Condon-Shortley phase up to a degree, as files of splats use them.
  * @param {number} degree
  * @param {number} x
  * @param {number} y
  * @param {number} z
  * @param {Float64Array} basis
  */
-function fillBasis(degree, x, y, z, basis) {
-  basis[0] = BAND_0;
+function evaluateBasis(degree, x, y, z, basis) {
+  basis[0] = SH_BAND_0;
   if (degree < 1) return;
   basis[1] = -0.4886025119029199 * y;
   basis[2] = 0.4886025119029199 * z;

@@ -1,10 +1,10 @@
-// The model out of the bytes of a `.hyrf` file, versions 1.0 to 1.2 (docs/format.md).
+// Reads models from the bytes of `.hyrf` files, versions 1.0 to 1.2 (docs/format.md).
 
 import { decodeChannels } from "./channels.js";
-import { Container, EXPOSURE_TYPE, FIELD_TYPES, LAYERED_TYPES, incompleteFile, layerType } from "./container.js";
-import { DamagedData, HyrfFormatError, damagedFile, newerFile } from "./errors.js";
+import { Container, EXPOSURE_TYPE, FIELD_TYPES, LAYERED_TYPES, layerType, rejectIncomplete } from "./container.js";
+import { DamagedData, HyrfFormatError, rejectDamaged, rejectNewer } from "./errors.js";
 import { decodeExposure } from "./exposure.js";
-import { ROW_FEATURES, decoderSize, tableRows } from "./grids.js";
+import { FEATURES_PER_ROW, decoderSize, tableRows } from "./grids.js";
 import { decodeGroups, decoderGroups, tableGroups } from "./groups.js";
 import { decodeLattice, latticePositions } from "./lattice.js";
 import { readMetadata } from "./metadata.js";
@@ -12,8 +12,9 @@ import { decodeFloat16, decodeFloat32, decodeMinMax, decodeVectors } from "./pla
 
 export { HyrfFormatError };
 
-// Gaussians that a file may have: so many for each of its bytes, and some that are free.
-const GAUSSIANS_A_BYTE = 32, FREE_GAUSSIANS = 2 ** 18;
+// A file of n bytes may have at most MAX_GAUSSIANS_PER_BYTE n + BASE_GAUSSIANS Gaussians.
+const MAX_GAUSSIANS_PER_BYTE = 32;
+const BASE_GAUSSIANS = 2 ** 18;
 
 /**
  * @typedef {import("./container.js").Entry} Entry
@@ -23,7 +24,8 @@ const GAUSSIANS_A_BYTE = 32, FREE_GAUSSIANS = 2 ** 18;
  * @typedef {import("./metadata.js").Config} Config
  * @typedef {import("./metadata.js").Metadata} Metadata
  *
- * A field: its hash table (rows x 2) and the numbers of its decoder. See `gridLevels` and `decoderLayout`.
+ * A field: its hash table (rows x 2) and the numbers of its decoder. `gridLevels` and `decoderLayout` give their
+ * shapes.
  * @typedef {{table: Float32Array, decoder: Float32Array}} Field
  *
  * @typedef {{
@@ -39,7 +41,7 @@ const GAUSSIANS_A_BYTE = 32, FREE_GAUSSIANS = 2 ** 18;
  *   geometry: Field,
  *   radiance: Field,
  *   exposure: ExposureMap | null,
- * }} Model `exposure`: how exposure varies with the viewpoint, null where the file does not say; see `logGains`
+ * }} Model `exposure` is the exposure map, for `logGains`, or null where the file has none
  *
  * @typedef {{
  *   version: [number, number],
@@ -48,27 +50,27 @@ const GAUSSIANS_A_BYTE = 32, FREE_GAUSSIANS = 2 ** 18;
  *   firstLayer: number,
  * }} Description
  *
- * A section to be decoded: what it is called in the first layer, and its matrix.
- * @typedef {{type: string, group: string, layer: number, rows: number, columns: number}} WantedSection
+ * A section that the metadata requires: `group` is its type in the first layer, `rows` x `columns` its shape.
+ * @typedef {{type: string, group: string, layer: number, rows: number, columns: number}} ExpectedSection
  */
 
 const CODEC_FLOAT32 = 1, CODEC_FLOAT16 = 2, CODEC_VECTORS = 3, CODEC_MIN_MAX = 4;
 const CODEC_LATTICE = 6, CODEC_CHANNELS = 7, CODEC_GROUPS = 8, CODEC_EXPOSURE = 9;
-const KNOWN_CODECS = [CODEC_FLOAT32, CODEC_FLOAT16, CODEC_VECTORS, CODEC_MIN_MAX];
-KNOWN_CODECS.push(CODEC_LATTICE, CODEC_CHANNELS, CODEC_GROUPS);
+const PARAMETER_CODECS = [CODEC_FLOAT32, CODEC_FLOAT16, CODEC_VECTORS, CODEC_MIN_MAX];
+PARAMETER_CODECS.push(CODEC_LATTICE, CODEC_CHANNELS, CODEC_GROUPS);
 const LAYERED_COLUMNS = [3, 3, 1, 1];
 
 /**
- * What a file holds, from its first bytes: header and table of contents are enough.
+ * Describes a file by its header and its table of contents.
  * @param {Uint8Array} bytes the start of a file, or all of it
- * @returns {Description} `firstLayer`: so many bytes of the file make a model, if only a coarse one
+ * @returns {Description} `firstLayer` is the number of bytes, from the start, that a model of the first layer needs
  * @throws {HyrfFormatError}
  */
 export const describe = (bytes) => {
   const container = new Container(bytes, true);
   let firstLayer = 0;
   for (const type of ["META", ...LAYERED_TYPES, ...FIELD_TYPES]) {
-    firstLayer = Math.max(firstLayer, entryOf(container, type).end);
+    firstLayer = Math.max(firstLayer, requireEntry(container, type).end);
   }
   const sections = [...container.entries.values()].map(({ type, codec, offset, stored, raw }) => {
     return { type, codec, offset, stored, raw };
@@ -77,9 +79,9 @@ export const describe = (bytes) => {
 };
 
 /**
- * Decode a file.
+ * Decodes a file.
  * @param {Uint8Array} bytes
- * @param {{partial?: boolean}} [options] `partial`: the start of a file will do, for a model of the layers in it
+ * @param {{partial?: boolean}} [options] `partial`: accept the start of a file, and read the layers that are in it
  * @returns {Promise<Model>}
  * @throws {HyrfFormatError}
  */
@@ -93,6 +95,7 @@ export const read = async (bytes, { partial = false } = {}) => {
 };
 
 /**
+ * Decodes all sections that are available.
  * @param {Container} container
  * @returns {Model}
  */
@@ -100,71 +103,73 @@ const readModel = (container) => {
   const metadata = readMetadata(container);
   const { config } = metadata;
   const counts = metadata.layers?.length ? metadata.layers : [metadata.gaussians];
-  const sections = wantedSections(config, counts);
-  sections.forEach((section) => checkSection(container, section)); // all, before the first is decoded
-  let there = 1;
-  while (there < counts.length && LAYERED_TYPES.every((type) => container.has(layerType(type, there)))) there++;
-  const wanted = sections.filter(({ layer }) => layer < there);
-  if (!wanted.every(({ type }) => container.has(type))) {
-    incompleteFile(container, Math.max(...wanted.map(({ type }) => entryOf(container, type).end)));
+  const sections = expectedSections(config, counts);
+  sections.forEach((section) => checkSection(container, section)); // all of them before any is decoded
+  let layerCount = 1;
+  /** @param {number} layer */
+  const hasLayer = (layer) => LAYERED_TYPES.every((type) => container.has(layerType(type, layer)));
+  while (layerCount < counts.length && hasLayer(layerCount)) layerCount++;
+  const required = sections.filter(({ layer }) => layer < layerCount);
+  if (!required.every(({ type }) => container.has(type))) {
+    rejectIncomplete(container, Math.max(...required.map(({ type }) => requireEntry(container, type).end)));
   }
 
-  const layers = counts.slice(0, there), count = layers.reduce((sum, each) => sum + each, 0);
-  if (count > GAUSSIANS_A_BYTE * container.bytes.length + FREE_GAUSSIANS) {
-    damagedFile(`it says ${count} Gaussians, too many for its bytes`);
+  const layers = counts.slice(0, layerCount), count = layers.reduce((sum, each) => sum + each, 0);
+  if (count > MAX_GAUSSIANS_PER_BYTE * container.bytes.length + BASE_GAUSSIANS) {
+    rejectDamaged(`it says ${count} Gaussians, too many for its bytes`);
   }
 
   /** @type {Map<string, Float32Array>} */
   const arrays = new Map();
   /** @type {LatticePoints[]} */
-  const points = []; // of each layer that has its positions on a lattice
-  for (const section of wanted) arrays.set(section.type, decodeSection(container, section, config, points));
+  const points = []; // by layer, where positions are lattice points
+  for (const section of required) arrays.set(section.type, decodeSection(container, section, config, points));
 
   /** @param {string} type */
-  const joined = (type) => joinedArrays(layers.map((_, layer) => arrayOf(arrays, layerType(type, layer))));
+  const joined = (type) => concatenateArrays(layers.map((_, layer) => getArray(arrays, layerType(type, layer))));
   const [positions, colorLogits, scaleLogits, opacityLogits] = LAYERED_TYPES.map(joined);
   return {
     metadata,
     config,
     count,
     layers,
-    whole: there === counts.length,
+    whole: layerCount === counts.length,
     positions,
     colorLogits,
     scaleLogits,
     opacityLogits,
-    geometry: { table: arrayOf(arrays, "GTAB"), decoder: arrayOf(arrays, "GMLP") },
-    radiance: { table: arrayOf(arrays, "RTAB"), decoder: arrayOf(arrays, "RMLP") },
+    geometry: { table: getArray(arrays, "GTAB"), decoder: getArray(arrays, "GMLP") },
+    radiance: { table: getArray(arrays, "RTAB"), decoder: getArray(arrays, "RMLP") },
     exposure: readExposure(container),
   };
 };
 
 /**
- * The exposure map, null where the file has none or its bytes are not there yet.
+ * Reads the exposure map; null where the file has none or its bytes are not available yet.
  * @param {Container} container
  * @returns {ExposureMap | null}
  */
 const readExposure = (container) => {
   if (!container.has(EXPOSURE_TYPE)) return null;
-  const { codec, raw } = entryOf(container, EXPOSURE_TYPE);
-  if (codec !== CODEC_EXPOSURE) newerFile(`section '${EXPOSURE_TYPE}' has the codec ${codec}, which is unknown`);
-  return decodeNamed(EXPOSURE_TYPE, () => decodeExposure(container.stored(EXPOSURE_TYPE), raw));
+  const { codec, raw } = requireEntry(container, EXPOSURE_TYPE);
+  if (codec !== CODEC_EXPOSURE) rejectNewer(`section '${EXPOSURE_TYPE}' has the codec ${codec}, which is unknown`);
+  return nameDamagedSection(EXPOSURE_TYPE, () => decodeExposure(container.stored(EXPOSURE_TYPE), raw));
 };
 
 /**
- * All sections that a model must have but the metadata; positions come before what leans on them.
+ * Lists the sections that a model must have, except the metadata. Positions come first, because others depend on them.
  * @param {Config} config
- * @param {number[]} counts of the layers
- * @returns {WantedSection[]}
+ * @param {number[]} counts the number of Gaussians of each layer
+ * @returns {ExpectedSection[]}
  */
-const wantedSections = (config, counts) => {
+const expectedSections = (config, counts) => {
   const sections = counts.flatMap((rows, layer) =>
     LAYERED_TYPES.map((group, i) => {
       return { type: layerType(group, layer), group, layer, rows, columns: LAYERED_COLUMNS[i] };
     }),
   );
   for (const group of FIELD_TYPES) {
-    const columns = group.endsWith("TAB") ? ROW_FEATURES : 1, field = fieldOf(group);
+    const columns = group.endsWith("TAB") ? FEATURES_PER_ROW : 1, field = fieldOf(group);
     const rows = columns === 1 ? decoderSize(config, field) : tableRows(config[field]);
     sections.push({ type: group, group, layer: 0, rows, columns });
   }
@@ -172,41 +177,44 @@ const wantedSections = (config, counts) => {
 };
 
 /**
- * The field that a table or decoder is of.
+ * Returns the field that a table or a decoder belongs to.
  * @param {string} type
  * @returns {FieldName}
  */
 const fieldOf = (type) => (type.startsWith("G") ? "geometry" : "radiance");
 
 /**
+ * Returns the entry of a section; throws an error where there is none.
  * @param {Container} container
  * @param {string} type
  * @returns {Entry}
  */
-const entryOf = (container, type) =>
-  container.entries.get(type) ?? damagedFile(`there is no section '${type}', so that it is incomplete`);
+const requireEntry = (container, type) =>
+  container.entries.get(type) ?? rejectDamaged(`there is no section '${type}', so that it is incomplete`);
 
 /**
+ * Checks the codec and the size of a section.
  * @param {Container} container
- * @param {WantedSection} section
+ * @param {ExpectedSection} section
  */
 const checkSection = (container, { type, rows, columns }) => {
-  const { codec, raw } = entryOf(container, type);
-  if (!KNOWN_CODECS.includes(codec)) newerFile(`section '${type}' has the codec ${codec}, which is unknown`);
-  if (raw !== 4 * rows * columns) damagedFile(`section '${type}' says another size than the metadata`);
+  const { codec, raw } = requireEntry(container, type);
+  if (!PARAMETER_CODECS.includes(codec)) rejectNewer(`section '${type}' has the codec ${codec}, which is unknown`);
+  if (raw !== 4 * rows * columns) rejectDamaged(`section '${type}' says another size than the metadata`);
 };
 
 /**
+ * Decodes a section and checks its numbers.
  * @param {Container} container
- * @param {WantedSection} section
+ * @param {ExpectedSection} section
  * @param {Config} config
- * @param {LatticePoints[]} points of each layer, added to
+ * @param {LatticePoints[]} points by layer; the section of positions adds its own
  * @returns {Float32Array} (rows x columns), finite
  */
 const decodeSection = (container, section, config, points) => {
-  const { type } = section, { codec } = entryOf(container, type);
+  const { type } = section, { codec } = requireEntry(container, type);
   const data = container.stored(type);
-  return decodeNamed(type, () => {
+  return nameDamagedSection(type, () => {
     const numbers = decodeNumbers(section, codec, data, config, points);
     for (let i = 0; i < numbers.length; i++) {
       if (numbers[i] - numbers[i] !== 0) throw new DamagedData("it holds numbers that are not finite");
@@ -216,14 +224,14 @@ const decodeSection = (container, section, config, points) => {
 };
 
 /**
- * What `decode` returns; an error about damaged data gets the section's name.
+ * Returns the result of `decode`, and adds the section's name to an error about damaged data.
  * @template Decoded
  * @param {string} type
  * @param {() => Decoded} decode
  * @returns {Decoded}
  * @throws {HyrfFormatError}
  */
-const decodeNamed = (type, decode) => {
+const nameDamagedSection = (type, decode) => {
   try {
     return decode();
   } catch (error) {
@@ -233,7 +241,8 @@ const decodeNamed = (type, decode) => {
 };
 
 /**
- * @param {WantedSection} section
+ * Decodes the numbers of a section by its codec.
+ * @param {ExpectedSection} section
  * @param {number} codec
  * @param {Uint8Array} data
  * @param {Config} config
@@ -259,13 +268,17 @@ const decodeNumbers = ({ group, layer, rows, columns }, codec, data, config, poi
 };
 
 /**
+ * Returns the array of a section that was decoded.
  * @param {Map<string, Float32Array>} arrays
  * @param {string} type
  */
-const arrayOf = (arrays, type) => /** @type {Float32Array} */ (arrays.get(type));
+const getArray = (arrays, type) => /** @type {Float32Array} */ (arrays.get(type));
 
-/** @param {Float32Array[]} parts */
-const joinedArrays = (parts) => {
+/**
+ * Concatenates arrays; a single one is returned as it is.
+ * @param {Float32Array[]} parts
+ */
+const concatenateArrays = (parts) => {
   if (parts.length === 1) return parts[0];
   const joined = new Float32Array(parts.reduce((sum, part) => sum + part.length, 0));
   let place = 0;

@@ -1,90 +1,93 @@
-// Streams of integers (docs/format.md 3.1): a token for the size of each, and its lower bits as they are.
+// Decodes streams of integers (docs/format.md 3.1): a token gives the size of each, extra bits its lower digits.
 
-import { BitReader, MOST_BITS_AT_ONCE } from "./bits.js";
-import { needSound } from "./errors.js";
+import { BitReader, MAX_BITS_PER_READ } from "./bits.js";
+import { assertValid } from "./errors.js";
 import { decodeTokens } from "./rans.js";
 
 const TOKEN_COUNT = 126;
-const FIRST_WIDE_TOKEN = 78; // stands for 2^32 and more
+const FIRST_WIDE_TOKEN = 78; // the first token of integers that do not fit 32 bits
 
-// Of each token: the bits of its integers that follow it, and the highest bits that it stands for.
-const EXTRA_BITS = new Uint8Array(TOKEN_COUNT);
-const LEADING_BITS = new Uint8Array(TOKEN_COUNT);
+// For each token: how many lower bits of the integer follow it, and the leading bits that the token stands for.
+const TOKEN_EXTRA_BITS = new Uint8Array(TOKEN_COUNT);
+const TOKEN_LEADING_BITS = new Uint8Array(TOKEN_COUNT);
 for (let token = 0; token < TOKEN_COUNT; token++) {
   if (token < 16) {
-    LEADING_BITS[token] = token;
+    TOKEN_LEADING_BITS[token] = token;
   } else if (token < 28) {
-    EXTRA_BITS[token] = (token >> 2) - 2;
-    LEADING_BITS[token] = 4 + (token & 3);
+    TOKEN_EXTRA_BITS[token] = (token >> 2) - 2;
+    TOKEN_LEADING_BITS[token] = 4 + (token & 3);
   } else {
-    EXTRA_BITS[token] = ((token - 14) >> 1) - 1;
-    LEADING_BITS[token] = 2 + (token & 1);
+    TOKEN_EXTRA_BITS[token] = ((token - 14) >> 1) - 1;
+    TOKEN_LEADING_BITS[token] = 2 + (token & 1);
   }
 }
 
-/** @param {Uint8Array} tokens */
-const extraBitsOf = (tokens) => {
+/**
+ * Returns how many extra bits follow tokens in all.
+ * @param {Uint8Array} tokens
+ */
+const sumExtraBits = (tokens) => {
   let bits = 0;
-  for (let i = 0; i < tokens.length; i++) bits += EXTRA_BITS[tokens[i]];
+  for (let i = 0; i < tokens.length; i++) bits += TOKEN_EXTRA_BITS[tokens[i]];
   return bits;
 };
 
 /**
- * Integers of 32 bits; where a section may hold them, larger ones are damage.
- * @param {Uint8Array} data no more and no fewer bytes than they take
+ * Decodes integers of at most 32 bits. Larger ones are treated as damage.
+ * @param {Uint8Array} data exactly the bytes of the integers
  * @param {number} count
- * @param {Uint8Array | null} contexts of each integer; null if there is one context
+ * @param {Uint8Array | null} contexts the context of each integer; null if there is one context
  * @param {boolean} isSigned
  * @returns {Int32Array}
  * @throws {DamagedData}
  */
 export const decodeIntegers = (data, count, contexts, isSigned) => {
   const { tokens, end } = decodeTokens(data, count, contexts);
-  const reader = new BitReader(data.subarray(end), extraBitsOf(tokens));
+  const reader = new BitReader(data.subarray(end), sumExtraBits(tokens));
   const values = new Int32Array(count);
   for (let i = 0; i < count; i++) {
-    const token = tokens[i], bits = EXTRA_BITS[token];
-    let value = LEADING_BITS[token];
-    if (bits > MOST_BITS_AT_ONCE) {
-      needSound(token < FIRST_WIDE_TOKEN, "an integer is out of range");
-      const low = reader.take(MOST_BITS_AT_ONCE);
-      value = (value << bits) | (reader.take(bits - MOST_BITS_AT_ONCE) << MOST_BITS_AT_ONCE) | low;
+    const token = tokens[i], bits = TOKEN_EXTRA_BITS[token];
+    let value = TOKEN_LEADING_BITS[token];
+    if (bits > MAX_BITS_PER_READ) {
+      assertValid(token < FIRST_WIDE_TOKEN, "an integer is out of range");
+      const low = reader.take(MAX_BITS_PER_READ);
+      value = (value << bits) | (reader.take(bits - MAX_BITS_PER_READ) << MAX_BITS_PER_READ) | low;
     } else if (bits > 0) {
       value = (value << bits) | reader.take(bits);
     }
     if (isSigned) value = (value >>> 1) ^ -(value & 1);
-    else needSound(value >= 0, "an integer is out of range");
+    else assertValid(value >= 0, "an integer is out of range");
     values[i] = value;
   }
   return values;
 };
 
-/** Bits of the lower half of a wide integer. */
-export const HALF_BITS = 27;
+/** The number of bits in the lower half of a wide integer. */
+export const LOW_HALF_BITS = 27;
 
 /**
- * Integers below 2^56 in halves: high 2^27 + low.
- * @param {Uint8Array} data no more and no fewer bytes than they take
+ * Decodes integers below 2^56 as two halves: high 2^27 + low.
+ * @param {Uint8Array} data exactly the bytes of the integers
  * @param {number} count
  * @returns {{high: Int32Array, low: Int32Array}}
  * @throws {DamagedData}
  */
 export const decodeWideIntegers = (data, count) => {
   const { tokens, end } = decodeTokens(data, count, null);
-  const reader = new BitReader(data.subarray(end), extraBitsOf(tokens));
+  const reader = new BitReader(data.subarray(end), sumExtraBits(tokens));
   const high = new Int32Array(count), low = new Int32Array(count);
-  const half = HALF_BITS - MOST_BITS_AT_ONCE;
+  const half = LOW_HALF_BITS - MAX_BITS_PER_READ;
   for (let i = 0; i < count; i++) {
-    const bits = EXTRA_BITS[tokens[i]], leading = LEADING_BITS[tokens[i]];
-    if (bits < MOST_BITS_AT_ONCE) {
+    const bits = TOKEN_EXTRA_BITS[tokens[i]], leading = TOKEN_LEADING_BITS[tokens[i]];
+    if (bits < MAX_BITS_PER_READ) {
       low[i] = (leading << bits) | reader.take(bits);
       continue;
     }
-    const lowest = reader.take(MOST_BITS_AT_ONCE), left = bits - MOST_BITS_AT_ONCE;
-    let rest = leading << left; // the bits above, at most 32
-    rest |= reader.take(Math.min(left, MOST_BITS_AT_ONCE));
-    if (left > MOST_BITS_AT_ONCE) rest |= reader.take(left - MOST_BITS_AT_ONCE) << MOST_BITS_AT_ONCE;
-    low[i] = ((rest & ((1 << half) - 1)) << MOST_BITS_AT_ONCE) | lowest;
+    const lowest = reader.take(MAX_BITS_PER_READ), left = bits - MAX_BITS_PER_READ;
+    let rest = leading << left; // all higher bits; they are at most 32
+    rest |= reader.take(Math.min(left, MAX_BITS_PER_READ));
+    if (left > MAX_BITS_PER_READ) rest |= reader.take(left - MAX_BITS_PER_READ) << MAX_BITS_PER_READ;
+    low[i] = ((rest & ((1 << half) - 1)) << MAX_BITS_PER_READ) | lowest;
     high[i] = rest >>> half;
   }
   return { high, low };

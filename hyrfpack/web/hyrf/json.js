@@ -1,14 +1,15 @@
-// JSON as docs/format.md 2.1 wants it: unlike JSON.parse, this tells 1 from 1.0 and bounds the nesting.
+// Parses JSON by the rules of docs/format.md 2.1. Unlike JSON.parse, it distinguishes 1 from 1.0 and limits the
+// nesting.
 
-import { needSound } from "./errors.js";
+import { assertValid } from "./errors.js";
 
-const DEEPEST = 64; // objects and lists within each other
-const MOST_DIGITS = 4300; // of an integer
-const NUMBER_TEXT = /-?(?:0|[1-9]\d*)(\.\d+)?([eE][+-]?\d+)?/y;
+const MAX_NESTING_DEPTH = 64;
+const MAX_INTEGER_DIGITS = 4300;
+const NUMBER_PATTERN = /-?(?:0|[1-9]\d*)(\.\d+)?([eE][+-]?\d+)?/y;
 /** @type {[string, boolean | null][]} */
-const JSON_WORDS = [["true", true], ["false", false], ["null", null]];
+const JSON_LITERALS = [["true", true], ["false", false], ["null", null]];
 
-/** A number, the nearest one that JavaScript has, and whether it is written as an integer. */
+/** A number, rounded to the nearest one of JavaScript, and whether its text is an integer. */
 export class JsonNumber {
   /**
    * @param {string} text
@@ -21,24 +22,24 @@ export class JsonNumber {
 }
 
 /**
- * Objects are maps, so that no key means anything to JavaScript.
+ * A parsed value. Objects become maps, so that keys such as `__proto__` have no special meaning.
  * @typedef {null | boolean | string | JsonNumber | JsonNode[] | JsonObject} JsonNode
  * @typedef {Map<string, any>} JsonObject
  */
 
 /**
- * The value of a text. Of equal keys the last one counts.
+ * Parses a text. Of equal keys the last one counts.
  * @param {string} text
  * @returns {JsonNode}
- * @throws {DamagedData} it is not JSON, too deep, or holds a number that is not finite
+ * @throws {DamagedData} the text is not JSON, is nested too deeply, or has a number that is not finite
  */
 export const parseJson = (text) => {
   let place = 0;
 
   /** @param {boolean} holds */
-  const needJson = (holds) => needSound(holds, `it is not valid JSON at character ${place}`);
+  const assertJson = (holds) => assertValid(holds, `it is not valid JSON at character ${place}`);
 
-  const skipBlanks = () => {
+  const skipWhitespace = () => {
     for (; ; place++) {
       const code = text.charCodeAt(place);
       if (code !== 32 && code !== 10 && code !== 13 && code !== 9) return;
@@ -46,46 +47,46 @@ export const parseJson = (text) => {
   };
 
   /**
-   * The next sign, taken if it is this one.
+   * Consumes the next character if it is `sign`, and returns whether it was.
    * @param {string} sign
    */
-  const took = (sign) => {
-    skipBlanks();
-    const is = text[place] === sign;
-    if (is) place++;
-    return is;
+  const accept = (sign) => {
+    skipWhitespace();
+    const isNext = text[place] === sign;
+    if (isNext) place++;
+    return isNext;
   };
 
   /** @returns {string} */
   const parseString = () => {
     const start = place;
-    needJson(took('"'));
+    assertJson(accept('"'));
     while (text[place] !== '"') {
-      needJson(place < text.length);
+      assertJson(place < text.length);
       place += text[place] === "\\" ? 2 : 1;
     }
     place++;
     try {
       return JSON.parse(text.slice(start, place));
     } catch {
-      needJson(false);
+      assertJson(false);
       return "";
     }
   };
 
   /** @returns {JsonNumber} */
   const parseNumber = () => {
-    NUMBER_TEXT.lastIndex = place;
-    const match = NUMBER_TEXT.exec(text);
+    NUMBER_PATTERN.lastIndex = place;
+    const match = NUMBER_PATTERN.exec(text);
     if (!match) {
-      needJson(false);
+      assertJson(false);
       return new JsonNumber("0", true);
     }
-    place = NUMBER_TEXT.lastIndex;
+    place = NUMBER_PATTERN.lastIndex;
     const isInteger = match[1] === undefined && match[2] === undefined;
     const number = new JsonNumber(match[0], isInteger);
-    if (!isInteger) needSound(Number.isFinite(number.value), "a number is not finite");
-    else needSound(match[0].replace("-", "").length <= MOST_DIGITS, "an integer has too many digits");
+    if (!isInteger) assertValid(Number.isFinite(number.value), "a number is not finite");
+    else assertValid(match[0].replace("-", "").length <= MAX_INTEGER_DIGITS, "an integer has too many digits");
     return number;
   };
 
@@ -93,10 +94,10 @@ export const parseJson = (text) => {
   const parseList = (depth) => {
     /** @type {JsonNode[]} */
     const list = [];
-    if (took("]")) return list;
+    if (accept("]")) return list;
     do list.push(parseValue(depth));
-    while (took(","));
-    needJson(took("]"));
+    while (accept(","));
+    assertJson(accept("]"));
     return list;
   };
 
@@ -104,31 +105,31 @@ export const parseJson = (text) => {
   const parseObject = (depth) => {
     /** @type {JsonObject} */
     const object = new Map();
-    if (took("}")) return object;
+    if (accept("}")) return object;
     do {
-      skipBlanks();
+      skipWhitespace();
       const key = parseString();
-      needJson(took(":"));
+      assertJson(accept(":"));
       object.set(key, parseValue(depth));
-    } while (took(","));
-    needJson(took("}"));
+    } while (accept(","));
+    assertJson(accept("}"));
     return object;
   };
 
   /**
-   * @param {number} depth of what holds the value
+   * @param {number} depth the number of objects and lists around the value
    * @returns {JsonNode}
    */
   const parseValue = (depth) => {
-    skipBlanks();
+    skipWhitespace();
     const sign = text[place];
     if (sign === "{" || sign === "[") {
-      needSound(depth < DEEPEST, `it is nested deeper than ${DEEPEST} levels`);
+      assertValid(depth < MAX_NESTING_DEPTH, `it is nested deeper than ${MAX_NESTING_DEPTH} levels`);
       place++;
       return sign === "{" ? parseObject(depth + 1) : parseList(depth + 1);
     }
     if (sign === '"') return parseString();
-    for (const [word, value] of JSON_WORDS) {
+    for (const [word, value] of JSON_LITERALS) {
       if (sign === word[0] && text.startsWith(word, place)) {
         place += word.length;
         return value;
@@ -138,7 +139,7 @@ export const parseJson = (text) => {
   };
 
   const value = parseValue(0);
-  skipBlanks();
-  needJson(place === text.length);
+  skipWhitespace();
+  assertJson(place === text.length);
   return value;
 };

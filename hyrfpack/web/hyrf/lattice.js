@@ -1,27 +1,29 @@
-// Codec 6 (docs/format.md 3.3): points on a lattice of the contracted cube, in Morton order.
+// Codec 6 (docs/format.md 3.3): points on a lattice in the contracted cube, stored in Morton order.
 
 import { BitReader } from "./bits.js";
-import { needSound } from "./errors.js";
-import { HALF_BITS, decodeIntegers, decodeWideIntegers } from "./integers.js";
+import { assertValid } from "./errors.js";
+import { LOW_HALF_BITS, decodeIntegers, decodeWideIntegers } from "./integers.js";
 
 /**
- * Points of a layer: centres of their cells in units of 2^-19 of the cube (3 N), and classes (N).
+ * The points of a layer: the centres of their cells in units of 2^-19 of the cube (3 N), and their classes (N).
  * @typedef {{centers: Int32Array, classes: Uint8Array, count: number}} LatticePoints
  */
 
-const FINEST_BITS = 18;
-const MOST_POINT_CLASSES = 16;
-const LATTICE_HEADER = 10;
-const HALF_MASK = 2 ** HALF_BITS - 1;
-const AXIS_BITS = HALF_BITS / 3; // of each axis in half a Morton code
-const TAIL_BITS = 24; // of a tail read at once, 8 of each axis
+const MAX_BITS_PER_AXIS = 18;
+const MAX_POINT_CLASSES = 16;
+const LATTICE_HEADER_BYTES = 10;
+const LOW_HALF_MASK = 2 ** LOW_HALF_BITS - 1;
+const AXIS_BITS_PER_HALF = LOW_HALF_BITS / 3; // a half of a Morton code interleaves three axes
+const TAIL_BITS_PER_READ = 24; // a multiple of 3, at most MAX_BITS_PER_READ
 
-/** Units of a cell's centre in the cube, as a power of two. */
-export const CENTER_BITS = FINEST_BITS + 1;
+/** The logarithm to base 2 of the number of units along an axis of the cube in which centres of cells are given. */
+export const CENTER_BITS_PER_AXIS = MAX_BITS_PER_AXIS + 1;
 
-/** Every third bit of a Morton code, from the lowest on, of 27 bits.
- * @param {number} code */
-const everyThird = (code) => {
+/**
+ * Extracts every third bit of 27 bits of a Morton code, from the lowest on.
+ * @param {number} code
+ */
+const extractEveryThirdBit = (code) => {
   code &= 0x01249249;
   code = (code | (code >> 2)) & 0x010c30c3;
   code = (code | (code >> 4)) & 0x0100f00f;
@@ -30,20 +32,22 @@ const everyThird = (code) => {
 };
 
 /**
+ * Decodes the points of a layer.
  * @param {Uint8Array} data
  * @param {number} count
  * @returns {LatticePoints}
  * @throws {DamagedData}
  */
 export const decodeLattice = (data, count) => {
-  needSound(data.length >= LATTICE_HEADER, "it ends within its header");
+  assertValid(data.length >= LATTICE_HEADER_BYTES, "it ends within its header");
   const view = new DataView(data.buffer, data.byteOffset, data.length);
-  const base = data[0], kinds = data[1], gapsAt = LATTICE_HEADER + kinds;
+  const base = data[0], classCount = data[1], gapsAt = LATTICE_HEADER_BYTES + classCount;
   const classesAt = gapsAt + view.getUint32(2, true), tailsAt = classesAt + view.getUint32(6, true);
-  needSound(base >= 1 && base <= FINEST_BITS && kinds >= 1 && kinds <= MOST_POINT_CLASSES, "its header cannot be");
-  needSound(tailsAt <= data.length, "it ends too early");
-  const bits = data.subarray(LATTICE_HEADER, gapsAt);
-  needSound(bits.every((b) => b >= base && b <= FINEST_BITS), "a class of points has too few or too many bits");
+  const areClassesKnown = classCount >= 1 && classCount <= MAX_POINT_CLASSES;
+  assertValid(base >= 1 && base <= MAX_BITS_PER_AXIS && areClassesKnown, "its header cannot be");
+  assertValid(tailsAt <= data.length, "it ends too early");
+  const bits = data.subarray(LATTICE_HEADER_BYTES, gapsAt);
+  assertValid(bits.every((b) => b >= base && b <= MAX_BITS_PER_AXIS), "a class of points has too few or too many bits");
 
   const gaps = decodeWideIntegers(data.subarray(gapsAt, classesAt), count);
   const repeats = new Uint8Array(count);
@@ -52,32 +56,32 @@ export const decodeLattice = (data, count) => {
   const classes = new Uint8Array(count);
   let tailBits = 0;
   for (let i = 0; i < count; i++) {
-    needSound(chosen[i] < kinds, "a point has a class that is not there");
+    assertValid(chosen[i] < classCount, "a point has a class that is not there");
     classes[i] = chosen[i];
     tailBits += 3 * (bits[chosen[i]] - base);
   }
   const tails = new BitReader(data.subarray(tailsAt), tailBits);
 
-  // Codes are below 2^(3 base).
-  const mostHigh = 2 ** Math.max(3 * base - HALF_BITS, 0) - 1, mostLow = 2 ** Math.min(3 * base, HALF_BITS) - 1;
+  // A code of `base` bits an axis is below 2^(3 base).
+  const maxHigh = 2 ** Math.max(3 * base - LOW_HALF_BITS, 0) - 1, maxLow = 2 ** Math.min(3 * base, LOW_HALF_BITS) - 1;
   const centers = new Int32Array(3 * count);
   let high = 0, low = 0;
   for (let i = 0; i < count; i++) {
     low += gaps.low[i];
-    high += gaps.high[i] + (low >>> HALF_BITS);
-    low &= HALF_MASK;
-    needSound(high <= mostHigh && low <= mostLow, "a point lies outside the cube");
-    const finer = bits[classes[i]] - base, unit = FINEST_BITS - base - finer;
+    high += gaps.high[i] + (low >>> LOW_HALF_BITS);
+    low &= LOW_HALF_MASK;
+    assertValid(high <= maxHigh && low <= maxLow, "a point lies outside the cube");
+    const finer = bits[classes[i]] - base, unit = MAX_BITS_PER_AXIS - base - finer;
     let x = 0, y = 0, z = 0;
-    for (let left = 3 * finer, shift = 0; left > 0; left -= TAIL_BITS, shift += TAIL_BITS / 3) {
-      const tail = tails.take(Math.min(left, TAIL_BITS));
-      x |= everyThird(tail) << shift;
-      y |= everyThird(tail >> 1) << shift;
-      z |= everyThird(tail >> 2) << shift;
+    for (let left = 3 * finer, shift = 0; left > 0; left -= TAIL_BITS_PER_READ, shift += TAIL_BITS_PER_READ / 3) {
+      const tail = tails.take(Math.min(left, TAIL_BITS_PER_READ));
+      x |= extractEveryThirdBit(tail) << shift;
+      y |= extractEveryThirdBit(tail >> 1) << shift;
+      z |= extractEveryThirdBit(tail >> 2) << shift;
     }
-    x |= (everyThird(low) | (everyThird(high) << AXIS_BITS)) << finer;
-    y |= (everyThird(low >> 1) | (everyThird(high >> 1) << AXIS_BITS)) << finer;
-    z |= (everyThird(low >> 2) | (everyThird(high >> 2) << AXIS_BITS)) << finer;
+    x |= (extractEveryThirdBit(low) | (extractEveryThirdBit(high) << AXIS_BITS_PER_HALF)) << finer;
+    y |= (extractEveryThirdBit(low >> 1) | (extractEveryThirdBit(high >> 1) << AXIS_BITS_PER_HALF)) << finer;
+    z |= (extractEveryThirdBit(low >> 2) | (extractEveryThirdBit(high >> 2) << AXIS_BITS_PER_HALF)) << finer;
     centers[3 * i] = (2 * x + 1) << unit;
     centers[3 * i + 1] = (2 * y + 1) << unit;
     centers[3 * i + 2] = (2 * z + 1) << unit;
@@ -86,7 +90,7 @@ export const decodeLattice = (data, count) => {
 };
 
 /**
- * Local positions of lattice points: the inverse of the contraction, in float64 and then rounded.
+ * Computes the local positions of lattice points by the inverse of the contraction, in float64, and rounds them.
  * @param {LatticePoints} points
  * @param {number[]} halfExtent
  * @returns {Float32Array} (3 N)

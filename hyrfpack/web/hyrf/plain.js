@@ -1,15 +1,15 @@
-// Codecs 1 to 4 (docs/format.md 2.2): numbers as they are, and the two quantisers of profile paper.
+// Codecs 1 to 4 (docs/format.md 2.2): plain float32 and float16 numbers, and the two quantisers of the profile `paper`.
 
 import { readUint64 } from "./container.js";
-import { needSound } from "./errors.js";
+import { assertValid } from "./errors.js";
 import { decodeHuffman } from "./huffman.js";
 
-const MOST_STAGES = 16;
-const VECTORS_HEADER = 4;
-const MIN_MAX_HEADER = 9;
+const MAX_STAGES = 16;
+const VECTORS_HEADER_BYTES = 4;
+const MIN_MAX_HEADER_BYTES = 9;
 
 /**
- * The number of a binary16.
+ * Converts an IEEE 754 binary16 to a number.
  * @param {number} bits
  */
 const halfToNumber = (bits) => {
@@ -19,84 +19,86 @@ const halfToNumber = (bits) => {
 };
 
 /**
+ * Checks that the bytes are `count` numbers.
  * @param {Uint8Array} data
  * @param {number} count
- * @param {number} width bytes of a number
+ * @param {number} width the bytes of a number
  */
-const needNumbers = (data, count, width) =>
-  needSound(data.length === count * width, `it has ${data.length} bytes, and ${count} numbers take ${count * width}`);
+const assertLength = (data, count, width) =>
+  assertValid(data.length === count * width, `it has ${data.length} bytes, and ${count} numbers take ${count * width}`);
 
 /**
- * Codec 1.
+ * Decodes float32 numbers (codec 1).
  * @param {Uint8Array} data
  * @param {number} count
  */
 export const decodeFloat32 = (data, count) => {
-  needNumbers(data, count, 4);
+  assertLength(data, count, 4);
   const view = new DataView(data.buffer, data.byteOffset, data.length), numbers = new Float32Array(count);
   for (let i = 0; i < count; i++) numbers[i] = view.getFloat32(4 * i, true);
   return numbers;
 };
 
 /**
- * Codec 2.
+ * Decodes float16 numbers (codec 2).
  * @param {Uint8Array} data
  * @param {number} count
  */
 export const decodeFloat16 = (data, count) => {
-  needNumbers(data, count, 2);
+  assertLength(data, count, 2);
   const numbers = new Float32Array(count);
   for (let i = 0; i < count; i++) numbers[i] = halfToNumber(data[2 * i] | (data[2 * i + 1] << 8));
   return numbers;
 };
 
 /**
- * Codec 3: each row is the sum of a codeword of every stage.
+ * Decodes a residual vector quantiser (codec 3): each row is the sum of one codeword of every stage.
  * @param {Uint8Array} data
  * @param {number} rows
  * @param {number} columns
  */
 export const decodeVectors = (data, rows, columns) => {
-  needSound(data.length >= VECTORS_HEADER, "it ends within its header");
-  const stages = data[0], words = data[2] | (data[3] << 8), booksEnd = VECTORS_HEADER + 2 * stages * words * columns;
-  const isKnown = stages >= 1 && stages <= MOST_STAGES && data[1] === columns && words >= 1;
-  needSound(isKnown && booksEnd <= data.length, "the sizes of its codebooks cannot be");
-  const books = decodeFloat16(data.subarray(VECTORS_HEADER, booksEnd), stages * words * columns);
-  needSound(books.every(Number.isFinite), "its codebooks hold numbers that are not finite");
+  assertValid(data.length >= VECTORS_HEADER_BYTES, "it ends within its header");
+  const stages = data[0], words = data[2] | (data[3] << 8);
+  const codebooksEnd = VECTORS_HEADER_BYTES + 2 * stages * words * columns;
+  const isKnown = stages >= 1 && stages <= MAX_STAGES && data[1] === columns && words >= 1;
+  assertValid(isKnown && codebooksEnd <= data.length, "the sizes of its codebooks cannot be");
+  const codebooks = decodeFloat16(data.subarray(VECTORS_HEADER_BYTES, codebooksEnd), stages * words * columns);
+  assertValid(codebooks.every(Number.isFinite), "its codebooks hold numbers that are not finite");
   const view = new DataView(data.buffer, data.byteOffset, data.length);
   const numbers = new Float32Array(rows * columns);
-  let place = booksEnd;
+  let place = codebooksEnd;
   for (let stage = 0; stage < stages; stage++) {
-    needSound(place + 8 <= data.length, "it ends before its last stage");
+    assertValid(place + 8 <= data.length, "it ends before its last stage");
     const start = place + 8;
     place = start + readUint64(view, place);
-    needSound(place <= data.length, "it ends before its last stage");
+    assertValid(place <= data.length, "it ends before its last stage");
     const indices = decodeHuffman(data.subarray(start, place), rows);
-    const book = books.subarray(stage * words * columns, (stage + 1) * words * columns);
+    const codebook = codebooks.subarray(stage * words * columns, (stage + 1) * words * columns);
     for (let row = 0, at = 0; row < rows; row++) {
-      needSound(indices[row] < words, "it refers to a codeword that is not there");
-      for (let word = indices[row] * columns, end = word + columns; word < end; ) numbers[at++] += book[word++];
+      assertValid(indices[row] < words, "it refers to a codeword that is not there");
+      for (let word = indices[row] * columns, end = word + columns; word < end; ) numbers[at++] += codebook[word++];
     }
   }
-  needSound(place === data.length, `${data.length - place} bytes follow its last stage`);
+  assertValid(place === data.length, `${data.length - place} bytes follow its last stage`);
   return numbers;
 };
 
 /**
- * Codec 4: even levels between a minimum and a maximum.
+ * Decodes a uniform quantiser (codec 4), whose levels divide a range from a minimum to a maximum evenly.
  * @param {Uint8Array} data
  * @param {number} count
  */
 export const decodeMinMax = (data, count) => {
-  needSound(data.length >= MIN_MAX_HEADER, "it ends within its header");
+  assertValid(data.length >= MIN_MAX_HEADER_BYTES, "it ends within its header");
   const view = new DataView(data.buffer, data.byteOffset, data.length);
   const minimum = view.getFloat32(0, true), maximum = view.getFloat32(4, true), bits = data[8];
   const isRange = minimum > -Infinity && minimum <= maximum && maximum < Infinity;
-  needSound(isRange && bits >= 1 && bits <= 16, "its range cannot be");
-  const codes = decodeHuffman(data.subarray(MIN_MAX_HEADER), count), last = 2 ** bits - 1;
+  assertValid(isRange && bits >= 1 && bits <= 16, "its range cannot be");
+  const codes = decodeHuffman(data.subarray(MIN_MAX_HEADER_BYTES), count), last = 2 ** bits - 1;
   const numbers = new Float32Array(count);
   for (let i = 0; i < count; i++) {
-    needSound(codes[i] <= last, `a code has more than ${bits} bits`);
+    assertValid(codes[i] <= last, `a code has more than ${bits} bits`);
     numbers[i] = ((last - codes[i]) * minimum + codes[i] * maximum) / last;
   }
   return numbers;

@@ -1,7 +1,7 @@
-// Step sizes (docs/format.md 3.2).
+// Quantisation steps (docs/format.md 3.2).
 
-/** Numbers in fixed point count units of 1 / FIXED_ONE. */
-export const FIXED_ONE = 2 ** 24;
+/** The number 1 in fixed point: its unit is 1 / FIXED_POINT_ONE. */
+export const FIXED_POINT_ONE = 2 ** 24;
 
-/** The step, in these units, of each byte that stands for one. */
-export const STEP_OF_CODE = Float64Array.from({ length: 256 }, (_, code) => (8 + (code & 7)) * 2 ** (code >> 3));
+/** The quantisation step that each code stands for, in fixed point. */
+export const STEP_BY_CODE = Float64Array.from({ length: 256 }, (_, code) => (8 + (code & 7)) * 2 ** (code >> 3));

@@ -25,8 +25,8 @@ export function webAddress(text, what) {
 
 const shortened = (text) => (text.length > 60 ? `${text.slice(0, 60)}…` : text || "an empty one");
 
-// {content, poster, title, camera, exposure, noui, autorotate}, null where nothing is said, and `wrong`: sentences about
-// what cannot be used; addresses are "" then, the exposure is null.
+// {content, poster, title, camera, exposure, noui, autorotate}, null where nothing is said, and `wrong`: sentences
+// about what cannot be used; addresses are "" then, the exposure is null.
 export function readSearch(search) {
   const asked = new URLSearchParams(search), wrong = [];
   const web = (name, what) => {
@@ -77,8 +77,8 @@ export function parseCamera(text, scene) {
   }
 }
 
-// Position (world), rotation (camera from world: w, x, y, z), focal length by the root of the picture's area, depth of the
-// target: short, and within 1e-4 of the truth.
+// Position (world), rotation (camera from world: w, x, y, z), focal length by the root of the picture's area, depth of
+// the target: short, and within 1e-4 of the truth.
 export function compactCamera(eye, scene) {
   const { fy, camera_from_world: pose } = cameraOf(eye.view(SIDE, SIDE), scene);
   const position = eye.position.map((value, axis) => scene.center[axis] + scene.unit * value);

@@ -13,8 +13,8 @@ const TOUCH = 1 / 60; // s that a key moves at once, however short it is pressed
 const TYPED = { "=": "+", _: "-", Add: "+", Subtract: "-" }; // the same keys
 
 export class Controls {
-  // `acted` is told of everything that a person does, `pick(x, y)` of a double-click, `press(key)` of the keys that do not
-  // move, `ignored(kind)` of a wheel or a finger that is left to the page around.
+  // `acted` is told of everything that a person does, `pick(x, y)` of a double-click, `press(key)` of the keys that do
+  // not move, `ignored(kind)` of a wheel or a finger that is left to the page around.
   constructor(player, damper, { acted, pick, press, ignored }) {
     const { canvas } = player;
     Object.assign(this, { player, canvas, damper, acted, pick, press, ignored });

@@ -40,7 +40,8 @@ class HyrfViewer extends HTMLElement {
     if (this.isConnected) this.follow();
   }
 
-  // Once for all attributes that change together. Another camera only changes what follows #, so that nothing is loaded anew.
+  // Once for all attributes that change together. Another camera only changes what follows #, so that nothing is loaded
+  // anew.
   async follow() {
     if (this.following) return;
     this.following = true;

@@ -1,4 +1,5 @@
-// Which exposure pictures of a scene have: that of the photos taken near the viewpoint, or one that is the same everywhere.
+// Which exposure pictures of a scene have: that of the photos taken near the viewpoint, or one that is the same
+// everywhere.
 
 import { logGains } from "../hyrf/exposure.js";
 

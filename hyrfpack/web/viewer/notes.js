@@ -1,4 +1,5 @@
-// What a person is told: progress, what goes wrong, what was done. All of it stands at the lower edge, one above the other.
+// What a person is told: progress, what goes wrong, what was done. All of it stands at the lower edge, one above the
+// other.
 
 import { element } from "./parts.js";
 

@@ -2,9 +2,9 @@
 //
 // Events: "progress" (detail: {part: 0 to 1, what: "loading" | "unpacking" | "preparing"}), "opened" (detail: the scene
 // of a file that came without one), "counted" (detail: the same, when more of the file is there), "loaded" (there is
-// something to see), "exposed" (the exposure was chosen, or may have got or lost its map), "said" (detail: a sentence for the corner, "" for none), "drawn" (detail: ms a frame while
-// moving), "stood" (detail: number of the camera), "failed" (detail: Error). Movers, see `movers`, move the eye from
-// frame to frame.
+// something to see), "exposed" (the exposure was chosen, or may have got or lost its map), "said" (detail: a sentence
+// for the corner, "" for none), "drawn" (detail: ms a frame while moving), "stood" (detail: number of the camera),
+// "failed" (detail: Error). Movers, see `movers`, move the eye from frame to frame.
 
 import { Eye, cameraOf, viewOf } from "./camera.js";
 import { AS_PHOTOGRAPHED, EXPOSURES, viewGains } from "./exposure.js";

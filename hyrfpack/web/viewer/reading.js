@@ -1,6 +1,7 @@
 // What a worker does: read a file and sort what is in it by depth, away from the page's own thread.
 //
-// In:   {start: {name, scene, stage, plain}}   a file is to come; what the page knows of it, if anything, or of where to
+// In:   {start: {name, scene, stage, plain}}   a file is to come; what the page knows of it, if anything, or of where
+// to
 //                                   look at it from (cameras, up, target); `plain`: as splats
 //       {bytes}                           of the file, piece by piece; after them {end}, or {broken}: no more come
 //       {again: {plain}}                  what was read is wanted once more
@@ -11,7 +12,7 @@
 //       {order: {ticket, number, order, drawn}}
 //       {error}                           why it cannot be read, said as soon as that is certain
 
-import { ENTRY_BYTES, HEADER_BYTES, MAGIC_BYTES, MOST_SECTIONS } from "../hyrf/container.js";
+import { ENTRY_BYTES, HEADER_BYTES, MAGIC_BYTES, MAX_SECTIONS } from "../hyrf/container.js";
 import { fitHarmonics } from "../hyrf/harmonics.js";
 import { describe, read } from "../hyrf/index.js";
 import { viewpointOf } from "../hyrf/viewpoint.js";
@@ -29,7 +30,7 @@ let readSplats = null;
 let wanted = null;
 let pieces = [];
 let length = 0;
-let head = new Uint8Array(HEADER_BYTES + ENTRY_BYTES * MOST_SECTIONS); // first bytes, until what it is is known
+let head = new Uint8Array(HEADER_BYTES + ENTRY_BYTES * MAX_SECTIONS); // first bytes, until what it is is known
 let kind = null; // "model" or "other", once that is known
 let most = Infinity; // bytes that the file can have
 let first = Infinity; // bytes of a model's first layer, where they are worth showing alone
@@ -111,7 +112,7 @@ function learn(bytes, before) {
   }
   if (length < HEADER_BYTES) return;
   const parts = new DataView(head.buffer).getUint32(36, true);
-  if (parts <= MOST_SECTIONS && length < HEADER_BYTES + ENTRY_BYTES * parts) return;
+  if (parts <= MAX_SECTIONS && length < HEADER_BYTES + ENTRY_BYTES * parts) return;
   const told = describe(there);
   kind = "model";
   most = told.length;

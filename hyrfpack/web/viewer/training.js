@@ -16,8 +16,8 @@ async function askProgress(address) {
   }
 }
 
-// Follow a training until its server answers no more or `wanted()` is false. `show(progress)`, a promise that a snapshot
-// is shown, is called for the first one and for each newer one; `waiting()` while there is none.
+// Follow a training until its server answers no more or `wanted()` is false. `show(progress)`, a promise that a
+// snapshot is shown, is called for the first one and for each newer one; `waiting()` while there is none.
 export async function followTraining(address, { show, waiting, wanted }) {
   let shown = 0;
   for (let failures = 0; wanted() && failures < MOST_FAILURES; ) {

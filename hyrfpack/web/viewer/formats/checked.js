@@ -1,7 +1,7 @@
 // The door through which numbers of a foreign file become splats for the player.
 
 import { HyrfFormatError, groupedDigits } from "../../hyrf/errors.js";
-import { OTHER_HARMONICS, storedRange } from "../../hyrf/harmonics.js";
+import { HIGHER_HARMONICS_BY_DEGREE, chooseHarmonicsRange } from "../../hyrf/harmonics.js";
 
 const FRAME_SAMPLE = 1 << 16; // splats that tell where the scene is and how large
 const FRAME_PART = 0.9; // of them lie within a unit of its middle, along each axis
@@ -43,7 +43,7 @@ export function checkedSplats({ positions: places, range: known, ...numbers }, h
   for (let k = 0; k < scales.length; k++) scales[k] /= unit;
   needFiniteNumbers("position", positions, 3);
   needFiniteNumbers("scale", scales, 3);
-  const each = 3 * OTHER_HARMONICS[degree], range = known ?? rangeOfHarmonics(count, each, harmonic);
+  const each = 3 * HIGHER_HARMONICS_BY_DEGREE[degree], range = known ?? rangeOfHarmonics(count, each, harmonic);
   const harmonics = new Uint8Array(each * count);
   for (let i = 0, to = 0; i < count; i++) {
     for (let at = 0; at < each; at++) {
@@ -106,5 +106,5 @@ function rangeOfHarmonics(count, each, harmonic) {
   for (let i = 0; i < count; i += step) {
     for (let at = 0; at < each; at++) sizes.push(Math.abs(harmonic(i, at)));
   }
-  return storedRange(sizes.filter(Number.isFinite));
+  return chooseHarmonicsRange(sizes.filter(Number.isFinite));
 }

@@ -2,7 +2,7 @@
 // f_rest_0.. (higher ones, channel after channel), opacity (its logit), scale_0..2 (natural logarithms) and rot_0..3
 // (wxyz). Rows may be binary or text, properties in any order and of any type.
 
-import { BAND_0, OTHER_HARMONICS } from "../../hyrf/harmonics.js";
+import { HIGHER_HARMONICS_BY_DEGREE, SH_BAND_0 } from "../../hyrf/harmonics.js";
 import { checkedSplats, refuseSplats } from "./checked.js";
 import { decodeCompressedPly, isCompressedPly } from "./compressed_ply.js";
 import { readPlyHeader, readPlyRows } from "./ply_elements.js";
@@ -52,9 +52,9 @@ function decodePlainPly(bytes, header) {
     scales: values(PLY_SCALE, Math.exp),
     quats: values(PLY_TURN, (value) => value),
     opacities: values(["opacity"], (logit) => 1 / (1 + Math.exp(-logit))),
-    colors: values(PLY_COLOR, (value) => 0.5 + BAND_0 * Math.fround(value)),
+    colors: values(PLY_COLOR, (value) => 0.5 + SH_BAND_0 * Math.fround(value)),
   };
-  const columns = Array.from({ length: 3 * OTHER_HARMONICS[degree] }, (_, at) => {
+  const columns = Array.from({ length: 3 * HIGHER_HARMONICS_BY_DEGREE[degree] }, (_, at) => {
     return higher[(at % 3) * (rest / 3) + Math.floor(at / 3)];
   });
   return checkedSplats(numbers, (i, at) => Math.fround(columns[at](i)));

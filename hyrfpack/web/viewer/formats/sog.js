@@ -12,7 +12,7 @@
 //                                entries of shN.codebook
 
 import { groupedDigits, quotedText } from "../../hyrf/errors.js";
-import { BAND_0, OTHER_HARMONICS } from "../../hyrf/harmonics.js";
+import { HIGHER_HARMONICS_BY_DEGREE, SH_BAND_0 } from "../../hyrf/harmonics.js";
 import { checkedSplats, refuseSplats } from "./checked.js";
 import { readPicture } from "./picture.js";
 import { writeQuat } from "./smallest_three.js";
@@ -68,7 +68,7 @@ export async function decodeSog(bytes) {
       const steps = low[at + k] + 256 * high[at + k], drawnIn = mins[k] + (steps / 65535) * (maxs[k] - mins[k]);
       positions[3 * i + k] = Math.sign(drawnIn) * Math.expm1(Math.abs(drawnIn));
       scales[3 * i + k] = Math.exp(books.get("scales")[sizes[at + k]]);
-      colors[3 * i + k] = 0.5 + BAND_0 * books.get("sh0")[tints[at + k]];
+      colors[3 * i + k] = 0.5 + SH_BAND_0 * books.get("sh0")[tints[at + k]];
     }
     opacities[i] = tints[at + 3] / 255;
     const largest = turns[at + 3] - 252;
@@ -85,11 +85,11 @@ export async function decodeSog(bytes) {
 async function paletteOf(meta, files, pixels, count) {
   const name = pictureName(meta, "shN", 0), values = book(meta, "shN");
   const { width, height, pixels: entries } = await readPicture(files.get(name), LARGEST_PALETTE * 15, quotedText(name));
-  const degree = OTHER_HARMONICS.indexOf(width / ABREAST), rows = height * ABREAST;
+  const degree = HIGHER_HARMONICS_BY_DEGREE.indexOf(width / ABREAST), rows = height * ABREAST;
   if (degree < 1 || rows > LARGEST_PALETTE) {
     refuseSplats(`${quotedText(name)} in it is ${width} x ${height}, no palette of degree 1 to 3; it is damaged`);
   }
-  const labels = await pixels("shN", 1), terms = OTHER_HARMONICS[degree];
+  const labels = await pixels("shN", 1), terms = HIGHER_HARMONICS_BY_DEGREE[degree];
   const label = (i) => labels[4 * i] + 256 * labels[4 * i + 1];
   for (let i = 0; i < count; i++) {
     if (label(i) >= rows) refuseSplats(`a label names row ${label(i)} of ${rows} of its palette; it is damaged`);

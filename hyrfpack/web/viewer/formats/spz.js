@@ -14,7 +14,7 @@
 // Axes are RUB; they are turned by half a turn about x, as all programs do that write other files from these.
 
 import { groupedDigits } from "../../hyrf/errors.js";
-import { BAND_0, OTHER_HARMONICS } from "../../hyrf/harmonics.js";
+import { HIGHER_HARMONICS_BY_DEGREE, SH_BAND_0 } from "../../hyrf/harmonics.js";
 import { checkedSplats, refuseSplats } from "./checked.js";
 import { writeQuat } from "./smallest_three.js";
 import { Unpacker } from "./unpack.js";
@@ -54,7 +54,7 @@ function splatsOfSpz({ version, count, degree, bits, flags }, [places, alphas, t
       const place = version === 1 ? halfFloat(halfs.getUint16(2 * from, true)) : signed24(places, at) * step;
       positions[from] = sign * place;
       scales[from] = Math.exp(sizes[from] / 16 - 10);
-      colors[from] = 0.5 + (BAND_0 * (tints[from] / 255 - 0.5)) / 0.15;
+      colors[from] = 0.5 + (SH_BAND_0 * (tints[from] / 255 - 0.5)) / 0.15;
     }
     opacities[i] = alphas[i] / 255;
     const at = 4 * i;
