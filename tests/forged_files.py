@@ -8,7 +8,7 @@ import zlib
 
 import numpy as np
 
-from hyrfpack.format.arrays import RULES, group_shapes, parse_config
+from hyrfpack.format.arrays import MODEL_RULES, group_shapes, parse_config
 from hyrfpack.quant.integers import encode_integers
 from tools.safety.fuzz_mutate import Part, assemble
 
@@ -43,7 +43,7 @@ Payloads = dict[str, tuple[int, bytes]]
 def metadata(count: int, provenance: dict | None = None, **config: object) -> dict:
     """What META says."""
     texts = {"profile": "", "settings": {}, "provenance": provenance or {}, "writer": ""}
-    return {"gaussians": count, "config": CONFIG | config, "rules": RULES, **texts}
+    return {"gaussians": count, "config": CONFIG | config, "rules": MODEL_RULES, **texts}
 
 
 def with_text(text: bytes, payloads: Payloads, shapes: dict[str, tuple[int, int]], deflated: bytes = b"") -> bytes:

@@ -22,7 +22,7 @@ from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import DEFAULT_PROFILE, PROFILES
 from hyrfpack.format.container import read_container
 from hyrfpack.format.metadata import read_metadata
-from hyrfpack.format.sections import LAYERED, POSITIONS, SECTIONS
+from hyrfpack.format.sections import LAYERED_SECTIONS, POSITIONS, SECTION_CONTENTS
 from hyrfpack.measure.error import Error, measure_error
 from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import HybridModel
@@ -102,9 +102,11 @@ def parameter_errors(before: HybridModel, after: HybridModel) -> dict[str, Error
     old, new = to_arrays(before), to_arrays(after)
     if len(before) == len(after):
         order = _order(old, new)
-        new |= {group: new[group][order] for group in LAYERED}
+        new |= {group: new[group][order] for group in LAYERED_SECTIONS}
     return {
-        SECTIONS[group]: measure_error(torch.from_numpy(new[group]), torch.from_numpy(values), SECTIONS[group])
+        SECTION_CONTENTS[group]: measure_error(
+            torch.from_numpy(new[group]), torch.from_numpy(values), SECTION_CONTENTS[group]
+        )
         for group, values in old.items()
         if values.shape == new[group].shape
     }
@@ -118,7 +120,7 @@ def _order(old: dict[str, np.ndarray], new: dict[str, np.ndarray]) -> np.ndarray
     if np.median(moved) <= 0.01 * np.median(spread):
         return np.arange(count)
     # All their numbers together tell apart those at one place; each column counts by its spread.
-    rows = [np.concatenate([arrays[group] for group in LAYERED], axis=1) for arrays in (old, new)]
+    rows = [np.concatenate([arrays[group] for group in LAYERED_SECTIONS], axis=1) for arrays in (old, new)]
     size = rows[0].std(axis=0) + 1e-12
     return cKDTree(rows[1] / size).query(rows[0] / size)[1]
 
@@ -142,7 +144,7 @@ def _cases(subject: Subject, profile: str, note: Callable[[str], None]) -> Itera
 def _plain(model: HybridModel, profile: str) -> tuple[Callable[..., bytes], dict]:
     """What writes the model with settings of a profile, and their defaults."""
     encode = partial(encode_model, model, profile)
-    defaults = read_metadata(read_container(encode(), SECTIONS)).settings
+    defaults = read_metadata(read_container(encode(), SECTION_CONTENTS)).settings
     # They came through JSON, which has no tuples.
     return encode, {name: tuple(value) if isinstance(value, list) else value for name, value in defaults.items()}
 

@@ -246,10 +246,10 @@ def _describe_photos(path: Path, as_json: bool) -> None:
 
 def _describe_run(folder: Path, as_json: bool) -> None:
     from hyrfpack.format import describe, read_run_status
-    from hyrfpack.format.run_folder import MODEL, describe_unfinished
+    from hyrfpack.format.run_folder import MODEL_FILE, describe_unfinished_run
 
     run = read_run_status(folder)
-    facts = describe(folder) if (folder / MODEL).is_file() else {}
+    facts = describe(folder) if (folder / MODEL_FILE).is_file() else {}
     if as_json:
         print_json({**facts, "run": asdict(run)})
         return
@@ -258,7 +258,7 @@ def _describe_run(folder: Path, as_json: bool) -> None:
         seconds = "" if run.seconds is None else f" in {run.seconds:,.0f} s"
         _say(f"{folder}: a finished training run{steps}{seconds}")
     else:
-        _say(f"{folder}: {describe_unfinished(run)}")
+        _say(f"{folder}: {describe_unfinished_run(run)}")
     if run.photos is not None:
         _say(f"photos: {run.photos}, {run.train} to train on and {run.test} held out")
     if run.psnr is not None and run.ssim is not None:
@@ -266,7 +266,7 @@ def _describe_run(folder: Path, as_json: bool) -> None:
         _say(f"held-out photos: PSNR {run.psnr:.2f} dB{consistent}, SSIM {run.ssim:.4f}")
     if facts:
         click.echo()
-        _print_model(folder / MODEL, facts)
+        _print_model(folder / MODEL_FILE, facts)
 
 
 def _describe_splats(path: Path, as_json: bool) -> None:
@@ -396,19 +396,19 @@ def _print_report(report: CompressionReport, scores: dict[str, float], as_json: 
 
 def _section_table(sections: list[dict], total: int, gaussians: int, shares: dict[str, float] | None = None) -> str:
     """Bytes of each section, all layers together, and what part of the loss comes from it where that is known."""
-    from hyrfpack.format.sections import NON_PARAMETERS, SECTIONS, group_and_layer
+    from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, SECTION_CONTENTS, group_and_layer
 
     together: dict[str, list] = {}
     for part in sections:
         tag = group_and_layer(part["type"])[0]
-        sizes = together.setdefault(tag, [SECTIONS.get(tag, part["holds"]), 0, 0])
+        sizes = together.setdefault(tag, [SECTION_CONTENTS.get(tag, part["holds"]), 0, 0])
         sizes[1] += part["before"]
         sizes[2] += part["after"]
     parts = [(tag, holds, f"{before:,}", after) for tag, (holds, before, after) in together.items()]
     parts.append(("", "header, table of contents, padding", "", total - sum(after for *_, after in parts)))
     rows, header = [], ["section", "unpacked bytes", "stored bytes", "share", "bits/Gaussian", "bits/number"]
     for tag, holds, before, after in parts:
-        numbers = int(before.replace(",", "") or 0) / 4 if tag not in (*NON_PARAMETERS, "") else 0
+        numbers = int(before.replace(",", "") or 0) / 4 if tag not in (*NON_PARAMETER_SECTIONS, "") else 0
         rows.append(
             [
                 f"{tag} {holds}".strip(),

@@ -128,9 +128,10 @@ def train(
         raise click.UsageError("--poses is the work of one process; 'hyrfpack poses' first, then train from its folder")
     from hyrfpack.data import PictureCache
     from hyrfpack.device import describe_device
+    from hyrfpack.format.run_folder import MODEL_FILE
     from hyrfpack.train import TrainConfig
     from hyrfpack.train import train as run
-    from hyrfpack.train.run import MODEL, is_begun, resuming
+    from hyrfpack.train.run import is_begun, resuming
 
     place = chosen_device(device, ranks)
     try:
@@ -160,7 +161,7 @@ def train(
     elif not result.complete:
         note(f"stopped after step {result.step:,}; {resuming(overwrite)} goes on from there")
     if result.model is not None:
-        note_rename(out / MODEL, result.model)
+        note_rename(out / MODEL_FILE, result.model)
     if result.missing:
         note(f"{resuming(overwrite)} writes what is missing")
     if as_json:

@@ -13,7 +13,7 @@ from hyrfpack.compare.page import encode_comparison
 from hyrfpack.compare.run import read_run, short_names
 from hyrfpack.compare.views import read_views
 from hyrfpack.errors import HyrfError
-from hyrfpack.format.run_folder import METRICS, MODEL
+from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE
 from hyrfpack.outputs import Outputs, StrPath
 
 
@@ -66,7 +66,9 @@ def compare(runs: Sequence[StrPath], out: StrPath, *, overwrite: bool = False) -
     if len({os.path.realpath(folder) for folder in folders}) < max(2, len(folders)):
         raise HyrfError("there are not two different runs to compare; name two folders of runs or more, each once")
     found = [read_run(folder) for folder in folders]
-    read = [path for run in found for path in (run.folder / METRICS, run.folder / MODEL, *run.pictures.values())]
+    read = [
+        path for run in found for path in (run.folder / METRICS_FILE, run.folder / MODEL_FILE, *run.pictures.values())
+    ]
     Outputs(*read, overwrite=overwrite).file(out, ".html", ".htm")
     names = short_names(folders)
     check_scores(found, names)

@@ -11,7 +11,7 @@ from typing import Any
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.format import describe
-from hyrfpack.format.run_folder import CHECKPOINT, METRICS, MODEL
+from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.outputs import StrPath
 from hyrfpack.render.files import file_names
 from hyrfpack.train.run import VIEWS
@@ -98,15 +98,15 @@ def read_run(folder: StrPath) -> Run:
     folder = Path(folder)
     if not folder.is_dir():
         raise HyrfDataError(f"{folder}: there is no such folder; name one that 'hyrfpack train' wrote to")
-    if (folder / CHECKPOINT).exists():
+    if (folder / CHECKPOINT_FILE).exists():
         raise HyrfDataError(
-            f"{folder}: this run is not finished ({CHECKPOINT} is there); the 'hyrfpack train' command that started "
-            "it finishes it with `resume=True` (instead of `overwrite=True`)"
+            f"{folder}: this run is not finished ({CHECKPOINT_FILE} is there); the 'hyrfpack train' command that "
+            "started it finishes it with `resume=True` (instead of `overwrite=True`)"
         )
-    for name in (METRICS, MODEL):
+    for name in (METRICS_FILE, MODEL_FILE):
         if not (folder / name).is_file():
             raise HyrfDataError(f"{folder}: there is no {name}, so this is no finished run; name a folder of one")
-    path = folder / METRICS
+    path = folder / METRICS_FILE
     try:
         metrics = json.loads(path.read_text("utf-8"), parse_constant=_refuse_constant)
         return _run(folder, metrics)
@@ -155,7 +155,7 @@ def _run(folder: Path, metrics: Any) -> Run:
         scores=scores,
         skipped=skipped,
         pictures=_pictures(folder, [*(score.name for score in scores), *skipped]),
-        cameras=describe(folder / MODEL)["provenance"].get("cameras"),
+        cameras=describe(folder / MODEL_FILE)["provenance"].get("cameras"),
     )
 
 
@@ -194,8 +194,8 @@ def _optional(values: Mapping, name: str) -> float | None:
 
 def _files(folder: Path) -> dict[str, int]:
     """Bytes of each `.hyrf` file, the model first."""
-    names = sorted(path.name for path in folder.glob("*.hyrf") if path.is_file() and path.name != MODEL)
-    return {name: os.path.getsize(folder / name) for name in (MODEL, *names)}
+    names = sorted(path.name for path in folder.glob("*.hyrf") if path.is_file() and path.name != MODEL_FILE)
+    return {name: os.path.getsize(folder / name) for name in (MODEL_FILE, *names)}
 
 
 def _pictures(folder: Path, names: Sequence[str]) -> dict[str, Path]:

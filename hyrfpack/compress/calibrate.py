@@ -21,20 +21,20 @@ from hyrfpack.cameras.view_sampling import sample_views
 from hyrfpack.compress.plan import make_plan, of_each_number, worth_keeping
 from hyrfpack.compress.quantize import opacity_error, quantize
 from hyrfpack.compress.sensitivity import PRUNED, Sensitivity, measure_sensitivity
-from hyrfpack.format.arrays import by_parameter, to_arrays
+from hyrfpack.format.arrays import iter_parameters, to_arrays
 from hyrfpack.format.compact.plan import Plan
-from hyrfpack.format.compact.quantized import Quantized
+from hyrfpack.format.compact.quantized import QuantizedModel
 from hyrfpack.format.sections import (
     COLORS,
+    DECODER_SECTIONS,
     GEOMETRY_TABLE,
-    LOGITS,
-    MLPS,
+    LOGIT_SECTIONS,
     OPACITIES,
     POSITIONS,
     RADIANCE_TABLE,
     SCALES,
-    SECTIONS,
-    TABLES,
+    SECTION_CONTENTS,
+    TABLE_SECTIONS,
 )
 from hyrfpack.model import Decoded, HybridModel
 from hyrfpack.parallel.pool import parallel_map
@@ -50,7 +50,12 @@ MINOR = 0.03  # share of the distortion below which a part is left as it is
 FARTHEST = 64.0  # factor of one correction
 # What is tried by itself. A decoder has too few numbers for an error that is more than luck: it goes with its table.
 Part = tuple[str, ...]
-PARTS: tuple[Part, ...] = ((POSITIONS,), (COLORS,), (SCALES, OPACITIES), *zip(TABLES, MLPS, strict=True))
+PARTS: tuple[Part, ...] = (
+    (POSITIONS,),
+    (COLORS,),
+    (SCALES, OPACITIES),
+    *zip(TABLE_SECTIONS, DECODER_SECTIONS, strict=True),
+)
 # Powers of found over foretold by which sensitivities are corrected. Errors of small independent numbers fall with the
 # square of their steps: 1. Those of swapped orders fall with the step: up to 2. What is pruned adds up: from 1/2.
 LAWS: dict[Part, float] = {(POSITIONS,): 1.5, (PRUNED,): 0.7}
@@ -214,7 +219,7 @@ def calibrate(
         told, stored = _added(planned, quantized, scaled), quantized.arrays()
         # In the order of those that are left, so that what they decode to but for the part that changes serves again.
         order = np.argsort(plan.kept)
-        stored = {name: values[order] if name in LOGITS else values for name, values in stored.items()}
+        stored = {name: values[order] if name in LOGIT_SECTIONS else values for name, values in stored.items()}
 
         def found(part: Part) -> float:
             if part == (POSITIONS,):
@@ -224,7 +229,7 @@ def calibrate(
 
         tried = {}
         for number, part in enumerate(parts):
-            report(f"calibrating {' and '.join(SECTIONS[name] for name in part)}", number / len(parts))
+            report(f"calibrating {' and '.join(SECTION_CONTENTS[name] for name in part)}", number / len(parts))
             tried[part] = Tried(found(part), sum(told[name] for name in part))
         return tried
 
@@ -232,14 +237,14 @@ def calibrate(
 
 
 def foretold(
-    model: HybridModel, planned: HybridModel, quantized: Quantized, sensitivity: Sensitivity
+    model: HybridModel, planned: HybridModel, quantized: QuantizedModel, sensitivity: Sensitivity
 ) -> dict[str, float]:
     """What storing a model adds to the pictures' mean squared error, by section and by what is pruned; by estimate."""
     removed = np.delete(sensitivity.removals, quantized.plan.kept)
     return {PRUNED: float(removed.sum()), **_added(planned, quantized, sensitivity)}
 
 
-def _added(planned: HybridModel, quantized: Quantized, sensitivity: Sensitivity) -> dict[str, float]:
+def _added(planned: HybridModel, quantized: QuantizedModel, sensitivity: Sensitivity) -> dict[str, float]:
     """As `foretold`, by the sections that are quantised and by positions."""
     plan = quantized.plan
     wanted, stored, s = to_arrays(planned), quantized.arrays(), sensitivity.of(plan.kept)
@@ -290,7 +295,7 @@ def _corrected(
 def _changed(model: HybridModel, arrays: dict[str, np.ndarray]) -> HybridModel:
     """A model with other numbers in some sections."""
     changed = deepcopy(model)
-    changed.load_state_dict(dict(by_parameter(arrays, changed)), strict=False)
+    changed.load_state_dict(dict(iter_parameters(arrays, changed)), strict=False)
     return changed
 
 

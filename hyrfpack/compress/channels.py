@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hyrfpack.compress.rate_distortion import ERROR_PER_BIT, best_steps, bits_of, cheapest, code_bits
-from hyrfpack.format.compact.channels import LIMIT, Channel
+from hyrfpack.format.compact.channels import MAX_ABS_CHANNEL_VALUE, Channel
 from hyrfpack.quant.lifting import lift
 from hyrfpack.quant.steps import ONE, step_of
 
@@ -32,7 +32,7 @@ def quantize_channel(
     """Choose the steps and the symbols of a channel.
 
     Args:
-        values: (N,) float64; cut to +-LIMIT.
+        values: (N,) float64; cut to +-MAX_ABS_CHANNEL_VALUE.
         classes: (N,) uint8.
         sensitivity: (N,) s of each number, above 0.
         distortion: D, what each number may add, see `hyrfpack.compress.rate_distortion`.
@@ -45,7 +45,7 @@ def quantize_channel(
     mean_sensitivity = np.bincount(classes, sensitivity, kinds) / np.maximum(members, 1)
     codes = np.maximum(best_steps(np.where(members > 0, mean_sensitivity, 1), distortion), FINEST)
     steps = step_of(codes)[classes]
-    values = np.clip(values, -LIMIT, LIMIT)
+    values = np.clip(values, -MAX_ABS_CHANNEL_VALUE, MAX_ABS_CHANNEL_VALUE)
     mean = np.float32(np.average(values, weights=1 / steps)) if len(values) else np.float32(0)
     target = np.rint((values - float(mean)) * ONE).astype(np.int64)
     weight = _best_weight(target, steps) if weight is None else weight

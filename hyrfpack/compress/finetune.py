@@ -18,9 +18,9 @@ from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate.exposure import fitted_gains
-from hyrfpack.format.arrays import by_parameter
-from hyrfpack.format.compact.plan import Plan, from_lattice
-from hyrfpack.format.compact.quantized import Quantized
+from hyrfpack.format.arrays import iter_parameters
+from hyrfpack.format.compact.plan import Plan, lattice_to_local
+from hyrfpack.format.compact.quantized import QuantizedModel
 from hyrfpack.format.sections import COLORS, POSITIONS
 from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import expose
@@ -96,7 +96,7 @@ def finetune(
     rates = {name: (share * first, share * last) for name, (first, last) in dataclasses.asdict(RATES).items()}
     optimizer = Optimizer(tuned, LearningRates(**rates), ranks.size)
     steps = -(-steps // ranks.size)
-    quantized: Quantized | None = None
+    quantized: QuantizedModel | None = None
     keep_freed_memory()
     photos = Photos(tuned.gaussians.positions.device)
     order = shuffled(views, seed, range(ranks.rank, steps * ranks.size, ranks.size))
@@ -105,7 +105,7 @@ def finetune(
             quantized = quantize(tuned, plan, sensitivity, reach=0, like=quantized)
             exact = {name: value.clone() for name, value in tuned.state_dict().items()}
             decoded = {**quantized.arrays(), POSITIONS: _on_lattice(tuned, plan)}
-            tuned.load_state_dict(dict(by_parameter(decoded, tuned)), strict=False)
+            tuned.load_state_dict(dict(iter_parameters(decoded, tuned)), strict=False)
             problem: HyrfError | None = None
             try:
                 loss = _fit(tuned, photos, *next(pictures), gains)
@@ -180,12 +180,12 @@ def _on_lattice(model: HybridModel, plan: Plan) -> np.ndarray:
     places, start = [], 0
     for points in (layer.points for layer in plan.layers):
         part = slice(start, start := start + len(points.classes))
-        places.append(from_lattice(at_cells(cube[part], points.classes, points.bits), model.config.frame))
+        places.append(lattice_to_local(at_cells(cube[part], points.classes, points.bits), model.config.frame))
     return np.concatenate(places)
 
 
 @torch.no_grad()
-def _add_rate(model: HybridModel, quantized: Quantized, price: float) -> None:
+def _add_rate(model: HybridModel, quantized: QuantizedModel, price: float) -> None:
     """Add the gradient of price * bits to the parameters' gradients."""
     parameters, plan, slopes = dict(model.named_parameters()), quantized.plan, {}
     for group in quantized.channels[0]:
@@ -200,7 +200,7 @@ def _add_rate(model: HybridModel, quantized: Quantized, price: float) -> None:
         groups = plan.groups[group]
         slopes[group] = _slope(chosen.symbols, groups.index, groups.count, chosen.codes)
     slopes = {group: (price * values).astype(np.float32) for group, values in slopes.items()}
-    for name, slope in by_parameter(slopes, model):
+    for name, slope in iter_parameters(slopes, model):
         gradient = parameters[name].grad
         if gradient is not None:
             gradient += slope.to(gradient)

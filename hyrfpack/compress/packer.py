@@ -36,8 +36,8 @@ from hyrfpack.format.codec import (
     write_model,
 )
 from hyrfpack.format.info import describe
+from hyrfpack.format.min_file_size import check_target_bytes
 from hyrfpack.format.run_folder import find_model
-from hyrfpack.format.smallest import check_target_bytes
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks

@@ -10,9 +10,9 @@ import torch
 from hyrfpack.compress.rate_distortion import ERROR_PER_BIT
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.format.arrays import to_arrays
-from hyrfpack.format.compact.channels import LIMIT
-from hyrfpack.format.compact.plan import Layer, Plan, groups_of
-from hyrfpack.format.sections import COLORS, MLPS, TABLES
+from hyrfpack.format.compact.channels import MAX_ABS_CHANNEL_VALUE
+from hyrfpack.format.compact.plan import Layer, Plan, build_step_groups
+from hyrfpack.format.sections import COLORS, DECODER_SECTIONS, TABLE_SECTIONS
 from hyrfpack.model import HybridModel
 from hyrfpack.quant.morton import MAX_BITS
 from hyrfpack.quant.points import Points, encode_points
@@ -47,7 +47,10 @@ def make_plan(model: HybridModel, sensitivity: Sensitivity, distortion: float, p
         order.append(members[index])
     kept = kept[np.concatenate(order)]
     basis = color_basis(to_arrays(model)[COLORS][kept])
-    groups = {group: groups_of(group, model.config, layers[0].points) for group in (*TABLES, *MLPS)}
+    groups = {
+        group: build_step_groups(group, model.config, layers[0].points)
+        for group in (*TABLE_SECTIONS, *DECODER_SECTIONS)
+    }
     return Plan(kept, tuple(layers), basis, groups, each)
 
 
@@ -91,7 +94,7 @@ def follow(plan: Plan, model: HybridModel) -> tuple[Plan, HybridModel]:
         layers.append(layer)
         order.append(members[index])
     places = np.concatenate(order)
-    groups = {group: groups_of(group, model.config, layers[0].points) for group in plan.groups}
+    groups = {group: build_step_groups(group, model.config, layers[0].points) for group in plan.groups}
     there = replace(plan, kept=places, layers=tuple(layers), groups=groups)
     return replace(there, kept=plan.kept[places]), there.apply(model)
 
@@ -154,6 +157,6 @@ def color_basis(colors: np.ndarray) -> np.ndarray:
     """
     if len(colors) < 2:
         return np.eye(3, dtype=np.float32)
-    within = np.clip(colors.T.astype(np.float64), -LIMIT / 2, LIMIT / 2)
+    within = np.clip(colors.T.astype(np.float64), -MAX_ABS_CHANNEL_VALUE / 2, MAX_ABS_CHANNEL_VALUE / 2)
     basis = np.linalg.eigh(np.cov(within))[1][:, ::-1]
     return (basis * np.where(basis.sum(axis=0) < 0, -1, 1)).astype(np.float32)

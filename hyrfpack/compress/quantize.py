@@ -15,10 +15,10 @@ from hyrfpack.compress.groups import quantize_groups
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.format.arrays import to_arrays
-from hyrfpack.format.compact.channels import LIMIT
+from hyrfpack.format.compact.channels import MAX_ABS_CHANNEL_VALUE
 from hyrfpack.format.compact.plan import Plan
-from hyrfpack.format.compact.quantized import COLUMNS, Quantized
-from hyrfpack.format.sections import COLORS, LOGITS, MLPS, OPACITIES, SCALES, TABLES
+from hyrfpack.format.compact.quantized import LOGIT_COLUMNS, QuantizedModel
+from hyrfpack.format.sections import COLORS, DECODER_SECTIONS, LOGIT_SECTIONS, OPACITIES, SCALES, TABLE_SECTIONS
 from hyrfpack.model import HybridModel
 from hyrfpack.parallel.pool import run_jobs
 
@@ -26,7 +26,7 @@ SATURATED = 8.0  # an opacity's total logit beyond it looks like it: sigmoid is 
 OPACITY_REACH = 4  # where opacity is near 0 or 1 logits may move far
 
 
-def decide(model: HybridModel, sensitivity: Sensitivity, distortion: float, prune: bool = True) -> Quantized:
+def decide(model: HybridModel, sensitivity: Sensitivity, distortion: float, prune: bool = True) -> QuantizedModel:
     """Plan a model and quantise it, ready to be encoded. Arguments as `make_plan`."""
     plan = make_plan(model, sensitivity, distortion, prune)
     return quantize(plan.apply(model), plan, sensitivity)
@@ -38,9 +38,9 @@ def quantize(
     sensitivity: Sensitivity,
     *,
     reach: int = 1,
-    like: Quantized | None = None,
-    sections: Collection[str] = (*LOGITS, *TABLES, *MLPS),
-) -> Quantized:
+    like: QuantizedModel | None = None,
+    sections: Collection[str] = (*LOGIT_SECTIONS, *TABLE_SECTIONS, *DECODER_SECTIONS),
+) -> QuantizedModel:
     """Quantise a planned model (`plan.apply`) by rate and distortion.
 
     Args:
@@ -59,11 +59,13 @@ def quantize(
         for group, groups in plan.groups.items()
         if group in sections
     }
-    logits = [group for group in LOGITS if group in sections]
+    logits = [group for group in LOGIT_SECTIONS if group in sections]
     weights = {COLORS: sensitivity.colors, SCALES: sensitivity.scales, OPACITIES: sensitivity.opacities}
     error: ErrorModel | None = None
     if COLORS in logits:  # cut before it is turned: a colour far outside would come back as another
-        arrays[COLORS] = np.clip(arrays[COLORS], -LIMIT / 2, LIMIT / 2) @ plan.basis.astype(np.float64)
+        arrays[COLORS] = np.clip(
+            arrays[COLORS], -MAX_ABS_CHANNEL_VALUE / 2, MAX_ABS_CHANNEL_VALUE / 2
+        ) @ plan.basis.astype(np.float64)
     if OPACITIES in logits:
         numbers, error = opacity_error(model, arrays[OPACITIES][:, 0], sensitivity.opacities)
         arrays[OPACITIES] = numbers[:, None]
@@ -81,10 +83,10 @@ def quantize(
                 )
     done = run_jobs(jobs)
     channels = [
-        {group: [done[f"{group} {layer} {column}"] for column in range(COLUMNS[group])] for group in logits}
+        {group: [done[f"{group} {layer} {column}"] for column in range(LOGIT_COLUMNS[group])] for group in logits}
         for layer in range(len(plan.layers))
     ]
-    return Quantized(plan, channels, {group: done[group] for group in plan.groups if group in sections})
+    return QuantizedModel(plan, channels, {group: done[group] for group in plan.groups if group in sections})
 
 
 def _of_later(error: ErrorModel, start: int, places: Any, candidates: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from hyrfpack.errors import printable
 from hyrfpack.evaluate import Evaluation
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
 from hyrfpack.format import CompressionReport
-from hyrfpack.format.sections import NON_PARAMETERS, group_and_layer
+from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, group_and_layer
 
 PLOT = "size_against_loss.png"
 SHOWN = 4  # views whose pictures stand on the page, at most
@@ -219,7 +219,7 @@ def _parts(report: CompressionReport) -> list[Element]:
     header = ["part", "bytes before", "bytes after", "share of the file", "bits a number"]
     rows, total = [], report.bytes_after
     for tag, (before, after) in sizes.items():
-        numbers = 0 if tag in NON_PARAMETERS else before // 4
+        numbers = 0 if tag in NON_PARAMETER_SECTIONS else before // 4
         bits = f"{8 * after / numbers:.2f}" if numbers else ""
         loss = f"{report.shares[tag]:.1%}" if tag in report.shares else ""
         rows.append([names.get(tag, tag), f"{before:,}", f"{after:,}", f"{after / total:.1%}", bits, loss])

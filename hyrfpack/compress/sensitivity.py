@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from hyrfpack.cameras.view_sampling import sample_views
-from hyrfpack.format.arrays import GROUPS
-from hyrfpack.format.sections import COLORS, MLPS, OPACITIES, POSITIONS, SCALES, TABLES
+from hyrfpack.format.arrays import SECTION_PARAMETERS
+from hyrfpack.format.sections import COLORS, DECODER_SECTIONS, OPACITIES, POSITIONS, SCALES, TABLE_SECTIONS
 from hyrfpack.model import Geometry, HybridModel, expand
 from hyrfpack.progress import Report, no_report
 from hyrfpack.render import render
@@ -145,14 +145,15 @@ def _gathered(
             np.maximum((views * measured + TRUSTED * _local(model, measured, guess)) / (views + TRUSTED), 1e-30)
         )
     fields = {
-        group: np.concatenate([squares[name].double().cpu().numpy().ravel() for name in GROUPS[group]]) / field_pixels
-        for group in (*TABLES, *MLPS)
+        group: np.concatenate([squares[name].double().cpu().numpy().ravel() for name in SECTION_PARAMETERS[group]])
+        / field_pixels
+        for group in (*TABLE_SECTIONS, *DECODER_SECTIONS)
     }
     # Both numbers of a row are read together.
-    fields |= {group: fields[group].reshape(-1, 2).mean(axis=1).repeat(2) for group in TABLES}
+    fields |= {group: fields[group].reshape(-1, 2).mean(axis=1).repeat(2) for group in TABLE_SECTIONS}
     parameters = dict(model.named_parameters())
-    for group in MLPS:
-        size = sum(float(parameters[name].detach().double().square().sum()) for name in GROUPS[group])
+    for group in DECODER_SECTIONS:
+        size = sum(float(parameters[name].detach().double().square().sum()) for name in SECTION_PARAMETERS[group])
         fields[group] = np.maximum(fields[group], max(LEAST * fields[group].mean(), WITHOUT / max(size, 1e-30)))
     positions, colors, scales, opacities = explicit
     removals = removal_error(geometry.opacities.double().cpu().numpy(), opacities)

@@ -1,6 +1,6 @@
-"""The `.hyrf` file: the container (bytes, sections, checks) and the codec that maps a HybridModel to its sections.
+"""Reading and writing `.hyrf` files: the container (bytes, sections, checks) and the codec of a HybridModel.
 
-`describe` needs no torch; the names that do are loaded at their first use.
+`describe` needs no torch. The names that need torch are imported at their first use.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A HybridModel as a handful of matrices, and back."""
+"""Conversion of a HybridModel to one matrix per section, and back."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.model.hash_grid import FEATURES, HashGridConfig
 from hyrfpack.model.hybrid import HybridModel
 
-# What every model of this version computes and no setting of it says; `docs/format.md` has the equations.
-RULES = {
+# Equations that every model of this version uses and that no setting changes; `docs/format.md` defines each name.
+MODEL_RULES = {
     "activations": "sigmoid",
     "background_radius": BACKGROUND_RADIUS,
     "contraction": "l2",
@@ -27,59 +27,67 @@ RULES = {
 }
 
 
-def _decoder(field: str) -> tuple[str, ...]:
+def _decoder_parameters(field: str) -> tuple[str, ...]:
+    """Return the names of a decoder's parameters in file order: weights and biases of each layer."""
     return tuple(f"{field}.{kind}.{layer}" for layer in range(3) for kind in ("weights", "biases"))
 
 
-# The parameters in each group, laid one after another, each row by row.
-GROUPS = {
+# Names of the model parameters in each section, in file order; each parameter is stored row by row.
+SECTION_PARAMETERS = {
     sections.POSITIONS: ("gaussians.positions",),
     sections.COLORS: ("gaussians.color_logits",),
     sections.SCALES: ("gaussians.scale_logits",),
     sections.OPACITIES: ("gaussians.opacity_logits",),
     sections.GEOMETRY_TABLE: ("geometry.grid.table",),
-    sections.GEOMETRY_DECODER: _decoder("geometry"),
+    sections.GEOMETRY_DECODER: _decoder_parameters("geometry"),
     sections.RADIANCE_TABLE: ("radiance.grid.table",),
-    sections.RADIANCE_DECODER: _decoder("radiance"),
+    sections.RADIANCE_DECODER: _decoder_parameters("radiance"),
 }
 
 
 def to_arrays(model: HybridModel) -> dict[str, np.ndarray]:
-    """The model's parameters by group, as float32 matrices; a decoder's are one column, layer after layer.
+    """Return the model's parameters by section, as float32 matrices.
+
+    The parameters of a decoder form one column, layer after layer.
 
     Raises:
         HyrfError: a parameter is NaN or infinite.
     """
     state = model.state_dict()
     matrices = {}
-    for group, names in GROUPS.items():
+    for group, names in SECTION_PARAMETERS.items():
         parts = [state[name].cpu().numpy().astype(np.float32) for name in names]
         values = parts[0] if len(parts) == 1 else np.concatenate([part.ravel() for part in parts])[:, None]
         if wrong := int(np.count_nonzero(~np.isfinite(values))):
             raise HyrfError(
-                f"{wrong} of {values.size} numbers in the model's {sections.SECTIONS[group]} are NaN or infinite; "
-                "train it again from an earlier checkpoint"
+                f"{wrong} of {values.size} numbers in the model's {sections.SECTION_CONTENTS[group]} are NaN or "
+                "infinite; train it again from an earlier checkpoint"
             )
         matrices[group] = values
     return matrices
 
 
 def group_shapes(config: ModelConfig, gaussians: int) -> dict[str, tuple[int, int]]:
-    """(rows, columns) of each matrix of a model. Allocates nothing: what a file claims can be checked first."""
-    shapes = {group: (gaussians, width) for group, width in zip(sections.LAYERED, Gaussians.WIDTHS, strict=True)}
-    shapes |= {group: (grid.rows, FEATURES) for group, grid in grids(config).items()}
+    """Return (rows, columns) of each matrix of a model.
+
+    It allocates no arrays, so that a reader can check the sizes that a file declares before it decodes anything.
+    """
+    shapes = {
+        group: (gaussians, width) for group, width in zip(sections.LAYERED_SECTIONS, Gaussians.WIDTHS, strict=True)
+    }
+    shapes |= {group: (grid.rows, FEATURES) for group, grid in grid_configs(config).items()}
     for group, widths in decoder_widths(config).items():
         shapes[group] = (sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(widths)), 1)
-    return {group: shapes[group] for group in GROUPS}
+    return {group: shapes[group] for group in SECTION_PARAMETERS}
 
 
-def grids(config: ModelConfig) -> dict[str, HashGridConfig]:
-    """The hash grid of each field, by the section of its table."""
+def grid_configs(config: ModelConfig) -> dict[str, HashGridConfig]:
+    """Return the hash grid configuration of each field, by the section of its table."""
     return {sections.GEOMETRY_TABLE: config.geometry, sections.RADIANCE_TABLE: config.radiance}
 
 
 def decoder_widths(config: ModelConfig) -> dict[str, tuple[int, int, int, int]]:
-    """Inputs, hidden, hidden and outputs of each field's decoder, by its section."""
+    """Return the layer widths (inputs, hidden, hidden, outputs) of each field's decoder, by its section."""
     hidden, direction = (config.hidden, config.hidden), DIRECTION_FEATURES[config.direction_encoding]
     return {
         sections.GEOMETRY_DECODER: (config.geometry.levels * FEATURES, *hidden, 8),
@@ -88,34 +96,40 @@ def decoder_widths(config: ModelConfig) -> dict[str, tuple[int, int, int, int]]:
 
 
 def to_model(config: ModelConfig, arrays: dict[str, np.ndarray]) -> HybridModel:
-    """The inverse of `to_arrays`; shapes must be those of `group_shapes`."""
-    gaussians = Gaussians(*(torch.from_numpy(arrays[group]) for group in sections.LAYERED))
-    with torch.device("meta"):  # shapes alone: nothing is drawn or allocated that would be thrown away
+    """Build a model from matrices: the inverse of `to_arrays`. Shapes must be those of `group_shapes`."""
+    gaussians = Gaussians(*(torch.from_numpy(arrays[group]) for group in sections.LAYERED_SECTIONS))
+    with torch.device("meta"):  # has shapes but no storage, so that no initial values are drawn and thrown away
         model = HybridModel(config, gaussians)
-    model.load_state_dict({name: value.clone() for name, value in by_parameter(arrays, model)}, assign=True)
+    model.load_state_dict({name: value.clone() for name, value in iter_parameters(arrays, model)}, assign=True)
     return model
 
 
-def by_parameter(arrays: dict[str, np.ndarray], model: HybridModel) -> Iterator[tuple[str, torch.Tensor]]:
-    """Numbers of some groups by the names of the model's parameters and in their shapes, on the CPU."""
+def iter_parameters(arrays: dict[str, np.ndarray], model: HybridModel) -> Iterator[tuple[str, torch.Tensor]]:
+    """Yield (name, tensor) of the model parameters in the given sections, in their shapes, on the CPU."""
     shapes = {name: value.shape for name, value in model.state_dict().items()}
     for group, values in arrays.items():
-        parts = torch.from_numpy(values).flatten().split([shapes[name].numel() for name in GROUPS[group]])
-        yield from ((name, part.view(shapes[name])) for name, part in zip(GROUPS[group], parts, strict=True))
+        parts = torch.from_numpy(values).flatten().split([shapes[name].numel() for name in SECTION_PARAMETERS[group]])
+        yield from (
+            (name, part.view(shapes[name])) for name, part in zip(SECTION_PARAMETERS[group], parts, strict=True)
+        )
 
 
 def check_rules(rules: dict) -> None:
-    """Raise HyrfFormatError unless this version computes by exactly these rules."""
-    for name in sorted({*rules, *RULES}):
-        if name not in RULES or rules.get(name) != RULES[name]:
+    """Raise HyrfFormatError unless `rules` are exactly the `MODEL_RULES` of this version."""
+    for name in sorted({*rules, *MODEL_RULES}):
+        if name not in MODEL_RULES or rules.get(name) != MODEL_RULES[name]:
             raise HyrfFormatError(
-                f"rule {name!r:.40} is {rules.get(name)!r:.40} and this hyrfpack knows only {RULES.get(name)!r}; "
+                f"rule {name!r:.40} is {rules.get(name)!r:.40} and this hyrfpack knows only {MODEL_RULES.get(name)!r}; "
                 "update hyrfpack"
             )
 
 
 def parse_config(values: dict) -> ModelConfig:
-    """The ModelConfig of checked metadata. Raises HyrfFormatError when a field is unknown or out of range."""
+    """Build a ModelConfig from metadata whose types have been checked.
+
+    Raises:
+        HyrfFormatError: a field is unknown or out of range.
+    """
     try:
         return ModelConfig.from_dict(values)
     except (TypeError, ValueError, KeyError) as error:

@@ -1,4 +1,4 @@
-"""HybridModel <-> `.hyrf` bytes. What each byte means is in `docs/format.md`."""
+"""Encoding of a HybridModel to the bytes of a `.hyrf` file, and back; `docs/format.md` specifies each byte."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from hyrfpack.checks import check_type
 from hyrfpack.device import choose_device
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import compact, paper, raw
-from hyrfpack.format.arrays import RULES, check_rules, group_shapes, parse_config, to_model
-from hyrfpack.format.container import Container, Section, raw_limit, read_container, write_container
-from hyrfpack.format.exposure import decode_exposure, exposure_section
+from hyrfpack.format.arrays import MODEL_RULES, check_rules, group_shapes, parse_config, to_model
+from hyrfpack.format.container import Container, Section, raw_bytes_limit, read_container, write_container
+from hyrfpack.format.exposure import decode_exposure, encode_exposure
 from hyrfpack.format.info import SectionSize, section_sizes
 from hyrfpack.format.metadata import Metadata, read_metadata
 from hyrfpack.format.run_folder import find_model
 from hyrfpack.format.sections import (
     EXPOSURE,
-    LAYERED,
-    NON_PARAMETERS,
+    LAYERED_SECTIONS,
+    NON_PARAMETER_SECTIONS,
     POSITIONS,
-    SECTIONS,
+    SECTION_CONTENTS,
     group_and_layer,
     layer_section,
 )
@@ -42,30 +42,35 @@ PROFILES: dict[str, Callable[..., tuple[list[Section], dict]]] = {
     "paper": paper.encode,
     "compact": compact.encode,
 }
-DEFAULT_PROFILE = "compact"  # of `compress`
-# Gaussians that a file may have: so many for each of its bytes, and some that are free, as equal ones take no bytes.
-GAUSSIANS_A_BYTE, FREE_GAUSSIANS = 32, 1 << 18
-DECODERS = {**raw.DECODERS, **paper.DECODERS}  # of codecs that need no other section
+DEFAULT_PROFILE = "compact"  # `hyrfpack.compress` and the command line use it where no profile is named
+# A file may declare a number of Gaussians for each of its bytes. The extra ones are needed because Gaussians that are
+# all equal take no bytes.
+MAX_GAUSSIANS_PER_FILE_BYTE = 32
+EXTRA_GAUSSIANS_PER_FILE = 1 << 18
+# Decoders of the codecs that read no other section; `compact` has those that need the positions.
+DECODER_BY_CODEC = {**raw.DECODER_BY_CODEC, **paper.DECODER_BY_CODEC}
 
 
 @dataclass(frozen=True)
 class CompressionReport:
-    """What a file takes, and what was lost.
+    """Size of a written file and the error that compression added.
 
     Attributes:
         profile: "raw", "paper" or "compact".
-        gaussians: how many.
-        bytes_before: of all parameters as float32.
-        bytes_after: of the file.
+        gaussians: number of Gaussians in the file.
+        bytes_before: bytes of all parameters as float32.
+        bytes_after: bytes of the file.
         sections: bytes of each section before and after; header, table of contents and padding are the rest.
-        shares: of "compact": what part of the error in pictures comes from each section, and from what is "pruned".
-        error: of "compact": the mean squared error that pictures got, colours in [0, 1]; by estimate where the file was
-            not drawn.
-        found: in words, what a search came to.
-        finetuned: of "compact": whether its numbers were fitted to photos.
-        sensitivity: of "compact": what each number does to pictures (`hyrfpack.compress.sensitivity.Sensitivity`), by
-            which it was packed; kept so that a page about the file need not measure it again.
-        file: the path that was written.
+        shares: profile "compact" only: the fraction of the error in renders that comes from each section, and from
+            the "pruned" Gaussians.
+        error: profile "compact" only: the mean squared error of renders, colours in [0, 1]; an estimate where the file
+            was not rendered.
+        found: the outcome of a search for a target size or quality, as a sentence.
+        finetuned: profile "compact" only: whether the quantised numbers were fine-tuned on photos.
+        sensitivity: profile "compact" only: how much each number changes renders
+            (`hyrfpack.compress.sensitivity.Sensitivity`), by which the steps were chosen; kept so that a report page
+            need not measure it again.
+        file: path of the file that was written.
     """
 
     profile: str
@@ -81,25 +86,25 @@ class CompressionReport:
     file: str = ""
 
     def to_dict(self) -> dict:
-        """All but the sensitivity, as plain numbers, strings, lists and dictionaries, ready for JSON."""
+        """Return all fields but the sensitivity as plain numbers, strings, lists and dictionaries, ready for JSON."""
         values = asdict(replace(self, sensitivity=None))
         del values["sensitivity"]
         return values
 
 
 def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | None = None, **settings: Any) -> bytes:
-    """Write a model as the bytes of a `.hyrf` file: same model, same settings, same bytes.
+    """Encode a model as the bytes of a `.hyrf` file. The same model and settings give the same bytes.
 
     Args:
-        model: on any device.
+        model: the model, on any device.
         profile: "raw" (float32, exact), "paper" (see `hyrfpack.format.paper`) or "compact" (`hyrfpack.format.compact`).
-        provenance: where the model comes from, any JSON object; kept for people.
-        settings: of the profile: the fields of `paper.PaperSettings`; for "compact" what `hyrfpack.compress`
-            decided, its `quantized` numbers; "raw" has none.
+        provenance: any JSON object that says where the model comes from; stored for people to read.
+        settings: settings of the profile: for "paper" the fields of `paper.PaperSettings`, for "compact" the
+            `quantized` numbers from `hyrfpack.compress`; "raw" has none.
 
     Raises:
-        HyrfError: there is no such profile, or a parameter is NaN, infinite or too large for the profile.
-        TypeError: `model` is no HybridModel.
+        HyrfError: the profile does not exist, or a parameter is NaN, infinite or too large for the profile.
+        TypeError: `model` is not a HybridModel.
     """
     check_type("model", model, HybridModel)
     if profile not in PROFILES:
@@ -107,14 +112,16 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
     sections, used = PROFILES[profile](model, **settings)
     counts = [section.raw_length // 12 for section in sections if group_and_layer(section.type)[0] == POSITIONS]
     layers = counts if len(counts) > 1 else []
-    metadata = Metadata(profile, sum(counts), model.config.to_dict(), RULES, used, provenance or {}, layers=layers)
-    is_compact = profile == "compact"  # without a map, all else is read by readers of version 1.0 too
-    minor = int(is_compact)
+    metadata = Metadata(
+        profile, sum(counts), model.config.to_dict(), MODEL_RULES, used, provenance or {}, layers=layers
+    )
+    is_compact = profile == "compact"
+    minor = int(is_compact)  # readers of version 1.0 can read every profile but this one
     if model.exposure is not None:
-        sections, minor = [exposure_section(model.exposure), *sections], 2
+        sections, minor = [encode_exposure(model.exposure), *sections], 2
     sections = [metadata.to_section(deflate=is_compact), *sections]
     stored, raw_length = (sum(sizes) for sizes in zip(*((len(s.data), s.raw_length) for s in sections), strict=True))
-    if raw_length > raw_limit(stored) or sum(counts) > most_gaussians(stored):
+    if raw_length > raw_bytes_limit(stored) or sum(counts) > gaussian_limit(stored):
         raise HyrfError(
             f"{raw_length:,} bytes of numbers, nearly all alike, would take only {stored:,}, and readers do not "
             "unpack so much from so few; keep this model as profile raw"
@@ -122,9 +129,9 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
     return write_container(sections, minor=minor)
 
 
-def most_gaussians(file_length: int) -> int:
-    """Most Gaussians that a file of `file_length` bytes may hold."""
-    return GAUSSIANS_A_BYTE * file_length + FREE_GAUSSIANS
+def gaussian_limit(file_length: int) -> int:
+    """Return the largest number of Gaussians that a file of `file_length` bytes may hold."""
+    return MAX_GAUSSIANS_PER_FILE_BYTE * file_length + EXTRA_GAUSSIANS_PER_FILE
 
 
 def decode_model(
@@ -133,22 +140,25 @@ def decode_model(
     name: str = "the data",
     fraction: float | None = None,
 ) -> HybridModel:
-    """Read a model from the bytes of a `.hyrf` file. Safe on any input.
+    """Decode a model from the bytes of a `.hyrf` file. It is safe on untrusted input.
 
-    Its parameters want no gradients, so that pictures of it are plain numbers; `model.requires_grad_()` changes that.
+    The parameters do not require gradients, so that renders carry no autograd graph; `model.requires_grad_()` changes
+    that.
 
     Args:
-        device: where the parameters shall live, see `hyrfpack.device.choose_device`.
-        name: what error messages call the file.
-        fraction: read only this part of the file, from its first byte, 0 to 1; the rest may be missing. Files of
-            profile "compact" come in layers: what is whole of them makes a coarser model. None wants the whole file.
+        data: the bytes of the file.
+        device: device of the parameters, see `hyrfpack.device.choose_device`.
+        name: name of the file in error messages.
+        fraction: read only this fraction of the file, 0 to 1, from its first byte; the rest may be missing. Files of
+            profile "compact" are stored in layers, and the complete layers make a coarser model. None reads the whole
+            file.
 
     Raises:
-        HyrfFormatError: the bytes are damaged, contradict themselves, or come from a newer version.
-        HyrfError: there is no such device.
+        HyrfFormatError: the bytes are damaged, inconsistent, or of a newer format version.
+        HyrfError: the device is not available.
     """
     device = choose_device(device)
-    return _decode(read_container(data, SECTIONS, name, fraction)).to(device)
+    return _decode(read_container(data, SECTION_CONTENTS, name, fraction)).to(device)
 
 
 def save(
@@ -160,13 +170,16 @@ def save(
     overwrite: bool = True,
     **settings: Any,
 ) -> CompressionReport:
-    """Write a model to a `.hyrf` file, whole or not at all. Arguments and errors as `encode_model`.
+    """Write a model to a `.hyrf` file, whole or not at all.
+
+    The other arguments and errors are those of `encode_model`.
 
     Args:
-        overwrite: replace a file at `path`. Without it, the file gets a free name beside, which the report tells.
+        overwrite: replace a file at `path`. Without it, a free file name in the same folder is used; `report.file`
+            is the path that was written.
 
     Raises:
-        HyrfError: also when the file cannot be written.
+        HyrfError: the file cannot be written, or as `encode_model`.
 
     Example:
         >>> import hyrfpack
@@ -179,24 +192,30 @@ def save(
 
 
 def write_model(data: bytes, path: str | os.PathLike[str], *, overwrite: bool = True) -> CompressionReport:
-    """Write what `encode_model` made to a file, whole or not at all. `overwrite` as of `save`.
+    """Write the bytes that `encode_model` returned to a file, whole or not at all; `overwrite` as in `save`.
 
     Raises:
         HyrfError: the file cannot be written.
     """
     written = write_atomic(path, data, overwrite=overwrite)
-    container = read_container(data, SECTIONS)
+    container = read_container(data, SECTION_CONTENTS)
     metadata, sizes = read_metadata(container), section_sizes(container)
-    before = sum(size.before for size in sizes if size.type not in NON_PARAMETERS)
+    before = sum(size.before for size in sizes if size.type not in NON_PARAMETER_SECTIONS)
     return CompressionReport(metadata.profile, metadata.gaussians, before, len(data), sizes, file=str(written))
 
 
 def load(
     path: str | os.PathLike[str], device: str | torch.device = "cpu", fraction: float | None = None
 ) -> HybridModel:
-    """Read a model from a `.hyrf` file, or from the folder of a run.
+    """Read a model from a `.hyrf` file, or from the folder of a training run.
 
-    Arguments and errors as `decode_model`, and where no file can be read.
+    The other arguments and the errors are those of `decode_model`.
+
+    Args:
+        path: a `.hyrf` file, or the folder of a training run.
+
+    Raises:
+        HyrfFormatError: there is no readable file at `path`, or as `decode_model`.
 
     Example:
         >>> import hyrfpack
@@ -205,7 +224,7 @@ def load(
         (3, False)
     """
     device = choose_device(device)
-    with Container.open(path, SECTIONS, fraction) as container:
+    with Container.open(path, SECTION_CONTENTS, fraction) as container:
         return _decode(container).to(device)
 
 
@@ -218,13 +237,14 @@ def repack(
     overwrite: bool = True,
     **settings: Any,
 ) -> CompressionReport:
-    """Rewrite a `.hyrf` file with profile "raw" or "paper"; its provenance goes along, see `quantized_provenance`.
+    """Rewrite a `.hyrf` file with profile "raw" or "paper", and copy its provenance.
 
-    Arguments and errors as `encode_model`, `load` and `save`.
+    Except for profile "raw", the cameras in the provenance are rounded, see `quantized_provenance`. The other
+    arguments and the errors are those of `encode_model`, `load` and `save`.
 
     Args:
-        overwrite: replace a file at `target`. Without it, one that is there is an error, and one that appears in the
-            meantime is kept: the result gets a free name beside it, which the report names.
+        overwrite: replace a file at `target`. Without it, an existing file is an error. A file that appears in the
+            meantime is kept: then a free file name in the same folder is used, which the report names.
     """
     source = find_model(source)
     Outputs(source, overwrite=overwrite).file(target)
@@ -234,8 +254,8 @@ def repack(
 
 
 def load_with_provenance(path: str | os.PathLike[str], fraction: float | None = None) -> tuple[HybridModel, dict]:
-    """A model and where it comes from. Arguments and errors as `load`."""
-    with Container.open(path, SECTIONS, fraction) as container:
+    """Read a model and its provenance. Arguments and errors as `load`."""
+    with Container.open(path, SECTION_CONTENTS, fraction) as container:
         return _decode(container), read_metadata(container).provenance
 
 
@@ -250,58 +270,60 @@ def _decode(container: Container) -> HybridModel:
     shapes = {}
     for layer, count in enumerate(layers):
         for group, shape in group_shapes(config, count).items():
-            if layer == 0 or group in LAYERED:
+            if layer == 0 or group in LAYERED_SECTIONS:
                 shapes[layer_section(group, layer)] = shape
-    # Every size is checked before the first section is decoded.
+    # Every size is checked before the first section is decoded, so that a forged file cannot cause large allocations.
     for tag, (rows, columns) in shapes.items():
         entry = container.entries.get(tag)
         if entry is None:
             raise HyrfFormatError(f"{name}: there is no section '{tag}'; the file is incomplete, write it again")
-        if entry.codec not in DECODERS and entry.codec not in compact.CODECS:
+        if entry.codec not in DECODER_BY_CODEC and entry.codec not in compact.SECTIONS_BY_CODEC:
             raise HyrfFormatError(f"{name}: section '{tag}' has the unknown codec {entry.codec}; update hyrfpack")
         if entry.raw_length != 4 * rows * columns:
             raise HyrfFormatError(
                 f"{name}: section '{tag}' says it decodes to {entry.raw_length} bytes and the metadata asks for "
                 f"{4 * rows * columns}; the file is damaged, write it again"
             )
-    # Of a file that is not all there: the first layer must be, further ones up to the first that lacks something.
-    there = 1
-    while there < len(layers) and all(layer_section(group, there) in container for group in LAYERED):
-        there += 1
-    wanted = [tag for tag in shapes if group_and_layer(tag)[1] < there]
-    if any(tag not in container for tag in wanted) and container.available < container.length:
-        needed = max(container.entries[tag].end for tag in wanted)
+    # Of a partial file the first layer must be complete; further layers are used up to the first incomplete one.
+    layer_count = 1
+    while layer_count < len(layers) and all(
+        layer_section(group, layer_count) in container for group in LAYERED_SECTIONS
+    ):
+        layer_count += 1
+    used_tags = [tag for tag in shapes if group_and_layer(tag)[1] < layer_count]
+    if any(tag not in container for tag in used_tags) and container.available < container.length:
+        needed = max(container.entries[tag].end for tag in used_tags)
         raise HyrfFormatError(
             f"{name}: the first {needed:,} of {container.length:,} bytes make a model, and only "
             f"{container.available:,} are there or allowed; take more of the file"
         )
-    if sum(layers[:there]) > (most := most_gaussians(container.available)):
+    if sum(layers[:layer_count]) > (limit := gaussian_limit(container.available)):
         raise HyrfFormatError(
-            f"{name}: it says {sum(layers[:there]):,} Gaussians, and so few bytes may hold {most:,}; the file is "
-            "damaged, copy or write it again"
+            f"{name}: it says {sum(layers[:layer_count]):,} Gaussians, and so few bytes may hold {limit:,}; the file "
+            "is damaged, copy or write it again"
         )
-    sections = {tag: container[tag] for tag in wanted}
+    sections = {tag: container[tag] for tag in used_tags}
     arrays: dict[str, np.ndarray] = {}
-    points = {}  # of each layer with positions on a lattice, on which other sections lean
+    points = {}  # lattice points by layer, where positions are on a lattice; other sections need them for decoding
 
     def decode_positions(layer: int) -> None:
         tag = layer_section(POSITIONS, layer)
         if sections[tag].codec == compact.CODEC_POINTS:
-            with _naming(name, tag):
+            with _add_error_context(name, tag):
                 arrays[tag], points[layer] = compact.decode_positions(
                     memoryview(sections[tag].data), layers[layer], config
                 )
 
-    run_tasks(decode_positions, there)
-    rest = [tag for tag in wanted if tag not in arrays]
+    run_tasks(decode_positions, layer_count)
+    rest = [tag for tag in used_tags if tag not in arrays]
 
     def decode(index: int) -> None:
         tag = rest[index]
         group, layer = group_and_layer(tag)
         codec, data = sections[tag].codec, memoryview(sections[tag].data)
-        with _naming(name, tag):
-            if codec in DECODERS:
-                arrays[tag] = DECODERS[codec](data, shapes[tag])
+        with _add_error_context(name, tag):
+            if codec in DECODER_BY_CODEC:
+                arrays[tag] = DECODER_BY_CODEC[codec](data, shapes[tag])
             else:
                 arrays[tag] = compact.decode_section(group, codec, data, shapes[tag], config, points.get(layer))
 
@@ -309,19 +331,19 @@ def _decode(container: Container) -> HybridModel:
     for tag, values in arrays.items():
         if not np.isfinite(values).all():
             raise HyrfFormatError(f"{name}: section '{tag}' holds numbers that are not finite; write the file again")
-    for group in LAYERED if there > 1 else ():
-        arrays[group] = np.concatenate([arrays.pop(layer_section(group, layer)) for layer in range(there)])
+    for group in LAYERED_SECTIONS if layer_count > 1 else ():
+        arrays[group] = np.concatenate([arrays.pop(layer_section(group, layer)) for layer in range(layer_count)])
     model = to_model(config, arrays).requires_grad_(False)
     if EXPOSURE in container:
         section = container[EXPOSURE]
-        with _naming(name, EXPOSURE):
+        with _add_error_context(name, EXPOSURE):
             model.exposure = decode_exposure(section.codec, memoryview(section.data), section.raw_length)
     return model
 
 
 @contextmanager
-def _naming(name: str, group: str) -> Iterator[None]:
-    """Say which file and section an error is of."""
+def _add_error_context(name: str, group: str) -> Iterator[None]:
+    """Add the file and the section to the message of a format error."""
     try:
         yield
     except (HyrfFormatError, DamagedDataError) as error:

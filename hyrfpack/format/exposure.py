@@ -1,4 +1,4 @@
-"""The exposure map of a model <-> the bytes of section `EXPO`. Section codec 9."""
+"""Encoding of a model's exposure map as section `EXPO` (section codec 9), and back."""
 
 from __future__ import annotations
 
@@ -6,33 +6,38 @@ import numpy as np
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.container import Section
-from hyrfpack.format.exposure_head import CENTER_BYTES, CODEC_EXPOSURE, ExposureHead, read_exposure_head
+from hyrfpack.format.exposure_header import BYTES_PER_CENTER, CODEC_EXPOSURE, ExposureHeader, read_exposure_header
 from hyrfpack.format.sections import EXPOSURE
 from hyrfpack.model.exposure import ExposureMap
 
-_CENTER = np.dtype([("position", "u1", 3), ("direction", "i1", 3), ("weight", "<i2", 3)])
-assert _CENTER.itemsize == CENTER_BYTES
+_CENTER_DTYPE = np.dtype([("position", "u1", 3), ("direction", "i1", 3), ("weight", "<i2", 3)])
+assert _CENTER_DTYPE.itemsize == BYTES_PER_CENTER
 
 
-def exposure_section(exposure: ExposureMap) -> Section:
-    """The optional section that holds an exposure map; readers that do not know it show the consistent exposure."""
-    centers = np.zeros(len(exposure.positions), _CENTER)
+def encode_exposure(exposure: ExposureMap) -> Section:
+    """Encode an exposure map as an optional section; readers that do not know it show the consistent exposure."""
+    centers = np.zeros(len(exposure.positions), _CENTER_DTYPE)
     centers["position"], centers["direction"] = exposure.positions, exposure.directions
     centers["weight"] = exposure.weights
     parts = (exposure.lengths, exposure.box, exposure.mean, exposure.limits, exposure.steps)
-    head = ExposureHead(len(centers), *(tuple(part.ravel().tolist()) for part in parts))
+    head = ExposureHeader(len(centers), *(tuple(part.ravel().tolist()) for part in parts))
     data = head.to_bytes() + centers.tobytes()
     return Section(EXPOSURE, CODEC_EXPOSURE, data, len(data), required=False)
 
 
 def decode_exposure(codec: int, data: memoryview, raw_length: int) -> ExposureMap:
-    """Read an exposure map.
+    """Decode an exposure map from the bytes of its section.
+
+    Args:
+        codec: codec number of the section.
+        data: stored bytes of the section.
+        raw_length: bytes that the section declares to decode to.
 
     Raises:
-        HyrfFormatError: as `read_exposure_head`, or numbers are out of range.
+        HyrfFormatError: numbers are out of range, or as `read_exposure_header`.
     """
-    head, rest = read_exposure_head(codec, data, raw_length)
-    centers = np.frombuffer(rest, _CENTER)
+    head, rest = read_exposure_header(codec, data, raw_length)
+    centers = np.frombuffer(rest, _CENTER_DTYPE)
     try:
         return ExposureMap(
             box=np.array(head.box, np.float32).reshape(2, 3),

@@ -1,4 +1,4 @@
-"""What a `.hyrf` file holds, told from its first kilobytes. Imports neither torch nor numpy."""
+"""Description of a `.hyrf` file from its header and metadata. It imports neither torch nor numpy."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ from dataclasses import asdict, dataclass
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.container import Container
-from hyrfpack.format.exposure_head import read_exposure_head
+from hyrfpack.format.exposure_header import read_exposure_header
 from hyrfpack.format.metadata import read_metadata
-from hyrfpack.format.sections import EXPOSURE, SECTIONS
+from hyrfpack.format.sections import EXPOSURE, SECTION_CONTENTS
 
 
 @dataclass(frozen=True)
 class SectionSize:
-    """Bytes of one section.
+    """Type, content and size of one section.
 
     Attributes:
-        type, holds: its four letters, and what they stand for.
-        before: bytes of its content as float32 (of the metadata and the exposure map: as it is).
-        after: bytes stored.
+        type: four letters of the section's type.
+        holds: the content that the type stands for.
+        before: bytes of the decoded content, numbers as float32 (metadata and exposure map: as they are).
+        after: stored bytes.
     """
 
     type: str
@@ -29,30 +30,30 @@ class SectionSize:
 
 
 def section_sizes(container: Container) -> list[SectionSize]:
-    """Sizes of all sections in file order, unknown optional ones included."""
+    """Return the sizes of all sections in file order, unknown optional ones included."""
     return [
-        SectionSize(tag, SECTIONS.get(tag, "unknown"), entry.raw_length, entry.length)
+        SectionSize(tag, SECTION_CONTENTS.get(tag, "unknown"), entry.raw_length, entry.length)
         for tag, entry in container.entries.items()
     ]
 
 
 def describe(path: str | os.PathLike[str], fraction: float | None = None) -> dict:
-    """Say what a `.hyrf` file holds without decoding it: header, table of contents and metadata are read, no more.
+    """Describe a `.hyrf` file without decoding it: only the header, table of contents, metadata and exposure are read.
 
     Args:
-        path: of the file, or of the folder of a run, see `hyrfpack.format.find_model`.
-        fraction: how much of the file must be there, see `hyrfpack.load`; None for all.
+        path: the file, or the folder of a training run, see `hyrfpack.format.find_model`.
+        fraction: fraction of the file that must exist, see `hyrfpack.load`; None for the whole file.
 
     Returns:
         A dictionary ready for JSON: `bytes` (of the file), `version` ("1.0"), and the metadata's `writer`, `profile`,
         `gaussians`, `config` (frame, grids, background, rules of the model), `rules`, `settings`, `provenance`;
-        `exposure` of a file with an exposure map: its number of `centers` and the lowest and the highest exposure of
-        renders in `stops`, mean of the three channels (null without one, or where its bytes are not there);
-        `bits_per_gaussian` of the whole file (null without Gaussians), and `sections`: for each `type`, `holds`,
-        `before` (bytes as float32), `after` (bytes stored) and `bits_per_gaussian`.
+        `exposure` of a file with an exposure map: its number of `centers`, and the lowest and the highest exposure of
+        renders in `stops`, each the mean of the three channels (null without a map, or where its bytes are missing);
+        `bits_per_gaussian` of the whole file (null without Gaussians); and `sections`, each with `type`, `holds`,
+        `before` (bytes as float32), `after` (stored bytes) and `bits_per_gaussian`.
 
     Raises:
-        HyrfFormatError: there is no such file, or its header, table of contents, metadata or exposure map is damaged.
+        HyrfFormatError: the file does not exist, or its header, table of contents, metadata or exposure map is damaged.
 
     Example:
         >>> import hyrfpack
@@ -60,7 +61,7 @@ def describe(path: str | os.PathLike[str], fraction: float | None = None) -> dic
         >>> facts["profile"], facts["version"], facts["sections"][0]["type"]
         ('compact', '1.1', 'META')
     """
-    with Container.open(path, SECTIONS, fraction) as container:
+    with Container.open(path, SECTION_CONTENTS, fraction) as container:
         metadata = read_metadata(container)
         sizes = section_sizes(container)
         exposure = _describe_exposure(container)
@@ -85,7 +86,7 @@ def _describe_exposure(container: Container) -> dict | None:
         return None
     section = container[EXPOSURE]
     try:
-        head, _ = read_exposure_head(section.codec, section.data, section.raw_length)
+        head, _ = read_exposure_header(section.codec, section.data, section.raw_length)
     except HyrfFormatError as error:
         raise HyrfFormatError(f"{container.name}: section '{EXPOSURE}': {error}") from error
     return {"centers": head.centers, "stops": list(head.stops)}

@@ -1,4 +1,4 @@
-"""Profile `paper`: the compression that the HyRF paper describes (section 3.4), and no more.
+"""Profile `paper`: exactly the compression that the HyRF paper describes (section 3.4).
 
 positions                          half precision                                       section codec 2
 decoders (MLPs)                    half precision                                       section codec 2
@@ -31,27 +31,29 @@ from hyrfpack.quant import (
     huffman_encode,
 )
 
-CODEC_FLOAT16, CODEC_RESIDUAL_VQ, CODEC_MIN_MAX = 2, 3, 4
+CODEC_FLOAT16 = 2
+CODEC_RESIDUAL_VQ = 3
+CODEC_MIN_MAX = 4
 FLOAT16_MAX = 65504.0
-TABLE_BITS = 8
-MAX_STAGES = 16  # of a residual quantiser: each costs a decoder some milliseconds, however few the rows
+TABLE_CODE_BITS = 8
+MAX_VQ_STAGES = 16  # bounds the decoding time: each stage takes some milliseconds, even for few rows
 
-_VQ_HEADER = struct.Struct("<BBH")  # stages, columns, codewords of a stage
-_STREAM_LENGTH = struct.Struct("<Q")
+_VQ_HEADER_STRUCT = struct.Struct("<BBH")  # stages, columns, codewords per stage
+_STREAM_LENGTH_STRUCT = struct.Struct("<Q")
 
 
 @dataclass(frozen=True)
 class PaperSettings:
-    """Settings of the profile.
+    """Settings of profile `paper`.
 
-    The defaults take 26 to 27 bits a Gaussian in scenes of 8,000 and more. With them the whole profile lost at most
-    0.08 dB on the six trained scenes (15 to 32 dB) they were chosen on. One quantiser for all five numbers needs more
-    for the same: colours go together, scales and opacities go their own ways.
+    The defaults take 26 to 27 bits per Gaussian in scenes of 8,000 Gaussians and more. On the six trained scenes (15
+    to 32 dB) on which they were chosen, the whole profile lost at most 0.08 dB. One quantiser for all five numbers
+    needs more bits for the same error: the colour channels are correlated, scales and opacities are not.
 
     Attributes:
-        color, scale, opacity: (stages, codewords of a stage) of the residual quantiser of these logits; 1 to 16 stages
+        color, scale, opacity: (stages, codewords per stage) of the residual quantiser of these logits; 1 to 16 stages
             of 1 to 256 codewords.
-        seed: of the quantisers' k-means.
+        seed: random seed of the quantisers' k-means.
     """
 
     color: tuple[int, int] = (2, 128)
@@ -61,27 +63,33 @@ class PaperSettings:
 
     def __post_init__(self) -> None:
         for stages, size in (self.color, self.scale, self.opacity):
-            if not (1 <= stages <= MAX_STAGES and 1 <= size <= 256):
+            if not (1 <= stages <= MAX_VQ_STAGES and 1 <= size <= 256):
                 raise HyrfError(
-                    f"the paper profile was asked for {stages} stages of {size} codewords; use 1 to {MAX_STAGES} "
+                    f"the paper profile was asked for {stages} stages of {size} codewords; use 1 to {MAX_VQ_STAGES} "
                     "stages of 1 to 256"
                 )
 
 
 def encode(model: HybridModel, **settings: Any) -> tuple[list[Section], dict]:
-    """Sections for a model, and the settings used. Gaussians keep their order.
+    """Encode a model; return its sections and the settings used. Gaussians keep their order.
+
+    Args:
+        model: the model to encode.
+        settings: fields of `PaperSettings`.
 
     Raises:
-        HyrfError: a parameter is NaN or infinite, a position, a logit or a decoder's weight is beyond half precision,
-            a setting is out of range, or dahuffman is not installed.
+        HyrfError: a parameter is NaN or infinite; a position, logit or decoder weight exceeds the range of half
+            precision; a setting is out of range; or dahuffman is not installed.
     """
     chosen = PaperSettings(**settings)
     with needs_package("dahuffman", "profile 'paper'"):
-        import dahuffman  # noqa: F401 - builds the Huffman codes; asked for here, before the work starts
+        import dahuffman  # noqa: F401 - builds the Huffman codes; imported here so that its absence shows at once
     arrays = to_arrays(model)
-    # First: what these refuse could overflow the field, which the opacities are cut by.
-    halves = {group: _encode_float16(group, arrays[group]) for group in (sections.POSITIONS, *sections.MLPS)}
-    arrays[sections.OPACITIES] = _without_tails(model, arrays[sections.OPACITIES])
+    # Halves come first: they reject values that would overflow the geometry field, which clips the opacities below.
+    halves = {
+        group: _encode_float16(group, arrays[group]) for group in (sections.POSITIONS, *sections.DECODER_SECTIONS)
+    }
+    arrays[sections.OPACITIES] = _clip_opacity_logits(model, arrays[sections.OPACITIES])
     return [
         halves[sections.POSITIONS],
         _encode_residual_vq(sections.COLORS, arrays[sections.COLORS], chosen.color, chosen.seed),
@@ -95,10 +103,10 @@ def encode(model: HybridModel, **settings: Any) -> tuple[list[Section], dict]:
 
 
 @torch.no_grad()
-def _without_tails(model: HybridModel, opacity_logits: np.ndarray) -> np.ndarray:
-    """Opacity logits (N, 1) cut where opacity no longer changes: codewords are not spent on tails that nobody sees.
+def _clip_opacity_logits(model: HybridModel, opacity_logits: np.ndarray) -> np.ndarray:
+    """Clip opacity logits (N, 1) where opacity no longer changes, so that no codewords are spent on invisible tails.
 
-    It is the sum with the field's part that is cut, to +-LOGIT_LIMIT, within 7e-6 of opacity 0 and 1.
+    The sum of the explicit logit and the field's output is clipped to +-LOGIT_LIMIT, within 7e-6 of opacity 0 and 1.
     """
     neural = model.geometry(model.cube_coords(model.gaussians.positions))[:, :1].cpu().numpy()
     if not np.isfinite(neural).all():
@@ -110,10 +118,11 @@ def _without_tails(model: HybridModel, opacity_logits: np.ndarray) -> np.ndarray
 
 
 def _check_half_range(tag: str, values: np.ndarray) -> None:
+    """Raise HyrfError if a value exceeds the range of half precision."""
     largest = np.abs(values).max(initial=0)
     if largest > FLOAT16_MAX:
         raise HyrfError(
-            f"numbers in the model's {sections.SECTIONS[tag]} reach {largest:.6g} and half precision ends at "
+            f"numbers in the model's {sections.SECTION_CONTENTS[tag]} reach {largest:.6g} and half precision ends at "
             f"{FLOAT16_MAX:.0f}; keep this model as profile raw, or train it again without such outliers"
         )
 
@@ -128,7 +137,7 @@ def _decode_float16(data: memoryview, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _encode_min_max(tag: str, values: np.ndarray) -> Section:
-    codes, params = MinMaxQuantizer(TABLE_BITS).encode(values)
+    codes, params = MinMaxQuantizer(TABLE_CODE_BITS).encode(values)
     data = params.to_bytes() + huffman_encode(codes.ravel()).to_bytes()
     return Section(tag, CODEC_MIN_MAX, data, 4 * values.size)
 
@@ -144,27 +153,27 @@ def _encode_residual_vq(tag: str, values: np.ndarray, shape: tuple[int, int], se
     stages, size = shape
     quantizer = ResidualVectorQuantizer(stages, size, codebook_dtype="float16", seed=seed)
     indices, codebooks = quantizer.encode(values)
-    parts = [_VQ_HEADER.pack(stages, values.shape[1], size), codebooks.astype("<f2").tobytes()]
+    parts = [_VQ_HEADER_STRUCT.pack(stages, values.shape[1], size), codebooks.astype("<f2").tobytes()]
     for stage in indices.T:
         stream = huffman_encode(np.ascontiguousarray(stage)).to_bytes()
-        parts += [_STREAM_LENGTH.pack(len(stream)), stream]
+        parts += [_STREAM_LENGTH_STRUCT.pack(len(stream)), stream]
     return Section(tag, CODEC_RESIDUAL_VQ, b"".join(parts), 4 * values.size)
 
 
 def _decode_residual_vq(data: memoryview, shape: tuple[int, int]) -> np.ndarray:
-    if len(data) < _VQ_HEADER.size:
+    if len(data) < _VQ_HEADER_STRUCT.size:
         raise HyrfFormatError(f"it has {len(data)} bytes, fewer than the header of a residual quantiser")
-    stages, columns, size = _VQ_HEADER.unpack_from(data)
-    position = _VQ_HEADER.size + 2 * stages * size * columns
-    if not (1 <= stages <= MAX_STAGES and size) or columns != shape[1] or position > len(data):
+    stages, columns, size = _VQ_HEADER_STRUCT.unpack_from(data)
+    position = _VQ_HEADER_STRUCT.size + 2 * stages * size * columns
+    if not (1 <= stages <= MAX_VQ_STAGES and size) or columns != shape[1] or position > len(data):
         raise HyrfFormatError(f"it says {stages} codebooks of {size} codewords of {columns} numbers; it is damaged")
-    codebooks = np.frombuffer(data[_VQ_HEADER.size : position], "<f2").reshape(stages, size, columns)
+    codebooks = np.frombuffer(data[_VQ_HEADER_STRUCT.size : position], "<f2").reshape(stages, size, columns)
     if not np.isfinite(codebooks).all():
         raise HyrfFormatError("its codebooks hold numbers that are not finite; it is damaged")
     decoded = np.zeros(shape, np.float32)
     for stage in range(stages):
-        start = position + _STREAM_LENGTH.size
-        position = start + (_STREAM_LENGTH.unpack_from(data, position)[0] if start <= len(data) else 0)
+        start = position + _STREAM_LENGTH_STRUCT.size
+        position = start + (_STREAM_LENGTH_STRUCT.unpack_from(data, position)[0] if start <= len(data) else 0)
         if not start <= position <= len(data):
             raise HyrfFormatError(f"it ends within stage {stage} of {stages}; it is damaged")
         indices = _decode_huffman(data[start:position], shape[0])
@@ -181,7 +190,7 @@ def _decode_huffman(data: memoryview, count: int) -> np.ndarray:
     return huffman_decode(stream)
 
 
-DECODERS = {
+DECODER_BY_CODEC = {
     CODEC_FLOAT16: _decode_float16,
     CODEC_RESIDUAL_VQ: _decode_residual_vq,
     CODEC_MIN_MAX: _decode_min_max,

@@ -1,4 +1,4 @@
-"""Profile `raw`: every number as float32, exact. Section codec 1."""
+"""Profile `raw`: every number is stored exactly, as float32 (section codec 1)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CODEC_FLOAT32 = 1
 
 
 def encode(model: HybridModel) -> tuple[list[Section], dict]:
-    """Sections for a model, one a group, and the settings used (none).
+    """Encode a model; return its sections and the settings used (none).
 
     Raises:
         HyrfError: a parameter is NaN or infinite.
@@ -26,10 +26,18 @@ def encode(model: HybridModel) -> tuple[list[Section], dict]:
 
 
 def decode_plain(data: memoryview, shape: tuple[int, int], dtype: str) -> np.ndarray:
-    """Numbers stored row by row as `dtype` -> (rows, columns) float32.
+    """Decode numbers that are stored row by row.
+
+    Args:
+        data: stored bytes.
+        shape: (rows, columns).
+        dtype: numpy dtype of the stored numbers.
+
+    Returns:
+        (rows, columns) float32.
 
     Raises:
-        HyrfFormatError: there are more or fewer bytes than that.
+        HyrfFormatError: the number of bytes does not fit the shape.
     """
     expected = shape[0] * shape[1] * np.dtype(dtype).itemsize
     if len(data) != expected:
@@ -41,4 +49,4 @@ def _decode_float32(data: memoryview, shape: tuple[int, int]) -> np.ndarray:
     return decode_plain(data, shape, "<f4")
 
 
-DECODERS = {CODEC_FLOAT32: _decode_float32}
+DECODER_BY_CODEC = {CODEC_FLOAT32: _decode_float32}

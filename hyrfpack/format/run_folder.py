@@ -1,4 +1,4 @@
-"""The folder of a training run: the files in it, how far the run is, and which model a path names."""
+"""The folder of a training run: names of its files, status of the run, and the model that a path names."""
 
 from __future__ import annotations
 
@@ -10,22 +10,24 @@ from pathlib import Path
 
 from hyrfpack.errors import HyrfFormatError
 
-MODEL, CHECKPOINT, METRICS = "model.hyrf", "checkpoint.pt", "metrics.json"
+MODEL_FILE = "model.hyrf"
+CHECKPOINT_FILE = "checkpoint.pt"
+METRICS_FILE = "metrics.json"
 
 
 @dataclass(frozen=True)
 class RunStatus:
-    """How far a training run is and what it reached. A field is None where the folder does not tell it.
+    """Progress and scores of a training run. A field is None where the folder does not hold its value.
 
     Attributes:
-        folder: of the run.
-        finished: whether the model is there and no checkpoint is left.
-        has_checkpoint: whether `hyrfpack train --resume` can continue it.
-        step: optimiser steps taken, by the checkpoint or, of a finished run, by its settings.
-        steps: optimiser steps that the run was asked for.
-        photos: folder of the photos that it trains on.
-        train, test: how many photos it trains on, and how many are held out.
-        seconds: spent on training.
+        folder: folder of the run.
+        finished: whether the model exists and no checkpoint is left.
+        has_checkpoint: whether `hyrfpack train --resume` can continue the run.
+        step: optimiser steps taken, from the checkpoint or, if the run has finished, from its settings.
+        steps: optimiser steps of the whole run.
+        photos: folder of the training photos.
+        train, test: number of training photos and of held-out photos.
+        seconds: training time in seconds.
         psnr, psnr_consistent, ssim: means over the held-out photos, as in `hyrfpack.Evaluation`; PSNR in dB.
     """
 
@@ -45,14 +47,14 @@ class RunStatus:
 
 def is_run_folder(path: str | os.PathLike[str]) -> bool:
     """Return whether a path is the folder of a training run, finished or not."""
-    return any(Path(path, name).is_file() for name in (MODEL, CHECKPOINT))
+    return any(Path(path, name).is_file() for name in (MODEL_FILE, CHECKPOINT_FILE))
 
 
 def find_model(path: str | os.PathLike[str]) -> Path:
-    """Return the `.hyrf` file that a path names: the file itself, or the model in the folder of a training run.
+    """Return the path of a `.hyrf` file: `path` itself, or the model if `path` is the folder of a training run.
 
     Raises:
-        HyrfFormatError: it is a folder without a model, or that of a run which has not finished.
+        HyrfFormatError: `path` is a folder without a model, or the folder of a run that has not finished.
 
     Example:
         >>> from hyrfpack.format import find_model
@@ -62,32 +64,32 @@ def find_model(path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     if not os.path.isdir(path):
         return path
-    if (path / MODEL).is_file():
-        return path / MODEL
-    if (path / CHECKPOINT).is_file():
-        raise HyrfFormatError(f"{path}: {describe_unfinished(read_run_status(path))}")
+    if (path / MODEL_FILE).is_file():
+        return path / MODEL_FILE
+    if (path / CHECKPOINT_FILE).is_file():
+        raise HyrfFormatError(f"{path}: {describe_unfinished_run(read_run_status(path))}")
     raise HyrfFormatError(
-        f"{path}: this folder holds no {MODEL}; name a .hyrf file, or a folder that 'hyrfpack train' wrote"
+        f"{path}: this folder holds no {MODEL_FILE}; name a .hyrf file, or a folder that 'hyrfpack train' wrote"
     )
 
 
-def describe_unfinished(run: RunStatus) -> str:
-    """Return the clause that tells of an unfinished run, and how to finish it."""
+def describe_unfinished_run(run: RunStatus) -> str:
+    """Return a message clause that says how far an unfinished run is and how to finish it."""
     done = "" if run.step is None or run.steps is None else f" (step {run.step:,} of {run.steps:,})"
     return f"the run has not finished{done}; finish it by running its 'hyrfpack train' command again with `resume=True`"
 
 
 def read_run_status(folder: str | os.PathLike[str]) -> RunStatus:
-    """Read how far the run in a folder is; what is missing or damaged stays None."""
+    """Read the status of the run in a folder; fields whose file is missing or damaged are None."""
     folder = Path(folder)
-    has_checkpoint = (folder / CHECKPOINT).is_file()
-    finished = (folder / MODEL).is_file() and not has_checkpoint
+    has_checkpoint = (folder / CHECKPOINT_FILE).is_file()
+    finished = (folder / MODEL_FILE).is_file() and not has_checkpoint
     if has_checkpoint:
-        step, steps = _checkpoint_steps(folder / CHECKPOINT)
+        step, steps = _read_checkpoint_steps(folder / CHECKPOINT_FILE)
         return RunStatus(str(folder), finished, has_checkpoint, step, steps)
-    metrics = _object(folder / METRICS)
-    settings, scene, scores = (_part(metrics, name) for name in ("settings", "scene", "evaluation"))
-    steps = _count(settings, "steps")
+    metrics = _read_json_object(folder / METRICS_FILE)
+    settings, scene, scores = (_get_dict(metrics, name) for name in ("settings", "scene", "evaluation"))
+    steps = _get_int(settings, "steps")
     photos = scene.get("path")
     return RunStatus(
         folder=str(folder),
@@ -96,19 +98,20 @@ def read_run_status(folder: str | os.PathLike[str]) -> RunStatus:
         step=steps,
         steps=steps,
         photos=photos if isinstance(photos, str) else None,
-        train=_count(scene, "train"),
-        test=_count(scene, "test"),
-        seconds=_number(metrics, "seconds"),
-        psnr=_number(scores, "psnr"),
-        psnr_consistent=_number(scores, "psnr_consistent"),
-        ssim=_number(scores, "ssim"),
+        train=_get_int(scene, "train"),
+        test=_get_int(scene, "test"),
+        seconds=_get_finite_number(metrics, "seconds"),
+        psnr=_get_finite_number(scores, "psnr"),
+        psnr_consistent=_get_finite_number(scores, "psnr_consistent"),
+        ssim=_get_finite_number(scores, "ssim"),
     )
 
 
-def _checkpoint_steps(path: Path) -> tuple[int | None, int | None]:
-    """The step that a checkpoint was written at and the last one of its run, as `hyrfpack.train.checkpoint` saves them.
+def _read_checkpoint_steps(path: Path) -> tuple[int | None, int | None]:
+    """Read the step at which a checkpoint was written, and the last step of its run.
 
-    None where the file cannot be read: nothing but a message depends on it. The tensors are not read.
+    Both are None where the file cannot be read, because only messages depend on them. `hyrfpack.train.checkpoint`
+    writes the file. Its tensors are not read.
     """
     import torch
 
@@ -117,12 +120,12 @@ def _checkpoint_steps(path: Path) -> tuple[int | None, int | None]:
         settings, progress = json.loads(content["settings"]), json.loads(content["progress"])
         processes = settings.get("processes", 1)
         return int(progress["step"]), -(-int(settings["steps"]) // int(processes))
-    except Exception:  # torch's unpickler raises whatever it meets
+    except Exception:  # torch's unpickler can raise errors of any type
         return None, None
 
 
-def _object(path: Path) -> dict:
-    """The JSON object in a file; an empty one where there is none."""
+def _read_json_object(path: Path) -> dict:
+    """Read the JSON object in a file; return an empty dictionary if there is none."""
     try:
         content = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -130,17 +133,20 @@ def _object(path: Path) -> dict:
     return content if isinstance(content, dict) else {}
 
 
-def _part(values: dict, name: str) -> dict:
+def _get_dict(values: dict, name: str) -> dict:
+    """Return the dictionary of this name; an empty one if there is none."""
     part = values.get(name)
     return part if isinstance(part, dict) else {}
 
 
-def _count(values: dict, name: str) -> int | None:
+def _get_int(values: dict, name: str) -> int | None:
+    """Return the integer of this name; None if there is none."""
     value = values.get(name)
     return value if isinstance(value, int) and not isinstance(value, bool) else None
 
 
-def _number(values: dict, name: str) -> float | None:
+def _get_finite_number(values: dict, name: str) -> float | None:
+    """Return the finite number of this name; None if there is none."""
     value = values.get(name)
     usable = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     return value if usable else None

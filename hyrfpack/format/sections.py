@@ -1,22 +1,31 @@
-"""The sections of a `.hyrf` file: what each is called, and what it holds. Plain Python: `describe` needs it fast."""
+"""Types and contents of the sections of a `.hyrf` file.
+
+This module imports nothing, because imports would make `describe` slow.
+"""
 
 from __future__ import annotations
 
 METADATA = "META"
 EXPOSURE = "EXPO"
-POSITIONS, COLORS, SCALES, OPACITIES = "POSI", "COLO", "SCAL", "OPAC"
-GEOMETRY_TABLE, GEOMETRY_DECODER, RADIANCE_TABLE, RADIANCE_DECODER = "GTAB", "GMLP", "RTAB", "RMLP"
+POSITIONS = "POSI"
+COLORS = "COLO"
+SCALES = "SCAL"
+OPACITIES = "OPAC"
+GEOMETRY_TABLE = "GTAB"
+GEOMETRY_DECODER = "GMLP"
+RADIANCE_TABLE = "RTAB"
+RADIANCE_DECODER = "RMLP"
 
-LOGITS = (COLORS, SCALES, OPACITIES)
-TABLES = (GEOMETRY_TABLE, RADIANCE_TABLE)
-MLPS = (GEOMETRY_DECODER, RADIANCE_DECODER)
-# Gaussians may come in layers, the most important first: sections of the first, and how many layers there may be.
-LAYERED = (POSITIONS, *LOGITS)
+LOGIT_SECTIONS = (COLORS, SCALES, OPACITIES)
+TABLE_SECTIONS = (GEOMETRY_TABLE, RADIANCE_TABLE)
+DECODER_SECTIONS = (GEOMETRY_DECODER, RADIANCE_DECODER)
+# Gaussians may be stored in layers, the most important first. These are the section types of the first layer.
+LAYERED_SECTIONS = (POSITIONS, *LOGIT_SECTIONS)
 MAX_LAYERS = 8
-NON_PARAMETERS = (METADATA, EXPOSURE)  # sections that hold no parameters of the model
+NON_PARAMETER_SECTIONS = (METADATA, EXPOSURE)
 
-# Section types and what they hold; every one but EXPOSURE is required.
-SECTIONS = {
+# Content of each section type. Every section but EXPOSURE is required.
+SECTION_CONTENTS = {
     METADATA: "metadata",
     EXPOSURE: "exposure map",
     POSITIONS: "positions",
@@ -31,14 +40,21 @@ SECTIONS = {
 
 
 def layer_section(group: str, layer: int) -> str:
-    """What a section of LAYERED is called in a layer: "POSI", then "POS1", "POS2", ..."""
+    """Return the section type of a member of LAYERED_SECTIONS in a layer: "POSI", then "POS1", "POS2", ..."""
     return f"{group[:3]}{layer}" if layer else group
 
 
-_OF_LAYERS = {layer_section(group, layer): (group, layer) for layer in range(MAX_LAYERS) for group in LAYERED}
-SECTIONS |= {tag: f"{SECTIONS[group]}, layer {layer}" for tag, (group, layer) in _OF_LAYERS.items() if layer}
+_GROUP_AND_LAYER_BY_TAG = {
+    layer_section(group, layer): (group, layer) for layer in range(MAX_LAYERS) for group in LAYERED_SECTIONS
+}
+SECTION_CONTENTS |= {
+    tag: f"{SECTION_CONTENTS[group]}, layer {layer}" for tag, (group, layer) in _GROUP_AND_LAYER_BY_TAG.items() if layer
+}
 
 
 def group_and_layer(tag: str) -> tuple[str, int]:
-    """What a section is called in the first layer, and its layer: "POS2" is ("POSI", 2). Others are of layer 0."""
-    return _OF_LAYERS.get(tag, (tag, 0))
+    """Return the section type in the first layer and the number of the layer: ("POSI", 2) for "POS2".
+
+    Sections without layers are in layer 0.
+    """
+    return _GROUP_AND_LAYER_BY_TAG.get(tag, (tag, 0))

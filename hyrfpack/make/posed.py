@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.format.run_folder import CHECKPOINT, METRICS, MODEL
+from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.make.progress import Progress, Reporter
 from hyrfpack.make.source import Reading, Source
@@ -53,7 +53,7 @@ def posed(
 
 def _check(source: Source, run: Path, *, overwrite: bool) -> None:
     for outputs in source.outputs(overwrite):
-        outputs.folder(run, [MODEL, CHECKPOINT, METRICS])
+        outputs.folder(run, [MODEL_FILE, CHECKPOINT_FILE, METRICS_FILE])
 
 
 def _estimate(photos: Path, scene: Path, overwrite: bool, report: Callable[[Progress], None] | None, say: Say) -> None:

@@ -12,7 +12,7 @@ from hyrfpack.data.folder import list_photos
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.export.folder import check_folder
 from hyrfpack.export.kinds import PLAYER, check_place, check_request, kind_of
-from hyrfpack.format.smallest import check_target_bytes
+from hyrfpack.format.min_file_size import check_target_bytes
 from hyrfpack.make.source import Reading, Source
 from hyrfpack.make.stages import EXPORTED, PACKED
 from hyrfpack.make.state import NAME, State, digest

@@ -23,7 +23,7 @@ from hyrfpack.evaluate import evaluate
 from hyrfpack.evaluate.metrics import decibels
 from hyrfpack.export import export
 from hyrfpack.format import describe, load
-from hyrfpack.format.run_folder import CHECKPOINT, METRICS, MODEL
+from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.make.plan import Plan
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.state import digest, digest_all
@@ -113,13 +113,13 @@ def fit(
                 raise error.__cause__ if isinstance(error.__cause__, HyrfError) else error from None
             if not trained.complete:
                 raise KeyboardInterrupt
-            if not (run / METRICS).is_file():  # a full disk; the next call completes it
+            if not (run / METRICS_FILE).is_file():  # a full disk; the next call completes it
                 raise HyrfError(trained.missing)
-        metrics = json.loads((run / METRICS).read_bytes())
+        metrics = json.loads((run / METRICS_FILE).read_bytes())
         facts = {key: metrics[key] for key in ("gaussians", "bytes", "choices", "device")}
-        psnr = describe(run / MODEL)["provenance"]["psnr"]
+        psnr = describe(run / MODEL_FILE)["provenance"]["psnr"]
         facts |= {"steps": plan.steps, "target_bytes": config.target_bytes, "psnr": psnr}
-        return facts, [f"{RUN}/{name}" for name in (MODEL, METRICS)]
+        return facts, [f"{RUN}/{name}" for name in (MODEL_FILE, METRICS_FILE)]
 
     return work.stage("training", inputs, act, {name: getattr(config, name) for name in FIXED_SETTINGS})
 
@@ -131,7 +131,7 @@ def trained_for(work: Work) -> int | None:
 
 def _is_finished(run: Path) -> bool:
     """Whether a run came to its end, of which the record did not hear: the checkpoint goes last."""
-    return (run / METRICS).is_file() and (run / MODEL).is_file() and not (run / CHECKPOINT).exists()
+    return (run / METRICS_FILE).is_file() and (run / MODEL_FILE).is_file() and not (run / CHECKPOINT_FILE).exists()
 
 
 def _split(scene: Scene) -> dict[str, Any]:
@@ -182,7 +182,7 @@ def pack(work: Work, scene: Scene, plan: Plan, device: torch.device) -> dict[str
     """Compress into `model.hyrf`; returns bytes and Gaussians."""
 
     def act(going_on: bool) -> tuple[dict, list[str]]:
-        source, target = work.folder / RUN / MODEL, work.folder / PACKED
+        source, target = work.folder / RUN / MODEL_FILE, work.folder / PACKED
         try:
             report = compress(
                 source, target, data=scene, finetune_steps=plan.finetune_steps, target_bytes=plan.target_bytes,
@@ -198,7 +198,7 @@ def pack(work: Work, scene: Scene, plan: Plan, device: torch.device) -> dict[str
 
     cameras = "photos" if plan.finetune_steps else "cameras"  # fine-tuning looks at all, the rest at where they are
     inputs = {
-        "model": digest(work.folder / RUN / MODEL),
+        "model": digest(work.folder / RUN / MODEL_FILE),
         cameras: work.state.inputs("training")["photos and poses"],
         "finetune": plan.finetune_steps,
         "target size": plan.target_bytes,

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
-from hyrfpack.format.exposure_head import STOPS_PER_LOG_GAIN
+from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
 from hyrfpack.model.exposure import expose
 from hyrfpack.model.frame import Frame
 from hyrfpack.ops.adam import adam_step

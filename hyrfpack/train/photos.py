@@ -8,7 +8,7 @@ from typing import Any
 
 from hyrfpack.data import LAYOUTS, load_scene
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.format.run_folder import METRICS, MODEL, find_model
+from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE, find_model
 from hyrfpack.scene import Scene
 
 
@@ -31,10 +31,10 @@ def photos_of(model: str | os.PathLike[str]) -> Scene | None:
         (8, 2)
     """
     model = find_model(model)
-    if model.name != MODEL:
+    if model.name != MODEL_FILE:
         return None
     try:
-        said = json.loads((model.parent / METRICS).read_text("utf-8"))["scene"]
+        said = json.loads((model.parent / METRICS_FILE).read_text("utf-8"))["scene"]
         reading, sizes = dict(said["reading"]), (said["train"], said["test"])
         path = reading.pop("path")
     except (OSError, ValueError, KeyError, TypeError, RecursionError):

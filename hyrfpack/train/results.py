@@ -27,7 +27,7 @@ from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate import evaluate, picture_names
 from hyrfpack.evaluate.figures import training_curve
 from hyrfpack.format.codec import write_model
-from hyrfpack.format.run_folder import CHECKPOINT, METRICS, MODEL
+from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render
 from hyrfpack.scene import Scene, evenly_spaced
@@ -166,14 +166,14 @@ def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) ->
         "curve": trainer.records,
     }
     digest = hashlib.sha256(data).hexdigest()
-    record = TrainingRecord(MODEL, digest, trainer.step, _settings_of(scene, config), metrics)
+    record = TrainingRecord(MODEL_FILE, digest, trainer.step, _settings_of(scene, config), metrics)
     is_recorded = True
     try:
         write_atomic(out / RECORD, record.encode())
     except HyrfError:
         is_recorded = False
     try:
-        name = Path(write_model(data, out / MODEL, overwrite=overwrite).file).name
+        name = Path(write_model(data, out / MODEL_FILE, overwrite=overwrite).file).name
     except HyrfError:
         _remove(out / RECORD)
         raise
@@ -182,10 +182,10 @@ def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) ->
         with suppress(HyrfError):
             write_atomic(out / RECORD, record.encode())
     if overwrite:
-        for result in (METRICS, CURVE, *_picture_files(scene)):  # they would be taken for results of this model
+        for result in (METRICS_FILE, CURVE, *_picture_files(scene)):  # they would be taken for results of this model
             _remove(out / result)
     if is_recorded and (overwrite or trainer.saved is not None):
-        _remove(out / CHECKPOINT)  # which also frees space for the results
+        _remove(out / CHECKPOINT_FILE)  # which also frees space for the results
     return record
 
 
@@ -244,11 +244,11 @@ def write_results(
         reasons.append(str(error))
     try:
         if is_scored:
-            write_atomic(out / METRICS, json.dumps(metrics, indent=1).encode(), overwrite=overwrite)
+            write_atomic(out / METRICS_FILE, json.dumps(metrics, indent=1).encode(), overwrite=overwrite)
         else:
-            missing.append(METRICS)
+            missing.append(METRICS_FILE)
     except HyrfError as error:
-        missing.append(METRICS)
+        missing.append(METRICS_FILE)
         reasons.append(str(error))
     if not missing:
         _remove(out / RECORD)

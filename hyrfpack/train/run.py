@@ -19,7 +19,7 @@ from hyrfpack.data.cache import memory_bytes
 from hyrfpack.device import choose_own_device
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate import picture_names
-from hyrfpack.format.run_folder import CHECKPOINT, METRICS, MODEL
+from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
@@ -177,7 +177,7 @@ def _train_in_folder(
     ranks: Ranks,
 ) -> TrainResult:
     """As `train`, in a folder that this call holds."""
-    checkpoint = out / CHECKPOINT
+    checkpoint = out / CHECKPOINT_FILE
     device = choose_own_device(device, ranks)
     resume = ranks.broadcast(resume or (ranks.restarts > 0 and is_begun(out)))
     replace = resume or overwrite
@@ -254,14 +254,14 @@ def _train_in_folder(
         if not complete or not ranks.is_main:
             if written:
                 written.end(complete=complete, step=trainer.step)
-            return TrainResult(complete, trainer.step, out / MODEL if complete else None, {})
+            return TrainResult(complete, trainer.step, out / MODEL_FILE if complete else None, {})
         with PhaseLine(silent) as phases:
             tell_phase = phase or phases.update
             with _naming_the_checkpoint(trainer, overwrite):
                 record = save_model(trainer, out, tell_phase, overwrite=replace)
             results = write_results(record, scene, out, config, device, tell_phase, overwrite=replace)
             missing = _tell_missing(results, phases)
-        if METRICS not in results.missing and (replace or trainer.saved is not None):
+        if METRICS_FILE not in results.missing and (replace or trainer.saved is not None):
             checkpoint.unlink(missing_ok=True)
         if written:
             _log_end(written, record.step, results)
@@ -285,7 +285,7 @@ def _open_questions(scene: Scene, config: TrainConfig) -> str:
 
 def is_begun(out: Path) -> bool:
     """Whether a run's folder has something that `resume` continues from: a checkpoint, or a model to be scored."""
-    return (out / CHECKPOINT).is_file() or read_record(out) is not None
+    return (out / CHECKPOINT_FILE).is_file() or read_record(out) is not None
 
 
 def _complete(
@@ -301,7 +301,7 @@ def _complete(
 ) -> TrainResult:
     """Compute and write what is missing beside a finished model; rank 0 does."""
     if not ranks.is_main:
-        return TrainResult(True, record.step, out / MODEL, {})
+        return TrainResult(True, record.step, out / MODEL_FILE, {})
     with PhaseLine(silent) as phases, ExitStack() as stack:
         phases.note("the model is trained already; its scores and pictures are computed now")
         written = None
@@ -311,8 +311,8 @@ def _complete(
         if written:
             _log_end(written, record.step, results)
         missing = _tell_missing(results, phases)
-    if METRICS not in results.missing:
-        (out / CHECKPOINT).unlink(missing_ok=True)
+    if METRICS_FILE not in results.missing:
+        (out / CHECKPOINT_FILE).unlink(missing_ok=True)
     return TrainResult(True, record.step, out / record.model, results.metrics, missing)
 
 
@@ -378,18 +378,20 @@ def _prepare(
                 f"{out}: the folder holds a model that was trained with other settings ({', '.join(different)}); "
                 "use the same ones to complete its results, or replace it with `overwrite=True`"
             )
-    elif resume and not (out / CHECKPOINT).is_file():
+    elif resume and not (out / CHECKPOINT_FILE).is_file():
         raise HyrfError(f"{out}: there is no checkpoint to resume; leave out `resume=True` to start a run")
-    left = [name for name in (MODEL, CHECKPOINT) if (out / name).exists()]
+    left = [name for name in (MODEL_FILE, CHECKPOINT_FILE) if (out / name).exists()]
     if left and not (resume or overwrite or record is not None):
-        hint = "`resume=True` goes on with it, " if CHECKPOINT in left else ""
+        hint = "`resume=True` goes on with it, " if CHECKPOINT_FILE in left else ""
         raise HyrfError(f"{out}: the folder holds an earlier run ({left[-1]}); {hint}`overwrite=True` replaces it")
     _check_outputs(out, scene, overwrite=resume or overwrite or record is not None)
 
 
 def _check_outputs(out: Path, scene: Scene, *, overwrite: bool) -> None:
     views = [f"{VIEWS}/{name}" for name in picture_names(scene.test).values()]
-    Outputs(scene=scene, overwrite=overwrite).folder(out, [MODEL, CHECKPOINT, METRICS, CURVE, RECORD, *views])
+    Outputs(scene=scene, overwrite=overwrite).folder(
+        out, [MODEL_FILE, CHECKPOINT_FILE, METRICS_FILE, CURVE, RECORD, *views]
+    )
 
 
 def _check_photos(scene: Scene, cache: PictureCache, phase: Phase) -> None:

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from hyrfpack.cameras.capture import quantized_provenance, scene_provenance
 from hyrfpack.cameras.paths import common_direction
 from hyrfpack.errors import HyrfTrainingError
-from hyrfpack.format.smallest import check_target_bytes
+from hyrfpack.format.min_file_size import check_target_bytes
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.hybrid import scale_bounds

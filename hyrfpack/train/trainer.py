@@ -19,7 +19,7 @@ from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload_array
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate.metrics import decibels
-from hyrfpack.format.exposure_head import STOPS_PER_LOG_GAIN
+from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.ssim import photometric_loss

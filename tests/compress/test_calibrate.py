@@ -23,7 +23,7 @@ from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.quantize import decide
 from hyrfpack.compress.sensitivity import PRUNED, Sensitivity, measure_sensitivity
 from hyrfpack.format import decode_model, encode_model
-from hyrfpack.format.arrays import by_parameter, to_arrays
+from hyrfpack.format.arrays import iter_parameters, to_arrays
 from hyrfpack.format.sections import COLORS, OPACITIES, POSITIONS
 from hyrfpack.model import HybridModel
 
@@ -187,7 +187,7 @@ def test_what_a_part_does_not_change_need_not_be_decoded_anew(part, says):
     arrays = to_arrays(before)
     generator = np.random.default_rng(0)
     other = {name: arrays[name] * generator.uniform(0.5, 1.5, arrays[name].shape).astype(np.float32) for name in part}
-    changed.load_state_dict(dict(by_parameter(other, changed)), strict=False)
+    changed.load_state_dict(dict(iter_parameters(other, changed)), strict=False)
 
     found = Originals.of(before, CAMERAS).error(changed, _decoded_anew(changed, before.decode(), part))
 

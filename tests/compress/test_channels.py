@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from hyrfpack.compress import channels
 from hyrfpack.compress.channels import quantize_channel
-from hyrfpack.format.compact.channels import LIMIT, Channel, decode_channel, encode_channel
+from hyrfpack.format.compact.channels import MAX_ABS_CHANNEL_VALUE, Channel, decode_channel, encode_channel
 from hyrfpack.quant.steps import step_of
 
 FIXED_POINT = 2**-24
@@ -52,7 +52,7 @@ CASES = {
     "outliers": np.where(np.arange(700) % 97, noise(700), 4000.0),
     "out of range": np.where(np.arange(64) % 2, 1e9, -1e30),
     "tiny": 1e-9 * noise(100),
-    "alternating ends": np.where(np.arange(64) % 2, LIMIT, -LIMIT),
+    "alternating ends": np.where(np.arange(64) % 2, MAX_ABS_CHANNEL_VALUE, -MAX_ABS_CHANNEL_VALUE),
 }
 
 
@@ -94,7 +94,7 @@ def test_many_numbers_round_trip() -> None:
     check_round_trip(channel, classes)
 
 
-@pytest.mark.parametrize("half_range", [600.0, LIMIT])
+@pytest.mark.parametrize("half_range", [600.0, MAX_ABS_CHANNEL_VALUE])
 def test_a_wide_range_in_the_finest_steps_round_trips(half_range: float) -> None:
     channel = quantize_channel(np.array([-half_range, half_range]), one_class(2), np.full(2, 1e6), 1e-12)
 
@@ -129,7 +129,9 @@ def test_every_number_adds_the_error_it_may() -> None:
 def test_numbers_beyond_the_limit_are_cut() -> None:
     channel = quantize_channel(np.array([1e30, -np.inf, 0.0, 4096.5]), one_class(4), np.ones(4), 1e-8, reach=0)
 
-    np.testing.assert_allclose(channel.values, [LIMIT, -LIMIT, 0, LIMIT], atol=1e-3)
+    np.testing.assert_allclose(
+        channel.values, [MAX_ABS_CHANNEL_VALUE, -MAX_ABS_CHANNEL_VALUE, 0, MAX_ABS_CHANNEL_VALUE], atol=1e-3
+    )
 
 
 def measured_cost(channel: Channel, values: np.ndarray, classes: np.ndarray, weights, distortion: float) -> float:

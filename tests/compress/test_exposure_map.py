@@ -16,7 +16,7 @@ from hyrfpack.compress import compress
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
 from hyrfpack.format import describe, load, save
-from hyrfpack.format.smallest import min_file_bytes
+from hyrfpack.format.min_file_size import min_file_bytes
 from hyrfpack.model import ExposureMap, HybridModel
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Picture, Scene

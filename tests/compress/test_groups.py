@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 
 from hyrfpack.compress.groups import quantize_groups
 from hyrfpack.compress.rate_distortion import best_steps, cheapest, code_bits
-from hyrfpack.format.compact.groups import LARGEST, MODELS, GroupSymbols, StepGroups, decode_groups, encode_groups
+from hyrfpack.format.compact.groups import (
+    ENTROPY_MODEL_COUNT,
+    MAX_ABS_SYMBOL,
+    GroupSymbols,
+    StepGroups,
+    decode_groups,
+    encode_groups,
+)
 from hyrfpack.quant.steps import NOT_CODED, ONE, step_of
 
 
@@ -127,7 +134,7 @@ def test_numbers_beyond_the_largest_symbol_are_cut() -> None:
 
     chosen = quantize_groups(np.array([1e30, -1e30, 1.0]), groups, np.ones(3), 1e-6, reach=0)
 
-    assert chosen.symbols[:2].tolist() == [LARGEST, -LARGEST]
+    assert chosen.symbols[:2].tolist() == [MAX_ABS_SYMBOL, -MAX_ABS_SYMBOL]
     check_round_trip(chosen, groups)
 
 
@@ -157,7 +164,7 @@ def test_groups_that_spread_alike_share_a_model() -> None:
 
     sizes = [len(check_round_trip(symbols, groups)) for symbols in (chosen, pooled)]
 
-    assert chosen.models[0] < chosen.models[1] < MODELS
+    assert chosen.models[0] < chosen.models[1] < ENTROPY_MODEL_COUNT
     assert sizes[0] < 0.9 * sizes[1]
 
 
@@ -218,7 +225,7 @@ def test_reach_never_costs_more_by_the_coders_own_measure(data: st.DataObject) -
     distortion = 10.0 ** data.draw(st.floats(-3, 2))
     near, far = (quantize_groups(values, groups, np.ones(len(values)), distortion, reach) for reach in (0, 1))
     models = far.models[groups.index]
-    bits, least = code_bits(near.symbols, models, MODELS, 1)
+    bits, least = code_bits(near.symbols, models, ENTROPY_MODEL_COUNT, 1)
 
     def cost(chosen: GroupSymbols) -> float:
         steps = step_of(best_steps(np.ones(1), distortion)) / ONE

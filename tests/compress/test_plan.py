@@ -24,10 +24,10 @@ from hyrfpack.compress.plan import (
 from hyrfpack.compress.quantize import decide, quantize
 from hyrfpack.compress.sensitivity import Sensitivity, removal_error
 from hyrfpack.format import decode_model, encode_model
-from hyrfpack.format.arrays import GROUPS, group_shapes, to_arrays, to_model
+from hyrfpack.format.arrays import SECTION_PARAMETERS, group_shapes, to_arrays, to_model
 from hyrfpack.format.compact import encode
-from hyrfpack.format.compact.plan import Plan, from_lattice
-from hyrfpack.format.compact.quantized import Quantized
+from hyrfpack.format.compact.plan import Plan, lattice_to_local
+from hyrfpack.format.compact.quantized import QuantizedModel
 from hyrfpack.model import Frame, HybridModel, contract
 from hyrfpack.quant.steps import NOT_CODED, ONE, step_of
 
@@ -70,7 +70,7 @@ def a_plan(model: HybridModel, distortion: float = DISTORTION, **settings) -> Pl
     return make_plan(model, a_sensitivity(model), distortion, **settings)
 
 
-def decided(model: HybridModel, distortion: float = DISTORTION, **settings) -> Quantized:
+def decided(model: HybridModel, distortion: float = DISTORTION, **settings) -> QuantizedModel:
     return decide(model, a_sensitivity(model), distortion, **settings)
 
 
@@ -108,11 +108,11 @@ def test_the_planned_model_is_that_part_of_the_model_on_the_lattice() -> None:
     planned = plan.apply(model)
 
     arrays = to_arrays(planned)
-    for group in GROUPS:
+    for group in SECTION_PARAMETERS:
         expected = original[group][plan.kept] if group in EXPLICIT else original[group]
         if group != "POSI":
             np.testing.assert_array_equal(arrays[group], expected)
-    np.testing.assert_array_equal(arrays["POSI"], from_lattice(plan.layers[0].points, frame))
+    np.testing.assert_array_equal(arrays["POSI"], lattice_to_local(plan.layers[0].points, frame))
     # In the cube each is back at its cell's centre, up to float32 of a local position.
     centers = plan.layers[0].points.centers() / 2**19
     assert np.abs(cube_of(planned) - centers).max() < 1e-6

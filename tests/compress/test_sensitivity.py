@@ -11,7 +11,7 @@ from hyrfpack.cameras.view_sampling import interpolate_views
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
-from hyrfpack.format.arrays import GROUPS
+from hyrfpack.format.arrays import SECTION_PARAMETERS
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.contraction import contract, expand
 from hyrfpack.render import render
@@ -187,7 +187,7 @@ def test_sizes_are_those_of_the_file():
 
     parameters = dict(model.named_parameters())
     for group, values in found.fields.items():
-        assert len(values) == sum(parameters[name].numel() for name in GROUPS[group]), group
+        assert len(values) == sum(parameters[name].numel() for name in SECTION_PARAMETERS[group]), group
         assert values.dtype == np.float64 and np.isfinite(values).all()
     for name in ("positions", "colors", "scales", "opacities"):
         assert getattr(found, name).shape == (20,) and getattr(found, name).dtype == np.float64

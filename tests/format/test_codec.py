@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import decode_model, describe, encode_model, load, repack, save
-from hyrfpack.format.container import MINOR, Section, read_container, write_container
+from hyrfpack.format.container import MINOR_VERSION, Section, read_container, write_container
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from tools.safety.plans import drawn, encode
@@ -54,7 +54,7 @@ def rewrite(data: bytes, **changes: bytes | None) -> bytes:
             sections.append(replace(section, codec=0, data=payload, raw_length=len(payload)))
         elif payload is not None:
             sections.append(replace(section, data=payload))
-    return write_container(sections, minor=MINOR)
+    return write_container(sections, minor=MINOR_VERSION)
 
 
 def metadata_text(data: bytes) -> bytes:
@@ -386,14 +386,18 @@ def test_an_unknown_codec_is_refused():
     sections = read_container(encode_model(make_model())).sections
 
     with pytest.raises(HyrfFormatError, match="unknown codec 99; update"):
-        decode_model(write_container([replace(s, codec=99) if s.type == "RTAB" else s for s in sections], minor=MINOR))
+        decode_model(
+            write_container([replace(s, codec=99) if s.type == "RTAB" else s for s in sections], minor=MINOR_VERSION)
+        )
 
 
 def test_unknown_optional_section_is_skipped():
     model = make_model()
     sections = read_container(encode_model(model)).sections
 
-    decoded = decode_model(write_container([*sections, Section("NEW_", 7, b"later", 5, required=False)], minor=MINOR))
+    decoded = decode_model(
+        write_container([*sections, Section("NEW_", 7, b"later", 5, required=False)], minor=MINOR_VERSION)
+    )
 
     assert torch.equal(decoded.gaussians.positions, model.gaussians.positions)
 
@@ -495,7 +499,7 @@ def test_forged_deflated_metadata_is_refused_in_little_memory(forgery):
         replace(section, data=payload, raw_length=raw_length) if section.type == "META" else section
         for section in read_container(data).sections
     ]
-    forged = write_container(sections, minor=MINOR)
+    forged = write_container(sections, minor=MINOR_VERSION)
 
     tracemalloc.start()
     with pytest.raises(HyrfFormatError, match="the metadata "):

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hyrfpack.compress.channels import quantize_channel
-from hyrfpack.format.compact.channels import LIMIT, decode_channel, encode_channel
+from hyrfpack.format.compact.channels import MAX_ABS_CHANNEL_VALUE, decode_channel, encode_channel
 from hyrfpack.format.compact.quantized import decode_channels
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.integers import encode_integers
@@ -98,7 +98,7 @@ def test_damage_is_refused_or_yields_as_many_finite_numbers(data: st.DataObject)
 @pytest.mark.parametrize("sign", [1, -1])
 def test_the_largest_differences_allowed_do_not_overflow(code: int, sign: int) -> None:
     step = int(step_of(code))
-    largest = min(int(8 * LIMIT / FIXED_POINT) // step, 1 << 30)
+    largest = min(int(8 * MAX_ABS_CHANNEL_VALUE / FIXED_POINT) // step, 1 << 30)
 
     def decode(difference: int) -> np.ndarray:
         stream = encode_integers(np.full(1000, difference), one_class(1000), signed=True)

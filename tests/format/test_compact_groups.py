@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hyrfpack.compress.groups import quantize_groups
-from hyrfpack.format.compact.groups import LARGEST, StepGroups, decode_groups, encode_groups
+from hyrfpack.format.compact.groups import MAX_ABS_SYMBOL, StepGroups, decode_groups, encode_groups
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.integers import encode_integers
 
@@ -88,8 +88,8 @@ def test_bytes_made_by_hand_are_read() -> None:
         (written([2**50, 192], [0, 0], [1, 1, 1], [0, 0, 0]), "step code"),
         (written([192, 192], [8, 0], [1, 1, 1], [8, 0, 0]), "model"),
         (written([192, 192], [2**40, 0], [1, 1, 1], [0, 0, 0]), "model"),
-        (written([192, 192], [0, 0], [1, 1, LARGEST + 1], [0, 0, 0]), "steps"),
-        (written([192, 192], [0, 0], [1, 1, -LARGEST - 1], [0, 0, 0]), "steps"),
+        (written([192, 192], [0, 0], [1, 1, MAX_ABS_SYMBOL + 1], [0, 0, 0]), "steps"),
+        (written([192, 192], [0, 0], [1, 1, -MAX_ABS_SYMBOL - 1], [0, 0, 0]), "steps"),
         (written([192, 192], [0, 0], [1, -(2**54), 1], [0, 0, 0]), "steps"),
     ],
 )
@@ -99,10 +99,10 @@ def test_numbers_out_of_range_are_refused(data: bytes, claim: str) -> None:
 
 
 def test_the_largest_numbers_are_finite() -> None:
-    data = written([1, 255], [0, 0], [LARGEST, LARGEST, -LARGEST], [0, 0, 0])
+    data = written([1, 255], [0, 0], [MAX_ABS_SYMBOL, MAX_ABS_SYMBOL, -MAX_ABS_SYMBOL], [0, 0, 0])
 
     np.testing.assert_array_equal(
-        decode_groups(memoryview(data), TWO), np.float32([9.0, 1920.0 * LARGEST, -1920.0 * LARGEST])
+        decode_groups(memoryview(data), TWO), np.float32([9.0, 1920.0 * MAX_ABS_SYMBOL, -1920.0 * MAX_ABS_SYMBOL])
     )
 
 

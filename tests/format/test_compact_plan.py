@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from scenes import small_model
 
 from hyrfpack.errors import HyrfFormatError
-from hyrfpack.format.arrays import GROUPS, group_shapes, to_arrays, to_model
-from hyrfpack.format.compact import CODECS, decode_positions, decode_section, encode
+from hyrfpack.format.arrays import SECTION_PARAMETERS, group_shapes, to_arrays, to_model
+from hyrfpack.format.compact import SECTIONS_BY_CODEC, decode_positions, decode_section, encode
 from hyrfpack.format.compact import plan as layout
-from hyrfpack.format.compact.plan import groups_of
+from hyrfpack.format.compact.plan import build_step_groups
 from hyrfpack.format.compact.quantized import CODEC_CHANNELS, CODEC_GROUPS, CODEC_POINTS
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.hash_encode.reference import cells as reference_cells
@@ -49,7 +49,7 @@ def test_rows_share_a_step_by_level_and_how_often_they_are_read(group: str) -> N
     for row in read.flatten().tolist():
         counts[row] += 1
 
-    groups = groups_of(group, config, points)
+    groups = build_step_groups(group, config, points)
 
     usage = [0 if n == 0 else 1 + math.floor(math.log(n, 4) + 1e-9) for n in counts]
     level = [sum(row >= offset for offset in grid.offsets[1:-1]) for row in range(grid.rows)]
@@ -61,18 +61,18 @@ def test_rows_share_a_step_by_level_and_how_often_they_are_read(group: str) -> N
 def test_of_many_gaussians_every_nth_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     config, points = a_model(1).config, a_lattice(250)
     every_third = Points(points.cells[::3], points.classes[::3], points.bits)
-    expected = groups_of("GTAB", config, every_third)
+    expected = build_step_groups("GTAB", config, every_third)
 
-    monkeypatch.setattr(layout, "COUNTED", 100)
+    monkeypatch.setattr(layout, "MAX_COUNTED_GAUSSIANS", 100)
 
-    np.testing.assert_array_equal(groups_of("GTAB", config, points).index, expected.index)
+    np.testing.assert_array_equal(build_step_groups("GTAB", config, points).index, expected.index)
 
 
 def test_no_gaussian_reads_no_row() -> None:
     config = a_model(1).config
     points = Points(np.zeros((0, 3), np.int64), np.zeros(0, np.uint8), np.ones(6, np.int64))
 
-    groups = groups_of("RTAB", config, points)
+    groups = build_step_groups("RTAB", config, points)
 
     assert (groups.index % 16 == 0).all() and len(groups.index) == 2 * config.radiance.rows
 
@@ -81,7 +81,7 @@ def test_no_gaussian_reads_no_row() -> None:
 def test_weights_of_an_output_share_a_step_and_biases_of_a_layer(group: str, field: str) -> None:
     model = a_model(1)
     arrays = to_arrays(model)
-    groups = groups_of(group, model.config, None)
+    groups = build_step_groups(group, model.config, None)
     arrays[group] = groups.index.astype(np.float32)[:, None]
 
     parts = getattr(to_model(model.config, arrays), field)
@@ -101,7 +101,12 @@ def test_weights_of_an_output_share_a_step_and_biases_of_a_layer(group: str, fie
 
 @pytest.mark.parametrize(
     ("group", "codec"),
-    [(group, codec) for codec, groups in CODECS.items() for group in GROUPS if group not in groups],
+    [
+        (group, codec)
+        for codec, groups in SECTIONS_BY_CODEC.items()
+        for group in SECTION_PARAMETERS
+        if group not in groups
+    ],
 )
 def test_sections_with_the_codec_of_another_are_refused(group: str, codec: int) -> None:
     with pytest.raises(HyrfFormatError, match="codec"):

@@ -16,7 +16,14 @@ from hypothesis import strategies as st
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import container as format_container
-from hyrfpack.format.container import MINOR, Container, Section, raw_limit, read_container, write_container
+from hyrfpack.format.container import (
+    MINOR_VERSION,
+    Container,
+    Section,
+    raw_bytes_limit,
+    read_container,
+    write_container,
+)
 
 # Places of header fields and table columns, from docs/format.md and not from the code.
 HEADER = {"major": (8, "<H"), "minor": (10, "<H"), "flags": (12, "<I"), "file_length": (16, "<Q")}
@@ -75,15 +82,15 @@ section_lists = st.lists(
 
 @given(section_lists)
 def test_sections_come_back_as_written(sections):
-    assert contents(read_all(write_container(sections, minor=MINOR), known=None)) == contents(sections)
+    assert contents(read_all(write_container(sections, minor=MINOR_VERSION), known=None)) == contents(sections)
 
 
 @given(section_lists)
 def test_same_sections_give_same_bytes_and_rewriting_what_was_read_changes_nothing(sections):
-    data = write_container(sections, minor=MINOR)
+    data = write_container(sections, minor=MINOR_VERSION)
 
-    assert write_container(sections, minor=MINOR) == data
-    assert write_container(read_all(data, known=None), minor=MINOR) == data
+    assert write_container(sections, minor=MINOR_VERSION) == data
+    assert write_container(read_all(data, known=None), minor=MINOR_VERSION) == data
 
 
 def test_bytes_are_those_of_the_specification():
@@ -97,11 +104,13 @@ def test_bytes_are_those_of_the_specification():
 
 
 def test_sections_start_at_multiples_of_eight():
-    assert all(entry.offset % 8 == 0 for entry in read_container(write_container(SMALL, minor=MINOR)).entries.values())
+    assert all(
+        entry.offset % 8 == 0 for entry in read_container(write_container(SMALL, minor=MINOR_VERSION)).entries.values()
+    )
 
 
 def test_memory_is_viewed_and_not_copied():
-    data = write_container([Section("BULK", 0, bytes(1 << 20), 1 << 20)], minor=MINOR)
+    data = write_container([Section("BULK", 0, bytes(1 << 20), 1 << 20)], minor=MINOR_VERSION)
 
     tracemalloc.start()
     section = read_container(data)["BULK"]
@@ -113,7 +122,9 @@ def test_memory_is_viewed_and_not_copied():
 
 @pytest.mark.parametrize("values", [np.arange(6.0).reshape(2, 3), np.empty((0, 3))], ids=["filled", "empty"])
 def test_writer_accepts_any_contiguous_buffer(values):
-    (section,) = read_all(write_container([Section("DATA", 0, values.data, values.nbytes)], minor=MINOR), known=None)
+    (section,) = read_all(
+        write_container([Section("DATA", 0, values.data, values.nbytes)], minor=MINOR_VERSION), known=None
+    )
 
     assert bytes(section.data) == values.tobytes()
 
@@ -135,7 +146,7 @@ def test_writer_accepts_any_contiguous_buffer(values):
 )
 def test_writer_refuses_what_the_reader_would(sections):
     with pytest.raises(ValueError):
-        write_container(sections, minor=MINOR)
+        write_container(sections, minor=MINOR_VERSION)
 
 
 @pytest.mark.parametrize("minor", [-1, 3])
@@ -149,7 +160,7 @@ def test_writer_refuses_a_minor_version_that_the_specification_does_not_have(min
 
 def test_open_reads_header_and_table_only_until_a_section_is_asked_for(tmp_path):
     path = tmp_path / "large.hyrf"
-    path.write_bytes(write_container([Section("BULK", 0, bytes(8 << 20), 8 << 20), *SMALL], minor=MINOR))
+    path.write_bytes(write_container([Section("BULK", 0, bytes(8 << 20), 8 << 20), *SMALL], minor=MINOR_VERSION))
 
     tracemalloc.start()
     with Container.open(path) as container:
@@ -164,7 +175,7 @@ def test_open_reads_header_and_table_only_until_a_section_is_asked_for(tmp_path)
 
 def test_open_sees_damage_only_in_the_section_that_is_read(tmp_path):
     path = tmp_path / "damaged.hyrf"
-    data = bytearray(write_container(SMALL, minor=MINOR))
+    data = bytearray(write_container(SMALL, minor=MINOR_VERSION))
     data[-9] ^= 1
     path.write_bytes(data)
 
@@ -176,7 +187,7 @@ def test_open_sees_damage_only_in_the_section_that_is_read(tmp_path):
 
 def test_open_reports_a_file_cut_short_while_it_is_read(tmp_path):
     path = tmp_path / "cut.hyrf"
-    path.write_bytes(write_container([Section("BULK", 0, bytes(1 << 20), 1 << 20)], minor=MINOR))
+    path.write_bytes(write_container([Section("BULK", 0, bytes(1 << 20), 1 << 20)], minor=MINOR_VERSION))
 
     with Container.open(path) as container:
         os.truncate(path, 1 << 19)
@@ -197,7 +208,7 @@ def a_text_file(path: Path) -> None:
 
 
 def a_file_mangled_as_text(path: Path) -> None:
-    path.write_bytes(write_container(SMALL, minor=MINOR).replace(b"\r\n", b"\n"))
+    path.write_bytes(write_container(SMALL, minor=MINOR_VERSION).replace(b"\r\n", b"\n"))
 
 
 def a_pipe(path: Path) -> None:
@@ -241,7 +252,7 @@ def test_open_refuses_a_name_with_a_null_byte():
 
 
 def test_unknown_optional_section_is_skipped_and_still_listed():
-    container = read_container(write_container(SMALL, minor=MINOR), known={"META", "POSI"})
+    container = read_container(write_container(SMALL, minor=MINOR_VERSION), known={"META", "POSI"})
 
     assert contents(container.sections) == contents(SMALL[:2])
     assert "TABL" not in container and list(container.entries) == ["META", "POSI", "NOTE", "TABL"]
@@ -251,7 +262,7 @@ def test_unknown_optional_section_is_skipped_and_still_listed():
 
 def test_unknown_required_section_is_refused_by_name():
     with pytest.raises(HyrfFormatError, match="'POSI' is required.*update hyrfpack"):
-        read_container(write_container(SMALL, minor=MINOR), known={"META"})
+        read_container(write_container(SMALL, minor=MINOR_VERSION), known={"META"})
 
 
 def test_newer_major_version_is_refused_whatever_follows_the_version():
@@ -260,21 +271,21 @@ def test_newer_major_version_is_refused_whatever_follows_the_version():
 
 
 def test_newer_minor_version_is_read():
-    container = read_container(forge(write_container(SMALL, minor=MINOR), minor=9), KNOWN)
+    container = read_container(forge(write_container(SMALL, minor=MINOR_VERSION), minor=9), KNOWN)
 
     assert container.version == (1, 9) and contents(container.sections) == contents(SMALL)
 
 
 def test_unknown_header_flag_is_refused():
     with pytest.raises(HyrfFormatError, match="flags 0x4.*update hyrfpack"):
-        read_container(forge(write_container(SMALL, minor=MINOR), flags=4))
+        read_container(forge(write_container(SMALL, minor=MINOR_VERSION), flags=4))
 
 
 # --- damage ---
 
 
 def test_every_truncation_is_refused():
-    data = write_container(SMALL, minor=MINOR)
+    data = write_container(SMALL, minor=MINOR_VERSION)
 
     for length in range(len(data)):
         with pytest.raises(HyrfFormatError, match="truncated" if length >= HEADER_BYTES else None):
@@ -282,7 +293,7 @@ def test_every_truncation_is_refused():
 
 
 def test_every_truncation_is_refused_even_where_the_header_agrees():
-    data = write_container(SMALL, minor=MINOR)
+    data = write_container(SMALL, minor=MINOR_VERSION)
 
     for length in range(HEADER_BYTES, len(data)):
         with pytest.raises(HyrfFormatError):
@@ -290,7 +301,7 @@ def test_every_truncation_is_refused_even_where_the_header_agrees():
 
 
 def test_bytes_after_the_end_are_refused():
-    data = write_container(SMALL, minor=MINOR)
+    data = write_container(SMALL, minor=MINOR_VERSION)
 
     with pytest.raises(HyrfFormatError, match=f"says {len(data)} bytes and there are {len(data) + 8}"):
         read_container(data + bytes(8))
@@ -299,7 +310,7 @@ def test_bytes_after_the_end_are_refused():
 
 
 def test_every_flipped_bit_is_found():
-    data = write_container(SMALL, minor=MINOR)
+    data = write_container(SMALL, minor=MINOR_VERSION)
 
     for bit in range(8 * len(data)):
         flipped = bytearray(data)
@@ -309,7 +320,7 @@ def test_every_flipped_bit_is_found():
 
 
 def test_padding_that_is_not_zero_is_refused():
-    data = bytearray(write_container(SMALL, minor=MINOR))
+    data = bytearray(write_container(SMALL, minor=MINOR_VERSION))
     data[-1] = 1
 
     with pytest.raises(HyrfFormatError, match="padding after section 'TABL'"):
@@ -327,24 +338,24 @@ HUGE = (1 << 63, (1 << 64) - 1, 1 << 40)
 )
 def test_forged_header_place_is_refused(field, says, value):
     with pytest.raises(HyrfFormatError, match=says):
-        read_container(forge(write_container(SMALL, minor=MINOR), **{field: value}))
+        read_container(forge(write_container(SMALL, minor=MINOR_VERSION), **{field: value}))
 
 
 @pytest.mark.parametrize("field", ["toc_length", "count"])
 @pytest.mark.parametrize("value", (0, 3, 5, 1024, 1025, (1 << 32) - 1))
 def test_forged_table_size_is_refused(field, value):
     with pytest.raises(HyrfFormatError):
-        read_container(forge(write_container(SMALL, minor=MINOR), **{field: value}))
+        read_container(forge(write_container(SMALL, minor=MINOR_VERSION), **{field: value}))
 
 
 @pytest.mark.parametrize("count", (20, 1024))
 def test_table_past_the_end_is_refused(count):
     with pytest.raises(HyrfFormatError, match="misplaces the table of contents"):
-        read_container(forge(write_container(SMALL, minor=MINOR), count=count, toc_length=count * ENTRY_BYTES))
+        read_container(forge(write_container(SMALL, minor=MINOR_VERSION), count=count, toc_length=count * ENTRY_BYTES))
 
 
 def test_more_sections_than_allowed_are_refused(monkeypatch):
-    data = write_container(SMALL, minor=MINOR)
+    data = write_container(SMALL, minor=MINOR_VERSION)
     monkeypatch.setattr(format_container, "MAX_SECTIONS", 3)
 
     with pytest.raises(HyrfFormatError, match="4 sections, more than the 3"):
@@ -353,7 +364,7 @@ def test_more_sections_than_allowed_are_refused(monkeypatch):
 
 def test_section_past_the_end_is_named():
     with pytest.raises(HyrfFormatError, match="'TABL' says 64 bytes and 16 are left"):
-        read_container(forge(write_container(SMALL, minor=MINOR), 3, length=64))
+        read_container(forge(write_container(SMALL, minor=MINOR_VERSION), 3, length=64))
 
 
 @pytest.mark.parametrize("index", range(4))
@@ -372,11 +383,11 @@ def test_section_past_the_end_is_named():
 )
 def test_forged_entry_is_refused(index, fields):
     with pytest.raises(HyrfFormatError):
-        read_container(forge(write_container(SMALL, minor=MINOR), index, **fields))
+        read_container(forge(write_container(SMALL, minor=MINOR_VERSION), index, **fields))
 
 
 def test_overlapping_sections_are_refused():
-    data = write_container(SMALL, minor=MINOR)
+    data = write_container(SMALL, minor=MINOR_VERSION)
     first = read_container(data).entries["META"]
 
     with pytest.raises(HyrfFormatError, match="'POSI' says it starts at"):
@@ -385,17 +396,17 @@ def test_overlapping_sections_are_refused():
 
 def test_gap_between_sections_is_refused():
     with pytest.raises(HyrfFormatError, match="'POSI' says it starts at"):
-        read_container(forge(write_container(SMALL, minor=MINOR), 0, length=5))
+        read_container(forge(write_container(SMALL, minor=MINOR_VERSION), 0, length=5))
 
 
 def test_repeated_type_is_refused():
     with pytest.raises(HyrfFormatError, match="'META' occurs twice"):
-        read_container(forge(write_container(SMALL, minor=MINOR), 1, type=b"META"))
+        read_container(forge(write_container(SMALL, minor=MINOR_VERSION), 1, type=b"META"))
 
 
 def test_promised_bytes_are_bounded_over_all_sections_together():
-    data = write_container(SMALL, minor=MINOR)
-    half = raw_limit(len(data)) // 2
+    data = write_container(SMALL, minor=MINOR_VERSION)
+    half = raw_bytes_limit(len(data)) // 2
     assert read_container(forge(data, 0, raw_length=half)).entries["META"].raw_length == half
 
     with pytest.raises(HyrfFormatError, match="decode to"):
@@ -403,17 +414,17 @@ def test_promised_bytes_are_bounded_over_all_sections_together():
 
 
 def test_file_over_the_largest_size_is_refused(monkeypatch):
-    data = write_container(SMALL, minor=MINOR)
+    data = write_container(SMALL, minor=MINOR_VERSION)
     monkeypatch.setattr(format_container, "MAX_FILE_BYTES", len(data) - 1)
 
     with pytest.raises(HyrfFormatError, match="more than a .hyrf file may have"):
         read_container(data)
     with pytest.raises(ValueError, match="exceed"):
-        write_container(SMALL, minor=MINOR)
+        write_container(SMALL, minor=MINOR_VERSION)
 
 
 def test_forged_numbers_allocate_nothing():
-    data = write_container(SMALL, minor=MINOR)
+    data = write_container(SMALL, minor=MINOR_VERSION)
     forgeries = [forge(data, file_length=v) for v in HUGE] + [forge(data, toc_offset=v) for v in HUGE]
     forgeries += [forge(data, count=v, toc_length=v) for v in (1024, (1 << 32) - 1)]
     forgeries += [forge(data, i, **{f: v}) for i in range(4) for f in ("offset", "length", "raw_length") for v in HUGE]
@@ -434,7 +445,7 @@ numbers = st.one_of(st.integers(0, 300), st.sampled_from([1 << 15, 1 << 31, *HUG
 @settings(max_examples=400)
 @given(st.data())
 def test_any_mutation_reads_the_same_or_raises_a_format_error(data):
-    file = write_container(SMALL, minor=MINOR)
+    file = write_container(SMALL, minor=MINOR_VERSION)
     for _ in range(data.draw(st.integers(1, 3))):
         kind = data.draw(st.sampled_from(["header", "entry", "splice", "raw"]))
         if kind == "splice":
@@ -459,7 +470,7 @@ def test_any_mutation_reads_the_same_or_raises_a_format_error(data):
         assert str(error).count("\n") == 0
     else:
         # What is accepted is canonical: it is exactly what the writer makes of it (but for another minor version).
-        assert write_container(sections, minor=MINOR) == forge(file, minor=MINOR)
+        assert write_container(sections, minor=MINOR_VERSION) == forge(file, minor=MINOR_VERSION)
 
 
 @given(st.binary(max_size=300))

@@ -12,9 +12,9 @@ from scenes import ball_points, small_model
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.codec import decode_model, encode_model
-from hyrfpack.format.container import MINOR, read_container, write_container
-from hyrfpack.format.exposure import decode_exposure, exposure_section
-from hyrfpack.format.exposure_head import CODEC_EXPOSURE
+from hyrfpack.format.container import MINOR_VERSION, read_container, write_container
+from hyrfpack.format.exposure import decode_exposure, encode_exposure
+from hyrfpack.format.exposure_header import CODEC_EXPOSURE
 from hyrfpack.format.sections import EXPOSURE
 from hyrfpack.model.exposure import MAX_CENTERS
 from tools.safety.plans import encode
@@ -25,7 +25,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 @given(SEEDS, st.integers(0, MAX_CENTERS))
 def test_a_map_is_read_as_it_was_written(seed, centers):
     exposure = random_map(seed, centers)
-    section = exposure_section(exposure)
+    section = encode_exposure(exposure)
 
     assert len(section.data) == section.raw_length == 84 + 12 * centers and not section.required
     assert same_map(decode_exposure(section.codec, memoryview(section.data), section.raw_length), exposure)
@@ -52,7 +52,7 @@ def test_any_bytes_are_a_map_or_refused(data):
 
 @pytest.mark.parametrize("change", [b"", b"\1", None])
 def test_bytes_that_do_not_fit_are_refused(change):
-    section = exposure_section(random_map(0, 3))
+    section = encode_exposure(random_map(0, 3))
     data = section.data[:-1] if change is None else bytes(section.data) + change
     raw_length = len(data) + (change == b"")
     with pytest.raises(HyrfFormatError, match="damaged"):
@@ -75,7 +75,7 @@ HEAD = "<BBBB2f6f3f6f3f"  # by docs/format.md
     ],
 )
 def test_a_number_out_of_the_range_of_the_specification_is_refused(place, value):
-    section = exposure_section(random_map(3, 2))
+    section = encode_exposure(random_map(3, 2))
     numbers = list(struct.unpack_from(HEAD, section.data))
     assert struct.pack(HEAD, *numbers) == section.data[:84]
     numbers[place] = value
@@ -87,7 +87,7 @@ def test_a_number_out_of_the_range_of_the_specification_is_refused(place, value)
 
 @pytest.mark.parametrize("count", [65, 255])
 def test_more_centers_than_the_specification_allows_are_refused(count):
-    section = exposure_section(random_map(3, 0))
+    section = encode_exposure(random_map(3, 0))
     data = bytes([count]) + section.data[1:] + bytes(12 * count)
 
     with pytest.raises(HyrfFormatError, match="64"):
@@ -96,14 +96,14 @@ def test_more_centers_than_the_specification_allows_are_refused(count):
 
 @given(st.integers(0, MAX_CENTERS), st.binary(min_size=12 * MAX_CENTERS, max_size=12 * MAX_CENTERS))
 def test_every_code_of_a_center_is_allowed_and_written_again_as_it_was(count, centers):
-    head = exposure_section(random_map(5, 0)).data[1:84]
+    head = encode_exposure(random_map(5, 0)).data[1:84]
     data = bytes([count]) + head + centers[: 12 * count]
 
-    assert exposure_section(decode_exposure(CODEC_EXPOSURE, memoryview(data), len(data))).data == data
+    assert encode_exposure(decode_exposure(CODEC_EXPOSURE, memoryview(data), len(data))).data == data
 
 
 def test_another_codec_is_refused():
-    section = exposure_section(random_map(0, 3))
+    section = encode_exposure(random_map(0, 3))
     with pytest.raises(HyrfFormatError, match="update hyrfpack"):
         decode_exposure(1, memoryview(section.data), section.raw_length)
 
@@ -140,4 +140,4 @@ def test_a_damaged_map_names_file_and_section():
         dataclasses.replace(part, data=b"\0" * len(part.data)) if part.type == EXPOSURE else part for part in sections
     ]
     with pytest.raises(HyrfFormatError, match="scene.hyrf: section 'EXPO'"):
-        decode_model(write_container(broken, minor=MINOR), name="scene.hyrf")
+        decode_model(write_container(broken, minor=MINOR_VERSION), name="scene.hyrf")

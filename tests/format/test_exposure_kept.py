@@ -20,8 +20,8 @@ from hyrfpack.compress import plan
 from hyrfpack.compress.plan import follow
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import decode_model, describe, load, repack, save
-from hyrfpack.format.container import MINOR, read_container, write_container
-from hyrfpack.format.smallest import check_target_bytes, min_file_bytes
+from hyrfpack.format.container import MINOR_VERSION, read_container, write_container
+from hyrfpack.format.min_file_size import check_target_bytes, min_file_bytes
 from hyrfpack.model import HybridModel
 from tools.safety.plans import drawn, encode
 
@@ -54,7 +54,7 @@ def in_layers() -> bytes:
 def placed_last(data: bytes) -> bytes:
     """The same sections, with the exposure map after all others."""
     sections = sorted(read_container(data).sections, key=lambda section: section.type == "EXPO")
-    return write_container(sections, minor=MINOR)
+    return write_container(sections, minor=MINOR_VERSION)
 
 
 def damaged(data: bytes) -> bytes:
@@ -62,7 +62,8 @@ def damaged(data: bytes) -> bytes:
     sections = read_container(data).sections
     zeros = bytes(EXPOSURE_BYTES)
     return write_container(
-        [dataclasses.replace(part, data=zeros) if part.type == "EXPO" else part for part in sections], minor=MINOR
+        [dataclasses.replace(part, data=zeros) if part.type == "EXPO" else part for part in sections],
+        minor=MINOR_VERSION,
     )
 
 

@@ -91,7 +91,7 @@ def test_golden_file_with_an_exposure_map_renders_the_recorded_picture(name):
 def test_golden_model_encodes_to_the_same_bytes(name, monkeypatch):
     golden = (GOLDEN / f"{name}.hyrf").read_bytes()
     info, (profile, settings, exposure) = describe(GOLDEN / f"{name}.hyrf"), GOLDEN_FILES[name]
-    monkeypatch.setattr(metadata, "writer", lambda: info["writer"])
+    monkeypatch.setattr(metadata, "writer_name", lambda: info["writer"])
     model = load(GOLDEN / "v1.0_raw.hyrf")
     model.exposure = exposure
 

@@ -19,8 +19,8 @@ from hyrfpack.compress import plan
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import decode_model
 from hyrfpack.format.arrays import to_arrays
-from hyrfpack.format.container import MINOR, read_container, write_container
-from hyrfpack.format.exposure import decode_exposure, exposure_section
+from hyrfpack.format.container import MINOR_VERSION, read_container, write_container
+from hyrfpack.format.exposure import decode_exposure, encode_exposure
 from hyrfpack.model import ExposureMap
 from hyrfpack.quant.integers import encode_integers
 from tools.safety import minimal_reader
@@ -134,7 +134,7 @@ def exposure_part(data: bytes) -> minimal_reader.Section:
 def test_exposure_maps_of_any_numbers_give_the_same_gains(seed, centers):
     exposure = random_map(seed, centers)
 
-    assert_same_gains(minimal_reader.read_exposure(exposure_part(exposure_section(exposure).data)), exposure)
+    assert_same_gains(minimal_reader.read_exposure(exposure_part(encode_exposure(exposure).data)), exposure)
 
 
 ABOVE_8 = float(np.nextafter(np.float32(8), np.float32(9)))
@@ -143,7 +143,7 @@ HOSTILE = (np.nan, np.inf, -np.inf, 0.0, -0.0, 2.0**-149, -1.0, 8.0, -8.0, ABOVE
 
 def test_both_readers_accept_the_same_exposure_maps():
     """Every number in turn takes every hostile value; and every byte of the rest of the head."""
-    valid = exposure_section(random_map(4, 2)).data
+    valid = encode_exposure(random_map(4, 2)).data
     maps = [
         valid[: 4 * place] + np.float32(v).tobytes() + valid[4 * place + 4 :] for place in range(1, 21) for v in HOSTILE
     ]
@@ -168,7 +168,7 @@ def test_the_start_of_a_file_without_the_bytes_of_its_exposure_map_reads_without
     model = model_of(30)
     model.exposure = random_map(1, 5)
     sections = list(read_container(encode(model, "raw")).sections)
-    data = write_container(sorted(sections, key=lambda section: section.type == "EXPO"), minor=MINOR)
+    data = write_container(sorted(sections, key=lambda section: section.type == "EXPO"), minor=MINOR_VERSION)
 
     assert minimal_reader.read(data)[2] is not None and minimal_reader.read(data[:-1], part=True)[2] is None
     assert_same_bits(data)
@@ -214,7 +214,7 @@ def test_both_readers_bound_the_basis_alike(sign):
     def with_basis(first: np.float32) -> bytes:
         data = np.float32(sign * first).tobytes() + bytes(sections[place].data[4:])
         return write_container(
-            [*sections[:place], replace(sections[place], data=data), *sections[place + 1 :]], minor=MINOR
+            [*sections[:place], replace(sections[place], data=data), *sections[place + 1 :]], minor=MINOR_VERSION
         )
 
     assert_same_bits(with_basis(largest))
@@ -238,7 +238,7 @@ def test_both_readers_refuse_the_same_damage(profile, monkeypatch):
     refused, count = 0, 30
 
     for _ in range(count):
-        data = write_container(damaged(sections, rng), minor=MINOR)
+        data = write_container(damaged(sections, rng), minor=MINOR_VERSION)
         try:
             assert_same_bits(data)
         except (ValueError, zlib.error):

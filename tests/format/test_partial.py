@@ -17,9 +17,9 @@ from scenes import small_model
 from hyrfpack.compress import plan
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import decode_model, describe, load
-from hyrfpack.format.arrays import RULES, to_arrays
+from hyrfpack.format.arrays import MODEL_RULES, to_arrays
 from hyrfpack.format.codec import repack
-from hyrfpack.format.container import MINOR, Container, Section, read_container, write_container
+from hyrfpack.format.container import MINOR_VERSION, Container, Section, read_container, write_container
 from hyrfpack.format.metadata import Metadata, read_metadata
 from hyrfpack.model import HybridModel
 from tools.safety.plans import encode
@@ -61,7 +61,7 @@ def in_layers(model: HybridModel, layers: list[int]) -> bytes:
         for name, group in zip(names(layer), GROUPS, strict=True):
             parts[name] = arrays[group][start:stop]
     return write_container(
-        [metadata_of(model, layers), *[exact(type, part) for type, part in parts.items()]], minor=MINOR
+        [metadata_of(model, layers), *[exact(type, part) for type, part in parts.items()]], minor=MINOR_VERSION
     )
 
 
@@ -72,11 +72,13 @@ def exact(type: str, values: np.ndarray) -> Section:
 def metadata_of(model: HybridModel, layers: object, gaussians: int | None = None) -> Section:
     count = len(model) if gaussians is None else gaussians
     config = model.config.to_dict()
-    return Metadata("compact", count, config, RULES, layers=layers).to_section()
+    return Metadata("compact", count, config, MODEL_RULES, layers=layers).to_section()
 
 
 def with_metadata(data: bytes, metadata: Section) -> bytes:
-    return write_container([metadata, *[s for s in read_container(data).sections if s.type != "META"]], minor=MINOR)
+    return write_container(
+        [metadata, *[s for s in read_container(data).sections if s.type != "META"]], minor=MINOR_VERSION
+    )
 
 
 def prefix(arrays: dict[str, np.ndarray], count: int) -> dict[str, np.ndarray]:
@@ -226,7 +228,7 @@ def test_layers_are_the_gaussians_one_after_another(layers):
 
 def test_sections_may_come_in_any_order():
     sections = list(read_container(in_layers(MODEL, [400, 200])).sections)
-    data = write_container(sections[::-1], minor=MINOR)
+    data = write_container(sections[::-1], minor=MINOR_VERSION)
     entries = read_container(data).entries
 
     assert_same_bits(decode_model(data), to_arrays(MODEL))
@@ -236,7 +238,7 @@ def test_sections_may_come_in_any_order():
 
 def test_a_layer_lacking_a_section_ends_the_model_even_where_later_ones_are_whole():
     sections = read_container(in_layers(MODEL, [200] * 3)).sections
-    data = write_container(sorted(sections, key=lambda section: section.type == "SCA1"), minor=MINOR)
+    data = write_container(sorted(sections, key=lambda section: section.type == "SCA1"), minor=MINOR_VERSION)
 
     assert_same_bits(decode_model(data[:-1], fraction=1.0), prefix(to_arrays(MODEL), 200))
 
@@ -244,7 +246,7 @@ def test_a_layer_lacking_a_section_ends_the_model_even_where_later_ones_are_whol
 def test_each_layer_stands_alone_and_the_fields_lean_on_the_first():
     """Without the bytes of further layers, and without a word of them, the rest reads the same."""
     first = [section for section in read_container(COMPACT).sections if section.type in (*GROUPS, *FIELDS)]
-    alone = write_container([metadata_of(MODEL, [], LAYERS[0]), *first], minor=MINOR)
+    alone = write_container([metadata_of(MODEL, [], LAYERS[0]), *first], minor=MINOR_VERSION)
 
     assert_same_bits(decode_model(alone), prefix(WHOLE, LAYERS[0]))
 
@@ -263,7 +265,7 @@ def test_each_layer_may_have_a_codec_of_its_own():
     for group in GROUPS:
         expected[group][part] = to_arrays(MODEL)[group][part]
 
-    assert_same_bits(decode_model(write_container([*sections.values()], minor=MINOR)), expected)
+    assert_same_bits(decode_model(write_container([*sections.values()], minor=MINOR_VERSION)), expected)
 
 
 @pytest.mark.parametrize(("replaced", "refused"), [(["POS1"], "COL1|SCA1|OPA1"), (GROUPS, "GTAB|RTAB")])
@@ -272,7 +274,7 @@ def test_lattice_points_of_another_layer_are_none_to_lean_on(replaced, refused):
     sections |= {name: exact(name, np.zeros(sections[name].raw_length // 4, np.float32)) for name in replaced}
 
     with pytest.raises(HyrfFormatError, match=f"section '({refused})': codec . needs positions of codec 6"):
-        decode_model(write_container([*sections.values()], minor=MINOR))
+        decode_model(write_container([*sections.values()], minor=MINOR_VERSION))
 
 
 # --- what is refused ---
@@ -327,7 +329,7 @@ def test_what_is_not_there_may_promise_anything_and_costs_nothing():
     sections = list(read_container(COMPACT).sections)
     layers = [*LAYERS[:-1], 10**11]
     metadata = metadata_of(MODEL, layers, sum(layers))
-    data = write_container([metadata, *sections[1:]], minor=MINOR)
+    data = write_container([metadata, *sections[1:]], minor=MINOR_VERSION)
     last = names(len(LAYERS) - 1)
     lines, cut = [line(data, name) for name in last], read_container(data).entries[last[0]].offset
     for place, width in zip(lines, (3, 3, 1, 1), strict=True):
@@ -392,7 +394,7 @@ def test_layers_whose_sections_are_not_listed_are_refused(fraction):
     for missing in names(1):
         sections = [s for s in read_container(in_layers(MODEL, [400, 200])).sections if s.type != missing]
         with pytest.raises(HyrfFormatError, match=f"there is no section '{missing}'"):
-            decode_model(write_container(sections, minor=MINOR), fraction=fraction)
+            decode_model(write_container(sections, minor=MINOR_VERSION), fraction=fraction)
     with pytest.raises(HyrfFormatError, match="there is no section 'POS2'"):
         decode_model(with_metadata(in_layers(MODEL, [400, 200]), metadata_of(MODEL, [400, 200, 0])), fraction=fraction)
 
@@ -410,7 +412,7 @@ def test_a_ninth_layer_has_no_sections():
     sections = list(read_container(in_layers(MODEL, [75] * 8)).sections)
 
     with pytest.raises(HyrfFormatError, match="section 'POS8' is required"):
-        decode_model(write_container([*sections, extra], minor=MINOR))
+        decode_model(write_container([*sections, extra], minor=MINOR_VERSION))
 
 
 def test_damage_before_the_cut_is_found_and_after_it_does_not_matter():
@@ -436,7 +438,7 @@ def test_damaged_layers_with_right_checksums_are_refused_or_make_a_model(data):
     for _ in range(data.draw(st.integers(1, 3), "changes")):
         stored[data.draw(st.integers(0, len(stored) - 1), "place")] = data.draw(st.integers(0, 255), "value")
     forged = write_container(
-        [*sections[:which], replace(sections[which], data=bytes(stored)), *sections[which + 1 :]], minor=MINOR
+        [*sections[:which], replace(sections[which], data=bytes(stored)), *sections[which + 1 :]], minor=MINOR_VERSION
     )
     cut = data.draw(st.integers(0, len(forged)), "cut")
 

@@ -23,8 +23,8 @@ from scenes import small_model
 from hyrfpack.cli.files import info
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import encode_model, repack
-from hyrfpack.format.codec import FREE_GAUSSIANS, most_gaussians
-from hyrfpack.format.sections import SECTIONS
+from hyrfpack.format.codec import EXTRA_GAUSSIANS_PER_FILE, gaussian_limit
+from hyrfpack.format.sections import SECTION_CONTENTS
 from tools.safety.fuzz import allowance, check_file, check_model, decode, pattern
 from tools.safety.fuzz_mutate import GROUPS, KINDS, assemble, disassemble, mutant, seeds
 from tools.safety.plans import even
@@ -118,7 +118,7 @@ def test_what_is_taken_apart_is_put_together_the_same():
 
 def test_more_gaussians_than_a_file_of_its_length_may_have_are_refused_before_they_take_memory():
     parts = disassemble(encode_model(small_model(np.zeros((4, 3))), "raw"))
-    count = most_gaussians(len(assemble(parts))) + 10_000
+    count = gaussian_limit(len(assemble(parts))) + 10_000
     metadata = json.loads(parts[0].data) | {"gaussians": count}
     parts[0].data = json.dumps(metadata).encode()
     parts[0].raw_length = len(parts[0].data)
@@ -135,7 +135,7 @@ def test_more_gaussians_than_a_file_of_its_length_may_have_are_refused_before_th
 
 
 def test_a_file_that_readers_would_not_unpack_is_not_written():
-    model = small_model(np.zeros((FREE_GAUSSIANS + 200_000, 3)))
+    model = small_model(np.zeros((EXTRA_GAUSSIANS_PER_FILE + 200_000, 3)))
 
     with pytest.raises(HyrfError, match="nearly all alike.*keep this model as profile raw"):
         encode_model(model, "compact", quantized=even(model, 1.0))
@@ -146,7 +146,7 @@ def test_a_file_that_readers_would_not_unpack_is_not_written():
 def test_a_small_file_that_declares_a_huge_model_takes_little_memory(codec, kept):
     """All that the limits allow for so small a file and none of it there."""
     parts = disassemble(encode_model(decode(seeds()[0][0]), "raw"))
-    count = FREE_GAUSSIANS - 1000
+    count = EXTRA_GAUSSIANS_PER_FILE - 1000
     metadata = json.loads(parts[0].data) | {"gaussians": count}
     parts[0].data = json.dumps(metadata).encode()
     parts[0].raw_length = len(parts[0].data)
@@ -210,7 +210,7 @@ def test_seeds_reach_every_group_and_codec():
     met = {(part.tag.decode(), part.codec) for data in seeds()[0] for part in disassemble(data)[1:]}
 
     groups = {group for group, _ in met}
-    assert groups >= {*GROUPS, "POS1", "COL1", "SCA1", "OPA2", "EXPO"} and groups < set(SECTIONS)
+    assert groups >= {*GROUPS, "POS1", "COL1", "SCA1", "OPA2", "EXPO"} and groups < set(SECTION_CONTENTS)
     assert {codec for _, codec in met} == {1, 2, 3, 4, 6, 7, 8, 9}
     assert {disassemble(data)[0].codec for data in seeds()[0]} == {0, 5}
     assert all(not isinstance(decode(data), str) for data in seeds()[0])

@@ -10,7 +10,7 @@ from scenes import ball_points, ring, small_model
 from hyrfpack import compress, load, save
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
-from hyrfpack.format.compact.quantized import Quantized
+from hyrfpack.format.compact.quantized import QuantizedModel
 from hyrfpack.format.container import read_container
 from hyrfpack.model import HybridModel
 from tools.safety.plans import drawn, even
@@ -19,7 +19,7 @@ STEP = 2.0**-10
 WIDEST = STEP * 16 / 15  # of the steps that `even` may come to
 
 
-def through(model: HybridModel, quantized: Quantized) -> HybridModel:
+def through(model: HybridModel, quantized: QuantizedModel) -> HybridModel:
     return decode_model(encode_model(model, "compact", quantized=quantized))
 
 

@@ -18,7 +18,7 @@ from scenes import camera_at, small_model
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.codec import PROFILES
-from hyrfpack.format.compact.groups import LARGEST as LARGEST_SYMBOL
+from hyrfpack.format.compact.groups import MAX_ABS_SYMBOL as LARGEST_SYMBOL
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.model import HashGridConfig, HybridModel
 from hyrfpack.model.hash_grid import FEATURES

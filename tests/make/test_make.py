@@ -18,7 +18,7 @@ from PIL import Image
 
 from hyrfpack import evaluate, load, load_scene, save
 from hyrfpack.errors import HyrfError
-from hyrfpack.format.smallest import min_file_bytes
+from hyrfpack.format.min_file_size import min_file_bytes
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.make import Stopped, make, stages
 from hyrfpack.make.progress import Progress, Reporter

@@ -14,7 +14,7 @@ from scenes import ball_scene
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.evaluate import Evaluation, ViewScore
-from hyrfpack.format.exposure_head import STOPS_PER_LOG_GAIN
+from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
 from hyrfpack.model.exposure import expose
 from hyrfpack.scene import Scene, View
 from hyrfpack.train import TrainConfig, budget_pilots, decisions, exposure_pilots, pilots, train

@@ -20,7 +20,7 @@ from hyrfpack.compress.quantize import quantize
 from hyrfpack.format.arrays import to_arrays, to_model
 from hyrfpack.format.codec import decode_model, encode_model
 from hyrfpack.format.compact.plan import Plan
-from hyrfpack.format.sections import LOGITS, TABLES
+from hyrfpack.format.sections import LOGIT_SECTIONS, TABLE_SECTIONS
 from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
@@ -44,7 +44,7 @@ def drawn_model(count: int, log2_table_size: int) -> HybridModel:
     gaussians = Gaussians(torch.from_numpy(places).float(), logits[:, :3], logits[:, 3:4], logits[:, 4:])
     model = HybridModel(config, gaussians, torch.Generator().manual_seed(0))
     arrays = to_arrays(model)
-    for group in TABLES:
+    for group in TABLE_SECTIONS:
         arrays[group] = rng.normal(0, 0.1, arrays[group].shape).astype(np.float32)
     return to_model(config, arrays)
 
@@ -117,7 +117,7 @@ def _error(decoded: HybridModel, model: HybridModel, plan: Plan | None) -> float
     """Root mean square error of the explicit logits, of the worst group."""
     order = slice(None) if plan is None else plan.kept
     after, before = to_arrays(decoded), to_arrays(model)
-    return max(float(np.sqrt(np.square(after[group] - before[group][order]).mean())) for group in LOGITS)
+    return max(float(np.sqrt(np.square(after[group] - before[group][order]).mean())) for group in LOGIT_SECTIONS)
 
 
 def main() -> None:

@@ -47,8 +47,8 @@ from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.cli.files import info
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import decode_model, describe, encode_model, load
-from hyrfpack.format.container import raw_limit
-from hyrfpack.format.exposure import exposure_section
+from hyrfpack.format.container import raw_bytes_limit
+from hyrfpack.format.exposure import encode_exposure
 from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import MAX_LOG_GAIN
 from hyrfpack.render.renderer import render
@@ -105,7 +105,7 @@ def allowance(data: bytes) -> int:
         (count,) = struct.unpack_from("<I", data, 36)
         entries = range(72, min(48 + 40 * count, len(data) - 8), 40)
         declared = sum(struct.unpack_from("<Q", data, at)[0] for at in entries)
-    return 10 * (min(declared, raw_limit(len(data))) + len(data)) + SLACK
+    return 10 * (min(declared, raw_bytes_limit(len(data))) + len(data)) + SLACK
 
 
 def decode(data: bytes) -> HybridModel | str:
@@ -131,7 +131,7 @@ def check_model(model: HybridModel) -> None:
             raise Failure(f"{name} does not survive")
     if model.exposure is None:
         return
-    if again.exposure is None or exposure_section(again.exposure) != exposure_section(model.exposure):
+    if again.exposure is None or encode_exposure(again.exposure) != encode_exposure(model.exposure):
         raise Failure("the exposure map does not survive")
     for position in (np.zeros(3), np.full(3, 1e30)):
         gains = model.exposure.log_gains(position, np.array([0.0, 0.0, 1.0]))

@@ -24,7 +24,7 @@ from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import group_shapes, parse_config, to_arrays
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.container import read_container
-from hyrfpack.format.exposure import exposure_section
+from hyrfpack.format.exposure import encode_exposure
 from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.quant import HuffmanCode, MinMaxQuantizer, ResidualVectorQuantizer, huffman_encode
@@ -417,7 +417,7 @@ def _forge_exposure(rng: Random) -> bytes:
     parts = [replace(part) for part in _pick(rng)]
     place = next((index for index, part in enumerate(parts) if part.tag == b"EXPO"), None)
     if place is None:
-        section, place = exposure_section(_exposure(rng.choice((0, 1, 5, 64)))), 1
+        section, place = encode_exposure(_exposure(rng.choice((0, 1, 5, 64)))), 1
         parts.insert(place, Part(section.type.encode(), section.codec, 0, section.data, section.raw_length))
     data = bytearray(parts[place].data)
     for _ in range(rng.choice((1, 1, 2))):

@@ -38,7 +38,7 @@ from PIL import Image
 import hyrfpack
 from hyrfpack.atomic import PREFIX, SUFFIX
 from hyrfpack.demo.scene import write_demo_scene
-from hyrfpack.format.run_folder import CHECKPOINT, METRICS, MODEL
+from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.make.state import NAME as RECORD
 from hyrfpack.train.checkpoint import DIGEST_BYTES
 
@@ -118,13 +118,13 @@ def fault(name: str, data: bytes, case: Case) -> str | None:
     if data == case.old.get(name):
         return None
     base = os.path.basename(name)
-    if base != CHECKPOINT and name not in case.new:
+    if base != CHECKPOINT_FILE and name not in case.new:
         return "nobody asked for this file"
     try:
-        if base == CHECKPOINT:
+        if base == CHECKPOINT_FILE:
             same = hashlib.sha256(data[:-DIGEST_BYTES]).digest() == data[-DIGEST_BYTES:]
             torch.load(io.BytesIO(data[:-DIGEST_BYTES]), weights_only=True)
-        elif base == METRICS:
+        elif base == METRICS_FILE:
             same = untimed(data) == untimed(case.new[name])
         elif base == RECORD:
             same = set(json.loads(data)["stages"]) <= set(json.loads(case.new[name])["stages"])
@@ -160,7 +160,7 @@ def moment(found: dict[str, bytes], case: Case, killed: bool) -> str:
 def rerun(case: Case, out: Path) -> list[str]:
     """Run the command again after a kill: it must end as if nothing had happened."""
     arguments = case.arguments(out)
-    if (out / CHECKPOINT).exists():
+    if (out / CHECKPOINT_FILE).exists():
         arguments = [argument if argument != "--overwrite" else "--resume" for argument in arguments]
     process = start(arguments)
     _, complaint = process.communicate()
@@ -168,7 +168,7 @@ def rerun(case: Case, out: Path) -> list[str]:
         return [f"run again, it exits with {process.returncode}: {complaint.decode()[-300:]}"]
     after = contents(out)
     wrong = [f"run again: {sentence}" for sentence in faults(after, case)]
-    wrong += [f"run again: {name} is left" for name in after if is_stray(name) or name.endswith(CHECKPOINT)]
+    wrong += [f"run again: {name} is left" for name in after if is_stray(name) or name.endswith(CHECKPOINT_FILE)]
     wrong += [
         f"run again: {name} is missing or still the old one"
         for name in case.new
@@ -212,7 +212,7 @@ def prepare(work: Path, names: Sequence[str]) -> list[Case]:
     for name in names:
 
         def arguments(out: Path, seed: int = 0, name: str = name) -> list[str]:
-            model, packed = work / f"train-{seed}" / MODEL, work / f"compress-{seed}" / "out.hyrf"
+            model, packed = work / f"train-{seed}" / MODEL_FILE, work / f"compress-{seed}" / "out.hyrf"
             return {
                 "train": ["train", str(scene), "-o", str(out), "--overwrite", "--seed", str(seed), *TRAINING],
                 "compress": ["compress", str(model), "-o", str(out / "out.hyrf"), "--overwrite"],

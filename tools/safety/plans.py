@@ -15,8 +15,8 @@ from hyrfpack.compress import plan as planning
 from hyrfpack.compress.quantize import decide
 from hyrfpack.compress.sensitivity import Sensitivity, removal_error
 from hyrfpack.format import encode_model
-from hyrfpack.format.arrays import decoder_widths, grids, to_arrays
-from hyrfpack.format.compact.quantized import Quantized
+from hyrfpack.format.arrays import decoder_widths, grid_configs, to_arrays
+from hyrfpack.format.compact.quantized import QuantizedModel
 from hyrfpack.model import HybridModel
 from hyrfpack.quant.morton import MAX_BITS
 
@@ -33,7 +33,7 @@ def drawn_sensitivity(model: HybridModel, seed: int = 0) -> Sensitivity:
     places = model.cube_coords(model.gaussians.positions.detach().double()).numpy()
     points = 2 * np.minimum(places * (1 << MAX_BITS), (1 << MAX_BITS) - 1).astype(np.int64) + 1
     fields = {}
-    for group, grid in grids(model.config).items():
+    for group, grid in grid_configs(model.config).items():
         usage = grid.usage(points, MAX_BITS + 1)
         fields[group] = (TABLE * usage / max(usage.sum(), 1)).repeat(2)
     for group, widths in decoder_widths(model.config).items():
@@ -43,13 +43,15 @@ def drawn_sensitivity(model: HybridModel, seed: int = 0) -> Sensitivity:
     return Sensitivity(POSITIONS * shares, *[LOGITS * shares] * 3, removals, fields)
 
 
-def drawn(model: HybridModel, distortion: float = DISTORTION, prune: bool = True, layered: bool = False) -> Quantized:
+def drawn(
+    model: HybridModel, distortion: float = DISTORTION, prune: bool = True, layered: bool = False
+) -> QuantizedModel:
     """What `drawn_sensitivity` leads to; with `layered` in layers however few the Gaussians are."""
     with patch.object(planning, "LEAST_OF_LAYER", (2, 100) if layered else planning.LEAST_OF_LAYER):
         return decide(model, drawn_sensitivity(model), distortion, prune)
 
 
-def even(model: HybridModel, step: float) -> Quantized:
+def even(model: HybridModel, step: float) -> QuantizedModel:
     """All Gaussians, and all numbers, those that nobody reads included, in steps within 1/15 of `step`."""
     arrays = to_arrays(model)
     ones = {group: np.ones(values.size) for group, values in arrays.items()}

@@ -38,7 +38,7 @@ import hyrfpack.export
 import hyrfpack.make  # noqa: F401 - these three are loaded before processes are forked
 from hyrfpack.cli import main as cli
 from hyrfpack.demo.scene import write_demo_scene
-from hyrfpack.train.run import METRICS, MODEL
+from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE
 from tools.safety.kill import ENVIRONMENT, is_stray
 
 FOREIGN = b"of another program"
@@ -125,7 +125,7 @@ def written_by(output: Path, said: str) -> Path:
     """The file that a command says it has written."""
     facts = json.loads(said)
     if "complete" in facts:
-        return output / MODEL
+        return output / MODEL_FILE
     return Path(facts.get("file") or facts["output"])
 
 
@@ -134,7 +134,7 @@ def judge(command: Command, output: Path, running: Running) -> Outcome:
     code, said, complaint = running.end()
     if code == 0:
         written = written_by(output, said)
-        beside = written.name != (MODEL if output.is_dir() else output.name)
+        beside = written.name != (MODEL_FILE if output.is_dir() else output.name)
         data = written.read_bytes() if written.is_file() else b""
         wrong = [] if data == command.expected else [f"exit code 0, and {written.name} does not hold its result"]
         return Outcome("beside" if beside else "written", wrong)
@@ -158,7 +158,7 @@ def race_two(race: Race, folder: Path, draw: random.Random, together: bool) -> O
         wrong.append("none of them has written its output")
     if output.is_dir() and not wrong:
         winner = next(number for number, end in enumerate(ends) if end.words == "written")
-        seed = json.loads((output / METRICS).read_text())["settings"]["seed"]
+        seed = json.loads((output / METRICS_FILE).read_text())["settings"]["seed"]
         if order[winner] is not race.commands[seed]:
             wrong.append(f"the metrics are of seed {seed}, and the model is not")
     return Outcome(" + ".join(sorted(end.words for end in ends)), wrong)
@@ -194,7 +194,7 @@ def finish(running: Running) -> str:
 def prepare(work: Path) -> dict[str, Race]:
     """Make the inputs, and run every command once without a disturbance."""
     scene, run = write_demo_scene(work / "scene", views=10, size=48), work / "run"
-    model, packed = str(run / MODEL), str(work / "packed.hyrf")
+    model, packed = str(run / MODEL_FILE), str(work / "packed.hyrf")
     finish(Running(["train", str(scene), "-o", str(run), *TRAINING]))
     finish(Running(["compress", model, "-o", packed, "--profile", "paper"]))
 

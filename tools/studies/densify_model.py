@@ -19,7 +19,7 @@ from pathlib import Path
 import hyrfpack
 from hyrfpack.atomic import check_writable, make_folder
 from hyrfpack.cameras.paths import Viewpoint
-from hyrfpack.format.run_folder import MODEL
+from hyrfpack.format.run_folder import MODEL_FILE
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
@@ -111,8 +111,8 @@ def main() -> None:
         f"in {GROWING} steps (seed {args.seed}), settled in {args.settle}",
     }
     provenance["viewpoint"] = Viewpoint.from_cameras([view.camera for view in scene.train]).to_json()
-    written = hyrfpack.save(model, args.out / MODEL, profile="raw", provenance=provenance)
-    print(f"{args.out / MODEL}: {written.bytes_after:,} bytes")
+    written = hyrfpack.save(model, args.out / MODEL_FILE, profile="raw", provenance=provenance)
+    print(f"{args.out / MODEL_FILE}: {written.bytes_after:,} bytes")
 
 
 if __name__ == "__main__":

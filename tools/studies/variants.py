@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 import hyrfpack
-from hyrfpack.format.exposure_head import STOPS_PER_LOG_GAIN
+from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
 from hyrfpack.model.exposure import expose
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 

@@ -1,11 +1,11 @@
-"""Profile `compact`: every number as coarse as pictures allow, in as few bits as that takes.
+"""Profile `compact`: every number is quantised as coarsely as renders allow and entropy coded.
 
 positions                          lattice of the contracted cube, Morton order, gaps       section codec 6
 colour, scale, opacity logits      a step for each class of Gaussians, prediction, rANS     section codec 7
 hash tables                        a step by how often a row is read, rANS                  section codec 8
 decoders (MLPs)                    a step for each output, rANS                             section codec 8
 
-`hyrfpack.compress` decides what is stored and how finely; here what it quantised becomes bytes, and bytes numbers.
+`hyrfpack.compress` chooses what is stored and the quantisation steps; this package only encodes and decodes.
 """
 
 from __future__ import annotations
@@ -14,46 +14,66 @@ import numpy as np
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.compact.groups import decode_groups
-from hyrfpack.format.compact.plan import from_lattice, groups_of
+from hyrfpack.format.compact.plan import build_step_groups, lattice_to_local
 from hyrfpack.format.compact.quantized import CODEC_CHANNELS, CODEC_GROUPS, CODEC_POINTS, decode_channels, encode
-from hyrfpack.format.sections import LOGITS, MLPS, POSITIONS, TABLES
+from hyrfpack.format.sections import DECODER_SECTIONS, LOGIT_SECTIONS, POSITIONS, TABLE_SECTIONS
 from hyrfpack.model.config import ModelConfig
 from hyrfpack.quant.points import Points, decode_points
 
 __all__ = ["CODEC_POINTS", "decode_positions", "decode_section", "encode"]
 
-# The sections that may have a codec.
-CODECS = {CODEC_POINTS: (POSITIONS,), CODEC_CHANNELS: LOGITS, CODEC_GROUPS: (*TABLES, *MLPS)}
+# The sections that each codec is allowed for.
+SECTIONS_BY_CODEC = {
+    CODEC_POINTS: (POSITIONS,),
+    CODEC_CHANNELS: LOGIT_SECTIONS,
+    CODEC_GROUPS: (*TABLE_SECTIONS, *DECODER_SECTIONS),
+}
 
 
 def decode_positions(data: memoryview, count: int, config: ModelConfig) -> tuple[np.ndarray, Points]:
-    """Local positions (count, 3) float32 and the lattice points that the other sections need.
+    """Decode the positions of a layer.
+
+    Args:
+        data: stored bytes of the section.
+        count: number of Gaussians in the layer.
+        config: configuration of the model.
+
+    Returns:
+        Local positions (count, 3) float32, and the lattice points that are needed to decode the other sections.
 
     Raises:
         DamagedDataError: the bytes are damaged.
     """
     points = decode_points(data, count)
-    return from_lattice(points, config.frame), points
+    return lattice_to_local(points, config.frame), points
 
 
 def decode_section(
     group: str, codec: int, data: memoryview, shape: tuple[int, int], config: ModelConfig, points: Points | None
 ) -> np.ndarray:
-    """The numbers of a section of codec 7 or 8.
+    """Decode a section of codec 7 or 8.
 
     Args:
-        points: from `decode_positions`; None when the positions have another codec.
+        group: section type in the first layer.
+        codec: codec number of the section.
+        data: stored bytes of the section.
+        shape: (rows, columns) of the result.
+        config: configuration of the model.
+        points: lattice points from `decode_positions`; None when the positions have another codec.
+
+    Returns:
+        (rows, columns) float32.
 
     Raises:
         DamagedDataError: the bytes are damaged.
-        HyrfFormatError: the section cannot have this codec, or not beside such positions.
+        HyrfFormatError: this codec is not allowed for the section, or needs positions of another codec.
     """
-    if group not in CODECS[codec]:
+    if group not in SECTIONS_BY_CODEC[codec]:
         raise HyrfFormatError(f"it cannot have codec {codec}; the file is damaged, write it again")
-    if group in MLPS:
-        return decode_groups(data, groups_of(group, config)).reshape(shape)
+    if group in DECODER_SECTIONS:
+        return decode_groups(data, build_step_groups(group, config)).reshape(shape)
     if points is None:
         raise HyrfFormatError(f"codec {codec} needs positions of codec {CODEC_POINTS}; write the file again")
     if codec == CODEC_CHANNELS:
         return decode_channels(data, points, shape[1])
-    return decode_groups(data, groups_of(group, config, points)).reshape(shape)
+    return decode_groups(data, build_step_groups(group, config, points)).reshape(shape)

@@ -1,7 +1,8 @@
-"""Numbers in groups, each with a step of its own. The decoder knows which number is in which group.
+"""Coding of numbers in groups with one quantisation step per group. The decoder knows the group of each number.
 
-Groups are coded with one of a few models, by how far their symbols spread; a group of zeros takes nothing.
-The bytes: u32 and u32 lengths of the two streams that follow, step codes and models; then the stream of the symbols.
+The symbols of a group are coded with one of a few entropy models, chosen by their spread; a group of zeros takes no
+symbols. The bytes are: u32 length of the stream of step codes, u32 length of the stream of models, these two streams,
+and the stream of the symbols.
 """
 
 from __future__ import annotations
@@ -16,33 +17,33 @@ from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.integers import decode_integers, encode_integers
 from hyrfpack.quant.steps import NOT_CODED, ONE, step_of
 
-MODELS = 8  # of the entropy coder
-LARGEST = 1 << 24  # steps from zero
-_PART = 1 << 15
-_HEADER = struct.Struct("<II")
+ENTROPY_MODEL_COUNT = 8
+MAX_ABS_SYMBOL = 1 << 24
+_NUMBERS_PER_BLOCK = 1 << 15  # small enough that temporary arrays stay in the caches
+_HEADER_STRUCT = struct.Struct("<II")
 
 
-def parts(count: int) -> Iterator[slice]:
-    """Consecutive parts of a list of numbers, few enough in each that temporaries stay in the caches."""
-    return (slice(first, first + _PART) for first in range(0, count, _PART))
+def iter_blocks(count: int) -> Iterator[slice]:
+    """Return consecutive slices of a list of `count` numbers, so short that temporary arrays stay in the caches."""
+    return (slice(first, first + _NUMBERS_PER_BLOCK) for first in range(0, count, _NUMBERS_PER_BLOCK))
 
 
 @dataclass(frozen=True)
 class StepGroups:
-    """Which numbers have a step in common.
+    """Assignment of numbers to groups that share a quantisation step.
 
     Attributes:
-        index: (n,) integers of any width, 0 to count - 1.
-        count: how many groups there may be.
+        index: (n,) group of each number: integers of any width, 0 to count - 1.
+        count: number of groups; some may be empty.
     """
 
     index: np.ndarray
     count: int
 
-    def spread(self, values: np.ndarray) -> np.ndarray:
-        """(n,) the value of each number's group, of `values` (count,)."""
+    def gather(self, values: np.ndarray) -> np.ndarray:
+        """Return for each number (n,) the value of its group, out of `values` (count,)."""
         result = np.empty(len(self.index), values.dtype)
-        for part in parts(len(result)):
+        for part in iter_blocks(len(result)):
             result[part] = values.take(self.index[part])
         return result
 
@@ -53,9 +54,9 @@ class GroupSymbols:
 
     Attributes:
         codes: (count,) uint8 step codes, NOT_CODED for groups of zeros.
-        models: (count,) uint8, 0 to MODELS - 1.
-        symbols: (n,) int64, in steps.
-        values: (n,) float32, as they will be decoded.
+        models: (count,) uint8 entropy model of each group, 0 to ENTROPY_MODEL_COUNT - 1.
+        symbols: (n,) int64 numbers in steps, at most MAX_ABS_SYMBOL in magnitude.
+        values: (n,) float32 numbers as they will be decoded.
     """
 
     codes: np.ndarray
@@ -65,42 +66,49 @@ class GroupSymbols:
 
 
 def encode_groups(chosen: GroupSymbols, groups: StepGroups) -> bytes:
-    """The bytes of numbers in groups."""
-    coded = groups.spread(chosen.codes != NOT_CODED)
+    """Encode quantised numbers in groups as bytes."""
+    coded = groups.gather(chosen.codes != NOT_CODED)
     codes = encode_integers(chosen.codes)
     models = encode_integers(chosen.models[chosen.codes != NOT_CODED])
-    symbols = encode_integers(chosen.symbols[coded], groups.spread(chosen.models)[coded], signed=True)
-    return _HEADER.pack(len(codes), len(models)) + codes + models + symbols
+    symbols = encode_integers(chosen.symbols[coded], groups.gather(chosen.models)[coded], signed=True)
+    return _HEADER_STRUCT.pack(len(codes), len(models)) + codes + models + symbols
 
 
 def decode_groups(data: memoryview, groups: StepGroups) -> np.ndarray:
-    """The numbers (n,) float32.
+    """Decode numbers in groups.
+
+    Args:
+        data: the bytes, no more and no fewer.
+        groups: the groups that the encoder used.
+
+    Returns:
+        (n,) float32.
 
     Raises:
-        DamagedDataError: the bytes are truncated, damaged or contradict themselves.
+        DamagedDataError: the bytes are truncated, damaged or inconsistent.
     """
-    if len(data) < _HEADER.size or sum(_HEADER.unpack_from(data)) > len(data) - _HEADER.size:
+    if len(data) < _HEADER_STRUCT.size or sum(_HEADER_STRUCT.unpack_from(data)) > len(data) - _HEADER_STRUCT.size:
         raise DamagedDataError(f"the lengths of its parts do not fit its {len(data)} bytes; it is damaged")
-    first, second = _HEADER.unpack_from(data)
-    data = data[_HEADER.size :]
+    first, second = _HEADER_STRUCT.unpack_from(data)
+    data = data[_HEADER_STRUCT.size :]
     codes = decode_integers(data[:first], groups.count)
     if codes.max(initial=0) > 255:
         raise DamagedDataError(f"the step code {codes.max()} is above 255; it is damaged")
     used = codes != NOT_CODED
     chosen = decode_integers(data[first : first + second], int(np.count_nonzero(used)))
-    if chosen.max(initial=0) >= MODELS:
-        raise DamagedDataError(f"the model {chosen.max()} of {MODELS}; it is damaged")
-    models = np.full(groups.count, MODELS, np.uint8)
+    if chosen.max(initial=0) >= ENTROPY_MODEL_COUNT:
+        raise DamagedDataError(f"the model {chosen.max()} of {ENTROPY_MODEL_COUNT}; it is damaged")
+    models = np.full(groups.count, ENTROPY_MODEL_COUNT, np.uint8)
     models[used] = chosen
-    contexts = groups.spread(models)
-    coded = contexts < MODELS
+    contexts = groups.gather(models)
+    coded = contexts < ENTROPY_MODEL_COUNT
     contexts = contexts[coded]
     symbols = decode_integers(data[first + second :], len(contexts), contexts, signed=True)
-    if symbols.max(initial=0) > LARGEST or symbols.min(initial=0) < -LARGEST:
-        raise DamagedDataError(f"a number is more than {LARGEST} steps; it is damaged")
+    if symbols.max(initial=0) > MAX_ABS_SYMBOL or symbols.min(initial=0) < -MAX_ABS_SYMBOL:
+        raise DamagedDataError(f"a number is more than {MAX_ABS_SYMBOL} steps; it is damaged")
     values = np.zeros(len(groups.index), np.float32)
     steps, place = step_of(codes) / ONE, 0
-    for part in parts(len(values)):
+    for part in iter_blocks(len(values)):
         index = groups.index[part][coded[part]]
         values[part][coded[part]] = symbols[place : place + len(index)] * steps[index]
         place += len(index)

@@ -1,4 +1,4 @@
-"""A model's quantised numbers as sections, and sections as numbers."""
+"""Encoding of a model's quantised numbers as sections, and decoding of its channels."""
 
 from __future__ import annotations
 
@@ -12,25 +12,36 @@ from hyrfpack.format.compact.channels import Channel, decode_channel, encode_cha
 from hyrfpack.format.compact.groups import GroupSymbols, encode_groups
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.container import Section
-from hyrfpack.format.sections import COLORS, LAYERED, LOGITS, MLPS, POSITIONS, TABLES, layer_section
+from hyrfpack.format.sections import (
+    COLORS,
+    DECODER_SECTIONS,
+    LAYERED_SECTIONS,
+    LOGIT_SECTIONS,
+    POSITIONS,
+    TABLE_SECTIONS,
+    layer_section,
+)
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.parallel.pool import run_jobs
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.points import Points
 
-CODEC_POINTS, CODEC_CHANNELS, CODEC_GROUPS = 6, 7, 8
-COLUMNS = dict(zip(LOGITS, (3, 1, 1), strict=True))
-_BLOCK = 1 << 15  # numbers at once: few enough that temporaries stay in the caches
+CODEC_POINTS = 6
+CODEC_CHANNELS = 7
+CODEC_GROUPS = 8
+LOGIT_COLUMNS = dict(zip(LOGIT_SECTIONS, (3, 1, 1), strict=True))
+_GAUSSIANS_PER_BLOCK = 1 << 15  # small enough that temporary arrays stay in the caches
 
 
 @dataclass(frozen=True)
-class Quantized:
-    """A model's numbers as they will be stored; of some sections, until it is encoded.
+class QuantizedModel:
+    """Quantised numbers of a model. Only `encode` needs those of all sections.
 
     Attributes:
-        plan: which they are.
-        channels: of each layer colour (3, in the plan's basis), scale (1) and opacity logits (1), by section.
-        groups: of the hash tables and decoders, by section.
+        plan: selection, order and grouping of the numbers.
+        channels: for each layer, the channels of colour (3, in the plan's basis), scale (1) and opacity logits (1), by
+            section.
+        groups: symbols of the hash tables and decoders, by section.
     """
 
     plan: Plan
@@ -38,22 +49,22 @@ class Quantized:
     groups: dict[str, GroupSymbols]
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The numbers as they will be decoded: flat tables and decoders, (M, columns) explicit logits; float32."""
+        """Return the numbers as they will be decoded, float32: flat tables and decoders, logits (M, columns)."""
         arrays = {group: chosen.values for group, chosen in self.groups.items()}
         for group in self.channels[0]:
             layers = [[channel.values for channel in layer[group]] for layer in self.channels]
-            arrays[group] = np.concatenate([_joined(values, self.plan.basis) for values in layers])
+            arrays[group] = np.concatenate([_join_channels(values, self.plan.basis) for values in layers])
         return arrays
 
 
-def encode(model: HybridModel, quantized: Quantized) -> tuple[list[Section], dict]:
-    """Sections for a model but for the metadata, in file order, and what was decided, for people.
+def encode(model: HybridModel, quantized: QuantizedModel) -> tuple[list[Section], dict]:
+    """Encode quantised numbers; return all sections but the metadata, in file order, and the settings for people.
 
-    A part of the file from its start on is a model if it holds the first layer and the fields.
+    The start of the file is a usable model as soon as it contains the first layer and the fields.
 
     Args:
-        model: whose numbers were quantised.
-        quantized: from `hyrfpack.compress.quantize`.
+        model: the model that was quantised.
+        quantized: its numbers, from `hyrfpack.compress.quantize`.
     """
     plan = quantized.plan
 
@@ -61,7 +72,7 @@ def encode(model: HybridModel, quantized: Quantized) -> tuple[list[Section], dic
         basis = plan.basis.astype("<f4").tobytes() if group == COLORS else b""
         classes = plan.layers[layer].points.classes
         data = basis + b"".join(encode_channel(channel, classes) for channel in quantized.channels[layer][group])
-        return Section(layer_section(group, layer), CODEC_CHANNELS, data, 4 * COLUMNS[group] * len(classes))
+        return Section(layer_section(group, layer), CODEC_CHANNELS, data, 4 * LOGIT_COLUMNS[group] * len(classes))
 
     def encode_numbers(group: str) -> Section:
         data = encode_groups(quantized.groups[group], plan.groups[group])
@@ -69,21 +80,29 @@ def encode(model: HybridModel, quantized: Quantized) -> tuple[list[Section], dic
 
     jobs: dict[str, Callable[[], Section]] = {group: partial(encode_numbers, group) for group in plan.groups}
     for layer in range(len(plan.layers)):
-        jobs |= {layer_section(group, layer): partial(encode_channels, layer, group) for group in COLUMNS}
+        jobs |= {layer_section(group, layer): partial(encode_channels, layer, group) for group in LOGIT_COLUMNS}
     done = run_jobs(jobs)
     for layer, part in enumerate(plan.layers):
         tag = layer_section(POSITIONS, layer)
         done[tag] = Section(tag, CODEC_POINTS, part.positions, 12 * len(part.points.classes))
-    further = [layer_section(group, layer) for layer in range(1, len(plan.layers)) for group in LAYERED]
+    further = [layer_section(group, layer) for layer in range(1, len(plan.layers)) for group in LAYERED_SECTIONS]
     settings = {"distortion": plan.distortion_per_number, "gaussians_before": len(model)}
-    return [done[tag] for tag in (*MLPS, *LAYERED, *TABLES, *further)], settings
+    return [done[tag] for tag in (*DECODER_SECTIONS, *LAYERED_SECTIONS, *TABLE_SECTIONS, *further)], settings
 
 
 def decode_channels(data: memoryview, points: Points, columns: int) -> np.ndarray:
-    """The explicit logits (N, columns) float32, 3 columns in a basis that comes before them.
+    """Decode explicit logits; the basis of 3 columns is stored before them.
+
+    Args:
+        data: stored bytes of the section.
+        points: lattice points with the class of each Gaussian.
+        columns: number of columns, 1 or 3.
+
+    Returns:
+        (N, columns) float32.
 
     Raises:
-        DamagedDataError: the bytes are truncated, damaged or contradict themselves.
+        DamagedDataError: the bytes are truncated, damaged or inconsistent.
     """
     basis = np.eye(columns)
     if columns == 3:
@@ -99,16 +118,19 @@ def decode_channels(data: memoryview, points: Points, columns: int) -> np.ndarra
         channels.append(values)
     if len(data):
         raise DamagedDataError(f"{len(data)} bytes follow its last channel; it is damaged")
-    return _joined(channels, basis)
+    return _join_channels(channels, basis)
 
 
-def _joined(channels: list[np.ndarray], basis: np.ndarray) -> np.ndarray:
-    """Channels back in their columns, float32. Products are added in order: every decoder gets the same numbers."""
+def _join_channels(channels: list[np.ndarray], basis: np.ndarray) -> np.ndarray:
+    """Transform channels back to columns (N, columns) float32.
+
+    Products are added in a fixed order, so that every decoder gets the same numbers.
+    """
     if len(channels) == 1:
         return channels[0][:, None].astype(np.float32)
     joined = np.empty((len(channels[0]), 3), np.float32)
-    for start in range(0, len(joined), _BLOCK):
-        part = slice(start, start + _BLOCK)
+    for start in range(0, len(joined), _GAUSSIANS_PER_BLOCK):
+        part = slice(start, start + _GAUSSIANS_PER_BLOCK)
         for column in range(3):
             first, second, third = (values[part] * float(basis[column, j]) for j, values in enumerate(channels))
             joined[part, column] = first + second + third

@@ -14,8 +14,8 @@ from scenes import ball_points, small_model
 from web.scripts import run_script
 
 from hyrfpack.format import encode_model
-from hyrfpack.format.container import MINOR, read_container, write_container
-from hyrfpack.format.exposure import exposure_section
+from hyrfpack.format.container import MINOR_VERSION, read_container, write_container
+from hyrfpack.format.exposure import encode_exposure
 from hyrfpack.format.sections import EXPOSURE
 from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import MAX_CENTERS, ExposureMap
@@ -86,10 +86,10 @@ def file_with(stored: bytes, **changes: object) -> bytes:
     changed = {"data": stored, "raw_length": len(stored), **changes}
     sections = [container[tag] for tag in container.entries]
     replaced = [dataclasses.replace(part, **changed) if part.type == EXPOSURE else part for part in sections]
-    return write_container(replaced, minor=MINOR)
+    return write_container(replaced, minor=MINOR_VERSION)
 
 
-STORED = bytes(exposure_section(random_map(0, 3)).data)
+STORED = bytes(encode_exposure(random_map(0, 3)).data)
 FLOATS = {"length": 0, "box": 2, "mean": 8, "limit": 11, "step": 17}  # first of each among the floats
 
 

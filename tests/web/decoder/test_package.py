@@ -13,7 +13,7 @@ import hyrfpack
 from hyrfpack.format import describe
 from hyrfpack.format.arrays import group_shapes, parse_config
 from hyrfpack.format.container import read_container
-from hyrfpack.format.sections import LAYERED, MLPS, TABLES
+from hyrfpack.format.sections import DECODER_SECTIONS, LAYERED_SECTIONS, TABLE_SECTIONS
 from hyrfpack.model import HashGridConfig
 
 ROOT = Path(__file__).parents[3]
@@ -133,7 +133,7 @@ def test_shapes_of_grids_and_decoders_are_hyrfpacks():
         assert [level[0] for level in levels] == list(grid.resolutions)
         assert [level[1] for level in levels] + [levels[-1][2]] == list(grid.offsets)
         assert rows == grid.rows
-        assert [(geometry, 1), (radiance, 1)] == [shapes[tag] for tag in MLPS]
+        assert [(geometry, 1), (radiance, 1)] == [shapes[tag] for tag in DECODER_SECTIONS]
         hidden, directions = config["hidden"], {"sh": 9, "frequency": 24}[config["direction_encoding"]]
         inputs = 2 * grid.levels + directions
         assert [(layer["inputs"], layer["outputs"]) for layer in layers] == [
@@ -161,7 +161,7 @@ def test_a_file_is_described_from_its_first_bytes():
 
     answer = run_module(code, PACKAGE, str(file), str(start))
 
-    first = ("META", *LAYERED, *TABLES, *MLPS)
+    first = ("META", *LAYERED_SECTIONS, *TABLE_SECTIONS, *DECODER_SECTIONS)
     assert (
         answer["facts"]
         == answer["same"]

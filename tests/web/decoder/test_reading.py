@@ -33,9 +33,9 @@ from forged_files import (
 )
 
 from hyrfpack.format import encode_model
-from hyrfpack.format.arrays import GROUPS
+from hyrfpack.format.arrays import SECTION_PARAMETERS
 from hyrfpack.format.container import read_container
-from hyrfpack.format.sections import LAYERED, SECTIONS, layer_section
+from hyrfpack.format.sections import LAYERED_SECTIONS, SECTION_CONTENTS, layer_section
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.quant import huffman_encode, rans_lanes
@@ -98,7 +98,7 @@ def test_golden_files_decode_to_the_recorded_numbers(file):
     (verdict,) = in_javascript([(file.read_bytes(), False)])
 
     assert verdict.whole and sum(verdict.layers) == len(recorded["gaussians.positions"])
-    for group, names in GROUPS.items():
+    for group, names in SECTION_PARAMETERS.items():
         numbers = b"".join(recorded[name].astype("<f4").tobytes() for name in names)
         assert verdict.groups[group] == hashlib.sha256(numbers).hexdigest(), group
 
@@ -224,7 +224,7 @@ def layered() -> bytes:
 
 
 def test_the_start_of_a_file_is_read_or_refused_as_hyrfpack_does(layered):
-    entries = read_container(layered, SECTIONS).entries.values()
+    entries = read_container(layered, SECTION_CONTENTS).entries.values()
     ends = {end + step for entry in entries for end in (entry.offset + entry.length, entry.end) for step in (-1, 0, 1)}
     cuts = sorted({*range(0, len(layered), 37), *ends, len(layered)} - {len(layered) + 1})
 
@@ -236,7 +236,7 @@ def test_the_start_of_a_file_is_read_or_refused_as_hyrfpack_does(layered):
 
 
 def _further_layers() -> set[str]:
-    return {layer_section(group, layer) for group in LAYERED for layer in range(1, 8)}
+    return {layer_section(group, layer) for group in LAYERED_SECTIONS for layer in range(1, 8)}
 
 
 def test_what_was_read_of_a_file_is_told(layered):
@@ -496,7 +496,7 @@ def test_what_sections_may_decode_to_is_bounded(count, a_byte, words):
 
     def file_and_slack(count: int) -> tuple[bytes, int]:
         data = file_of(metadata(count, geometry=grid, radiance=grid), decoders | empty)
-        raw = sum(entry.raw_length for entry in read_container(data, SECTIONS, fraction=0).entries.values())
+        raw = sum(entry.raw_length for entry in read_container(data, SECTION_CONTENTS, fraction=0).entries.values())
         return data, (FREE + 1024 * len(data) - raw) // 32 if a_byte == 1024 else GAUSSIANS + 32 * len(data) - count
 
     for _ in range(3):  # a longer number makes a longer file
@@ -511,7 +511,7 @@ def test_what_sections_may_decode_to_is_bounded(count, a_byte, words):
 
 def test_what_is_not_there_may_promise_anything():
     meta = metadata(1 << 39) | {"layers": [0, 1 << 39]}
-    tags = {layer_section(group, 1): 1 << 39 for group in LAYERED}
+    tags = {layer_section(group, 1): 1 << 39 for group in LAYERED_SECTIONS}
     parts = disassemble(file_of(metadata(0), plain(metadata(0))))
     parts[0] = Part(b"META", 0, 1, text_of(meta), len(text_of(meta)))
     parts += [Part(tag.encode(), 1, 1, b"12345678", 4 * (3, 3, 1, 1)[k] << 39) for k, tag in enumerate(tags)]

@@ -13,7 +13,7 @@ from hyrfpack.cameras.capture import quantized_provenance
 from hyrfpack.compress.distortion import LIMITS
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.codec import load_with_provenance
-from hyrfpack.format.smallest import check_target_bytes, min_file_bytes
+from hyrfpack.format.min_file_size import check_target_bytes, min_file_bytes
 from hyrfpack.train import TrainConfig, train
 
 

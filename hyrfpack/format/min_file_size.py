@@ -1,0 +1,83 @@
+"""Size of the smallest `.hyrf` file that packing can write, and the check of a target size against it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from hyrfpack.errors import HyrfError
+from hyrfpack.format.codec import encode_model
+from hyrfpack.format.compact.channels import Channel
+from hyrfpack.format.compact.groups import ENTROPY_MODEL_COUNT, GroupSymbols, StepGroups
+from hyrfpack.format.compact.plan import Layer, Plan, build_step_groups
+from hyrfpack.format.compact.quantized import LOGIT_COLUMNS, QuantizedModel
+from hyrfpack.format.sections import DECODER_SECTIONS, TABLE_SECTIONS
+from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
+from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.quant.points import Points, encode_points
+from hyrfpack.quant.steps import NOT_CODED
+
+# A table of zeros takes the same bytes at any size, so that the smallest size, which is encoded fastest, is used.
+MIN_LOG2_TABLE_SIZE = 4
+# A target size below these many bytes was most likely meant in megabytes or in kilobytes.
+MEGABYTE_HINT_BELOW_BYTES = 100
+KILOBYTE_HINT_BELOW_BYTES = 1_000
+
+
+def min_file_bytes(provenance: dict | None = None, exposure: ExposureMap | None = None) -> int:
+    """Return the size in bytes of the smallest `.hyrf` file that packing can write.
+
+    It encodes, with profile "compact", a model without Gaussians whose fields are zero. Such a file consists of the
+    headers of all sections and the metadata, which every file has, and of the exposure map.
+
+    Args:
+        provenance: provenance in the file; None for none.
+        exposure: exposure map in the file; None for none.
+
+    Example:
+        >>> min_file_bytes() < min_file_bytes({"source": "a drone"}) < 2000
+        True
+    """
+    table = HashGridConfig(MIN_LOG2_TABLE_SIZE)
+    config = ModelConfig(Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0)), table, table, background=False)
+    triple, single = torch.zeros(0, 3), torch.zeros(0, 1)
+    model = HybridModel(config, Gaussians(triple, triple, single, single), torch.Generator().manual_seed(0))
+    model.exposure = exposure
+    data, _, points = encode_points(Points(np.zeros((0, 3), np.int64), np.zeros(0, np.uint8), np.ones(1, np.int64)))
+    groups = {group: build_step_groups(group, config, points) for group in (*TABLE_SECTIONS, *DECODER_SECTIONS)}
+    plan = Plan(np.zeros(0, np.int64), (Layer(points, data),), np.eye(3, dtype=np.float32), groups, 0.0)
+    empty = Channel(np.float32(0), 0, np.zeros(1, np.uint8), np.zeros(0, np.int64), np.zeros(0))
+    channels = {group: [empty] * count for group, count in LOGIT_COLUMNS.items()}
+    symbols = {group: _zero_symbols(members) for group, members in groups.items()}
+    return len(encode_model(model, "compact", provenance, quantized=QuantizedModel(plan, [channels], symbols)))
+
+
+def check_target_bytes(target_bytes: int, provenance: dict | None = None, exposure: ExposureMap | None = None) -> None:
+    """Raise an error if a target size is below the smallest possible file.
+
+    Args:
+        target_bytes: largest allowed size of the packed file, bytes.
+        provenance: provenance that the file will have, as far as it is known.
+        exposure: exposure map that the file will have, as far as it is known.
+
+    Raises:
+        HyrfError: no packed file is so small. The message suggests a unit where it seems to be missing.
+    """
+    smallest = min_file_bytes(provenance, exposure)
+    if target_bytes >= smallest:
+        return
+    unit = (
+        "MB" if target_bytes < MEGABYTE_HINT_BELOW_BYTES else "kB" if target_bytes < KILOBYTE_HINT_BELOW_BYTES else None
+    )
+    remedy = f"did you mean {target_bytes}{unit}?" if unit else "ask for more"
+    raise HyrfError(
+        f"a target size of {target_bytes:,} bytes is below the smallest possible file, about {smallest:,} bytes; "
+        f"{remedy}"
+    )
+
+
+def _zero_symbols(groups: StepGroups) -> GroupSymbols:
+    """Return the symbols of groups in which all numbers are zero."""
+    count = len(groups.index)
+    codes, models = np.full(groups.count, NOT_CODED, np.uint8), np.full(groups.count, ENTROPY_MODEL_COUNT - 1, np.uint8)
+    return GroupSymbols(codes, models, np.zeros(count, np.int64), np.zeros(count, np.float32))
