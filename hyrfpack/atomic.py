@@ -1,4 +1,4 @@
-"""Files appear whole or not at all."""
+"""Atomic writes: a file appears whole under its name, or not at all."""
 
 from __future__ import annotations
 
@@ -20,10 +20,12 @@ try:
 except ModuleNotFoundError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-PREFIX, SUFFIX = ".hyrfpack-", ".tmp"  # of temporary files; what is between is random
-MAX_NAME_BYTES = 255  # of a file, on common systems
+# A temporary file's name is this prefix, random digits and this suffix.
+TEMPORARY_PREFIX = ".hyrfpack-"
+TEMPORARY_SUFFIX = ".tmp"
+MAX_NAME_BYTES = 255  # the limit of common file systems
 _SUFFIX_PART = r"\.[A-Za-z][A-Za-z0-9]*"
-_NAME = re.compile(rf"(.+?)((?:{_SUFFIX_PART}){{1,2}})", re.DOTALL)  # stem and suffix
+_STEM_AND_SUFFIX = re.compile(rf"(.+?)((?:{_SUFFIX_PART}){{1,2}})", re.DOTALL)
 
 
 @dataclass
@@ -31,8 +33,8 @@ class PendingFile:
     """A file that is being written.
 
     Attributes:
-        temporary: where to write it.
-        path: the name that it will get; after the block of `pending_file`, the name that it has.
+        temporary: path to write the content to.
+        path: the path that the file will get; after the block of `pending_file`, the path that it has got.
     """
 
     temporary: Path
@@ -42,12 +44,15 @@ class PendingFile:
 def write_atomic(
     path: str | os.PathLike[str], data: bytes | memoryview, *, overwrite: bool = True, rename: bool = True
 ) -> Path:
-    """Write `data` to `path` in one step: at any moment, a crash included, readers find the old file or the new one.
+    """Write `data` to `path` atomically: at any time, also after a crash, readers find the old file or the new one.
 
-    Arguments and errors as `pending_file`. Returns the path that was written.
+    Arguments and errors are those of `pending_file`.
+
+    Returns:
+        The path that was written.
     """
-    # The view is let go of in any case: that of a BytesIO, kept by the traceback of a failure, crashes Python 3.12.1
-    # when garbage is collected.
+    # The view is released in any case. If the traceback of a failure kept the view of a BytesIO, the garbage collector
+    # of Python 3.12.1 would crash.
     with memoryview(data) as view:
         del data
         with pending_file(path, view.nbytes, overwrite=overwrite, rename=rename) as pending:
@@ -57,8 +62,8 @@ def write_atomic(
 
 
 @contextmanager
-def replacing(path: str | os.PathLike[str], length: int | None = None) -> Iterator[Path]:
-    """The temporary path of a `pending_file` that replaces what is at `path`."""
+def replace_file(path: str | os.PathLike[str], length: int | None = None) -> Iterator[Path]:
+    """Yield the temporary path of a `pending_file` that replaces the file at `path`."""
     with pending_file(path, length) as pending:
         yield pending.temporary
 
@@ -67,29 +72,29 @@ def replacing(path: str | os.PathLike[str], length: int | None = None) -> Iterat
 def pending_file(
     path: str | os.PathLike[str], length: int | None = None, *, overwrite: bool = True, rename: bool = True
 ) -> Iterator[PendingFile]:
-    """A temporary file beside `path`, which gets its final name when the block ends.
+    """Yield a temporary file beside `path`, which gets its final name when the block ends.
 
-    The bytes are forced to the disk before the file gets its name. When anything fails, an interrupt included, what
-    was at `path` is untouched and the temporary file is removed. What a killed process left behind is removed by the
-    next one that writes into the same folder (but on Windows).
+    The bytes are forced to the disk before the file gets its name. When anything fails, an interrupt included, the
+    file at `path` is untouched and the temporary file is removed. The temporary files of killed processes are removed
+    by the next call that writes into the same folder (but not on Windows).
 
-    With `overwrite`, the file replaces one that is there; of several writers at once the last one wins, and of a link
-    the target is replaced. Without `overwrite`, no file is ever replaced, not even one that appears at the last moment:
-    the name is given by a hard link, which the system refuses where the name is taken. On file systems without hard
-    links (FAT, some network file systems) the name is first claimed by an empty file, which a crash at that moment
+    With `overwrite`, the file replaces an existing one. Of several simultaneous writers the last one wins, and of a
+    link the target is replaced. Without `overwrite`, no file is ever replaced, not even one that appears at the last
+    moment: the name is given by a hard link, which the system refuses where the name is taken. File systems without
+    hard links (FAT, some network file systems) get an empty file of that name first, which a crash at that moment
     would leave behind.
 
     Args:
-        path: of the file; its folder is created if missing.
-        length: bytes that will be written, for the message when the disk is full.
+        path: path of the file; its folder is created if missing.
+        length: number of bytes that will be written, for the message when the disk is full.
         overwrite: replace a file at `path`.
         rename: where a file at `path` may not be replaced, take the first free one of `numbered_names`; otherwise
             raise.
 
     Raises:
-        HyrfError: the folder cannot be created, is not writable or full; with `overwrite`, what is at `path` is no
-            file; with neither `overwrite` nor `rename`, something is at `path`. An OSError in the block counts as one
-            of writing.
+        HyrfError: the folder cannot be created, is not writable or is full; with `overwrite`, `path` exists and is not
+            a file; with neither `overwrite` nor `rename`, `path` exists. An OSError in the block is reported as a
+            failed write.
     """
     path = Path(path)
     try:
@@ -109,13 +114,13 @@ def pending_file(
                 pending.path = path.with_name(_move_to_free_name(temporary, target, rename).name)
         _sync_folder(target.parent)
     except OSError as error:
-        raise HyrfError(_explain(path, length, error)) from error
+        raise HyrfError(_write_error_message(path, length, error)) from error
 
 
 def numbered_names(path: Path) -> Iterator[Path]:
-    """A path, then those beside it that are numbered from 2, with the whole suffix kept.
+    """Yield a path, then paths beside it with a number from 2 on between stem and suffix.
 
-    A suffix has one or two parts that begin with a letter.
+    A suffix has one or two parts, each of which begins with a letter.
 
     Example:
         >>> from itertools import islice
@@ -123,7 +128,7 @@ def numbered_names(path: Path) -> Iterator[Path]:
         ['out/scene.points.ply', 'out/scene-2.points.ply', 'out/scene-3.points.ply']
     """
     yield path
-    match = _NAME.fullmatch(path.name)
+    match = _STEM_AND_SUFFIX.fullmatch(path.name)
     stem, suffix = match.groups() if match else (path.name, "")
     for number in itertools.count(2):
         end = f"-{number}{suffix}"
@@ -133,12 +138,15 @@ def numbered_names(path: Path) -> Iterator[Path]:
 
 
 def describe_rename(asked: str | os.PathLike[str], written: str | os.PathLike[str]) -> str:
-    """Return the sentence that says why a file was written under another name than the one that was asked for."""
+    """Return a sentence that explains why a file was written under another name than requested."""
     return f"{asked}: this file was created by something else in the meantime and is kept; the result is in {written}"
 
 
 def _move_to_free_name(temporary: Path, target: Path, rename: bool) -> Path:
-    """Give a finished file its name, or the first free one beside it; returns that. The temporary name may stay."""
+    """Move a finished file to `target`, or with `rename` to the first free name beside it, and return that path.
+
+    The file may keep its temporary name as well.
+    """
     for name in numbered_names(target):
         try:
             _move_without_replacing(temporary, name)
@@ -153,12 +161,16 @@ def _move_to_free_name(temporary: Path, target: Path, rename: bool) -> Path:
 
 
 def _move_without_replacing(temporary: Path, target: Path) -> None:
-    """Raises FileExistsError where something is at `target`, in the same step as the name would be given."""
+    """Move a file to a free path.
+
+    Raises:
+        FileExistsError: `target` exists. The system checks this in the same step that gives the name.
+    """
     try:
         os.link(temporary, target)
     except FileExistsError:
         raise
-    except OSError:  # no hard links here
+    except OSError:  # this file system has no hard links
         os.close(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
         try:
             os.replace(temporary, target)
@@ -168,7 +180,11 @@ def _move_without_replacing(temporary: Path, target: Path) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and those above it. Raises HyrfError when that cannot be done."""
+    """Create a folder and its parents.
+
+    Raises:
+        HyrfError: it cannot be created.
+    """
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -178,7 +194,11 @@ def make_folder(path: Path) -> None:
 
 
 def check_writable(folder: Path) -> None:
-    """Raises HyrfError when no file can be made in a folder: better before hours of work than after."""
+    """Check that files can be created in a folder, so that a failure comes before hours of work and not after.
+
+    Raises:
+        HyrfError: no file can be created in it.
+    """
     try:
         with _temporary_file(folder):
             pass
@@ -190,9 +210,9 @@ def check_writable(folder: Path) -> None:
 
 @contextmanager
 def _temporary_file(folder: Path) -> Iterator[Path]:
-    """A new, empty file, removed at the end if it is still there. Removes litter first."""
-    _remove_litter(folder)
-    temporary, lock = _claim(folder)
+    """Yield a new, empty file and remove it at the end if it still exists; first remove stale files in the folder."""
+    _remove_stale_files(folder)
+    temporary, lock = _create_locked_file(folder)
     try:
         yield temporary
     finally:
@@ -202,32 +222,32 @@ def _temporary_file(folder: Path) -> Iterator[Path]:
             os.close(lock)
 
 
-def _claim(folder: Path) -> tuple[Path, int | None]:
-    """A new temporary file and the descriptor that holds its lock: to others it says that the writer lives."""
+def _create_locked_file(folder: Path) -> tuple[Path, int | None]:
+    """Create a temporary file and return it with the descriptor of its lock, which shows others that it is in use."""
     while True:
-        temporary = folder / f"{PREFIX}{secrets.token_hex(6)}{SUFFIX}"
-        # Made by hand rather than through tempfile, which would make the file private (mode 0600).
+        temporary = folder / f"{TEMPORARY_PREFIX}{secrets.token_hex(6)}{TEMPORARY_SUFFIX}"
+        # The module tempfile would make the file private (mode 0600).
         lock = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        if fcntl is None:  # a file that is open cannot be renamed there
+        if fcntl is None:  # Windows cannot rename an open file
             os.close(lock)
             return temporary, None
-        with contextlib.suppress(OSError):  # where locks are unknown (some network folders) litter stays
+        with contextlib.suppress(OSError):  # some network folders have no locks, and stale files stay there
             fcntl.flock(lock, fcntl.LOCK_EX)
         if temporary.exists():
             return temporary, lock
-        os.close(lock)  # in the moment before the lock, another process took the file for litter
+        os.close(lock)  # before it was locked, another process removed the file as a stale one
 
 
-def _remove_litter(folder: Path) -> None:
-    """Remove the temporary files of killed processes: those whose lock is free."""
+def _remove_stale_files(folder: Path) -> None:
+    """Remove the temporary files of killed processes, which are those whose lock is free."""
     if fcntl is None:
         return
     try:
         names = os.listdir(folder)
-    except OSError:  # it may be written and not read, or is not there
+    except OSError:  # the folder is writable but not readable, or does not exist
         return
     for name in names:
-        if name.startswith(PREFIX) and name.endswith(SUFFIX):
+        if name.startswith(TEMPORARY_PREFIX) and name.endswith(TEMPORARY_SUFFIX):
             with contextlib.suppress(OSError):
                 lock = os.open(folder / name, os.O_RDWR)
                 try:
@@ -238,7 +258,10 @@ def _remove_litter(folder: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make the new name survive a power cut. Windows and some network folders cannot; the file is whole there too."""
+    """Force a folder's new entry to the disk, so that it survives a power cut.
+
+    Windows and some network folders do not support this; the file is whole there too.
+    """
     with contextlib.suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -247,7 +270,7 @@ def _sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-def _explain(path: str | os.PathLike[str], length: int | None, error: OSError) -> str:
+def _write_error_message(path: str | os.PathLike[str], length: int | None, error: OSError) -> str:
     size = "some space" if length is None else f"{length:,} bytes"
     if error.errno == errno.ENOSPC:
         return f"{path}: the disk is full and this file was not written; free {size} and try again"

@@ -1,6 +1,6 @@
-"""Refusing settings and arguments that make no sense where they are given, not in the middle of the work.
+"""Checks of settings and arguments, which fail at the call instead of in the middle of the work.
 
-Settings are written as JSON beside results, so only Python's own numbers are taken: NumPy's have no place there.
+Settings are written as JSON beside results. JSON cannot hold NumPy's numbers, so only Python's own are accepted.
 """
 
 from __future__ import annotations
@@ -9,44 +9,65 @@ import sys
 from collections.abc import Collection
 from typing import Any
 
-LARGEST = sys.float_info.max
+MAX_FLOAT = sys.float_info.max
 
 
-def check_int(name: str, value: Any, least: int, most: int | None = None) -> None:
-    """Raises ValueError: the value is no int (a bool is none) or lies outside of [least, most]."""
-    if isinstance(value, int) and not isinstance(value, bool) and value >= least and (most is None or value <= most):
+def check_int(name: str, value: Any, minimum: int, maximum: int | None = None) -> None:
+    """Check that a value is an int, not a bool, in [minimum, maximum].
+
+    Raises:
+        ValueError: it is not.
+    """
+    is_int = isinstance(value, int) and not isinstance(value, bool)
+    if is_int and value >= minimum and (maximum is None or value <= maximum):
         return
-    allowed = f"of at least {least}" if most is None else f"in [{least}, {most}]"
+    allowed = f"of at least {minimum}" if maximum is None else f"in [{minimum}, {maximum}]"
     raise ValueError(f"{name} is {value!r}; it must be an int {allowed}")
 
 
-def check_float(name: str, value: Any, least: float = 0.0, most: float = LARGEST) -> None:
-    """Raises ValueError: the value is no float or int, not finite, or lies outside of [least, most]."""
-    if isinstance(value, float | int) and not isinstance(value, bool) and least <= value <= most:
+def check_float(name: str, value: Any, minimum: float = 0.0, maximum: float = MAX_FLOAT) -> None:
+    """Check that a value is a float or an int, not a bool and not NaN, in [minimum, maximum].
+
+    Raises:
+        ValueError: it is not.
+    """
+    if isinstance(value, float | int) and not isinstance(value, bool) and minimum <= value <= maximum:
         return
-    allowed = f"finite and at least {least:g}" if most == LARGEST else f"in [{least:g}, {most:g}]"
+    allowed = f"finite and at least {minimum:g}" if maximum == MAX_FLOAT else f"in [{minimum:g}, {maximum:g}]"
     raise ValueError(f"{name} is {value!r}; it must be a float, {allowed}")
 
 
 def check_bool(name: str, value: Any) -> None:
-    """Raises ValueError: the value is neither True nor False."""
+    """Check that a value is True or False.
+
+    Raises:
+        ValueError: it is not.
+    """
     if not isinstance(value, bool):
         raise ValueError(f"{name} is {value!r}; it must be True or False")
 
 
 def check_choice(name: str, value: Any, choices: Collection[str]) -> None:
-    """Raises ValueError: the value is none of the choices."""
+    """Check that a value is one of the choices.
+
+    Raises:
+        ValueError: it is not.
+    """
     if value not in choices:
         raise ValueError(f"{name} is {value!r}; it must be one of {', '.join(choices)}")
 
 
 def check_pair(name: str, value: Any) -> None:
-    """Raises ValueError: the value is no tuple of two."""
+    """Check that a value is a tuple of two.
+
+    Raises:
+        ValueError: it is not.
+    """
     if not (isinstance(value, tuple) and len(value) == 2):
         raise ValueError(f"{name} is {value!r}; it must be a tuple of two numbers")
 
 
-# Where what a call was given instead of can be had, by the type that it wants.
+# How to get an argument of the type that a call needs, by the name of the type.
 _REMEDIES = {
     "Camera": "a View has one: view.camera",
     "HybridModel": "hyrfpack.load reads it from a file",
@@ -56,9 +77,13 @@ _REMEDIES = {
 }
 
 
-def check_type(argument: str, value: object, kind: type) -> None:
-    """Refuse what a call from a program cannot be about: TypeError, with what to do, unless `value` is of a kind."""
-    if not isinstance(value, kind):
+def check_type(argument: str, value: object, expected: type) -> None:
+    """Check that an argument of a call has the expected type, one of those in `_REMEDIES`.
+
+    Raises:
+        TypeError: it has not; the message says how to get one.
+    """
+    if not isinstance(value, expected):
         raise TypeError(
-            f"{argument} must be a {kind.__name__}, not a {type(value).__name__}; {_REMEDIES[kind.__name__]}"
+            f"{argument} must be a {expected.__name__}, not a {type(value).__name__}; {_REMEDIES[expected.__name__]}"
         )

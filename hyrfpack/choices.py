@@ -1,9 +1,14 @@
-"""Words that settings take: for the rooms that know what they mean, and for the command line, which loads none of them
-to list its options."""
+"""The values of settings that take one of a few words.
 
-AS_PHOTOGRAPHED, CONSISTENT = EXPOSURES = ("as-photographed", "consistent")  # of renders
-LOCAL_EXPOSURE, _ = SPLAT_EXPOSURES = ("local", CONSISTENT)  # of splats that a model is baked to
-LAYOUTS = (  # of photos and poses: the keys of `hyrfpack.data.LAYOUTS`
+They stand here, below the rooms that implement them, so that the command line lists its options without loading those.
+"""
+
+# How renders are exposed: each like the photos taken near its camera, or all alike.
+AS_PHOTOGRAPHED, CONSISTENT_EXPOSURE = RENDER_EXPOSURES = ("as-photographed", "consistent")
+# How the splats that a model is baked to are exposed: each like the photos that see it, or all alike.
+LOCAL_EXPOSURE, _ = SPLAT_EXPOSURES = ("local", CONSISTENT_EXPOSURE)
+# Layouts of photos and poses. They are the keys of `hyrfpack.data.LAYOUTS`.
+LAYOUTS = (
     "colmap",
     "blender",
     "nerfstudio",
@@ -14,7 +19,11 @@ LAYOUTS = (  # of photos and poses: the keys of `hyrfpack.data.LAYOUTS`
     "polycam",
     "record3d",
 )
-MATCHING = ("auto", "exhaustive", "sequential", "retrieval")  # which photos are compared
-PRESETS = ("auto", "synthetic", "standard", "large", "street")  # the kind of scene that is trained
-PRECISIONS = ("mixed", "float32")  # what a GPU multiplies in
-QUALITIES = ("draft", "normal", "best")  # how long `make` works: the keys of `hyrfpack.make.QUALITIES`
+# Methods that choose the pairs of photos to match.
+MATCHING_METHODS = ("auto", "exhaustive", "sequential", "retrieval")
+# Kinds of scenes, each with its defaults of training.
+PRESETS = ("auto", "synthetic", "standard", "large", "street")
+# Number formats of matrix products on a GPU: bfloat16 with float32 sums, or float32.
+PRECISIONS = ("mixed", "float32")
+# Trade-offs of time and quality of `make`. They are the keys of `hyrfpack.make.QUALITIES`.
+QUALITIES = ("draft", "normal", "best")

@@ -1,7 +1,7 @@
-"""The one family of errors that a user can cause.
+"""The errors that a user can cause and correct.
 
-Each message is one sentence that says what is wrong, where, and what to do. The command line prints it and
-exits with code 2; anything else that escapes is a bug of ours and keeps its traceback.
+Each message is one sentence that says what is wrong, where, and what to do. The command line prints it and exits with
+code 2. Any other exception is a bug in hyrfpack and keeps its traceback.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from contextlib import contextmanager
 
 
 def printable(text: str) -> str:
-    """Text out of a file as one line that any terminal can show: what is not printable becomes an escape ("\\n")."""
+    """Return text from a file as one line that any terminal can show; unprintable characters become escapes ("\\n")."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 class HyrfError(Exception):
-    """Something about the input or the request is wrong and the user can correct it.
+    """The input or the request is wrong, and the user can correct it.
 
-    Sentences quote what hostile files say, so they are made `printable`.
+    Messages quote hostile files, so every message is made `printable`.
     """
 
     def __init__(self, sentence: str) -> None:
@@ -26,50 +26,53 @@ class HyrfError(Exception):
 
 
 class HyrfDataError(HyrfError):
-    """Photos, poses or points on disk cannot be used as they are."""
+    """Photos, poses or points on disk cannot be used."""
 
 
 class HyrfNoPosesError(HyrfDataError):
-    """There are photos, or a video, and no poses: these have to be estimated first."""
+    """There are photos or a video but no poses, which have to be estimated first."""
 
 
 class HyrfFormatError(HyrfError):
-    """A `.hyrf` file is damaged, hostile, or made by a newer version."""
+    """A `.hyrf` file is damaged, hostile, or written by a newer version."""
 
 
 class HyrfSizeError(HyrfError):
-    """A model does not fit into the size that was asked for.
+    """A model does not fit into the target size.
 
     Attributes:
-        smallest: bytes that it takes at least, about; 0 where that is not known.
+        min_bytes: approximate size of the smallest file that holds the model; 0 where that is not known.
     """
 
-    def __init__(self, sentence: str, smallest: int = 0) -> None:
+    def __init__(self, sentence: str, min_bytes: int = 0) -> None:
         super().__init__(sentence)
-        self.smallest = smallest
+        self.min_bytes = min_bytes
 
 
 class HyrfTrainingError(HyrfError):
-    """Training cannot start or cannot go on (a loss that is not finite, a checkpoint that does not fit)."""
+    """Training cannot start or continue: the loss is not finite, or a checkpoint does not fit."""
 
 
-def without_path(error: HyrfError, path: object) -> str:
-    """The sentence of an error without the path that it starts with, for a sentence that names the file otherwise."""
+def strip_path(error: HyrfError, path: object) -> str:
+    """Return an error's message without the path at its start, for a sentence that names the file itself."""
     return str(error).removeprefix(f"{printable(str(path))}: ")
 
 
-def reason_of(error: Exception, longest: int = 120) -> str:
-    """What another library says of an error, for a place in a sentence of ours: its first line, or else its kind."""
-    return str(error).splitlines()[0][:longest] if str(error) else type(error).__name__
+def short_reason(error: Exception, max_length: int = 120) -> str:
+    """Return the first line of another library's error message, to be quoted in one of ours; else the error's type."""
+    return str(error).splitlines()[0][:max_length] if str(error) else type(error).__name__
 
 
 @contextmanager
 def needs_package(package: str, task: str) -> Iterator[None]:
-    """Import what one task alone needs inside this block: where it is not installed, that is a HyrfError.
+    """Turn a failed import inside the block into a HyrfError that says which package to install.
 
     Args:
-        package: what pip calls it.
-        task: what cannot be done without it, as the sentence starts ("model.hyrf: drawing figures").
+        package: name of the package for pip.
+        task: what needs the package, as the start of the message: "model.hyrf: drawing figures".
+
+    Raises:
+        HyrfError: a module that is imported in the block is not installed.
     """
     try:
         yield

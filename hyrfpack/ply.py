@@ -1,4 +1,4 @@
-"""PLY, the container (Turk 1994): a header in text that names elements and their properties, and then their rows."""
+"""Reader of the PLY container (Turk 1994): a text header names elements and their properties, and their rows follow."""
 
 from __future__ import annotations
 
@@ -11,21 +11,23 @@ import numpy as np
 
 from hyrfpack.errors import HyrfDataError
 
-_LONGEST_HEADER = 1 << 16
-_ENDS = re.compile(rb"^end_header\r?\n", re.MULTILINE)
+_MAX_HEADER_BYTES = 1 << 16
+_END_OF_HEADER = re.compile(rb"^end_header\r?\n", re.MULTILINE)
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
-_KINDS = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"} | {
-    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"
-} | {"float32": "f4", "float64": "f8"}  # fmt: skip
+_NUMPY_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Element:
-    """One element of the header.
+    """One element of a PLY header.
 
     Attributes:
-        count: of its rows.
-        properties: name of each -> numpy's name of its type without byte order; "" for a list.
+        count: number of rows.
+        properties: name of each property -> numpy's name of its type without byte order, or "" for a list.
     """
 
     count: int
@@ -34,12 +36,12 @@ class Element:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What the text at the start of a PLY file says.
+    """The header of a PLY file.
 
     Attributes:
-        order: "<" or ">" for binary rows, "=" for rows in text.
-        elements: by name, in the order of the file.
-        length: bytes of the header; rows follow.
+        order: byte order of binary rows, "<" or ">"; "=" for text rows.
+        elements: the elements by name, in the order of the file.
+        length: size of the header in bytes; the rows follow.
     """
 
     order: str
@@ -50,14 +52,18 @@ class PlyHeader:
 def read_header(data: bytes, name: str) -> PlyHeader:
     """Read the header of a PLY file.
 
+    Args:
+        data: the whole file, or at least its header.
+        name: name of the file in error messages.
+
     Raises:
-        HyrfDataError: this is not a PLY file, or its header breaks the rules of the format.
+        HyrfDataError: this is not a PLY file, or its header is malformed.
     """
     if not re.match(rb"ply\r?\n", data):
         raise HyrfDataError(f"{name}: this is not a PLY file, for its first line is not 'ply'")
-    end = _ENDS.search(data, 0, _LONGEST_HEADER)
+    end = _END_OF_HEADER.search(data, 0, _MAX_HEADER_BYTES)
     if end is None:
-        raise HyrfDataError(f"{name}: its PLY header has no end within {_LONGEST_HEADER:,} bytes; it is damaged")
+        raise HyrfDataError(f"{name}: its PLY header has no end within {_MAX_HEADER_BYTES:,} bytes; it is damaged")
     order, elements = "", dict[str, Element]()
     properties: dict[str, str] | None = None
     for line in data[: end.start()].decode("utf-8", "replace").split("\n")[1:]:
@@ -69,8 +75,10 @@ def read_header(data: bytes, name: str) -> PlyHeader:
             case ["element", element, count] if re.fullmatch("[0-9]{1,15}", count) and element not in elements:
                 properties = {}
                 elements[element] = Element(int(count), properties)
-            case ["property", kind, label] if kind in _KINDS and properties is not None and label not in properties:
-                properties[label] = _KINDS[kind]
+            case ["property", kind, label] if (
+                kind in _NUMPY_TYPES and properties is not None and label not in properties
+            ):
+                properties[label] = _NUMPY_TYPES[kind]
             case ["property", "list", _, _, label] if properties is not None and label not in properties:
                 properties[label] = ""
             case _:
@@ -81,19 +89,20 @@ def read_header(data: bytes, name: str) -> PlyHeader:
 
 
 def read_elements(data: bytes, header: PlyHeader, wanted: set[str], name: str) -> dict[str, np.ndarray]:
-    """Rows of those `wanted` elements that the file has; others are skipped.
+    """Read the rows of those `wanted` elements that the file has, and skip the others.
 
     Args:
         data: the whole file.
-        header: of it.
+        header: its header.
         wanted: names of elements.
-        name: what messages call the file.
+        name: name of the file in error messages.
 
     Returns:
-        By name, a structured array (count,) with the file's property names. Rows in text come as float64.
+        By element, a structured array (count,) with the file's property names. Text rows are float64.
 
     Raises:
-        HyrfDataError: the file ends too early, a row in text is not made of numbers, or lists stand in the way.
+        HyrfDataError: the file ends too early, a text row does not consist of numbers, or a wanted element, or a binary
+            one before it, has list properties.
     """
     rows, place = dict[str, np.ndarray](), header.length
     text = io.StringIO(data[place:].decode("ascii", "replace")) if header.order == "=" else None
@@ -110,30 +119,30 @@ def read_elements(data: bytes, header: PlyHeader, wanted: set[str], name: str) -
             lines = (line for line in text if not line.isspace())
             taken = [line for _, line in zip(range(element.count), lines, strict=False)]
             if len(taken) < element.count:
-                raise _ends_early(name, label, element.count)
+                raise _truncated_error(name, label, element.count)
             if label in wanted:
-                rows[label] = _numbers(taken, kinds, label, name)
+                rows[label] = _parse_rows(taken, kinds, label, name)
             continue
         layout = np.dtype([(key, header.order + kind) for key, kind in kinds.items()])
         if element.count * layout.itemsize > len(data) - place:
-            raise _ends_early(name, label, element.count)
+            raise _truncated_error(name, label, element.count)
         if label in wanted:
             rows[label] = np.ndarray(element.count if kinds else 0, layout, data, place)
         place += element.count * layout.itemsize
     return rows
 
 
-def columns(rows: np.ndarray, names: Collection[str]) -> np.ndarray:
-    """The properties `names` of rows, as one array (count, len(names)) of their widest type."""
-    there = rows.dtype.names or ()
-    kinds = {rows.dtype[name] for name in there}
-    if len(kinds) == 1:  # as all programs write it: one table, many times faster
-        table = rows.view(kinds.pop()).reshape(len(rows), len(there))
-        return table[:, [there.index(name) for name in names]]
+def stack_columns(rows: np.ndarray, names: Collection[str]) -> np.ndarray:
+    """Return the properties `names` of rows as one array (count, len(names)) of their widest type."""
+    fields = rows.dtype.names or ()
+    kinds = {rows.dtype[name] for name in fields}
+    if len(kinds) == 1:  # most files have one type, and viewing their rows as one table is many times faster
+        table = rows.view(kinds.pop()).reshape(len(rows), len(fields))
+        return table[:, [fields.index(name) for name in names]]
     return np.stack([rows[name] for name in names], axis=1)
 
 
-def _numbers(lines: list[str], kinds: dict[str, str], label: str, name: str) -> np.ndarray:
+def _parse_rows(lines: list[str], kinds: dict[str, str], label: str, name: str) -> np.ndarray:
     layout = np.dtype([(key, "f8") for key in kinds])
     if not lines or not kinds:
         return np.zeros(0, layout)
@@ -148,5 +157,5 @@ def _numbers(lines: list[str], kinds: dict[str, str], label: str, name: str) -> 
     return np.ascontiguousarray(table).view(layout)[:, 0]
 
 
-def _ends_early(name: str, label: str, count: int) -> HyrfDataError:
+def _truncated_error(name: str, label: str, count: int) -> HyrfDataError:
     return HyrfDataError(f"{name}: the file ends before the {count:,} rows of its element '{label}'; it is truncated")

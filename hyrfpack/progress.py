@@ -1,4 +1,4 @@
-"""Progress of long work, told in plain calls: what is being done, and which share of the whole work is done."""
+"""Progress reports of long work: calls that say what is being done, and which share of the whole work is done."""
 
 from __future__ import annotations
 
@@ -6,19 +6,21 @@ from collections.abc import Callable
 from threading import Lock
 from typing import TypeVar
 
-Report = Callable[[str, float], None]  # what is being done, and the share of the whole that is done, 0 to 1
+# A function of two arguments: what is being done, and the share of the whole work that is done, 0 to 1.
+Report = Callable[[str, float], None]
 S = TypeVar("S")
 T = TypeVar("T")
 
-ROUND_SHARE = 0.4  # of the work left, that each of a few rounds is taken to do
+# Share of the remaining work that each round is assumed to do, where nobody knows the number of rounds.
+REMAINING_SHARE_PER_ROUND = 0.4
 
 
 def no_report(doing: str, share: float) -> None:
-    """Report nothing."""
+    """Ignore a report, for callers that want none."""
 
 
 def report_part(report: Report, start: float, end: float) -> Report:
-    """Return the report of one part of the work, whose share 0 to 1 becomes `start` to `end` of the whole.
+    """Return a report for one part of the work: its share 0 to 1 becomes `start` to `end` of the whole work.
 
     Example:
         >>> report_part(lambda doing, share: print(doing, share), 0.5, 1.0)("measuring", 0.5)
@@ -28,18 +30,23 @@ def report_part(report: Report, start: float, end: float) -> Report:
 
 
 def report_round(report: Report, number: int) -> Report:
-    """Return the report of one round, counted from 0, of work that ends after a few rounds, nobody knows how many.
+    """Return a report for one round of work that takes a few rounds, where nobody knows how many.
 
-    Each round is taken to do ROUND_SHARE of what is left, so that the share grows and never reaches 1.
+    Each round is assumed to do REMAINING_SHARE_PER_ROUND of the remaining work, so that the share of the whole grows
+    and never reaches 1.
+
+    Args:
+        report: report of the whole work.
+        number: the number of the round, from 0.
     """
-    return report_part(report, *(1 - (1 - ROUND_SHARE) ** rounds for rounds in (number, number + 1)))
+    return report_part(report, *(1 - (1 - REMAINING_SHARE_PER_ROUND) ** rounds for rounds in (number, number + 1)))
 
 
-def reporting(function: Callable[[S], T], report: Report, doing: str, count: int) -> Callable[[S], T]:
-    """Return a function that does the same and reports after each of `count` calls, which threads may share."""
+def report_each_call(function: Callable[[S], T], report: Report, doing: str, count: int) -> Callable[[S], T]:
+    """Return a function that does the same as `function` and reports after each of `count` calls, from any thread."""
     lock, done = Lock(), 0
 
-    def called(item: S) -> T:
+    def call_and_report(item: S) -> T:
         nonlocal done
         result = function(item)
         with lock:
@@ -47,4 +54,4 @@ def reporting(function: Callable[[S], T], report: Report, doing: str, count: int
             report(doing, done / count)
         return result
 
-    return called
+    return call_and_report

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from hyrfpack import atomic
-from hyrfpack.atomic import numbered_names, replacing, write_atomic
+from hyrfpack.atomic import numbered_names, replace_file, write_atomic
 from hyrfpack.errors import HyrfError
 
 
@@ -151,7 +151,7 @@ needs_locks = pytest.mark.skipif(atomic.fcntl is None, reason="needs the locks o
 
 @needs_locks
 def test_file_of_a_living_writer_is_not_litter(tmp_path):
-    with replacing(tmp_path / "slow") as temporary:
+    with replace_file(tmp_path / "slow") as temporary:
         temporary.write_bytes(b"half")
         write_atomic(tmp_path / "quick", b"whole")
         assert temporary.read_bytes() == b"half"
@@ -192,7 +192,7 @@ def test_file_taken_for_litter_before_it_was_locked_is_made_anew(tmp_path, monke
 
     monkeypatch.setattr(atomic.fcntl, "flock", steal_the_first)
 
-    with replacing(tmp_path / "model.hyrf") as temporary:
+    with replace_file(tmp_path / "model.hyrf") as temporary:
         assert len(taken) == 1 and temporary not in taken and temporary.exists()
         temporary.write_bytes(b"new")
 

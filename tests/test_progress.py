@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from hyrfpack.parallel.pool import parallel_map
-from hyrfpack.progress import report_part, report_round, reporting
+from hyrfpack.progress import report_each_call, report_part, report_round
 
 
 def test_parts_of_parts_lie_where_they_belong_in_the_whole():
@@ -28,7 +28,7 @@ def test_rounds_follow_one_another_and_never_reach_the_end():
 
 def test_calls_of_several_threads_are_counted_once_each():
     told = []
-    assert parallel_map(reporting(abs, lambda *said: told.append(said), "drawing", 5), [-1, -2, 3, 4, -5]) == [
+    assert parallel_map(report_each_call(abs, lambda *said: told.append(said), "drawing", 5), [-1, -2, 3, 4, -5]) == [
         1,
         2,
         3,

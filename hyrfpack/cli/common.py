@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from hyrfpack.atomic import describe_rename
-from hyrfpack.choices import AS_PHOTOGRAPHED, EXPOSURES, LAYOUTS, PRECISIONS
+from hyrfpack.choices import AS_PHOTOGRAPHED, LAYOUTS, PRECISIONS, RENDER_EXPOSURES
 from hyrfpack.cli.manners import detail, note
 from hyrfpack.errors import HyrfError
 
@@ -138,7 +138,7 @@ device_option = click.option(
 
 exposure_option = click.option(
     "--exposure",
-    type=click.Choice(EXPOSURES),
+    type=click.Choice(RENDER_EXPOSURES),
     default=AS_PHOTOGRAPHED,
     show_default=True,
     help="Expose each view like the photos taken near it, or all views alike. The same for a model without an "

@@ -31,7 +31,7 @@ from hyrfpack.cli.common import (
 from hyrfpack.cli.processes import on_processes
 from hyrfpack.cli.progress import shown_progress
 from hyrfpack.errors import printable
-from hyrfpack.outputs import ARCHIVES, PICTURES, VIDEOS, Outputs
+from hyrfpack.outputs import ARCHIVE_SUFFIXES, PICTURE_SUFFIXES, VIDEO_SUFFIXES, Outputs
 from hyrfpack.progress import report_part
 
 if TYPE_CHECKING:
@@ -226,7 +226,9 @@ def info(path: Path, as_json: bool) -> None:
         _describe_run(path, as_json)
     elif is_splats(path):
         _describe_splats(path, as_json)
-    elif path.is_dir() or (path.is_file() and path.suffix.lower() in (*ARCHIVES, *VIDEOS, *PICTURES)):
+    elif path.is_dir() or (
+        path.is_file() and path.suffix.lower() in (*ARCHIVE_SUFFIXES, *VIDEO_SUFFIXES, *PICTURE_SUFFIXES)
+    ):
         _describe_photos(path, as_json)
     else:
         _describe_model(path, as_json)

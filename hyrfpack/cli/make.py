@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hyrfpack.choices import MATCHING, PRESETS, QUALITIES
+from hyrfpack.choices import MATCHING_METHODS, PRESETS, QUALITIES
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
@@ -51,7 +51,7 @@ LISTED = 5  # photos that were left out
 @click.option("--preset", type=click.Choice(PRESETS), default="auto", show_default=True, help="The kind of scene.")
 @click.option(
     "--matching",
-    type=click.Choice(MATCHING),
+    type=click.Choice(MATCHING_METHODS),
     default="auto",
     show_default=True,
     help="Which photos are compared with which to find poses, as of 'hyrfpack poses'.",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hyrfpack.choices import MATCHING
+from hyrfpack.choices import MATCHING_METHODS
 from hyrfpack.cli.common import OUTPUT, PATH, SEED, detail, json_option, note, print_json
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ _TOLD = 5  # photos that are named, of each reason that some were left out for
 @click.option("-o", "--output", "out", type=OUTPUT, required=True, metavar="SCENE", help="Folder of the scene.")
 @click.option(
     "--matching",
-    type=click.Choice(MATCHING),
+    type=click.Choice(MATCHING_METHODS),
     default="auto",
     show_default=True,
     help="Which photos are compared: all with all, each with those that follow it, or those that look alike; auto "

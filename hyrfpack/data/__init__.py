@@ -16,7 +16,7 @@ from hyrfpack.data.layouts import LAYOUTS
 from hyrfpack.data.places import find_set
 from hyrfpack.data.unusable import explain_no_photos, refuse_one_photo
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
-from hyrfpack.outputs import VIDEOS
+from hyrfpack.outputs import VIDEO_SUFFIXES
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 
 __all__ = ["LAYOUTS", "PictureCache", "load_scene", "pose_commands"]
@@ -128,7 +128,7 @@ def _folder_of(given: Path, notes: list[str]) -> Path:
         notes.append(f"{given.name} was unpacked into {folder}, where it is found again")
         return folder
     if not os.path.isdir(given):
-        if given.suffix.lower() in VIDEOS:
+        if given.suffix.lower() in VIDEO_SUFFIXES:
             raise HyrfNoPosesError(f"{given}: a video has no poses; {pose_commands(given)}")
         refuse_one_photo(given)
         raise HyrfDataError(f"{given}: a file, not a folder; give the folder that holds photos and poses, or its .zip")

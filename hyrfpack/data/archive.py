@@ -17,8 +17,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from hyrfpack.errors import HyrfDataError, HyrfError, reason_of
-from hyrfpack.outputs import ARCHIVES
+from hyrfpack.errors import HyrfDataError, HyrfError, short_reason
+from hyrfpack.outputs import ARCHIVE_SUFFIXES
 
 _MOST_FILES = 200_000
 _MOST_RATIO, _SLACK_BYTES = 100, 1 << 26  # photos hardly shrink in an archive; text does, to a tenth
@@ -31,7 +31,7 @@ _ENCRYPTED, _UTF8 = 0x1, 0x800  # flags of entries
 
 def is_archive(path: Path) -> bool:
     """Whether a path is a .zip file (or a .r3d, Record3D's), by its name: many a file of another kind is one inside."""
-    return path.suffix.lower() in ARCHIVES and os.path.isfile(path)
+    return path.suffix.lower() in ARCHIVE_SUFFIXES and os.path.isfile(path)
 
 
 def unpacked(archive: Path) -> Path:
@@ -64,7 +64,9 @@ def unpacked(archive: Path) -> Path:
             "yourself and give the folder"
         ) from error
     except Exception as error:  # zipfile and its decompressors raise whatever they meet
-        raise HyrfDataError(f"{archive}: the archive is damaged ({reason_of(error)}); copy or make it again") from error
+        raise HyrfDataError(
+            f"{archive}: the archive is damaged ({short_reason(error)}); copy or make it again"
+        ) from error
 
 
 def given_path(path: Path) -> Path:

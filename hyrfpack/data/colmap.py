@@ -20,7 +20,7 @@ from hyrfpack.data.pictures import read_header
 from hyrfpack.data.places import TABLES, find_photo_folder, find_workspace, folders_of
 from hyrfpack.data.points import read_ply
 from hyrfpack.data.undistort import Lens, brown
-from hyrfpack.errors import HyrfDataError, needs_package, reason_of
+from hyrfpack.errors import HyrfDataError, needs_package, short_reason
 from hyrfpack.scene import Scene
 
 
@@ -201,7 +201,7 @@ def _read_model(model: Path) -> tuple[dict[int, Lens], list[_Image], int, np.nda
         raise HyrfDataError(f"{model}: {error}") from error
     except Exception as error:  # pycolmap hands on whatever its C++ checks throw.
         raise HyrfDataError(
-            f"{model}: the model's tables do not fit together ({reason_of(error, 160)}); export it again"
+            f"{model}: the model's tables do not fit together ({short_reason(error, 160)}); export it again"
         ) from error
     if kind == ".txt":
         for name, count in zip(TABLES, (len(cameras), len(images), len(points)), strict=True):

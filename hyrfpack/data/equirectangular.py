@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hyrfpack.atomic import replacing
+from hyrfpack.atomic import replace_file
 from hyrfpack.data.archive import given_path
 from hyrfpack.data.pictures import Header, read_header, read_mask, read_pixels, same_aspect, says_panorama
 from hyrfpack.data.undistort import Lens
@@ -188,7 +188,7 @@ def cut_panorama(
 
         file = Path(folder, f"{path.stem}_{face.name}.jpg")
         picture = Image.fromarray(cut_face(rgb, face, size or face_size(width)))
-        with replacing(file) as temporary:
+        with replace_file(file) as temporary:
             picture.save(temporary, "JPEG", quality=_QUALITY, subsampling=0)
         written.append(file)
     return written

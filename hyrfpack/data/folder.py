@@ -14,7 +14,7 @@ from typing import Any
 
 from hyrfpack.data.pictures import is_picture_name, opened, read_header, read_orientation
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.outputs import RAW_PHOTOS, StrPath
+from hyrfpack.outputs import RAW_PHOTO_SUFFIXES, StrPath
 
 # Folders of pictures that are no photos: masks, previews, what depth sensors and other programs leave.
 _NO_PHOTOS = re.compile(r"masks?(_.*)?|thumb(nail)?s?|depths?(_maps?)?|normals?|confidence", re.IGNORECASE)
@@ -97,7 +97,7 @@ def list_pictures(folder: StrPath) -> list[Path]:
 
 def is_raw_name(name: str) -> bool:
     """Whether a file is called like a camera's raw photo, and is not hidden."""
-    return name.lower().endswith(RAW_PHOTOS) and not name.startswith(".")
+    return name.lower().endswith(RAW_PHOTO_SUFFIXES) and not name.startswith(".")
 
 
 def may_hold_photos(name: str) -> bool:

@@ -17,7 +17,7 @@ from hyrfpack.data.beside import Entry, photos_beside, picture_folder
 from hyrfpack.data.pictures import is_picture_name
 from hyrfpack.data.transforms import inverted
 from hyrfpack.data.undistort import Lens
-from hyrfpack.errors import HyrfDataError, reason_of
+from hyrfpack.errors import HyrfDataError, short_reason
 from hyrfpack.scene import Scene
 
 TABLE = "poses_bounds.npy"
@@ -73,7 +73,9 @@ def _read_table(file: Path) -> np.ndarray:
         # Mapped, so that a forged shape asks for no memory; no pickles.
         table = np.load(file, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # numpy raises whatever the header makes it meet.
-        raise HyrfDataError(f"{file}: not a table that can be read ({reason_of(error)}); restore the file") from error
+        raise HyrfDataError(
+            f"{file}: not a table that can be read ({short_reason(error)}); restore the file"
+        ) from error
     if not isinstance(table, np.ndarray) or table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind not in "fiu":
         raise HyrfDataError(f"{file}: not a table of 17 numbers for each photo, as LLFF writes it; restore the file")
     rows = np.array(table, np.float64)

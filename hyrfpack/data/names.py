@@ -16,7 +16,7 @@ from functools import cached_property
 from pathlib import Path
 
 from hyrfpack.data.folder import is_raw_name, list_photos, list_pictures
-from hyrfpack.outputs import PICTURES, READABLE
+from hyrfpack.outputs import PICTURE_SUFFIXES, READABLE_PICTURE_SUFFIXES
 
 _ENDING = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,4}$")  # what may be left out of a listed name; ".0001" is no ending
 _DRIVE = re.compile(r"[A-Za-z]:")
@@ -123,7 +123,7 @@ class PictureIndex:
         path = self.folder / name.replace("\\", "/")
         if is_raw_name(path.name):  # a picture of another ending may be there that was exported from it
             return None
-        candidates = [path] if path.name.lower().endswith(PICTURES) else [path, *_with_endings(path)]
+        candidates = [path] if path.name.lower().endswith(PICTURE_SUFFIXES) else [path, *_with_endings(path)]
         return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
 
     @cached_property
@@ -132,7 +132,7 @@ class PictureIndex:
         whole, stems, ends = defaultdict(list), defaultdict(list), defaultdict(list)
         for file in self.files:
             key = _key(file.relative_to(self.folder).as_posix())
-            stem = _without_ending(key, READABLE)
+            stem = _without_ending(key, READABLE_PICTURE_SUFFIXES)
             whole[key].append(file)
             stems[stem].append(file)
             for length in range(1, len(stem) + 1):
@@ -198,4 +198,4 @@ def _without_ending(key: Key, endings: tuple[str, ...] | None = None) -> Key:
 
 
 def _with_endings(path: Path) -> list[Path]:
-    return [Path(f"{path}{ending}") for suffix in READABLE for ending in (suffix, suffix.upper())]
+    return [Path(f"{path}{ending}") for suffix in READABLE_PICTURE_SUFFIXES for ending in (suffix, suffix.upper())]

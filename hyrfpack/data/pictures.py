@@ -15,8 +15,8 @@ import numpy as np
 
 from hyrfpack.data.archive import given_path
 from hyrfpack.data.undistort import Lens, undistort
-from hyrfpack.errors import HyrfDataError, HyrfError, needs_package, reason_of
-from hyrfpack.outputs import RAW_PHOTOS, READABLE
+from hyrfpack.errors import HyrfDataError, HyrfError, needs_package, short_reason
+from hyrfpack.outputs import RAW_PHOTO_SUFFIXES, READABLE_PICTURE_SUFFIXES
 from hyrfpack.scene import Picture
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ class PhotoFile:
 
 def is_picture_name(name: str) -> bool:
     """Whether a file is called like a picture that can be read, and is not hidden."""
-    return name.lower().endswith(READABLE) and not name.startswith(".")
+    return name.lower().endswith(READABLE_PICTURE_SUFFIXES) and not name.startswith(".")
 
 
 def same_aspect(width: int, height: int, of_width: int, of_height: int) -> bool:
@@ -123,7 +123,7 @@ def opened(path: Path) -> ImageFile:
         from PIL import Image, UnidentifiedImageError
 
     try:
-        if path.suffix.lower() in RAW_PHOTOS:  # many are TIFF files, and Pillow would read their previews
+        if path.suffix.lower() in RAW_PHOTO_SUFFIXES:  # many are TIFF files, and Pillow would read their previews
             raise HyrfDataError(f"{shown}: raw files are not supported; {RAW_REMEDY}")
         if os.path.getsize(path) == 0:
             raise HyrfDataError(f"{shown}: the picture file is empty (0 bytes); copy it again")
@@ -143,7 +143,7 @@ def opened(path: Path) -> ImageFile:
         ) from error
     except Exception as error:  # Pillow's header parsers raise whatever they meet.
         raise HyrfDataError(
-            f"{shown}: not a picture that can be read ({reason_of(error)}); replace the file"
+            f"{shown}: not a picture that can be read ({short_reason(error)}); replace the file"
         ) from error
     if min(image.size) < 1:
         raise HyrfDataError(f"{shown}: the picture has no pixels ({image.size[0]} x {image.size[1]}); replace the file")
@@ -231,7 +231,9 @@ def read_pixels(
             pixels = np.array(picture)
         except Exception as error:  # Pillow's decoders raise whatever they meet.
             shown = given_path(path)
-            raise HyrfDataError(f"{shown}: cannot decode the picture ({reason_of(error)}); replace the file") from error
+            raise HyrfDataError(
+                f"{shown}: cannot decode the picture ({short_reason(error)}); replace the file"
+            ) from error
     if pixels.ndim == 2:
         return np.repeat(pixels[..., None], 3, axis=2), None
     if pixels.shape[2] == 4:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hyrfpack.errors import HyrfDataError, reason_of
-from hyrfpack.ply import columns, read_elements, read_header
+from hyrfpack.errors import HyrfDataError, short_reason
+from hyrfpack.ply import read_elements, read_header, stack_columns
 
 _POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 _GREY = 0.5
@@ -23,17 +23,17 @@ def read_ply(ply: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         data = ply.read_bytes()
     except OSError as error:
-        raise HyrfDataError(f"{name}: the points cannot be read ({reason_of(error)}); export them again") from error
+        raise HyrfDataError(f"{name}: the points cannot be read ({short_reason(error)}); export them again") from error
     header = read_header(data, name)
     vertex = header.elements.get("vertex")
     kinds = vertex.properties if vertex else {}
     if not all(kinds.get(label) for label in _POSITION):
         raise HyrfDataError(f"{name}: it has no points, or no x, y and z of them; export them again")
     rows = read_elements(data, header, {"vertex"}, name)["vertex"]
-    points = columns(rows, _POSITION).astype(np.float64)
+    points = stack_columns(rows, _POSITION).astype(np.float64)
     if not all(kinds.get(label) for label in _COLOR):
         return points, np.full_like(points, _GREY)
     # The header tells what is full: rows in text come as float64, whatever they hold.
     full = [1.0 if kinds[label][0] == "f" else np.iinfo(kinds[label]).max for label in _COLOR]
-    colors = columns(rows, _COLOR).astype(np.float64) / full
+    colors = stack_columns(rows, _COLOR).astype(np.float64) / full
     return points, np.clip(np.nan_to_num(colors), 0, 1)

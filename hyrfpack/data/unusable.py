@@ -9,7 +9,7 @@ from pathlib import Path
 from hyrfpack.data.folder import list_raw_photos
 from hyrfpack.data.pictures import HEIC_NEEDS, HEIC_REMEDY, RAW_REMEDY
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.outputs import RAW_PHOTOS, READABLE, VIDEOS
+from hyrfpack.outputs import RAW_PHOTO_SUFFIXES, READABLE_PICTURE_SUFFIXES, VIDEO_SUFFIXES
 
 MAX_NAMED_FILES = 3  # in one sentence; the others are counted
 
@@ -33,9 +33,9 @@ def count_photos(count: int) -> str:
 def refuse_one_photo(path: Path) -> None:
     """Raises HyrfDataError: a path that was given as photos is one photo, raw or not."""
     ending = path.suffix.lower()
-    if ending in RAW_PHOTOS and path.is_file():
+    if ending in RAW_PHOTO_SUFFIXES and path.is_file():
         raise HyrfDataError(f"{path}: raw files are not supported; {RAW_REMEDY}")
-    if ending in READABLE and path.is_file():
+    if ending in READABLE_PICTURE_SUFFIXES and path.is_file():
         raise HyrfDataError(f"{path}: this is one photo, not a folder of photos; name the folder of all photos")
 
 
@@ -84,7 +84,7 @@ def explain_no_photos(given: Path, folder: Path) -> str:
         given: what the user named.
         folder: that was looked in; the same, or where an archive was unpacked.
     """
-    videos = sorted(entry.name for entry in folder.iterdir() if entry.suffix.lower() in VIDEOS)
+    videos = sorted(entry.name for entry in folder.iterdir() if entry.suffix.lower() in VIDEO_SUFFIXES)
     if videos:
         return f"{given}: there are no photos in this folder, but the video {videos[0]}; name the video itself"
     raw_photos = list_raw_photos(folder)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from hyrfpack.checks import check_type
-from hyrfpack.choices import AS_PHOTOGRAPHED, CONSISTENT
+from hyrfpack.choices import AS_PHOTOGRAPHED, CONSISTENT_EXPOSURE
 from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.exposure import corrected
@@ -214,7 +214,7 @@ def _color_renderer(
     """
     if isinstance(model, Drawable):
         return lambda camera: (draw(model, camera, settings).rgb, None)
-    decoded, at_one_exposure = model.decode(), replace(settings, exposure=CONSISTENT)
+    decoded, at_one_exposure = model.decode(), replace(settings, exposure=CONSISTENT_EXPOSURE)
 
     def draw_colors(camera: Camera) -> tuple[torch.Tensor, torch.Tensor | None]:
         rgb = render(model, camera, at_one_exposure, decoded=decoded).rgb

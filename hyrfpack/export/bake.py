@@ -23,7 +23,7 @@ from hyrfpack.ops.rasterize.light import sent_light
 from hyrfpack.ops.rasterize.reference import ALPHA_MIN
 from hyrfpack.ops.shade import Shading, encode_directions
 from hyrfpack.parallel.pool import parallel_map, run_tasks, torch_on_one_thread
-from hyrfpack.progress import Report, no_report, reporting
+from hyrfpack.progress import Report, no_report, report_each_call
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
 from hyrfpack.splats.harmonics import fibonacci_sphere, harmonics_basis, terms_of
@@ -143,7 +143,9 @@ def sights_of(model: HybridModel, cameras: Sequence[Camera], report: Report = no
         HyrfError: a camera's pose is NaN, infinite or beyond float32.
     """
     # Much of one runs on one core only.
-    see = reporting(partial(_sight, model, model.decode_geometry()), report, "looking from each camera", len(cameras))
+    see = report_each_call(
+        partial(_sight, model, model.decode_geometry()), report, "looking from each camera", len(cameras)
+    )
     return parallel_map(see, cameras)
 
 
@@ -216,7 +218,7 @@ def _fit(
             harmonics[here] = least_squares(owners, basis[:, some], colors, weights, gram[some, some], right[:, some])
 
     blocks = len(edges) - 1
-    run_tasks(reporting(fit_block, report, "fitting colours", blocks), blocks)
+    run_tasks(report_each_call(fit_block, report, "fitting colours", blocks), blocks)
     return fitted
 
 

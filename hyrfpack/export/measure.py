@@ -14,7 +14,7 @@ from hyrfpack.evaluate.metrics import psnr, to_8bit
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.background import pixel_directions
 from hyrfpack.parallel.pool import parallel_map
-from hyrfpack.progress import Report, no_report, reporting
+from hyrfpack.progress import Report, no_report, report_each_call
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, View
 from hyrfpack.splats.draw import Drawable, draw
@@ -76,7 +76,7 @@ def likeness(
             for name, picture in pictures.items()
         }
 
-    compare = reporting(scores_at, report, "comparing pictures with the model's", len(views))
+    compare = report_each_call(scores_at, report, "comparing pictures with the model's", len(views))
     scores = [found for found in parallel_map(compare, views) if found]
     return {name: _mean([found[name] for found in scores]) for name in ("model", *drawables)} if scores else {}
 

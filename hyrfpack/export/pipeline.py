@@ -15,7 +15,7 @@ import numpy as np
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_choice, check_type
-from hyrfpack.choices import CONSISTENT, LOCAL_EXPOSURE, SPLAT_EXPOSURES
+from hyrfpack.choices import CONSISTENT_EXPOSURE, LOCAL_EXPOSURE, SPLAT_EXPOSURES
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.background import background_picture, background_splats
 from hyrfpack.export.bake import Sight, bake, sights_of
@@ -164,7 +164,7 @@ def _export(
     points = kind in (COLMAP, *POINTS)
     sphere = background and crop is None and read.model.config.background and not points
     check_model(read, kind, crop, min_opacity, sphere)
-    by_exposure = {LOCAL_EXPOSURE: read, CONSISTENT: _without_map(read)}
+    by_exposure = {LOCAL_EXPOSURE: read, CONSISTENT_EXPOSURE: _without_map(read)}
     photographed, read = read, by_exposure[exposure]
     compares_exposures = photographed.model.exposure is not None and crop is None and bool(read.measured)
     places = f"{len(read.fitted)} " + (

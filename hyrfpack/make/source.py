@@ -12,7 +12,7 @@ from hyrfpack.data.archive import is_archive, unpacked
 from hyrfpack.data.folder import list_photos
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
 from hyrfpack.make.held_out import inner_view
-from hyrfpack.outputs import PICTURES, VIDEOS, Outputs, StrPath
+from hyrfpack.outputs import PICTURE_SUFFIXES, VIDEO_SUFFIXES, Outputs, StrPath
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.splats.files import READ
 
@@ -75,22 +75,24 @@ class Source:
         ending = path.suffix.lower()
         if path.is_file() and (ending == ".hyrf" or ending in READ or path.name == _LOOSE_SOG):
             return cls(path, "model" if ending == ".hyrf" else "splats")
-        if path.is_file() and not (is_archive(path) or ending in VIDEOS):
-            one = "this is one photo" if ending in PICTURES else "nothing can be made of this file"
+        if path.is_file() and not (is_archive(path) or ending in VIDEO_SUFFIXES):
+            one = "this is one photo" if ending in PICTURE_SUFFIXES else "nothing can be made of this file"
             raise HyrfDataError(
                 f"{path}: {one}; name a folder of photos, its .zip, a video, a .hyrf file, or splats of another program"
             )
         try:
             return cls(path, "scene", reading.scene(path))
         except HyrfNoPosesError:
-            if ending in VIDEOS and path.is_file():
+            if ending in VIDEO_SUFFIXES and path.is_file():
                 return cls(path, "video")
             if (path / _LOOSE_SOG).is_file():
                 return cls(path, "splats")
             archive, folder = (path, unpacked(path)) if is_archive(path) else (None, path)
             return cls(folder / (reading.images or ""), "photos", archive=archive)
         except HyrfDataError:
-            videos = sorted(p.name for p in path.iterdir() if p.suffix.lower() in VIDEOS) if path.is_dir() else []
+            videos = (
+                sorted(p.name for p in path.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES) if path.is_dir() else []
+            )
             if videos and not list_photos(path):
                 message = f"{path}: there are no photos in this folder, but {videos[0]}; name the video"
                 raise HyrfDataError(message) from None

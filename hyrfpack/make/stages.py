@@ -191,8 +191,8 @@ def pack(work: Work, scene: Scene, plan: Plan, device: torch.device) -> dict[str
         except HyrfSizeError as error:
             anew = ", or name another work folder (`work`) to train a smaller model for this size"
             raise HyrfError(
-                f"the trained model does not fit into {plan.target_bytes:,} bytes; ask for {error.smallest:,} bytes or "
-                f"more (`target_bytes`){anew if trained_for(work) != plan.target_bytes else ''}"
+                f"the trained model does not fit into {plan.target_bytes:,} bytes; ask for {error.min_bytes:,} bytes "
+                f"or more (`target_bytes`){anew if trained_for(work) != plan.target_bytes else ''}"
             ) from error
         return {"bytes": report.bytes_after, "gaussians": report.gaussians, "found": report.found}, [PACKED]
 

@@ -25,8 +25,8 @@ from hyrfpack.data.unusable import (
     refuse_one_photo,
     unreadable_sentences,
 )
-from hyrfpack.errors import HyrfDataError, HyrfNoPosesError, without_path
-from hyrfpack.outputs import PICTURES, VIDEOS, StrPath
+from hyrfpack.errors import HyrfDataError, HyrfNoPosesError, strip_path
+from hyrfpack.outputs import PICTURE_SUFFIXES, VIDEO_SUFFIXES, StrPath
 from hyrfpack.parallel.pool import thread_count
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene, evenly_spaced
 from hyrfpack.train.setup import detect_preset
@@ -118,7 +118,7 @@ def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | Non
     """
     path = Path(path)
     tell = report or (lambda text, share: None)
-    if path.is_file() and path.suffix.lower() in VIDEOS:
+    if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
         return _describe_video(path, tell)
     refuse_one_photo(path)
     folder = unpacked(path) if is_archive(path) else path
@@ -258,7 +258,7 @@ def _look(path: Path) -> _Look | str:
 
 
 def _reason(error: HyrfDataError, path: Path) -> str:
-    return without_path(error, given_path(path)).partition(";")[0]
+    return strip_path(error, given_path(path)).partition(";")[0]
 
 
 def _count_problems(count: int, scene: Scene | None, posed: int, path: Path) -> list[str]:
@@ -369,7 +369,7 @@ def _zoom_problems(facts: list[PhotoFacts]) -> list[str]:
 def _mask_problems(folder: Path, photos: list[Path]) -> list[str]:
     """Masks that are named as no photo is; with poses the reader says so."""
     masks = next((folder / name for name in ("masks", "mask") if (folder / name).is_dir()), None)
-    there = [] if masks is None else [file for file in masks.rglob("*") if file.suffix.lower() in PICTURES]
+    there = [] if masks is None else [file for file in masks.rglob("*") if file.suffix.lower() in PICTURE_SUFFIXES]
     names = {photo.stem for photo in photos} | {photo.name for photo in photos}
     stray = sorted(file.name for file in there if file.stem not in names)
     if not stray:

@@ -21,7 +21,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from hyrfpack.errors import HyrfError, reason_of
+from hyrfpack.errors import HyrfError, short_reason
 from hyrfpack.parallel.pool import available_cores
 
 Item = TypeVar("Item")
@@ -157,7 +157,7 @@ class Ranks:
         except RuntimeError as error:  # the type of all errors of torch.distributed
             if isinstance(error, (torch.OutOfMemoryError, NotImplementedError)):
                 raise
-            reason = re.sub(r"\[\S*/\S*:\d+\] ", "", reason_of(error, 300))  # less the location in gloo's source
+            reason = re.sub(r"\[\S*/\S*:\d+\] ", "", short_reason(error, 300))  # less the location in gloo's source
             raise HyrfError(
                 f"one of the {self.size} processes has ended or says nothing any more ({reason}); see what it said, "
                 "and whether memory was short"
@@ -213,8 +213,8 @@ def join_processes(environment: Mapping[str, str] | None = None) -> Iterator[Ran
     except (RuntimeError, ValueError) as error:
         hint = "set MASTER_PORT to a free one" if "EADDRINUSE" in str(error) else "see whether all were started"
         raise HyrfError(
-            f"process {ranks.rank} of {ranks.size} did not find the others at {address}:{port} ({reason_of(error)}); "
-            f"{hint}"
+            f"process {ranks.rank} of {ranks.size} did not find the others at {address}:{port} "
+            f"({short_reason(error)}); {hint}"
         ) from error
     try:
         yield ranks

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hyrfpack.checks import check_choice, check_int
-from hyrfpack.choices import MATCHING
+from hyrfpack.choices import MATCHING_METHODS
 from hyrfpack.data.archive import is_archive, naming_archives, unpacked
 from hyrfpack.data.equirectangular import FACES
 from hyrfpack.data.folder import list_photos, list_pictures, list_raw_photos
@@ -119,7 +119,7 @@ def estimate_poses(
         >>> len(hyrfpack.load_scene("scenes/corner").views) == found.registered
         True
     """
-    check_choice("matching", matching, MATCHING)
+    check_choice("matching", matching, MATCHING_METHODS)
     check_int("seed", seed, 0, 2**64 - 1)
     with disk_errors(Path(out)), naming_archives():
         return _Estimation(Path(photos), Path(out), matching, masks, seed, overwrite, report, say).run()

@@ -17,7 +17,7 @@ from PIL import Image
 from hyrfpack.atomic import write_atomic
 from hyrfpack.data.pictures import read_mask, read_pixels
 from hyrfpack.data.quality import sharpness
-from hyrfpack.errors import HyrfDataError, without_path
+from hyrfpack.errors import HyrfDataError, strip_path
 from hyrfpack.poses.database import make_database, opened
 from hyrfpack.poses.job import Job, chunks
 from hyrfpack.poses.process import Tell
@@ -82,7 +82,7 @@ def _make_copy(job: Job, folder: Path, size: tuple[int, int], name: str, number:
     try:
         rgb, alpha = read_pixels(job.images / name, size)
     except HyrfDataError as error:
-        return 0.0, without_path(error, job.images / name).partition(";")[0]
+        return 0.0, strip_path(error, job.images / name).partition(";")[0]
     grey = rgb.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
     if alpha is not None:
         grey *= alpha.astype(np.float32) / 255

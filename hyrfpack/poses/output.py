@@ -14,7 +14,7 @@ from typing import Any
 
 from hyrfpack.atomic import check_writable, write_atomic
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.outputs import MODELS, PICTURES, POSES, TABLES
+from hyrfpack.outputs import COLMAP_MODEL_FOLDERS, COLMAP_TABLE_NAMES, PICTURE_SUFFIXES, POSE_FILE_NAMES
 from hyrfpack.poses.made import FOLDERS, REPORT, Made, are_all, files_of, read_report, remove, still_there
 
 _VERSION = 4  # of what is kept on the way; older products are made anew
@@ -50,7 +50,7 @@ class Output:
             overwrite: poses of ours may be replaced.
         """
         there = set(os.listdir(self.scene))
-        if there.intersection((*MODELS, *TABLES, *POSES, "colmap")):
+        if there.intersection((*COLMAP_MODEL_FOLDERS, *COLMAP_TABLE_NAMES, *POSE_FILE_NAMES, "colmap")):
             if read_report(self.scene) is None:
                 raise HyrfError(
                     f"{self.scene}: the folder has poses of another program, which are kept; train on them, or name "
@@ -60,7 +60,7 @@ class Output:
                 raise HyrfError(
                     f"{self.scene}: the folder has poses already; use them, or replace them with `overwrite=True`"
                 )
-        if not same(photos, self.scene) and any(name.lower().endswith(PICTURES) for name in there):
+        if not same(photos, self.scene) and any(name.lower().endswith(PICTURE_SUFFIXES) for name in there):
             raise HyrfError(f"{self.scene}: photos lie in this folder; name another for the scene")
         check_writable(self.scene)
 

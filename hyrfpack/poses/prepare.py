@@ -19,7 +19,7 @@ from hyrfpack.data.archive import given_path
 from hyrfpack.data.equirectangular import FACES, Face, FaceFile, cut_panorama, face_lens, face_size, is_panorama
 from hyrfpack.data.folder import PhotoFacts, photo_facts
 from hyrfpack.data.pictures import opened, read_header
-from hyrfpack.errors import HyrfDataError, reason_of, without_path
+from hyrfpack.errors import HyrfDataError, short_reason, strip_path
 from hyrfpack.poses.copying import copy_file
 from hyrfpack.poses.job import Device
 
@@ -207,7 +207,9 @@ def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) ->
             try:
                 image.load()
             except Exception as error:  # Pillow's decoders raise whatever they meet
-                raise HyrfDataError(f"{mask}: the mask cannot be decoded ({reason_of(error)}); replace it") from error
+                raise HyrfDataError(
+                    f"{mask}: the mask cannot be decoded ({short_reason(error)}); replace it"
+                ) from error
             stored = photo.facts.size[::-1] if photo.facts.orientation >= 5 else photo.facts.size
             turned = photo.facts.orientation != 1 and image.size == stored
             if turned:
@@ -238,7 +240,7 @@ def _is_panorama_or_reason(path: Path) -> bool | str:
 
 def _reason(error: HyrfDataError, path: Path) -> str:
     """Why a photo cannot be used, without its path and what to do, which is said of all such photos at once."""
-    return without_path(error, given_path(path)).partition(";")[0]
+    return strip_path(error, given_path(path)).partition(";")[0]
 
 
 def _counted(items: Iterable[Item], progress: Progress) -> Iterator[Item]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError, needs_package
-from hyrfpack.outputs import VIDEOS, StrPath
+from hyrfpack.outputs import VIDEO_SUFFIXES, StrPath
 from hyrfpack.poses.hdr import HLG, PQ, standard_range
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def is_video(path: StrPath) -> bool:
         >>> is_video("clip.MOV"), is_video("photo.jpg")
         (True, False)
     """
-    return str(path).lower().endswith(VIDEOS)
+    return str(path).lower().endswith(VIDEO_SUFFIXES)
 
 
 class Video:

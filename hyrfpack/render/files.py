@@ -16,7 +16,7 @@ from torch import Tensor
 from hyrfpack.atomic import write_atomic
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
-from hyrfpack.outputs import PICTURES
+from hyrfpack.outputs import PICTURE_SUFFIXES
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.render.renderer import RenderSettings, render
 from hyrfpack.scene import Camera
@@ -116,7 +116,7 @@ def file_names(names: Sequence[str]) -> list[str]:
     """
     full = [_safe(name) for name in names]
     bare = [
-        str(PurePosixPath(name).with_suffix("")) if PurePosixPath(name).suffix.lower() in PICTURES else name
+        str(PurePosixPath(name).with_suffix("")) if PurePosixPath(name).suffix.lower() in PICTURE_SUFFIXES else name
         for name in full
     ]
     chosen = bare if len(set(bare)) == len(bare) else full

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.checks import check_choice, check_float, check_int, check_type
-from hyrfpack.choices import AS_PHOTOGRAPHED, EXPOSURES
+from hyrfpack.choices import AS_PHOTOGRAPHED, RENDER_EXPOSURES
 from hyrfpack.errors import HyrfError
 from hyrfpack.model import Decoded, HybridModel
 from hyrfpack.model.exposure import expose
@@ -57,9 +57,9 @@ class RenderSettings:
     def __post_init__(self) -> None:
         for name in ("near", "background_threshold"):
             check_float(name, getattr(self, name))
-        check_float("cull_tolerance", self.cull_tolerance, most=inf)
+        check_float("cull_tolerance", self.cull_tolerance, maximum=inf)
         check_int("background_stride", self.background_stride, 1)
-        check_choice("exposure", self.exposure, EXPOSURES)
+        check_choice("exposure", self.exposure, RENDER_EXPOSURES)
         check_float("transmittance_min", self.transmittance_min, 0, 1)
         if self.transmittance_min == 1:
             raise ValueError("transmittance_min is 1; it must lie in [0, 1), for at 1 nothing is drawn")

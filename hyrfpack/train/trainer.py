@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hyrfpack.choices import CONSISTENT
+from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload_array
 from hyrfpack.errors import HyrfError, HyrfTrainingError
@@ -234,7 +234,7 @@ class Trainer:
             rendering = render(
                 self.model,
                 view.camera,
-                RenderSettings(exposure=CONSISTENT),  # the photo's own gains come after
+                RenderSettings(exposure=CONSISTENT_EXPOSURE),  # the photo's own gains come after
                 absgrad=self.strategy.watching(self.step),
                 solid=None if solid is None else upload_array(solid, self.device),
             )

@@ -11,7 +11,7 @@ import torch
 from exposures import random_map, same_map
 from scenes import ball_points, ball_scene, small_model, view_of
 
-from hyrfpack.choices import CONSISTENT
+from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.compress import compress
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
@@ -82,7 +82,7 @@ def test_the_error_is_measured_on_renders_as_photographed(model, source, scene, 
     report = compress(source, tmp_path / "small.hyrf", data=scene, distortion=3e-5)
 
     packed, errors = load(tmp_path / "small.hyrf"), {}
-    for exposure in ("as-photographed", CONSISTENT):
+    for exposure in ("as-photographed", CONSISTENT_EXPOSURE):
         settings = RenderSettings(exposure=exposure)
         differences = [
             (render(model, view.camera, settings).rgb - render(packed, view.camera, settings).rgb).square().mean()
@@ -90,7 +90,9 @@ def test_the_error_is_measured_on_renders_as_photographed(model, source, scene, 
         ]
         errors[exposure] = float(torch.stack(differences).mean())
     assert report.error / 1.5 < errors["as-photographed"] < 1.5 * report.error
-    assert errors[CONSISTENT] < errors["as-photographed"] / 1.5  # the two differ, so the test can tell them apart
+    assert (
+        errors[CONSISTENT_EXPOSURE] < errors["as-photographed"] / 1.5
+    )  # the two differ, so the test can tell them apart
 
 
 def test_fine_tuning_fits_renders_as_photographed_and_leaves_the_exposure_to_the_map(model, source, scene, tmp_path):
@@ -98,7 +100,7 @@ def test_fine_tuning_fits_renders_as_photographed_and_leaves_the_exposure_to_the
 
     tuned = load(tmp_path / "tuned.hyrf")
     assert evaluate(tuned, scene.train).psnr > 28
-    consistent = RenderSettings(exposure=CONSISTENT)
+    consistent = RenderSettings(exposure=CONSISTENT_EXPOSURE)
     for view in scene.test:
         shown, expected = (render(each, view.camera, consistent).rgb.mean() for each in (tuned, model))
         assert float(shown) == pytest.approx(float(expected), abs=0.02)

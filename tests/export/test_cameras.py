@@ -98,7 +98,7 @@ def test_a_colmap_model_that_cannot_be_written_leaves_the_old_one(tmp_path, monk
     write_bytes = Path.write_bytes
 
     def full(self: Path, data: bytes) -> int:
-        if atomic.PREFIX in self.name and len(data) > 500:
+        if atomic.TEMPORARY_PREFIX in self.name and len(data) > 500:
             raise OSError(28, "No space left on device")
         return write_bytes(self, data)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hyrfpack.choices import CONSISTENT
+from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.format import describe, load, metadata
 from hyrfpack.model import Frame, HashGridConfig, ModelConfig
 from hyrfpack.render import RenderSettings, render
@@ -84,7 +84,9 @@ def test_golden_file_with_an_exposure_map_renders_the_recorded_picture(name):
     picture = render(model, camera).rgb.numpy()
 
     np.testing.assert_allclose(picture, recorded, rtol=0, atol=2e-3)
-    assert np.abs(render(model, camera, RenderSettings(exposure=CONSISTENT)).rgb.numpy() - recorded).max() > 0.02
+    assert (
+        np.abs(render(model, camera, RenderSettings(exposure=CONSISTENT_EXPOSURE)).rgb.numpy() - recorded).max() > 0.02
+    )
 
 
 @pytest.mark.parametrize("name", GOLDEN_FILES)

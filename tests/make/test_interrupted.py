@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from hyrfpack.atomic import PREFIX
+from hyrfpack.atomic import TEMPORARY_PREFIX
 from hyrfpack.errors import HyrfError
 from hyrfpack.make import Stopped, make, stages
 from hyrfpack.make.work import interruptible
@@ -151,7 +151,7 @@ def test_no_room_in_any_stage_is_one_sentence_and_the_same_call_goes_on(
         make(posed, output, **changes)
     assert not output.exists()
     assert make(posed, output, **changes).output.exists()
-    assert not [path for path in tmp_path.rglob("*") if path.name.startswith(PREFIX)]
+    assert not [path for path in tmp_path.rglob("*") if path.name.startswith(TEMPORARY_PREFIX)]
 
 
 CHILD = """

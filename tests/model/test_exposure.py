@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scenes import ball_points, ball_scene, small_model
 
-from hyrfpack.choices import CONSISTENT
+from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.model.exposure import MAX_CENTERS, ExposureMap, expose
 from hyrfpack.render import RenderSettings, render
 
@@ -106,7 +106,9 @@ def test_render_applies_the_map_unless_one_exposure_is_asked_for():
 
     gains = torch.tensor([0.5, 0.0, -0.25]).exp()
     torch.testing.assert_close(render(model, camera).rgb, expose(plain, gains))
-    torch.testing.assert_close(render(model, camera, RenderSettings(exposure=CONSISTENT)).rgb, plain, rtol=0, atol=0)
+    torch.testing.assert_close(
+        render(model, camera, RenderSettings(exposure=CONSISTENT_EXPOSURE)).rgb, plain, rtol=0, atol=0
+    )
 
 
 def test_render_differentiates_through_the_map():

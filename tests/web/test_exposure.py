@@ -28,7 +28,7 @@ from web.test_native import (
 from web.test_sources import Site, site
 
 from hyrfpack.cameras.capture import provenance_cameras
-from hyrfpack.choices import AS_PHOTOGRAPHED, CONSISTENT, EXPOSURES
+from hyrfpack.choices import AS_PHOTOGRAPHED, CONSISTENT_EXPOSURE, RENDER_EXPOSURES
 from hyrfpack.export import export
 from hyrfpack.format import encode_model, save
 from hyrfpack.format.container import read_container
@@ -92,7 +92,7 @@ def test_both_exposures_look_as_hyrfpack_renders_them(browser: Browser, tmp_path
     loaded(browser, tmp_path, page_of(model))
     assert browser.evaluate(MODE) == AS_PHOTOGRAPHED
     pictures = {}
-    for exposure in EXPOSURES:
+    for exposure in RENDER_EXPOSURES:
         choose(browser, exposure)
         pictures[exposure] = [shown(browser, camera) for camera in cameras()]
         pairs = zip(pictures[exposure], cameras(), strict=True)
@@ -107,7 +107,7 @@ def test_both_exposures_look_as_hyrfpack_renders_them(browser: Browser, tmp_path
 def test_a_consistent_picture_is_that_of_the_model_without_its_map(browser: Browser, tmp_path: Path):
     model = mapped()
     loaded(browser, tmp_path, page_of(model))
-    choose(browser, CONSISTENT)
+    choose(browser, CONSISTENT_EXPOSURE)
     with_map = [shown(browser, camera) for camera in cameras()]
     model.exposure = None
     loaded(browser, tmp_path, page_of(model))
@@ -159,7 +159,7 @@ def saved_picture(browser: Browser) -> np.ndarray:
 
 
 @pytest.mark.in_turn
-@pytest.mark.parametrize("exposure", EXPOSURES)
+@pytest.mark.parametrize("exposure", RENDER_EXPOSURES)
 def test_saved_pictures_and_the_window_have_the_chosen_exposure(browser: Browser, tmp_path: Path, exposure: str):
     model = mapped()
     browser.prefer(less_motion=True)  # the canvas appears at once
@@ -181,7 +181,7 @@ def test_fitted_harmonics_of_weak_devices_are_exposed_too(browser: Browser, tmp_
         model.radiance.weights[0][:, model.radiance.grid.features :] *= 0.1
     loaded(browser, tmp_path, page_of(model).replace(b'{"kind": "hyrf"', b'{"plain": true, "kind": "hyrf"'))
     assert browser.evaluate("Boolean(hyrfpack.player.renderer.content.harmonics)")
-    for exposure in EXPOSURES:
+    for exposure in RENDER_EXPOSURES:
         choose(browser, exposure)
         scores = [psnr(shown(browser, camera), expected(model, camera, exposure)) for camera in cameras()]
         assert min(scores) > 26, (exposure, scores)
@@ -239,7 +239,7 @@ def test_key_and_button_switch_the_exposure_and_say_so(wide: Browser, tmp_path: 
     heard = "document.getElementById('status').textContent"
 
     wide.press("x")
-    assert (wide.evaluate(MODE), wide.evaluate(PRESSED)) == (CONSISTENT, "false")
+    assert (wide.evaluate(MODE), wide.evaluate(PRESSED)) == (CONSISTENT_EXPOSURE, "false")
     assert wide.evaluate(heard) == "Exposure: consistent"
     wide.evaluate(f"{button}.focus()")
     wide.press("Enter")
@@ -264,7 +264,7 @@ def test_a_finger_switches_the_exposure(wide: Browser, tmp_path: Path):
     left, right, top, bottom = box
     wide.touch("touchStart", ((left + right) / 2, (top + bottom) / 2))
     wide.touch("touchEnd")
-    until(wide, f"{MODE} === '{CONSISTENT}' && {PRESSED} === 'false'")
+    until(wide, f"{MODE} === '{CONSISTENT_EXPOSURE}' && {PRESSED} === 'false'")
 
 
 @pytest.mark.in_turn
@@ -280,7 +280,7 @@ def test_files_without_a_map_offer_no_control(browser: Browser, tmp_path: Path):
 def test_the_control_follows_the_file_that_is_opened_and_the_choice_stays(browser: Browser, tmp_path: Path):
     model = mapped(50)
     reopened(browser, tmp_path, page_of(model))
-    choose(browser, CONSISTENT)
+    choose(browser, CONSISTENT_EXPOSURE)
     opening = "hyrfpack.player.open({ name: 'x.hyrf', stream: (async function* () { yield file.slice(); })() })"
     keep_file(browser, encode_model(made_up(60)))
     browser.evaluate(f"{opening}.then(() => true)")
@@ -302,7 +302,7 @@ def test_scripts_cannot_ask_for_an_unknown_exposure(browser: Browser, tmp_path: 
 
 
 @pytest.mark.in_turn
-@pytest.mark.parametrize("exposure", EXPOSURES)
+@pytest.mark.parametrize("exposure", RENDER_EXPOSURES)
 def test_the_address_chooses_the_exposure(browser: Browser, tmp_path: Path, exposure: str):
     model = mapped(300)
     reopened(browser, tmp_path, page_of(model), f"?exposure={exposure}")
@@ -323,7 +323,7 @@ def test_a_shared_link_has_the_exposure_that_is_shown(browser: Browser, tmp_path
     page = page_of(mapped(50))
     reopened(browser, tmp_path, page, "?noui&title=mine")
     for exposure, search in (
-        (CONSISTENT, "?noui=&title=mine&exposure=consistent"),
+        (CONSISTENT_EXPOSURE, "?noui=&title=mine&exposure=consistent"),
         (AS_PHOTOGRAPHED, "?noui=&title=mine"),
     ):
         browser.press("x")
@@ -362,7 +362,7 @@ def test_the_element_has_an_exposure(browser: Browser, host: Site):
     element = "document.querySelector('hyrf-viewer')"
     inside = f"{element}.shadowRoot.querySelector('iframe').contentWindow.hyrfpack?.player"
     browser.open(f"{host.address}/post.html")
-    until(browser, f"{inside}?.loaded && {inside}.hasExposureMap && {inside}.exposure === '{CONSISTENT}'")
+    until(browser, f"{inside}?.loaded && {inside}.hasExposureMap && {inside}.exposure === '{CONSISTENT_EXPOSURE}'")
     browser.evaluate(f"{element}.removeAttribute('exposure')")
     until(browser, f"{inside}?.loaded && {inside}.exposure === '{AS_PHOTOGRAPHED}'")
 
@@ -388,6 +388,8 @@ def test_an_exported_page_brings_the_map_and_its_poster_is_as_photographed(
 
     if target == "player":
         poster = np.asarray(Image.open(folder / "poster.jpg").convert("RGB"), np.float64)
-        first = dict(zip(EXPOSURES, (expected(model, kept[0], exposure) for exposure in EXPOSURES), strict=True))
+        first = dict(
+            zip(RENDER_EXPOSURES, (expected(model, kept[0], exposure) for exposure in RENDER_EXPOSURES), strict=True)
+        )
         assert poster.shape == first[AS_PHOTOGRAPHED].shape
-        assert psnr(poster, first[AS_PHOTOGRAPHED]) > psnr(poster, first[CONSISTENT]) + 5
+        assert psnr(poster, first[AS_PHOTOGRAPHED]) > psnr(poster, first[CONSISTENT_EXPOSURE]) + 5

@@ -36,7 +36,7 @@ import torch
 from PIL import Image
 
 import hyrfpack
-from hyrfpack.atomic import PREFIX, SUFFIX
+from hyrfpack.atomic import TEMPORARY_PREFIX, TEMPORARY_SUFFIX
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.make.state import NAME as RECORD
@@ -85,7 +85,7 @@ def start(arguments: list[str]) -> subprocess.Popen:
 
 def is_stray(name: str) -> bool:
     base = os.path.basename(name)
-    return base.startswith(PREFIX) and base.endswith(SUFFIX)
+    return base.startswith(TEMPORARY_PREFIX) and base.endswith(TEMPORARY_SUFFIX)
 
 
 def contents(folder: Path) -> dict[str, bytes]:

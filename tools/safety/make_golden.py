@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from hyrfpack.choices import CONSISTENT
+from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.format import decode_model
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
@@ -121,7 +121,7 @@ def recorded_gains(exposure: minimal_reader.Exposure, model: HybridModel) -> dic
     positions[0], directions[0] = (-0.1, -0.2, -1.0), (0.0, 0.0, 1.0)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     logs = np.array([minimal_reader.log_gains(exposure, *view) for view in zip(positions, directions, strict=True)])
-    consistent = render(model, golden_camera(), RenderSettings(exposure=CONSISTENT)).rgb.double().numpy()
+    consistent = render(model, golden_camera(), RenderSettings(exposure=CONSISTENT_EXPOSURE)).rgb.double().numpy()
     return {
         "exposure.positions": positions,
         "exposure.directions": directions,

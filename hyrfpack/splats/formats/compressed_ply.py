@@ -24,7 +24,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.ply import PlyHeader, columns, read_elements, read_header
+from hyrfpack.ply import PlyHeader, read_elements, read_header, stack_columns
 from hyrfpack.splats.formats.smallest_three import restore_largest
 from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.harmonics import BAND_0
@@ -93,7 +93,7 @@ def decode(data: bytes, name: str) -> Splats:
         harmonics[:, 0] = (colors - 0.5) / BAND_0
         if rest:
             harmonics[:, 1:] = (
-                _HARMONIC_BY_BYTE[columns(rows["sh"], rest)].reshape(count, 3, len(rest) // 3).transpose(0, 2, 1)
+                _HARMONIC_BY_BYTE[stack_columns(rows["sh"], rest)].reshape(count, 3, len(rest) // 3).transpose(0, 2, 1)
             )
         return build_valid_splats(
             name,
@@ -136,7 +136,7 @@ def _interpolate_in_chunk(chunk: np.ndarray, parts: Sequence[str], fractions: np
     """Interpolate linearly between the bounds of each Gaussian's chunk, by fractions (N, 3) in [0, 1]."""
     chunk_index = np.arange(len(fractions)) // _GAUSSIANS_PER_CHUNK
     low, high = (
-        columns(chunk, _bound_properties(end, parts)).astype(np.float64)[chunk_index] for end in ("min", "max")
+        stack_columns(chunk, _bound_properties(end, parts)).astype(np.float64)[chunk_index] for end in ("min", "max")
     )
     return low * (1 - fractions) + high * fractions
 

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import expit
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.ply import columns, read_elements, read_header
+from hyrfpack.ply import read_elements, read_header, stack_columns
 from hyrfpack.splats.formats import compressed_ply
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.validation import build_valid_splats
@@ -122,14 +122,14 @@ def decode_plain(data: bytes, name: str) -> Splats:
     rows = read_elements(data, header, {"vertex"}, name)["vertex"]
     harmonics = np.empty((len(rows), min(terms, terms_of(MAX_DEGREE)), 3), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # infinite results are rejected below; NaN may signal
-        harmonics[:, 0] = columns(rows, _COLOR_PROPERTIES)
+        harmonics[:, 0] = stack_columns(rows, _COLOR_PROPERTIES)
         for channel, term in product(range(3), range(1, harmonics.shape[1])):
             harmonics[:, term, channel] = rows[f"f_rest_{channel * (terms - 1) + term - 1}"]
         return build_valid_splats(
             name,
-            columns(rows, _POSITION_PROPERTIES),
-            np.exp(columns(rows, _SCALE_PROPERTIES).astype(np.float64)),
-            columns(rows, _ROTATION_PROPERTIES),
+            stack_columns(rows, _POSITION_PROPERTIES),
+            np.exp(stack_columns(rows, _SCALE_PROPERTIES).astype(np.float64)),
+            stack_columns(rows, _ROTATION_PROPERTIES),
             expit(rows["opacity"].astype(np.float64)),
             harmonics,
         )
