@@ -21,7 +21,7 @@ OPERATIONS = (
     "activate", "adam", "background", "composite", "contraction", "hash_encode", "mlp", "rasterize", "shade", "ssim",
 )  # fmt: skip
 # Not for users: `background_grid` and `shade` take a whole decoder, which no short example makes.
-WITHOUT = {"background_colors", "background_grid", "check", "check_shading", "choose_for", "shade"}
+WITHOUT = {"background_colors", "background_grid", "check", "check_shading", "choose_shading_implementation", "shade"}
 
 
 def public_functions() -> Iterator[tuple[str, object]]:

@@ -5,7 +5,7 @@ from hyrfpack.model.exposure import ExposureMap
 from hyrfpack.model.frame import Frame
 from hyrfpack.model.hash_grid import HashGridConfig
 from hyrfpack.model.hybrid import Decoded, Geometry, HybridModel
-from hyrfpack.ops.background import RADIUS as BACKGROUND_RADIUS
+from hyrfpack.ops.background import BACKGROUND_RADIUS
 from hyrfpack.ops.contraction import contract, expand
 from hyrfpack.ops.shade import DIRECTION_FEATURES
 

@@ -53,7 +53,7 @@ class Decoded:
     shading: Shading | None
 
     def __getitem__(self, index: Tensor) -> Decoded:
-        return Decoded(self.geometry[index], None if self.shading is None else self.shading.part(index))
+        return Decoded(self.geometry[index], None if self.shading is None else self.shading.subset(index))
 
 
 def scale_bounds(positions: Tensor, config: ModelConfig) -> Tensor:

@@ -12,7 +12,7 @@ from scenes import small_model
 from torch import Tensor
 
 from hyrfpack.model import contract
-from hyrfpack.ops.background import RADIUS, sphere_points
+from hyrfpack.ops.background import BACKGROUND_RADIUS, sphere_points
 from hyrfpack.ops.hash_encode import hash_encode, level_offsets
 from hyrfpack.ops.mlp import mlp
 
@@ -190,7 +190,7 @@ def test_a_relu_at_its_kink_passes_no_gradient(implementation: str) -> None:
 def test_rays_meet_the_sphere_from_however_far(distance: float) -> None:
     """Aimed at places inside of it, off the rim, where a ray is tangent and the answer wide open."""
     origin = torch.from_numpy(distance * _directions(1, seed=1)[0]).float()
-    targets = 0.95 * RADIUS * np.random.default_rng(2).uniform(size=(2000, 1)) * _directions(2000, seed=3)
+    targets = 0.95 * BACKGROUND_RADIUS * np.random.default_rng(2).uniform(size=(2000, 1)) * _directions(2000, seed=3)
     aims = targets - origin.double().numpy()
     directions = torch.from_numpy(aims / np.linalg.norm(aims, axis=1, keepdims=True)).float()
 
@@ -199,11 +199,11 @@ def test_rays_meet_the_sphere_from_however_far(distance: float) -> None:
     o, d = origin.numpy().astype(np.longdouble), directions.numpy().astype(np.longdouble)
     d /= np.sqrt((d**2).sum(1, keepdims=True))
     along = d @ o
-    root = np.sqrt(np.maximum(along**2 - o @ o + RADIUS**2, 0))  # the textbook root, with digits enough
-    bound = 8 * EPS * (distance + RADIUS)
-    hits = bound < RADIUS / 4
+    root = np.sqrt(np.maximum(along**2 - o @ o + BACKGROUND_RADIUS**2, 0))  # the textbook root, with digits enough
+    bound = 8 * EPS * (distance + BACKGROUND_RADIUS)
+    hits = bound < BACKGROUND_RADIUS / 4
     if hits:  # else float32 directions are too coarse to say what is hit
-        assert np.abs(np.linalg.norm(found, axis=1) - RADIUS).max() < bound
+        assert np.abs(np.linalg.norm(found, axis=1) - BACKGROUND_RADIUS).max() < bound
         np.testing.assert_allclose(found, (o + (root - along)[:, None] * d).astype(float), rtol=0, atol=bound)
     assert np.abs(np.cross(found - o.astype(float), d.astype(float))).max() < bound + 8 * EPS * distance
 

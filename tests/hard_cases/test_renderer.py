@@ -17,7 +17,7 @@ import hyrfpack
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.ops.background import RADIUS
+from hyrfpack.ops.background import BACKGROUND_RADIUS
 from hyrfpack.render import Rendering, RenderSettings, render
 from hyrfpack.scene import Camera
 from hyrfpack.train import TrainConfig
@@ -50,8 +50,12 @@ CASES: dict[str, Callable[[], tuple[HybridModel, Camera, bool]]] = {
     "1 x 1": lambda: (_balls(), _camera(FRONT, width=1, height=1, focal=2.0), True),
     "17 x 3": lambda: (_balls(), _camera(FRONT, width=17, height=3, focal=12.0), True),
     "inside a Gaussian": lambda: (_in_the_way(), _camera(FRONT), True),
-    "outside the sphere": lambda: (_balls(), _camera((0, -2.5 * RADIUS, 0), focal=2e3), True),
-    "outside, looking past": lambda: (_balls(), _camera((0, -2.5 * RADIUS, 0), (RADIUS, -2.5 * RADIUS, 0)), False),
+    "outside the sphere": lambda: (_balls(), _camera((0, -2.5 * BACKGROUND_RADIUS, 0), focal=2e3), True),
+    "outside, looking past": lambda: (
+        _balls(),
+        _camera((0, -2.5 * BACKGROUND_RADIUS, 0), (BACKGROUND_RADIUS, -2.5 * BACKGROUND_RADIUS, 0)),
+        False,
+    ),
     "1e5 away": lambda: (_balls(), _camera((0, -1e5, 0), focal=1e6), True),
     "upside down": lambda: (_balls(), _camera((2.0, -2.5, 1.0), up=(0, 0, -1)), True),
     "focal length of a thousandth of the width": lambda: (_balls(), _camera((0, -1.0, 0), focal=0.04), True),

@@ -14,7 +14,7 @@ from pretend_gpu import pretended_gpu
 from scenes import look_at
 
 from hyrfpack.ops.background import (
-    RADIUS,
+    BACKGROUND_RADIUS,
     background_colors,
     background_grid,
     grid_size,
@@ -134,8 +134,10 @@ CASES = {
     "threshold 0 draws wherever any light passes": Case(threshold=0.0, light="1e-30"),
     "one bright pixel": Case(threshold=0.0, light="one pixel", height=40, width=40, stride=3),
     "all light": Case(threshold=0.9, light="1"),
-    "outside the sphere": Case(position=(0.0, -2.5 * RADIUS, 30.0), focal=20.0),
-    "outside, looking past it": Case(position=(0.0, -3 * RADIUS, 0.0), target=(RADIUS, -3 * RADIUS, 9.0)),
+    "outside the sphere": Case(position=(0.0, -2.5 * BACKGROUND_RADIUS, 30.0), focal=20.0),
+    "outside, looking past it": Case(
+        position=(0.0, -3 * BACKGROUND_RADIUS, 0.0), target=(BACKGROUND_RADIUS, -3 * BACKGROUND_RADIUS, 9.0)
+    ),
 }
 
 
@@ -165,10 +167,12 @@ def test_mixed_precision_rounds_factors_alone(encoding: str) -> None:
 def test_far_cameras_lose_no_more_than_float32_must(implementation: str, distance: float, past: float) -> None:
     """A ray's direction is rounded, by 2^-24 a coordinate, and so its point on the sphere by that times the way."""
     position = np.array([0.6, -0.8, 0.3]) * distance
-    aside = np.array([0.8, 0.6, 0.0]) * past * RADIUS
+    aside = np.array([0.8, 0.6, 0.0]) * past * BACKGROUND_RADIUS
     case = Case(position=tuple(position), target=tuple(aside), focal=0.1 * distance, stride=3, finest=8, light="1")
     found, expected = case.run(torch.float32, implementation), case.run(torch.float64, "reference")
-    off = 4 * 2**-24 * distance / RADIUS  # in the cube; features change by up to 2 a vertex, and 7 of them span it
+    off = (
+        4 * 2**-24 * distance / BACKGROUND_RADIUS
+    )  # in the cube; features change by up to 2 a vertex, and 7 of them span it
     torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-4 + 14 * off)
 
 
@@ -357,7 +361,7 @@ def test_sphere_points_lie_on_the_sphere_ahead_of_the_camera(origin):
 
     points = sphere_points(origin, directions)
 
-    torch.testing.assert_close(torch.linalg.vector_norm(points, dim=1), torch.full((500,), RADIUS).double())
+    torch.testing.assert_close(torch.linalg.vector_norm(points, dim=1), torch.full((500,), BACKGROUND_RADIUS).double())
     steps = points - origin
     lengths = torch.linalg.vector_norm(steps, dim=1, keepdim=True)
     torch.testing.assert_close(steps, lengths * directions, rtol=1e-9, atol=1e-9)
@@ -365,12 +369,14 @@ def test_sphere_points_lie_on_the_sphere_ahead_of_the_camera(origin):
 
 def test_sphere_points_of_float32_cameras_are_on_the_sphere():
     points = sphere_points(torch.tensor([1.0, 2.0, -0.5]), random_directions(500).float())
-    torch.testing.assert_close(torch.linalg.vector_norm(points, dim=1), torch.full((500,), RADIUS), rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        torch.linalg.vector_norm(points, dim=1), torch.full((500,), BACKGROUND_RADIUS), rtol=1e-6, atol=0
+    )
 
 
 def test_sphere_points_from_outside_are_where_the_ray_leaves():
     points = sphere_points(torch.tensor([0.0, 0.0, -250.0]), torch.tensor([[0.0, 0.0, 1.0]]))
-    torch.testing.assert_close(points, torch.tensor([[0.0, 0.0, RADIUS]]))
+    torch.testing.assert_close(points, torch.tensor([[0.0, 0.0, BACKGROUND_RADIUS]]))
 
 
 def test_sphere_points_of_a_ray_that_misses_are_nearest_to_the_centre():

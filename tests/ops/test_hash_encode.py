@@ -271,14 +271,14 @@ def test_level_resolutions_refuses_a_finest_level_below_the_base() -> None:
 
 @needs_triton
 def test_coarse_levels_have_copies_that_take_no_more_rows_than_there_are_points() -> None:
-    from hyrfpack.ops.hash_encode.gpu import copies_for
+    from hyrfpack.ops.hash_encode.gpu import plan_gradient_copies
 
     resolutions, device = (8, 16, 32, 64), torch.device("cpu")
     offsets = level_offsets(resolutions, 15)
 
-    copies = {points: copies_for(points, resolutions, 15, device) for points in (1, 600, 5000, 70_000, 10**6)}
+    copies = {points: plan_gradient_copies(points, resolutions, 15, device) for points in (1, 600, 5000, 70_000, 10**6)}
 
-    counts = {points: told.numbers[:, 1].tolist() for points, told in copies.items()}
+    counts = {points: told.layout[:, 1].tolist() for points, told in copies.items()}
     assert counts == {
         1: [1, 1, 1, 1],
         600: [1, 1, 1, 1],
@@ -287,23 +287,26 @@ def test_coarse_levels_have_copies_that_take_no_more_rows_than_there_are_points(
         10**6: [32, 32, 16, 16],
     }
     for points, told in copies.items():
-        rows, count, first = told.numbers.T
+        rows, count, first = told.layout.T
         assert rows.tolist() == [512, 4096, 32768, 32768]
         assert (rows * count <= max(points, 1))[count > 1].all()
-        assert (told.levels, told.widest) == (int((count > 1).sum()), max(rows[count > 1].tolist(), default=0))
+        assert (told.copied_levels, told.max_copied_rows) == (
+            int((count > 1).sum()),
+            max(rows[count > 1].tolist(), default=0),
+        )
         # One after the other behind the table.
         assert first.tolist() == (offsets[-1] + torch.cumsum(rows * (count - 1), 0) - rows * (count - 1)).tolist()
-        assert told.rows == offsets[-1] + int((rows * (count - 1)).sum())
+        assert told.total_rows == offsets[-1] + int((rows * (count - 1)).sum())
 
 
 @needs_triton
 @pytest.mark.parametrize("resolutions", [(3, 5, 9), (9, 5, 3), (40, 3)])
 def test_sums_of_copies_are_the_gradient_in_any_order_of_levels(resolutions: tuple[int, ...]) -> None:
     """Many points in one cell, of five blocks and more: each block adds to another copy."""
-    from hyrfpack.ops.hash_encode.gpu import copies_for
+    from hyrfpack.ops.hash_encode.gpu import plan_gradient_copies
 
     coords = 0.02 * uniform(1200, 3) + 0.3
-    assert copies_for(len(coords), resolutions, 10, coords.device).numbers[:, 1].max() > 4
+    assert plan_gradient_copies(len(coords), resolutions, 10, coords.device).layout[:, 1].max() > 4
     table = table_for(resolutions, 10)
     upstream = 1 + uniform(len(coords), 2 * len(resolutions), seed=3)
 

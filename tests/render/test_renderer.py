@@ -10,7 +10,7 @@ from scenes import ball_points, camera_at, look_at, ring, small_model
 
 from hyrfpack.model import Frame
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.ops.background import RADIUS, reference
+from hyrfpack.ops.background import BACKGROUND_RADIUS, reference
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Camera
 
@@ -150,8 +150,11 @@ def test_any_picture_size_renders_whole(width, height):
         ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),  # in the middle of everything
         ((-0.5, 0.0, 0.0), (0.1, -0.5, -0.2)),  # inside a ball
         ((0.0, 0.0, 90.0), (0.0, 0.1, 0.0)),  # close to the background sphere
-        ((0.0, -3 * RADIUS, 0.0), (0.0, 0.0, 0.0)),  # outside of it
-        ((0.0, -3 * RADIUS, 0.0), (RADIUS, -3 * RADIUS, 0.0)),  # outside, looking past it
+        ((0.0, -3 * BACKGROUND_RADIUS, 0.0), (0.0, 0.0, 0.0)),  # outside of it
+        (
+            (0.0, -3 * BACKGROUND_RADIUS, 0.0),
+            (BACKGROUND_RADIUS, -3 * BACKGROUND_RADIUS, 0.0),
+        ),  # outside, looking past it
         ((1e6, 1e6, 0.0), (0.0, 0.0, 0.0)),
     ],
 )

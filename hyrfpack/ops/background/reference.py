@@ -1,4 +1,7 @@
-"""The background sphere in plain torch around the operations it needs: the definition of right."""
+"""Implements the background sphere in plain torch, on top of other operations.
+
+This reference defines the correct result.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +16,18 @@ from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.shade.directions import encode_directions
 
-RADIUS = 100.0  # local units, around the frame's centre
+# Radius of the background sphere around the frame's centre, in local units.
+BACKGROUND_RADIUS = 100.0
 
 
 def sphere_points(origin: Tensor, directions: Tensor) -> Tensor:
-    """Where rays leave the background sphere.
+    """Compute the points where rays leave the background sphere.
 
         p = q + sqrt(max(R^2 - |q|^2, 0)) d,  q = o - (o.d) d the ray's point nearest to the centre
 
-    A ray from outside that misses the sphere gives q, so every ray has a finite answer. The textbook root
-    -(o.d) + sqrt((o.d)^2 - |o|^2 + R^2) subtracts squares of the distance: from 1e5 away float32 would miss by R / 4.
+    For a ray from outside that misses the sphere, p = q, so that every ray has a finite result. The textbook root
+    -(o.d) + sqrt((o.d)^2 - |o|^2 + R^2) is not used, because it subtracts squares of the distance: from 1e5 away its
+    error in float32 would be R / 4.
 
     Args:
         origin: (3,) the camera, local units.
@@ -32,12 +37,12 @@ def sphere_points(origin: Tensor, directions: Tensor) -> Tensor:
         (N, 3) local units.
     """
     nearest = origin - (directions @ origin)[:, None] * directions
-    inside = (RADIUS**2 - nearest.square().sum(-1)).clamp_min(0)
+    inside = (BACKGROUND_RADIUS**2 - nearest.square().sum(-1)).clamp_min(0)
     return nearest + inside.sqrt()[:, None] * directions
 
 
 def pixel_directions(points: Tensor, intrinsics: tuple[float, float, float, float], pose: Tensor) -> Tensor:
-    """Unit viewing directions through points of the picture.
+    """Compute unit viewing directions through points of the image.
 
     Args:
         points: (N, 2) x and y in pixels; the first pixel's centre is (0.5, 0.5).
@@ -67,9 +72,11 @@ def background_colors(
     encoding: str,
     mixed: bool,
 ) -> Tensor:
-    """Colours (N, 3) of the sphere at points (N, 2) of the picture, in pixels; the rest as in `background_grid`.
+    """Compute the colours (N, 3) of the sphere at points (N, 2) of the image, in pixels.
 
-    sigmoid(mlp([hash_encode(contract(p / half_extent)), e(d)])),  p where the ray along d leaves the sphere
+        color = sigmoid(mlp([hash_encode(contract(p / half_extent)), e(d)]))
+
+    The ray of a point leaves the sphere at p along d. The other arguments are those of `background_grid`.
     """
     pose = pose.to(table, non_blocking=table.is_cuda)
     directions = pixel_directions(points, intrinsics, pose)
@@ -88,23 +95,23 @@ def field_colors(
     biases: Sequence[Tensor],
     mixed: bool,
 ) -> Tensor:
-    """Colours (N, 3) that the field has at coords (N, 3) of the cube, seen along directions encoded as (N, E)."""
+    """Compute the field's colours (N, 3) at coords (N, 3) of the cube for encoded directions (N, E)."""
     features = hash_encode(coords, table, resolutions, log2_table_size)
-    # Hash features are stored by columns, and joined so.
+    # Hash features are stored planar, so concatenating along the first axis is a plain copy.
     inputs = torch.cat((features.T, encoded.T)).T
     return torch.sigmoid(mlp(inputs, weights, biases, mixed=mixed))
 
 
 def grid_size(height: int, width: int, stride: int) -> tuple[int, int]:
-    """Rows and columns of nodes, the last at or past the picture's edge."""
+    """Return the rows and columns of the grid of nodes, whose last ones lie at or past the image's edge."""
     return -(-(height - 1) // stride) + 1, -(-(width - 1) // stride) + 1
 
 
 def background_grid(transmittance: Tensor, *, threshold: float, stride: int, **sphere) -> Tensor:
-    """As `hyrfpack.ops.background.background_grid`; `sphere` is what `background_colors` takes."""
+    """Compute `hyrfpack.ops.background.background_grid`; `sphere` holds the arguments of `background_colors`."""
     height, width = transmittance.shape
     rows, columns = grid_size(height, width, stride)
-    # A node is needed when light passes at any pixel nearer to it than the next nodes.
+    # A node is needed if light passes at any pixel that is nearer to it than its neighbouring nodes are.
     reach = stride - 1
     padded = torch.nn.functional.pad(
         transmittance.detach()[None], (reach, columns * stride - width, reach, rows * stride - height)

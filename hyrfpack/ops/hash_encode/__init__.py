@@ -1,4 +1,4 @@
-"""Multiresolution hash encoding (instant-ngp): a point of the unit cube -> features from the tables of all levels."""
+"""Multiresolution hash encoding (instant-ngp): maps points of the unit cube to features from tables of all levels."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ __all__ = ["cells", "corner_rows", "hash_encode", "level_offsets", "level_resolu
 def hash_encode(
     coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int, *, implementation: str = "auto"
 ) -> Tensor:
-    """Look a point up in every level's table, trilinearly between the 8 vertices around it.
+    """Interpolate features trilinearly between the 8 vertices around each point, on every level.
 
-    A level with r vertices per axis puts the point at x = coords * (r - 1), in the cell floor(x) clamped to
-    [0, r - 2]. A vertex has its own row where all r^3 fit the level's table, and otherwise shares the row that
-    instant-ngp's spatial hash gives it (see `corner_rows`).
+    A level with r vertices per axis scales a point to x = coords * (r - 1); its cell is floor(x), clamped to
+    [0, r - 2]. If all r^3 vertices fit into the level's table, each vertex has its own row (dense level). Otherwise
+    instant-ngp's spatial hash assigns the rows, and vertices may share one (see `corner_rows`).
 
     Args:
-        coords: (N, 3) points in [0, 1]; outside, the nearest cell is extrapolated. Finite.
-        table: (rows, F) features of all levels, one after the other as `level_offsets` says.
+        coords: (N, 3) points in [0, 1], finite; outside, the nearest cell is extrapolated.
+        table: (rows, F) features of all levels, concatenated as `level_offsets` defines.
         resolutions: (L,) vertices per axis, each at least 2; see `level_resolutions`.
-        log2_table_size: most rows of a level, as a power of two; 1 to 28.
-        implementation: "auto", "reference", "cpu" or "gpu" (these two: float32, two features a level).
+        log2_table_size: base-2 logarithm of the maximum number of rows per level; 1 to 28.
+        implementation: "auto", "reference", "cpu" or "gpu" (the last two take float32 and two features per level).
 
     Returns:
-        (N, L * F) features, level after level. "cpu" and "gpu" store them feature by feature, as the transpose of a
-        contiguous (L * F, N); what keeps that layout (`mlp` does) spares the backward pass a copy or slow reads.
-        Differentiable once in `table` and in `coords` (there by the cell the point is in). On "gpu" the order in
-        which points add to the gradient of `table` varies from run to run, and with it the last bits.
+        (N, L * F) features, ordered by level. "cpu" and "gpu" store them planar, as the transpose of a contiguous
+        (L * F, N). Callers that keep this layout, as `mlp` does, avoid a copy or slow reads in backward.
+        Differentiable once in `table` and in `coords`, in the latter within the cell of the point. On "gpu" the order
+        in which points add to the gradient of `table` varies from run to run, and with it the last bits.
 
     Raises:
-        ValueError: shapes, sizes, types or devices do not fit together.
+        ValueError: shapes, sizes, dtypes or devices do not match.
 
     Example:
-        >>> table = torch.ones(8 + 64, 2)  # of 2 x 2 x 2 and 4 x 4 x 4 corners
+        >>> table = torch.ones(8 + 64, 2)  # rows for 2 x 2 x 2 and 4 x 4 x 4 vertices
         >>> hash_encode(torch.rand(5, 3), table, (2, 4), log2_table_size=6).shape
         torch.Size([5, 4])
     """
@@ -62,7 +62,7 @@ def hash_encode(
 
 
 def _kernels(implementation: str) -> ModuleType:
-    """The module of an implementation; imported when first used, as not every machine has what it needs."""
+    """Import and return the module of an implementation, since not every machine has its dependencies."""
     if implementation == "gpu":
         from hyrfpack.ops.hash_encode import gpu
 
@@ -73,6 +73,8 @@ def _kernels(implementation: str) -> ModuleType:
 
 
 class _HashEncode(torch.autograd.Function):
+    """Autograd function of `hash_encode` for the kernels of one module."""
+
     @staticmethod
     def forward(
         ctx, coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int, kernels: ModuleType

@@ -1,16 +1,16 @@
-"""Multiresolution hash encoding in Triton, two features a level.
+"""Implements multiresolution hash encoding in Triton, with two features per level.
 
-A program does a block of points on one level. Programs run level after level, so that the table of one level, a few
-megabytes, stays in the L2 cache while all points read it. A row of the table (two float32) is fetched as one 64-bit
-number. Features and their gradients are planar, (2L, N), so that neighbouring threads write neighbouring numbers.
+A program processes a block of points on one level. Programs run in the order of levels, so that the table of one level,
+a few megabytes, stays in the L2 cache while all points read it. A row of the table (two float32) is loaded as one
+64-bit word. Features and their gradients are planar, (2L, N), so that neighbouring threads write neighbouring numbers.
 
-Points add to the table's gradient by atomics, and a row takes one at a time: on a level of 8 vertices an axis a third
-of the points may share one. So coarse levels have several copies that blocks add to by turns, and that are summed at
-last.
+Points add to the table's gradient by atomics, which serialise on a row: on a level of 8 vertices per axis, a third of
+the points may share one. Coarse levels therefore have several copies, to which blocks add in turn; a last kernel sums
+the copies.
 
-The cell is the floor of the rounded product coords * span, as in `reference.cells`: a product that goes to a floor
-cannot be fused into anything. The place within the cell, product - cell, may be fused; it is then off the reference's
-by the rounding of the product, and only there.
+The cell is the floor of the rounded product coords * span, as in `reference.cells`: the compiler cannot fuse a product
+whose floor is taken. It may fuse the position within the cell, product - cell, which then differs from the reference by
+the rounding of the product.
 """
 
 from __future__ import annotations
@@ -27,26 +27,35 @@ from torch import Tensor
 from hyrfpack.ops.gpu_pairs import unpack_pair
 from hyrfpack.ops.hash_encode.reference import PRIME_Y, PRIME_Z, level_offsets
 
-# One point a thread: no value changes threads on its way to a fetch or an atomic, and 32 registers let every thread
-# that a multiprocessor can hold have its 8 fetches under way.
-_POINTS = 256
-_WARPS = _POINTS // (64 if torch.version.hip else 32)
-_MOST_COPIES = 32
-_SUMMED = 512  # numbers that a program sums the copies of
+# Each thread handles one point, so that no value moves between threads on its way to a load or an atomic. With 32
+# registers per thread, a multiprocessor runs its maximum number of threads, each with 8 loads in flight.
+_POINTS_PER_PROGRAM = 256
+_WARPS_PER_PROGRAM = _POINTS_PER_PROGRAM // (64 if torch.version.hip else 32)
+_MAX_COPIES_PER_LEVEL = 32
+_SUMS_PER_PROGRAM = 512
 
 
 @triton.jit
 def axis_vertices(coords, span, factor):
-    """Place within the cell along one axis, and the shares of its two vertices in the row; always inside the level."""
+    """Locate points along one axis.
+
+    Returns:
+        The position within the cell, and the terms of its two vertices in the row, which always lie inside the level.
+    """
     x = coords * span
-    cell = tl.minimum(tl.where(x > 0, tl.floor(x), 0.0), span - 1)  # a NaN, too, is in a cell
+    cell = tl.minimum(tl.where(x > 0, tl.floor(x), 0.0), span - 1)  # This puts NaN into a cell, too.
     low = cell.to(tl.int32).to(tl.uint32) * factor
     return x - cell, low, low + factor
 
 
 @triton.jit
-def _cell(coords, axis_stride, point_stride, levels, level, start, lane, inside):
-    """Places and vertex shares along x, y, z of points on a level, and that level's span, hash mask and first row."""
+def _locate_cell(coords, axis_stride, point_stride, levels, level, start, lane, inside):
+    """Locate points on a level.
+
+    Returns:
+        Positions within the cells and row terms of the vertices along x, y and z, as of `axis_vertices`; then the
+        level's span, hash mask and first row.
+    """
     levels += level * 5
     span = tl.load(levels).to(tl.float32)
     first = coords + start * point_stride
@@ -62,17 +71,17 @@ def _cell(coords, axis_stride, point_stride, levels, level, start, lane, inside)
 
 @triton.jit
 def vertex_row(x, y, z, mask):
-    """Row of a vertex within its level, from its shares; `mask` is 0 on a dense level."""
+    """Return the row of a vertex within its level from its terms along x, y, z; `mask` is 0 on a dense level."""
     return tl.where(mask == 0, x + y + z, (x ^ y ^ z) & mask).to(tl.int32)
 
 
 @triton.jit(do_not_specialize=["points", "axis_stride"])
-def encode_level(coords, axis_stride, point_stride, table, levels, out, points, POINTS: tl.constexpr):
-    """Features of a block of points (axis 0) on a level (axis 1) into planar `out` (2L, N)."""
+def encode_kernel(coords, axis_stride, point_stride, table, levels, out, points, POINTS: tl.constexpr):
+    """Write the features of a block of points (grid axis 0) on a level (grid axis 1) to planar `out` (2L, N)."""
     start, level = tl.program_id(0).to(tl.int64) * POINTS, tl.program_id(1)
     lane = tl.arange(0, POINTS)
     inside = lane < points - start
-    x1, y1, z1, row_x0, row_x1, row_y0, row_y1, row_z0, row_z1, span, mask, offset = _cell(
+    x1, y1, z1, row_x0, row_x1, row_y0, row_y1, row_z0, row_z1, span, mask, offset = _locate_cell(
         coords, axis_stride, point_stride, levels, level, start, lane, inside
     )
     table += offset
@@ -91,11 +100,11 @@ def encode_level(coords, axis_stride, point_stride, table, levels, out, points, 
 
 
 @triton.jit(do_not_specialize=["points", "axis_stride", "feature_stride"])
-def scatter_level(
+def grad_table_kernel(
     coords, axis_stride, point_stride, levels, copies,
     grad, feature_stride, grad_stride, out, points, POINTS: tl.constexpr,
 ):  # fmt: skip
-    """Add the gradients of a block of points (axis 0) on a level (axis 1) to a copy of it in `out` (rows, 2)."""
+    """Add gradients of a block of points (grid axis 0) on a level (grid axis 1) to a copy of it in `out` (rows, 2)."""
     start, level = tl.program_id(0).to(tl.int64) * POINTS, tl.program_id(1)
     lane = tl.arange(0, POINTS)
     inside = lane < points - start
@@ -103,7 +112,7 @@ def scatter_level(
     grad0 = tl.load(grad + lane * grad_stride, mask=inside, other=0.0)
     grad1 = tl.load(grad + feature_stride + lane * grad_stride, mask=inside, other=0.0)
     live = (grad0 != 0) | (grad1 != 0)
-    x1, y1, z1, row_x0, row_x1, row_y0, row_y1, row_z0, row_z1, span, mask, offset = _cell(
+    x1, y1, z1, row_x0, row_x1, row_y0, row_y1, row_z0, row_z1, span, mask, offset = _locate_cell(
         coords, axis_stride, point_stride, levels, level, start, lane, live
     )
     copies += level * 3
@@ -123,8 +132,8 @@ def scatter_level(
 
 
 @triton.jit
-def sum_copies(levels, copies, out, BLOCK: tl.constexpr):
-    """Add the other copies of a level (axis 1) to its rows in `out` (rows, 2), a block of numbers (axis 0)."""
+def sum_copies_kernel(levels, copies, out, BLOCK: tl.constexpr):
+    """Add the further copies of a level (grid axis 1) to its rows in `out` (rows, 2), by blocks (grid axis 0)."""
     level = tl.program_id(1)
     rows, count = tl.load(copies + level * 3), tl.load(copies + level * 3 + 1)
     lane = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -139,7 +148,7 @@ def sum_copies(levels, copies, out, BLOCK: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=["points", "axis_stride", "feature_stride", "out_axis_stride"])
-def descend_levels(
+def grad_coords_kernel(
     coords,
     axis_stride,
     point_stride,
@@ -155,7 +164,7 @@ def descend_levels(
     LEVELS: tl.constexpr,
     POINTS: tl.constexpr,
 ):
-    """Gradient of the coordinates of a block of points (axis 0), summed over all levels in order, into `out`."""
+    """Write the gradient by the coordinates of a block of points (grid axis 0), summed over levels in order."""
     start = tl.program_id(0).to(tl.int64) * POINTS
     lane = tl.arange(0, POINTS)
     inside = lane < points - start
@@ -163,7 +172,7 @@ def descend_levels(
     total_x, total_y = tl.zeros([POINTS], tl.float32), tl.zeros([POINTS], tl.float32)
     total_z = tl.zeros([POINTS], tl.float32)
     for level in range(LEVELS):
-        x1, y1, z1, row_x0, row_x1, row_y0, row_y1, row_z0, row_z1, span, mask, offset = _cell(
+        x1, y1, z1, row_x0, row_x1, row_y0, row_y1, row_z0, row_z1, span, mask, offset = _locate_cell(
             coords, axis_stride, point_stride, levels, level, start, lane, inside
         )
         grad0 = tl.load(grad + lane * grad_stride, mask=inside, other=0.0)
@@ -190,8 +199,12 @@ def descend_levels(
 
 
 @cache
-def level_numbers(resolutions: tuple[int, ...], log2_table_size: int, device: torch.device) -> Tensor:
-    """(L, 5) int64 on the device: span, what a step along y and along z adds, hash mask (0: dense), first row."""
+def level_parameters(resolutions: tuple[int, ...], log2_table_size: int, device: torch.device) -> Tensor:
+    """Return the parameters of each level, (L, 5) int64 on the device.
+
+    They are the span (vertices per axis - 1), the row factors along y and z, the hash mask (0 for a dense level) and
+    the first row.
+    """
     size, rows = 1 << log2_table_size, []
     for resolution, offset in zip(resolutions, level_offsets(resolutions, log2_table_size), strict=False):
         dense = resolution**3 <= size
@@ -201,73 +214,78 @@ def level_numbers(resolutions: tuple[int, ...], log2_table_size: int, device: to
 
 
 @dataclass(frozen=True)
-class Copies:
-    """Where points add to a table's gradient.
+class GradientCopies:
+    """The copies of levels to which points add their gradients.
 
     Attributes:
-        numbers: (L, 3) int64 on the device: a level's rows, its copies, and the first row of the second one.
-        levels: up to the last that has several.
-        widest: rows of the largest that has several.
-        rows: of all, the table's own first.
+        layout: (L, 3) int64 on the device: a level's rows, its number of copies, and the first row of its second copy.
+        copied_levels: number of levels up to the last one with several copies.
+        max_copied_rows: rows of the largest level with several copies.
+        total_rows: rows of all copies, of which the table's own come first.
     """
 
-    numbers: Tensor
-    levels: int
-    widest: int
-    rows: int
+    layout: Tensor
+    copied_levels: int
+    max_copied_rows: int
+    total_rows: int
 
 
-def copies_for(points: int, resolutions: tuple[int, ...], log2_table_size: int, device: torch.device) -> Copies:
-    """Copies of the levels that so many points, at least one, add to.
+def plan_gradient_copies(
+    points: int, resolutions: tuple[int, ...], log2_table_size: int, device: torch.device
+) -> GradientCopies:
+    """Plan the copies of levels for the gradients of at least one point.
 
-    Of a level that has no more vertices than there are points as many as take no more rows than there are points, so
-    that they cost an eighth of the additions at most; of finer ones one, for few points share a row there.
+    A level with at most as many vertices as points gets as many copies as have no more rows in total than points, so
+    that summing costs at most an eighth of the additions. A finer level gets one, since few points share a row there.
     """
-    return _copies(points.bit_length() - 1, resolutions, log2_table_size, device)
+    return _plan_gradient_copies(points.bit_length() - 1, resolutions, log2_table_size, device)
 
 
 @cache
-def _copies(log2_points: int, resolutions: tuple[int, ...], log2_table_size: int, device: torch.device) -> Copies:
-    """As `copies_for`, of a power of two: points of a view differ from step to step."""
+def _plan_gradient_copies(
+    log2_points: int, resolutions: tuple[int, ...], log2_table_size: int, device: torch.device
+) -> GradientCopies:
+    """Plan the copies for 2^log2_points points; the cache stays small although the number varies from step to step."""
     offsets = level_offsets(resolutions, log2_table_size)
     points, numbers, end, levels, widest = 1 << log2_points, [], offsets[-1], 0, 0
     for level, (resolution, (first, last)) in enumerate(zip(resolutions, pairwise(offsets), strict=True)):
         rows = last - first
-        copies = min(_MOST_COPIES, points // rows) if resolution**3 <= points else 1
+        copies = min(_MAX_COPIES_PER_LEVEL, points // rows) if resolution**3 <= points else 1
         numbers.append((rows, copies, end))
         end += (copies - 1) * rows
         if copies > 1:
             levels, widest = level + 1, max(widest, rows)
-    return Copies(torch.tensor(numbers, device=device), levels, widest, end)
+    return GradientCopies(torch.tensor(numbers, device=device), levels, widest, end)
 
 
-def _blocks(points: int) -> int:
-    return triton.cdiv(points, _POINTS)
+def _program_count(points: int) -> int:
+    """Return the number of programs for a number of points."""
+    return triton.cdiv(points, _POINTS_PER_PROGRAM)
 
 
-def whole_rows(table: Tensor) -> Tensor:
-    """The (rows, 2) float32 table as one 64-bit number a row."""
+def rows_as_words(table: Tensor) -> Tensor:
+    """Return the (rows, 2) float32 table as one 64-bit word per row."""
     table = table.detach().contiguous()
-    if table.storage_offset() % 2:  # between two such numbers of the memory that it is a part of
+    if table.storage_offset() % 2:  # Words of a view at an odd offset would not be aligned to 8 bytes.
         table = table.clone()
     return table.view(torch.int64)
 
 
 def encode(coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int) -> Tensor:
-    """(N, 3) coords, in any layout, and (rows, 2) table -> (N, 2L) features, stored planar."""
+    """Compute the features (N, 2L), stored planar, of coords (N, 3), in any layout, from a table (rows, 2)."""
     points = coords.shape[0]
     features = coords.new_empty((2 * len(resolutions), points))
     if points:
-        encode_level[_blocks(points), len(resolutions)](
+        encode_kernel[_program_count(points), len(resolutions)](
             coords.detach(),
             coords.stride(1),
             coords.stride(0),
-            whole_rows(table),
-            level_numbers(resolutions, log2_table_size, coords.device),
+            rows_as_words(table),
+            level_parameters(resolutions, log2_table_size, coords.device),
             features,
             points,
-            POINTS=_POINTS,
-            num_warps=_WARPS,
+            POINTS=_POINTS_PER_PROGRAM,
+            num_warps=_WARPS_PER_PROGRAM,
             enable_fp_fusion=True,
         )
     return features.T
@@ -276,25 +294,25 @@ def encode(coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_tab
 def grad_table(
     coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int, grad: Tensor
 ) -> Tensor:
-    """(N, 2L) gradient of the features, in any layout -> gradient of the table, of its shape.
+    """Compute the gradient by the table, in its shape, from the gradient (N, 2L) of the features, in any layout.
 
-    Points add to rows by atomics, in no fixed order: sums differ in their last bits from run to run. A point whose
-    two gradients on a level are zero adds nothing there.
+    Points add to rows by atomics, in no fixed order, so sums differ in their last bits from run to run. A point whose
+    two gradients on a level are zero is skipped there.
     """
     points = coords.shape[0]
     if not points:
         return table.new_zeros(table.shape)
-    levels = level_numbers(resolutions, log2_table_size, coords.device)
-    copies = copies_for(points, resolutions, log2_table_size, coords.device)
-    result = table.new_zeros(copies.rows, 2)
-    scatter_level[_blocks(points), len(resolutions)](
-        coords.detach(), coords.stride(1), coords.stride(0), levels, copies.numbers,
+    levels = level_parameters(resolutions, log2_table_size, coords.device)
+    copies = plan_gradient_copies(points, resolutions, log2_table_size, coords.device)
+    result = table.new_zeros(copies.total_rows, 2)
+    grad_table_kernel[_program_count(points), len(resolutions)](
+        coords.detach(), coords.stride(1), coords.stride(0), levels, copies.layout,
         grad, grad.stride(1), grad.stride(0), result, points,
-        POINTS=_POINTS, num_warps=_WARPS, enable_fp_fusion=True,
+        POINTS=_POINTS_PER_PROGRAM, num_warps=_WARPS_PER_PROGRAM, enable_fp_fusion=True,
     )  # fmt: skip
-    if copies.levels:
-        sum_copies[triton.cdiv(2 * copies.widest, _SUMMED), copies.levels](
-            levels, copies.numbers, result, BLOCK=_SUMMED, num_warps=_WARPS
+    if copies.copied_levels:
+        sum_copies_kernel[triton.cdiv(2 * copies.max_copied_rows, _SUMS_PER_PROGRAM), copies.copied_levels](
+            levels, copies.layout, result, BLOCK=_SUMS_PER_PROGRAM, num_warps=_WARPS_PER_PROGRAM
         )
     return result[: len(table)]
 
@@ -302,16 +320,16 @@ def grad_table(
 def grad_coords(
     coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int, grad: Tensor
 ) -> Tensor:
-    """(N, 2L) gradient of the features, in any layout -> (N, 3) gradient of the coordinates, stored like these."""
+    """Compute the gradient (N, 3) by the coordinates, in their layout, from the gradient (N, 2L) of the features."""
     points = coords.shape[0]
     result = torch.empty_like(coords)
     if points:
-        descend_levels[(_blocks(points),)](
+        grad_coords_kernel[(_program_count(points),)](
             coords.detach(),
             coords.stride(1),
             coords.stride(0),
-            whole_rows(table),
-            level_numbers(resolutions, log2_table_size, coords.device),
+            rows_as_words(table),
+            level_parameters(resolutions, log2_table_size, coords.device),
             grad,
             grad.stride(1),
             grad.stride(0),
@@ -320,8 +338,8 @@ def grad_coords(
             result.stride(0),
             points,
             LEVELS=len(resolutions),
-            POINTS=_POINTS,
-            num_warps=_WARPS,
+            POINTS=_POINTS_PER_PROGRAM,
+            num_warps=_WARPS_PER_PROGRAM,
             enable_fp_fusion=True,
         )
     return result

@@ -1,34 +1,37 @@
-"""Multiresolution hash encoding in plain torch, any device and dtype: the definition of right."""
+"""Implements multiresolution hash encoding in plain torch for any device and dtype.
+
+This reference defines the correct result.
+"""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-# Instant-ngp's spatial hash: x ^ y * PRIME_Y ^ z * PRIME_Z, in 32-bit unsigned arithmetic.
+# Instant-ngp's spatial hash is x ^ y * PRIME_Y ^ z * PRIME_Z, in 32-bit unsigned arithmetic.
 PRIME_Y = 2654435761
 PRIME_Z = 805459861
 
 
 def level_resolutions(levels: int, base: int, finest: int) -> tuple[int, ...]:
-    """Vertices per axis of each level, growing geometrically from `base` to `finest`.
+    """Return the vertices per axis of each level, growing geometrically from `base` to `finest`.
 
         ceil(base * b^l),    b = (finest / base)^(1 / (levels - 1))
 
     Raises:
-        ValueError: no level, fewer than 2 vertices per axis, or `finest` below `base`.
+        ValueError: `levels` is below 1, `base` is below 2, or `finest` is below `base`.
     """
     if levels < 1 or not 2 <= base <= finest:
         raise ValueError(f"levels={levels}, base={base}, finest={finest}: need levels >= 1 and 2 <= base <= finest")
     growth = (finest / base) ** (1 / max(levels - 1, 1))
-    # The power of a root misses an integer by rounding alone; that must not add a vertex.
+    # The subtraction keeps rounding errors of the power from pushing an exact integer up to the next one.
     return tuple(-int(-(base * growth**level - 1e-6) // 1) for level in range(levels))
 
 
 def level_offsets(resolutions: tuple[int, ...], log2_table_size: int) -> tuple[int, ...]:
-    """First row of each level in the flat table, and the number of rows last: (levels + 1,).
+    """Return the first row of each level in the flat table, then the number of rows: (levels + 1,).
 
-    A level has min(resolution^3, 2^log2_table_size) rows: dense where its vertices fit, hashed otherwise.
+    A level has min(resolution^3, 2^log2_table_size) rows. It is dense if its vertices fit, and hashed otherwise.
     """
     offsets = [0]
     for resolution in resolutions:
@@ -37,9 +40,9 @@ def level_offsets(resolutions: tuple[int, ...], log2_table_size: int) -> tuple[i
 
 
 def cells(coords: Tensor, resolutions: tuple[int, ...]) -> Tensor:
-    """Cell of each point on each level: (N, 3) coords in [0, 1] -> (N, L, 3) int64 in [0, resolution - 2].
+    """Return the cells (N, L, 3), int64 in [0, resolution - 2], of coords (N, 3) in [0, 1] on each level.
 
-    One rounded product and a floor: the same cell on every machine for coordinates of the same dtype.
+    One rounded product and a floor give the same cell on every machine for coordinates of the same dtype.
     """
     spans = torch.tensor([resolution - 1 for resolution in resolutions], device=coords.device)
     x = coords[:, None, :] * spans.to(coords.dtype)[None, :, None]
@@ -47,7 +50,7 @@ def cells(coords: Tensor, resolutions: tuple[int, ...]) -> Tensor:
 
 
 def corner_rows(cells: Tensor, resolutions: tuple[int, ...], log2_table_size: int) -> Tensor:
-    """Rows of the flat table that the corners of these cells refer to. Integers only.
+    """Return the rows of the flat table for the corners of these cells, in integer arithmetic only.
 
         dense level:   x + r (y + r z)                                       r^3 <= 2^log2_table_size
         hashed level:  (x ^ y * 2654435761 ^ z * 805459861) mod 2^log2_table_size
@@ -55,7 +58,7 @@ def corner_rows(cells: Tensor, resolutions: tuple[int, ...], log2_table_size: in
     Args:
         cells: (N, L, 3) integer, the lowest corner of a cell on each level, in [0, resolution - 2].
         resolutions: (L,) vertices per axis.
-        log2_table_size: most rows of a level, as a power of two.
+        log2_table_size: base-2 logarithm of the maximum number of rows per level.
 
     Returns:
         (N, L, 8) int64, level offsets included; corner c is at (x + c % 2, y + c // 2 % 2, z + c // 4).
@@ -69,14 +72,14 @@ def corner_rows(cells: Tensor, resolutions: tuple[int, ...], log2_table_size: in
         if resolution**3 <= 1 << log2_table_size:
             row = x + resolution * (y + resolution * z)
         else:
-            # int64 holds the whole products, and the mask keeps only bits that 32-bit wrap-around leaves alone.
+            # int64 holds the full products. The mask keeps only low bits, which 32-bit overflow does not affect.
             row = (x ^ y * PRIME_Y ^ z * PRIME_Z) & ((1 << log2_table_size) - 1)
         rows[:, level] = row + offsets[level]
     return rows
 
 
 def hash_encode(coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int) -> Tensor:
-    """As `hyrfpack.ops.hash_encode.hash_encode`, differentiable by autograd alone."""
+    """Compute `hyrfpack.ops.hash_encode.hash_encode` with torch operations that autograd differentiates."""
     cell = cells(coords.detach(), resolutions)
     rows = corner_rows(cell, resolutions, log2_table_size)
     spans = torch.tensor([resolution - 1 for resolution in resolutions], dtype=coords.dtype, device=coords.device)

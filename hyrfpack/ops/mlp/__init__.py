@@ -1,4 +1,4 @@
-"""A small multilayer perceptron over many rows: the decoder of a field."""
+"""Evaluates a small multilayer perceptron on many rows, as the decoder of a field."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from torch.autograd.function import once_differentiable
 from hyrfpack.ops.dispatch import choose_implementation
 from hyrfpack.ops.mlp import reference
 
-__all__ = ["WIDEST", "mlp"]
+__all__ = ["MAX_GPU_LAYER_WIDTH", "mlp"]
 
-WIDEST = 128  # inputs and hidden layers that GPU kernels take
+# Widest input and hidden layers that the GPU kernels support.
+MAX_GPU_LAYER_WIDTH = 128
 
 
 def mlp(
@@ -24,25 +25,26 @@ def mlp(
     mixed: bool = False,
     implementation: str = "auto",
 ) -> Tensor:
-    """Run rows through linear layers with ReLU between them and nothing after the last.
+    """Apply linear layers with ReLU between them, and no activation after the last, to every row.
 
         h_0 = x,    h_l = relu(h_{l-1} W_l^T + b_l),    y = h_{L-1} W_L^T + b_L
 
     Args:
-        x: (N, I) rows, in any memory layout; its gradient comes back in the same.
+        x: (N, I) rows, in any memory layout; its gradient has the same layout.
         weights: one (out, in) matrix for each layer, at least one.
         biases: one (out,) vector for each layer.
-        mixed: products, here and in backward, take factors rounded to bfloat16 and are added up in float32: what the
-            matrix units of a GPU are fast at. "cpu" multiplies in float32 whatever is asked.
-        implementation: "auto", "reference", "cpu" or "gpu" (both float32). What the GPU kernels do not take - other
-            than two hidden layers, inputs or hidden layers wider than 128, more than 16 outputs - runs as "reference".
+        mixed: forward and backward round the factors of products to bfloat16 and sum in float32, which is fast on the
+            matrix units of a GPU. "cpu" always multiplies in float32.
+        implementation: "auto", "reference", "cpu" or "gpu" (the last two take float32 only). The GPU kernels support
+            two hidden layers, inputs and hidden layers of width 128 or less, and at most 16 outputs; otherwise "gpu"
+            falls back to "reference".
 
     Returns:
-        (N, O). Differentiable once in everything. In the backward pass of "cpu" rows whose gradient is all zero are
-        skipped, in that of "gpu" blocks of such rows.
+        (N, O). Differentiable once in `x`, `weights` and `biases`. The backward pass of "cpu" skips rows whose gradient
+        is all zero; that of "gpu" skips blocks of such rows.
 
     Raises:
-        ValueError: shapes, types or devices do not fit together.
+        ValueError: shapes, dtypes or devices do not match.
 
     Example:
         >>> weights, biases = [torch.eye(2), torch.ones(1, 2)], [torch.zeros(2), torch.zeros(1)]
@@ -62,12 +64,14 @@ def mlp(
     chosen = choose_implementation(implementation, ("reference", "cpu", "gpu"), x, *weights, *biases)
     if chosen == "cpu":
         return _CpuMlp.apply(x, *weights, *biases)
-    if chosen == "gpu" and len(weights) == 3 and max(widths[:3]) <= WIDEST and widths[3] <= 16:
+    if chosen == "gpu" and len(weights) == 3 and max(widths[:3]) <= MAX_GPU_LAYER_WIDTH and widths[3] <= 16:
         return _GpuMlp.apply(x, mixed, *weights, *biases)
     return reference.mlp(x, weights, biases, mixed)
 
 
 class _CpuMlp(torch.autograd.Function):
+    """Autograd function of `mlp` on the CPU."""
+
     @staticmethod
     def forward(ctx, x: Tensor, *parameters: Tensor) -> Tensor:
         from hyrfpack.ops.mlp import cpu
@@ -89,6 +93,8 @@ class _CpuMlp(torch.autograd.Function):
 
 
 class _GpuMlp(torch.autograd.Function):
+    """Autograd function of `mlp` on a GPU."""
+
     @staticmethod
     def forward(ctx, x: Tensor, mixed: bool, *parameters: Tensor) -> Tensor:
         from hyrfpack.ops.mlp import gpu

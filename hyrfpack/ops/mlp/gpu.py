@@ -1,9 +1,9 @@
-"""The multilayer perceptron on a GPU: two hidden layers in one kernel, on the matrix units.
+"""Evaluates the multilayer perceptron on a GPU: two hidden layers in one kernel, on the matrix units.
 
-Points are columns: a block of them is a tile [width, BLOCK], so features that are stored by rows load as they lie.
-Programs are few and stay, each going through every so-many-th block. Hidden activations never leave the chip: backward
-computes them again. A program adds up its own gradients of weights and biases and torch adds those of all programs: no
-atomics, and the same bytes at every run on the same machine.
+Points are columns: a block of them is a tile [width, BLOCK], so planar features load without a transpose. The kernels
+are persistent: a fixed number of programs loop over all blocks, each with a stride of the number of programs. Hidden
+activations never leave the chip; backward recomputes them. Each program sums its own gradients of weights and biases,
+and torch sums those of all programs. There are no atomics, so that all runs on one machine give the same bytes.
 """
 
 from __future__ import annotations
@@ -17,22 +17,33 @@ import triton.language as tl
 from torch import Tensor
 
 from hyrfpack.ops.dispatch import is_interpreting
-from hyrfpack.ops.mlp.tiles import factor, linear, load_transposed, pack, precision, product, relu_factor, sizes
+from hyrfpack.ops.mlp.tiles import (
+    kernel_widths,
+    linear,
+    load_tile_transposed,
+    multiply_add,
+    pack_weights,
+    product_precision,
+    round_factor,
+    round_relu,
+)
 
-# Programs that stay on a processor at once, by the registers they take, and so all that are started.
-_FORWARD_RESIDENT, _BACKWARD_RESIDENT = 4, 2
-# Points a block. Forward: the most that leave registers for _FORWARD_RESIDENT programs; in float32, that do not spill.
-_FORWARD_BLOCK, _FORWARD_BLOCK_SINGLE = 128, 32
+# As many programs are launched per multiprocessor as fit at once by their registers.
+_FORWARD_PROGRAMS_PER_PROCESSOR = 4
+_BACKWARD_PROGRAMS_PER_PROCESSOR = 2
+# The largest blocks that leave registers for all resident programs (mixed) or that do not spill (float32).
+_FORWARD_POINTS_PER_BLOCK_MIXED = 128
+_FORWARD_POINTS_PER_BLOCK_FLOAT32 = 32
 
 
 def forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], mixed: bool) -> tuple[Tensor, Tensor]:
-    """(N, I) rows -> (N, O), and the packed weights, for `backward`."""
-    constants = sizes([x.shape[1], *(weight.shape[0] for weight in weights)])
-    way = precision(mixed)
-    packed = pack(weights, way)
+    """Compute the outputs (N, O) of rows (N, I), and the packed weights for `backward`."""
+    constants = kernel_widths([x.shape[1], *(weight.shape[0] for weight in weights)])
+    multiplication = product_precision(mixed)
+    packed = pack_weights(weights, multiplication)
     result = x.new_empty(x.shape[0], constants["OUT"])
-    block = _FORWARD_BLOCK if mixed else _FORWARD_BLOCK_SINGLE
-    programs = _programs(x, block, _FORWARD_RESIDENT)
+    block = _FORWARD_POINTS_PER_BLOCK_MIXED if mixed else _FORWARD_POINTS_PER_BLOCK_FLOAT32
+    programs = _program_count(x, block, _FORWARD_PROGRAMS_PER_PROCESSOR)
     if programs:
         forward_kernel[(programs,)](
             x,
@@ -43,10 +54,10 @@ def forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], mixe
             x.shape[0],
             **constants,
             PLANAR=x.stride(0) == 1,
-            LONG=_is_long(x),
+            NEEDS_INT64=_needs_int64_offsets(x),
             BLOCK=block,
-            PRECISION=way,
-            num_warps=_warps(constants),
+            PRECISION=multiplication,
+            num_warps=_warps_per_program(constants),
             enable_fp_fusion=True,
         )
     return result, packed
@@ -61,28 +72,32 @@ def backward(
     needs_x: bool,
     mixed: bool,
 ) -> tuple[Tensor | None, list[Tensor], list[Tensor]]:
-    """(N, O) gradient of the result -> gradients of x (None unless needed; stored as x is), weights and biases.
+    """Compute the gradients of x, weights and biases from the gradient (N, O) of the outputs.
 
     Args:
-        packed: from `forward`.
-        biases: as in `forward`; the last is not needed.
+        packed: the packed weights that `forward` returned.
+        biases: as in `forward`; the last one is not used.
         widths: of inputs, hidden layers and outputs.
+        needs_x: whether to compute the gradient of x; otherwise it is None.
+
+    Returns:
+        The gradients of x, in its layout, of the weights and of the biases.
     """
-    constants = sizes(widths)
-    way = precision(mixed)
+    constants = kernel_widths(widths)
+    multiplication = product_precision(mixed)
     planar = x.stride(0) == 1
     grad_x = None
     if needs_x:
         grad_x = x.new_empty(x.shape[1], x.shape[0]).T if planar else torch.empty_like(x)
     inputs, hidden1, hidden2, outputs = widths
     lengths = [hidden1 * inputs, hidden2 * hidden1, outputs * hidden2, hidden1, hidden2, outputs]
-    block = _backward_block(way, x.device)
-    programs = _programs(x, block, _BACKWARD_RESIDENT)
+    block = _backward_points_per_block(multiplication, x.device)
+    programs = _program_count(x, block, _BACKWARD_PROGRAMS_PER_PROCESSOR)
     partials = x.new_empty(programs, sum(lengths))
-    parts = [{"UPPER": True, "LOWER": True, "NEEDS_X": needs_x}]
-    if way == "tf32x3":  # three times the factors: everything in one kernel would spill
-        parts = [{name: name == part for name in parts[0]} for part, needed in parts[0].items() if needed]
-    for part in parts if programs else []:
+    launches = [{"UPPER_LAYERS": True, "FIRST_LAYER": True, "NEEDS_X": needs_x}]
+    if multiplication == "tf32x3":  # Products take three times as many factors, so that one kernel for all would spill.
+        launches = [{name: name == part for name in launches[0]} for part, needed in launches[0].items() if needed]
+    for launch in launches if programs else []:
         backward_kernel[(programs,)](
             x,
             *x.stride(),
@@ -95,12 +110,12 @@ def backward(
             partials,
             x.shape[0],
             **constants,
-            **part,
+            **launch,
             PLANAR=planar,
-            LONG=_is_long(x) or _is_long(grad),
+            NEEDS_INT64=_needs_int64_offsets(x) or _needs_int64_offsets(grad),
             BLOCK=block,
-            PRECISION=way,
-            num_warps=_warps(constants),
+            PRECISION=multiplication,
+            num_warps=_warps_per_program(constants),
             enable_fp_fusion=True,
         )
     w1, w2, w3, b1, b2, b3 = partials.sum(0).split(lengths)
@@ -111,79 +126,82 @@ def backward(
     )
 
 
-def _warps(constants: dict[str, int]) -> int:
-    """Wide layers take the registers of twice as many threads."""
+def _warps_per_program(constants: dict[str, int]) -> int:
+    """Return the warps per program; wide layers need the registers of twice as many threads."""
     return 8 if max(constants["IN_P"], constants["H1_P"], constants["H2_P"]) > 64 else 4
 
 
 @cache
-def _backward_block(precision: str, device: torch.device) -> int:
-    """Points a block of the backward pass: the most that do not spill on this device.
+def _backward_points_per_block(product_precision: str, device: torch.device) -> int:
+    """Return the points per block of the backward pass: the most that do not spill registers on this device.
 
-    Matrix units that read a factor from shared memory (compute capability 9 and 10) leave registers for more.
+    Matrix units that read a factor from shared memory (compute capability 9 and 10) leave registers for more points.
     """
     if is_interpreting():
         return 32
     reads_shared = not torch.version.hip and torch.cuda.get_device_capability(device)[0] in (9, 10)
-    return 32 if reads_shared and precision == "bf16" else 16
+    return 32 if reads_shared and product_precision == "bf16" else 16
 
 
-def _programs(x: Tensor, block: int, resident: int) -> int:
-    """How many programs go through the rows of x."""
-    return min(triton.cdiv(x.shape[0], block), resident * _processors(x.device))
+def _program_count(x: Tensor, block: int, programs_per_processor: int) -> int:
+    """Return the number of programs to launch for the rows of x."""
+    return min(triton.cdiv(x.shape[0], block), programs_per_processor * _multiprocessor_count(x.device))
 
 
 @cache
-def _processors(device: torch.device) -> int:
+def _multiprocessor_count(device: torch.device) -> int:
+    """Return the number of multiprocessors of a device; 1 in Triton's interpreter."""
     return 1 if device.type == "cpu" else torch.cuda.get_device_properties(device).multi_processor_count
 
 
-def _is_long(x: Tensor) -> bool:
-    """Whether an offset from one feature to another may pass 32 bits."""
+def _needs_int64_offsets(x: Tensor) -> bool:
+    """Return whether offsets between features may exceed 32 bits."""
     return abs(x.stride(1)) * x.shape[1] >= 2**31
 
 
 @triton.jit
-def _offsets(stride_point, stride_feature, HEIGHT: tl.constexpr, BLOCK: tl.constexpr, LONG: tl.constexpr):
+def _offsets(stride_point, stride_feature, HEIGHT: tl.constexpr, BLOCK: tl.constexpr, NEEDS_INT64: tl.constexpr):
+    """Return the offsets of a tile [HEIGHT, BLOCK] of features and points."""
     feature, point = tl.arange(0, HEIGHT)[:, None], tl.arange(0, BLOCK)[None, :]
-    if LONG:
+    if NEEDS_INT64:
         feature = feature.to(tl.int64)
     return feature * stride_feature + point * stride_point
 
 
 @triton.jit
-def _inside(start, count, WIDTH: tl.constexpr, HEIGHT: tl.constexpr, BLOCK: tl.constexpr):
+def _tile_mask(start, count, WIDTH: tl.constexpr, HEIGHT: tl.constexpr, BLOCK: tl.constexpr):
+    """Return the mask of a tile [HEIGHT, BLOCK]: features below WIDTH of points below `count`."""
     return (tl.arange(0, HEIGHT)[:, None] < WIDTH) & (tl.arange(0, BLOCK)[None, :] < count - start)
 
 
 @triton.jit
-def _load(
+def _load_tile(
     x, stride_point, stride_feature, start, count,
-    WIDTH: tl.constexpr, HEIGHT: tl.constexpr, BLOCK: tl.constexpr, LONG: tl.constexpr,
+    WIDTH: tl.constexpr, HEIGHT: tl.constexpr, BLOCK: tl.constexpr, NEEDS_INT64: tl.constexpr,
 ):  # fmt: skip
-    """Rows start, start + 1, ... of x (count, WIDTH) as a tile [HEIGHT, BLOCK], zero outside."""
+    """Load rows start, start + 1, ... of x (count, WIDTH) as a tile [HEIGHT, BLOCK], zero outside."""
     x += start.to(tl.int64) * stride_point
-    offsets = _offsets(stride_point, stride_feature, HEIGHT, BLOCK, LONG)
-    return tl.load(x + offsets, mask=_inside(start, count, WIDTH, HEIGHT, BLOCK), other=0.0)
+    offsets = _offsets(stride_point, stride_feature, HEIGHT, BLOCK, NEEDS_INT64)
+    return tl.load(x + offsets, mask=_tile_mask(start, count, WIDTH, HEIGHT, BLOCK), other=0.0)
 
 
 @triton.jit
-def _store(
+def _store_tile(
     tile, x, stride_point, stride_feature, start, count,
-    WIDTH: tl.constexpr, HEIGHT: tl.constexpr, BLOCK: tl.constexpr, LONG: tl.constexpr,
+    WIDTH: tl.constexpr, HEIGHT: tl.constexpr, BLOCK: tl.constexpr, NEEDS_INT64: tl.constexpr,
 ):  # fmt: skip
-    """The inverse of `_load`."""
+    """Store a tile to rows start, start + 1, ... of x, the inverse of `_load_tile`."""
     x += start.to(tl.int64) * stride_point
-    offsets = _offsets(stride_point, stride_feature, HEIGHT, BLOCK, LONG)
-    tl.store(x + offsets, tile, mask=_inside(start, count, WIDTH, HEIGHT, BLOCK))
+    offsets = _offsets(stride_point, stride_feature, HEIGHT, BLOCK, NEEDS_INT64)
+    tl.store(x + offsets, tile, mask=_tile_mask(start, count, WIDTH, HEIGHT, BLOCK))
 
 
 @triton.jit
-def _zero(start, count):
-    """Zero in every block that there is, which the compiler cannot know.
+def _opaque_zero(start, count):
+    """Return a zero that the compiler cannot fold into a constant.
 
-    Added to a stride it keeps the addresses of a tile from being computed before the loop, once for all blocks: they
-    would hold 64 bits of registers for every number of the tile that a thread loads.
+    Added to a stride, it prevents the compiler from hoisting the addresses of a tile out of the loop over blocks. These
+    would take 64 bits of registers for every element of the tile that a thread loads.
     """
     return tl.minimum(count - start - 1, 0)
 
@@ -193,21 +211,21 @@ def forward_kernel(
     x, stride_point, stride_feature, packed, b1, b2, b3, y, count,
     IN: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, OUT: tl.constexpr,
     IN_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, OUT_P: tl.constexpr,
-    PLANAR: tl.constexpr, LONG: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
+    PLANAR: tl.constexpr, NEEDS_INT64: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """y (count, OUT) of x (count, IN); PLANAR: x's stride of points is 1."""
+    """Compute y (count, OUT) of x (count, IN). PLANAR says that the stride between points of x is 1."""
     w2 = packed + H1_P * IN_P
     w3 = w2 + H2_P * H1_P
     start = tl.program_id(0) * BLOCK
     while start < count:
         step = stride_feature
         if PLANAR:
-            step += _zero(start, count)
-        tile = factor(_load(x, stride_point, step, start, count, IN, IN_P, BLOCK, LONG), PRECISION)
-        tile = relu_factor(linear(packed, b1, tile, H1, H1_P, IN_P, PRECISION), PRECISION)
-        tile = relu_factor(linear(w2, b2, tile, H2, H2_P, H1_P, PRECISION), PRECISION)
+            step += _opaque_zero(start, count)
+        tile = round_factor(_load_tile(x, stride_point, step, start, count, IN, IN_P, BLOCK, NEEDS_INT64), PRECISION)
+        tile = round_relu(linear(packed, b1, tile, H1, H1_P, IN_P, PRECISION), PRECISION)
+        tile = round_relu(linear(w2, b2, tile, H2, H2_P, H1_P, PRECISION), PRECISION)
         tile = linear(w3, b3, tile, OUT, OUT_P, H2_P, PRECISION)
-        _store(tile, y, OUT, 1, start, count, OUT, OUT_P, BLOCK, False)
+        _store_tile(tile, y, OUT, 1, start, count, OUT, OUT_P, BLOCK, False)
         start += tl.num_programs(0) * BLOCK
 
 
@@ -217,12 +235,12 @@ def backward_kernel(
     grad_x, grad_x_stride_point, grad_x_stride_feature, partials, count,
     IN: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, OUT: tl.constexpr,
     IN_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, OUT_P: tl.constexpr,
-    UPPER: tl.constexpr, LOWER: tl.constexpr, NEEDS_X: tl.constexpr,
-    PLANAR: tl.constexpr, LONG: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
+    UPPER_LAYERS: tl.constexpr, FIRST_LAYER: tl.constexpr, NEEDS_X: tl.constexpr,
+    PLANAR: tl.constexpr, NEEDS_INT64: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of the second and third layer (UPPER), of the first (LOWER), and of x (NEEDS_X).
+    """Compute gradients of layers 2 and 3 (UPPER_LAYERS), of layer 1 (FIRST_LAYER), and of x (NEEDS_X).
 
-    partials: (programs, parameters), W1, W2, W3, b1, b2, b3 in a row.
+    Each program writes its sums to its row of `partials` (programs, parameters): W1, W2, W3, b1, b2, b3, flattened.
     """
     w2 = packed + H1_P * IN_P
     w3 = w2 + H2_P * H1_P
@@ -236,53 +254,64 @@ def backward_kernel(
     while start < count:
         step, grad_x_step = stride_feature, grad_x_stride_feature
         if PLANAR:
-            step += _zero(start, count)
-            grad_x_step += _zero(start, count)
-        upstream = _load(grad, grad_stride_point, grad_stride_output, start, count, OUT, OUT_P, BLOCK, LONG)
+            step += _opaque_zero(start, count)
+            grad_x_step += _opaque_zero(start, count)
+        upstream = _load_tile(grad, grad_stride_point, grad_stride_output, start, count, OUT, OUT_P, BLOCK, NEEDS_INT64)
         if tl.max(tl.max((upstream != 0).to(tl.int32), 1), 0) > 0:
-            tile = factor(_load(x, stride_point, step, start, count, IN, IN_P, BLOCK, LONG), PRECISION)
-            hidden1 = relu_factor(linear(packed, b1, tile, H1, H1_P, IN_P, PRECISION), PRECISION)
-            hidden2 = relu_factor(linear(w2, b2, hidden1, H2, H2_P, H1_P, PRECISION), PRECISION)
-            down3 = factor(upstream, PRECISION)
-            if UPPER:
-                grad_w3 = product(hidden2, tl.trans(down3), grad_w3, PRECISION)
+            tile = round_factor(
+                _load_tile(x, stride_point, step, start, count, IN, IN_P, BLOCK, NEEDS_INT64), PRECISION
+            )
+            hidden1 = round_relu(linear(packed, b1, tile, H1, H1_P, IN_P, PRECISION), PRECISION)
+            hidden2 = round_relu(linear(w2, b2, hidden1, H2, H2_P, H1_P, PRECISION), PRECISION)
+            grad3_factor = round_factor(upstream, PRECISION)
+            if UPPER_LAYERS:
+                grad_w3 = multiply_add(hidden2, tl.trans(grad3_factor), grad_w3, PRECISION)
                 grad_b3 += tl.sum(upstream, 1)
-            exact = product(load_transposed(w3, OUT_P, H2_P), down3, tl.zeros([H2_P, BLOCK], tl.float32), PRECISION)
-            exact = tl.where(hidden2 > 0, exact, 0.0)
-            down2 = factor(exact, PRECISION)
-            if UPPER:
-                grad_w2 = product(down2, tl.trans(hidden1), grad_w2, PRECISION)
-                grad_b2 += tl.sum(exact, 1)
-            if LOWER or NEEDS_X:
-                exact1 = product(load_transposed(w2, H2_P, H1_P), down2, tl.zeros([H1_P, BLOCK], tl.float32), PRECISION)
-                exact1 = tl.where(hidden1 > 0, exact1, 0.0)
-                down1 = factor(exact1, PRECISION)
-                if LOWER:
-                    grad_w1 = product(down1, tl.trans(tile), grad_w1, PRECISION)
-                    grad_b1 += tl.sum(exact1, 1)
+            grad2 = multiply_add(
+                load_tile_transposed(w3, OUT_P, H2_P), grad3_factor, tl.zeros([H2_P, BLOCK], tl.float32), PRECISION
+            )
+            grad2 = tl.where(hidden2 > 0, grad2, 0.0)
+            grad2_factor = round_factor(grad2, PRECISION)
+            if UPPER_LAYERS:
+                grad_w2 = multiply_add(grad2_factor, tl.trans(hidden1), grad_w2, PRECISION)
+                grad_b2 += tl.sum(grad2, 1)
+            if FIRST_LAYER or NEEDS_X:
+                grad1 = multiply_add(
+                    load_tile_transposed(w2, H2_P, H1_P), grad2_factor, tl.zeros([H1_P, BLOCK], tl.float32), PRECISION
+                )
+                grad1 = tl.where(hidden1 > 0, grad1, 0.0)
+                grad1_factor = round_factor(grad1, PRECISION)
+                if FIRST_LAYER:
+                    grad_w1 = multiply_add(grad1_factor, tl.trans(tile), grad_w1, PRECISION)
+                    grad_b1 += tl.sum(grad1, 1)
                 if NEEDS_X:
-                    below = product(
-                        load_transposed(packed, H1_P, IN_P), down1, tl.zeros([IN_P, BLOCK], tl.float32), PRECISION
+                    grad_tile = multiply_add(
+                        load_tile_transposed(packed, H1_P, IN_P),
+                        grad1_factor,
+                        tl.zeros([IN_P, BLOCK], tl.float32),
+                        PRECISION,
                     )
-                    _store(below, grad_x, grad_x_stride_point, grad_x_step, start, count, IN, IN_P, BLOCK, LONG)
+                    _store_tile(
+                        grad_tile, grad_x, grad_x_stride_point, grad_x_step, start, count, IN, IN_P, BLOCK, NEEDS_INT64
+                    )
         elif NEEDS_X:
-            idle = tl.zeros([IN_P, BLOCK], tl.float32)
-            _store(idle, grad_x, grad_x_stride_point, grad_x_step, start, count, IN, IN_P, BLOCK, LONG)
+            zero_tile = tl.zeros([IN_P, BLOCK], tl.float32)
+            _store_tile(zero_tile, grad_x, grad_x_stride_point, grad_x_step, start, count, IN, IN_P, BLOCK, NEEDS_INT64)
         start += tl.num_programs(0) * BLOCK
     partials += tl.program_id(0).to(tl.int64) * (H1 * IN + H2 * H1 + OUT * H2 + H1 + H2 + OUT)
     in_b1, in_b2, in_b3 = tl.arange(0, H1_P), tl.arange(0, H2_P), tl.arange(0, OUT_P)
     in_w1, in_w2 = tl.arange(0, IN_P)[None, :], tl.arange(0, H1_P)[None, :]
-    if LOWER:
+    if FIRST_LAYER:
         tl.store(partials + in_b1[:, None] * IN + in_w1, grad_w1, mask=(in_b1[:, None] < H1) & (in_w1 < IN))
     partials += H1 * IN
-    if UPPER:
+    if UPPER_LAYERS:
         tl.store(partials + in_b2[:, None] * H1 + in_w2, grad_w2, mask=(in_b2[:, None] < H2) & (in_w2 < H1))
         at = partials + H2 * H1
         inside = (in_b3[None, :] < OUT) & (in_b2[:, None] < H2)
         tl.store(at + in_b3[None, :] * H2 + in_b2[:, None], grad_w3, mask=inside)
     partials += H2 * H1 + OUT * H2
-    if LOWER:
+    if FIRST_LAYER:
         tl.store(partials + in_b1, grad_b1, mask=in_b1 < H1)
-    if UPPER:
+    if UPPER_LAYERS:
         tl.store(partials + H1 + in_b2, grad_b2, mask=in_b2 < H2)
         tl.store(partials + H1 + H2 + in_b3, grad_b3, mask=in_b3 < OUT)

@@ -1,4 +1,7 @@
-"""The multilayer perceptron in plain torch, any device and dtype: the definition of right."""
+"""Implements the multilayer perceptron in plain torch for any device and dtype.
+
+This reference defines the correct result.
+"""
 
 from __future__ import annotations
 
@@ -10,29 +13,29 @@ from torch import Tensor
 
 
 def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], mixed: bool) -> Tensor:
-    """As `hyrfpack.ops.mlp.mlp`, differentiable by autograd alone."""
+    """Compute `hyrfpack.ops.mlp.mlp` with torch operations that autograd differentiates."""
     linear = _MixedLinear.apply if mixed else F.linear
     for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
         x = F.relu(linear(x, weight, bias))
     return linear(x, weights[-1], biases[-1])
 
 
-def rounded(values: Tensor) -> Tensor:
-    """The nearest bfloat16 numbers, in the type of the input."""
+def round_to_bfloat16(values: Tensor) -> Tensor:
+    """Round to the nearest bfloat16 and return the result in the dtype of the input."""
     return values.bfloat16().to(values.dtype)
 
 
 class _MixedLinear(torch.autograd.Function):
-    """x W^T + b whose products, here and in backward, take factors rounded to bfloat16; sums are not rounded."""
+    """Computes x W^T + b. Forward and backward round the factors of products to bfloat16, but not the sums."""
 
     @staticmethod
     def forward(ctx, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        x, weight = rounded(x), rounded(weight)
+        x, weight = round_to_bfloat16(x), round_to_bfloat16(weight)
         ctx.save_for_backward(x, weight)
         return F.linear(x, weight, bias)
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         x, weight = ctx.saved_tensors
-        factor = rounded(grad)
+        factor = round_to_bfloat16(grad)
         return factor @ weight, factor.T @ x, grad.sum(0)

@@ -86,7 +86,7 @@ def rasterize_shaded(
     total, device = len(means), means.device
     inputs = (tensor.detach().contiguous() for tensor in (means, quats, scales, opacities))
     camera = camera_numbers(camera_from_world, intrinsics, width, height, near, device, cull_tolerance)
-    tensors, constants = shading.operands
+    tensors, constants = shading.kernel_arguments
     projection = Projection.empty(total, device)
     if total:
         block, warps = launch_size(shading.mixed)

@@ -11,7 +11,7 @@ from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import Rasterization, check, rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
-from hyrfpack.ops.shade import Shading, check_shading, choose_for, shade
+from hyrfpack.ops.shade import Shading, check_shading, choose_shading_implementation, shade
 
 
 @torch.no_grad()
@@ -55,7 +55,7 @@ def rasterize_shaded(
     geometry = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     check(geometry, camera_from_world, width, height, near, transmittance_min)
     check_shading(shading, len(means))
-    if choose_for(shading, implementation, *geometry.values()) == "gpu":
+    if choose_shading_implementation(shading, implementation, *geometry.values()) == "gpu":
         from hyrfpack.ops.rasterize.gpu_shaded import rasterize_shaded as run
 
         return run(

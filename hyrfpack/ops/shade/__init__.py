@@ -1,4 +1,4 @@
-"""Shading: the view-dependent colours of Gaussians, from what of the colour decoder does not depend on the view."""
+"""Shades Gaussians: computes their view-dependent colours from parts of the colour decoder precomputed once."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.ops.dispatch import choose_implementation
-from hyrfpack.ops.mlp import WIDEST
+from hyrfpack.ops.mlp import MAX_GPU_LAYER_WIDTH
 from hyrfpack.ops.shade import reference
 from hyrfpack.ops.shade.directions import (
     DIRECTION_FEATURES,
@@ -25,7 +25,7 @@ __all__ = [
     "FREQUENCY_OCTAVES",
     "Shading",
     "check_shading",
-    "choose_for",
+    "choose_shading_implementation",
     "encode_directions",
     "encode_views",
     "frequency_encoding",
@@ -36,18 +36,18 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Shading:
-    """The colour decoder as far as one model's Gaussians decide it. Nothing is differentiable.
+    """The colour decoder with the view-independent part precomputed for one model's Gaussians. Not differentiable.
 
-    Its first layer reads hash features of the place and an encoded direction; the part of the place, with the bias,
-    is worked out once.
+    The decoder's first layer reads the hash features of a position and an encoded direction. The position's part of
+    its output, including the bias, is the same for all views and is computed once.
 
     Attributes:
-        first_layer: (N, H) contiguous, W1 features + b1 before the ReLU; float32, or bfloat16 when mixed.
+        first_layer: (N, H) contiguous, W1 features + b1 before the ReLU; float32, or bfloat16 if mixed.
         direction_weight: (H, E) the first layer's columns for the encoded direction.
-        weights, biases: of the layers after it: (H2, H), (H2,), then (3, H2), (3,).
-        color_logits: (N, 3) the explicit ones, added to the decoder's.
+        weights, biases: of the second and third layer: (H2, H), (H2,), then (3, H2), (3,).
+        color_logits: (N, 3) explicit colour logits, added to the decoder's outputs.
         encoding: "frequency" (E = 24) or "sh" (E = 9), see `encode_directions`.
-        mixed: products take factors rounded to bfloat16, as in `hyrfpack.ops.mlp`.
+        mixed: the factors of products are rounded to bfloat16, as in `hyrfpack.ops.mlp`.
     """
 
     first_layer: Tensor
@@ -58,20 +58,20 @@ class Shading:
     encoding: str
     mixed: bool
 
-    def part(self, index: Tensor) -> Shading:
-        """The decoder of the Gaussians at `index` (n,) int64."""
+    def subset(self, index: Tensor) -> Shading:
+        """Return the decoder of the Gaussians at `index` (n,) int64."""
         return replace(self, first_layer=self.first_layer[index], color_logits=self.color_logits[index])
 
     @cached_property
-    def operands(self) -> tuple[tuple[Tensor, ...], dict]:
-        """What GPU kernels take of it, packed once for all views: tensors, and constants by name."""
+    def kernel_arguments(self) -> tuple[tuple[Tensor, ...], dict]:
+        """Tensors and named constants that GPU kernels take, packed once for all views."""
         from hyrfpack.ops.shade import gpu
 
-        return gpu.operands(self)
+        return gpu.kernel_arguments(self)
 
 
 def check_shading(shading: Shading, count: int) -> None:
-    """Raise ValueError unless it is a decoder for so many Gaussians."""
+    """Raise ValueError unless the shapes of `shading` form a decoder for `count` Gaussians."""
     rows, hidden = shading.first_layer.shape
     widths = [tuple(weight.shape) for weight in (shading.direction_weight, *shading.weights)]
     features = DIRECTION_FEATURES.get(shading.encoding)
@@ -83,12 +83,12 @@ def check_shading(shading: Shading, count: int) -> None:
         )
 
 
-def choose_for(
+def choose_shading_implementation(
     shading: Shading, implementation: str, *tensors: Tensor, available: tuple[str, ...] = ("reference", "gpu")
 ) -> str:
-    """As `dispatch.choose_implementation`, for kernels that take these tensors and a shading."""
+    """Choose the implementation that runs on these tensors and a shading, see `dispatch.choose_implementation`."""
     parameters = (shading.direction_weight, *shading.weights, *shading.biases, shading.color_logits)
-    if max(weight.shape[1] for weight in shading.weights) > WIDEST:
+    if max(weight.shape[1] for weight in shading.weights) > MAX_GPU_LAYER_WIDTH:
         available = tuple(name for name in available if name != "gpu")
     if shading.mixed:
         available = tuple(name for name in available if name != "cpu")
@@ -104,7 +104,7 @@ def shade(
     *,
     implementation: str = "auto",
 ) -> Tensor:
-    """Colours of Gaussians seen from a point.
+    """Compute the colours of Gaussians seen from a viewpoint.
 
         d = (p - o) / |p - o|,   h1 = relu(first_layer + W1' e(d)),   h2 = relu(W2 h1 + b2)
         color = sigmoid(W3 h2 + b3 + color_logits)
@@ -112,8 +112,8 @@ def shade(
     Args:
         positions: (N, 3) p.
         viewpoint: (3,) o, in the same units.
-        shading: of these N Gaussians.
-        index: (n,) int64 which of them; all when None.
+        shading: the decoder of these N Gaussians.
+        index: (n,) int64, the Gaussians to shade; None shades all.
         implementation: "auto", "reference", "cpu" (float32, not mixed) or "gpu" (float32, two hidden layers of at
             most 128).
 
@@ -121,19 +121,19 @@ def shade(
         (n, 3) in (0, 1). Not differentiable.
 
     Raises:
-        ValueError: shapes, types or devices do not fit together.
+        ValueError: shapes, dtypes or devices do not match.
     """
     check_shading(shading, len(positions))
     if positions.shape != (len(positions), 3) or viewpoint.shape != (3,):
         raise ValueError(f"{tuple(positions.shape)} positions and viewpoint {tuple(viewpoint.shape)}, not (N, 3), (3,)")
     available = ("reference", "cpu", "gpu")
-    chosen = choose_for(shading, implementation, positions, viewpoint, available=available)
+    chosen = choose_shading_implementation(shading, implementation, positions, viewpoint, available=available)
     if chosen == "cpu":
         from hyrfpack.ops.shade import cpu
 
         return cpu.shade(positions, viewpoint, shading, index)
     if index is not None:
-        positions, shading = positions[index], shading.part(index)
+        positions, shading = positions[index], shading.subset(index)
     if chosen == "gpu":
         from hyrfpack.ops.shade import gpu
 

@@ -1,6 +1,6 @@
-"""Shading on the CPU: chunks of Gaussians through torch's matrix products, one chunk a thread at a time.
+"""Shades Gaussians on the CPU with torch's matrix products, one chunk of Gaussians per thread at a time.
 
-What is worked out of a chunk never leaves the cache: neither encoded directions nor hidden layers are written for all.
+Encoded directions and hidden layers exist only for the chunks in progress and never leave the cache.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from hyrfpack.parallel.pool import run_tasks, torch_on_one_thread
 if TYPE_CHECKING:
     from hyrfpack.ops.shade import Shading
 
-_ROWS = 2048  # of a chunk: its hidden layers (0.5 MiB at width 64) stay in the second cache
+_GAUSSIANS_PER_CHUNK = 2048  # The hidden layers of a chunk (0.5 MiB at width 64) then stay in the L2 cache.
 
 
 def shade(positions: Tensor, viewpoint: Tensor, shading: Shading, index: Tensor | None) -> Tensor:
-    """As `hyrfpack.ops.shade.shade`."""
+    """Compute the colours of `hyrfpack.ops.shade.shade`."""
     total = len(positions) if index is None else len(index)
     colors = torch.empty(total, 3)
     (w2, w3), (b2, b3) = shading.weights, shading.biases
 
     def task(chunk: int) -> None:
-        some = slice(chunk * _ROWS, min(total, (chunk + 1) * _ROWS))
+        chunk_slice = slice(chunk * _GAUSSIANS_PER_CHUNK, min(total, (chunk + 1) * _GAUSSIANS_PER_CHUNK))
 
         def take(values: Tensor) -> Tensor:
-            return values[some] if index is None else values.index_select(0, index[some])
+            return values[chunk_slice] if index is None else values.index_select(0, index[chunk_slice])
 
         with torch.no_grad():
             encoded = encode_views(take(positions), viewpoint, shading.encoding, implementation="reference")
             hidden = torch.addmm(take(shading.first_layer), encoded, shading.direction_weight.T).relu_()
             hidden = torch.addmm(b2, hidden, w2.T).relu_()
             logits = torch.addmm(b3, hidden, w3.T).add_(take(shading.color_logits))
-            torch.sigmoid(logits, out=colors[some])
+            torch.sigmoid(logits, out=colors[chunk_slice])
 
     with torch_on_one_thread():
-        run_tasks(task, -(-total // _ROWS))
+        run_tasks(task, -(-total // _GAUSSIANS_PER_CHUNK))
     return colors

@@ -1,4 +1,4 @@
-"""What a decoder sees of a viewing direction."""
+"""Encodes viewing directions as inputs of the colour decoder."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from torch import Tensor
 from hyrfpack.ops.dispatch import choose_implementation
 
 FREQUENCY_OCTAVES = 4
+# Number of features per direction, by encoding.
 DIRECTION_FEATURES = {"sh": 9, "frequency": 6 * FREQUENCY_OCTAVES}
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
-    """Real spherical harmonics of bands 0 to 2, orthonormal on the unit sphere.
+    """Evaluate the real spherical harmonics of bands 0 to 2, orthonormal on the unit sphere.
 
     Args:
         directions: (N, 3) unit vectors.
@@ -40,14 +41,14 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 
 
 def frequency_encoding(directions: Tensor) -> Tensor:
-    """NeRF's positional encoding (Mildenhall et al. 2020, eq. 4) of directions (N, 3): (N, 24), octaves 0 to 3."""
+    """Return NeRF's positional encoding (Mildenhall et al. 2020, eq. 4) of directions (N, 3): (N, 24), octaves 0-3."""
     octaves = math.pi * 2 ** torch.arange(FREQUENCY_OCTAVES, dtype=directions.dtype, device=directions.device)
     phases = (directions[:, None, :] * octaves[:, None]).flatten(1)
     return torch.cat((phases.sin(), phases.cos()), dim=-1)
 
 
 def encode_directions(directions: Tensor, encoding: str) -> Tensor:
-    """Unit vectors (N, 3) to the decoder's direction inputs; `encoding` is "sh" or "frequency".
+    """Encode unit vectors (N, 3) as the decoder's direction inputs (N, E); `encoding` is "sh" or "frequency".
 
     Example:
         >>> encode_directions(torch.tensor([[0.0, 0.0, 1.0]]), "sh").shape
@@ -57,34 +58,34 @@ def encode_directions(directions: Tensor, encoding: str) -> Tensor:
 
 
 def encode_views(points: Tensor, viewpoint: Tensor, encoding: str, *, implementation: str = "auto") -> Tensor:
-    """What a decoder sees of the directions in which points are seen: e(d), d = (p - o) / |p - o|.
+    """Encode the viewing directions of points: e(d) with d = (p - o) / |p - o|.
 
     Args:
         points: (N, 3) p.
         viewpoint: (3,) o, in the same units, or (N, 3), one for each point.
         encoding: "sh" or "frequency", see `encode_directions`.
-        implementation: "auto", "reference" or "gpu" (float32, one viewpoint), which has no backward pass and is
-            offered where no gradient is wanted.
+        implementation: "auto", "reference" or "gpu" (float32, one viewpoint). "gpu" has no backward pass and is
+            available only if no gradient is needed.
 
     Returns:
-        (N, E), see `DIRECTION_FEATURES`. A point at the viewpoint itself is seen along (0, 0, 0).
+        (N, E), see `DIRECTION_FEATURES`. For a point at the viewpoint itself, d = (0, 0, 0).
 
     Raises:
-        ValueError: shapes, types or devices do not fit together, or there is no such encoding.
+        ValueError: shapes, dtypes or devices do not match, or the encoding is unknown.
 
     Example:
         >>> encode_views(torch.tensor([[0.0, 0.0, 5.0]]), torch.zeros(3), "sh").shape
         torch.Size([1, 9])
     """
-    single = viewpoint.shape == (3,)
+    is_single_viewpoint = viewpoint.shape == (3,)
     if (
         points.shape[1:] != (3,)
-        or not (single or viewpoint.shape == points.shape)
+        or not (is_single_viewpoint or viewpoint.shape == points.shape)
         or encoding not in DIRECTION_FEATURES
     ):
         raise ValueError(f"points {tuple(points.shape)} from {tuple(viewpoint.shape)}, encoding '{encoding}'")
-    wanted = torch.is_grad_enabled() and (points.requires_grad or viewpoint.requires_grad)
-    available = ("reference", "gpu") if single and not wanted else ("reference",)
+    needs_grad = torch.is_grad_enabled() and (points.requires_grad or viewpoint.requires_grad)
+    available = ("reference", "gpu") if is_single_viewpoint and not needs_grad else ("reference",)
     if choose_implementation(implementation, available, points, viewpoint) == "gpu":
         from hyrfpack.ops.shade import gpu_directions
 

@@ -1,6 +1,6 @@
-"""Shading in Triton: a block of Gaussians is a tile [width, BLOCK] that goes through the decoder on the matrix units.
+"""Shades Gaussians in Triton. A block of Gaussians is a tile [width, BLOCK]; the decoder runs on the matrix units.
 
-`shade_block` is a function of its own, so that the kernel that projects Gaussians can shade those that it draws.
+`shade_block` is a separate function, so that the kernel that projects Gaussians can also shade those it draws.
 """
 
 from __future__ import annotations
@@ -12,15 +12,23 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyrfpack.ops.mlp.tiles import factor, linear, pack, precision, product, relu_factor, sizes
-from hyrfpack.ops.shade.gpu_directions import encode_block, unit_block
+from hyrfpack.ops.mlp.tiles import (
+    kernel_widths,
+    linear,
+    multiply_add,
+    pack_weights,
+    product_precision,
+    round_factor,
+    round_relu,
+)
+from hyrfpack.ops.shade.gpu_directions import encode_block, normalize_block
 
 if TYPE_CHECKING:
     from hyrfpack.ops.shade import Shading
 
 
 def launch_size(mixed: bool) -> tuple[int, int]:
-    """Gaussians and warps a program: as many as registers allow, and float32 factors take more of them."""
+    """Return the Gaussians and the warps per program: as many as registers allow; float32 factors need more."""
     return (128, 4) if mixed else (64, 8)
 
 
@@ -31,24 +39,27 @@ def shade_block(
     IN_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, OUT_P: tl.constexpr,
     FREQUENCY: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Colours, tuple of 3 blocks, of Gaussians `index` where live; anything elsewhere.
+    """Compute the colours, a tuple of 3 blocks, of Gaussians `index` where live; undefined elsewhere.
 
     Args:
         mean: tuple of 3 blocks.
-        viewpoint: tuple of 3 numbers; first_layer, color_logits: pointers to (N, H1) and (N, 3).
-        packed: of `tiles.pack`, the direction's weight first; b2, b3: the later biases.
+        viewpoint: tuple of 3 numbers.
+        first_layer, color_logits: pointers to (N, H1) and (N, 3).
+        packed: the result of `tiles.pack_weights`, the direction's weight first.
+        b2, b3: biases of the second and third layer.
     """
-    x, y, z = unit_block(mean[0] - viewpoint[0], mean[1] - viewpoint[1], mean[2] - viewpoint[2])
+    x, y, z = normalize_block(mean[0] - viewpoint[0], mean[1] - viewpoint[1], mean[2] - viewpoint[2])
     neuron = tl.arange(0, H1_P)[:, None]
     at = first_layer + index[None, :].to(tl.int64) * H1 + neuron
     hidden = tl.load(at, mask=live[None, :] & (neuron < H1), other=0.0).to(tl.float32)
-    for row in tl.static_range(0, IN_P, 16):  # the least that the matrix units take: a whole tile would cost registers
+    # Slices of 16 rows, the minimum of the matrix units, take fewer registers than a whole tile.
+    for row in tl.static_range(0, IN_P, 16):
         weight = tl.load(packed + neuron * IN_P + (row + tl.arange(0, 16)[None, :]))
-        encoded = factor(encode_block(x, y, z, FREQUENCY, row, 16), PRECISION)
-        hidden = product(weight, encoded, hidden, PRECISION)
-    hidden = relu_factor(hidden, PRECISION)
+        encoded = round_factor(encode_block(x, y, z, FREQUENCY, row, 16), PRECISION)
+        hidden = multiply_add(weight, encoded, hidden, PRECISION)
+    hidden = round_relu(hidden, PRECISION)
     w2 = packed + H1_P * IN_P
-    hidden = relu_factor(linear(w2, b2, hidden, H2, H2_P, H1_P, PRECISION), PRECISION)
+    hidden = round_relu(linear(w2, b2, hidden, H2, H2_P, H1_P, PRECISION), PRECISION)
     raw = linear(w2 + H2_P * H1_P, b3, hidden, OUT, OUT_P, H2_P, PRECISION)
     channel = tl.arange(0, OUT_P)[:, None]
     logits = color_logits + index.to(tl.int64) * 3
@@ -65,7 +76,7 @@ def shade_kernel(
     IN_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, OUT_P: tl.constexpr,
     FREQUENCY: tl.constexpr, PRECISION: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write colours (N, 3)."""
+    """Write the colours (N, 3) of a block of Gaussians."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = index < total
     row = index.to(tl.int64) * 3
@@ -74,9 +85,9 @@ def shade_kernel(
         tl.load(means + row + 1, mask=live, other=0.0),
         tl.load(means + row + 2, mask=live, other=0.0),
     )
-    place = tl.load(viewpoint), tl.load(viewpoint + 1), tl.load(viewpoint + 2)
+    origin = tl.load(viewpoint), tl.load(viewpoint + 1), tl.load(viewpoint + 2)
     red, green, blue = shade_block(
-        mean, index, live, place, first_layer, packed, b2, b3, color_logits,
+        mean, index, live, origin, first_layer, packed, b2, b3, color_logits,
         IN, H1, H2, OUT, IN_P, H1_P, H2_P, OUT_P, FREQUENCY, PRECISION,
     )  # fmt: skip
     tl.store(colors + row, red, mask=live)
@@ -84,20 +95,20 @@ def shade_kernel(
     tl.store(colors + row + 2, blue, mask=live)
 
 
-def operands(shading: Shading) -> tuple[tuple[Tensor, ...], dict]:
-    """What `shade_block` takes after the viewpoint: tensors, and constants by name."""
-    kind = precision(shading.mixed)
+def kernel_arguments(shading: Shading) -> tuple[tuple[Tensor, ...], dict]:
+    """Return the tensors that `shade_block` takes after the viewpoint, and its constants by name."""
+    precision = product_precision(shading.mixed)
     weights = (shading.direction_weight, *shading.weights)
     later = (tensor.detach().contiguous() for tensor in (*shading.biases, shading.color_logits))
-    tensors = shading.first_layer.contiguous(), pack(weights, kind), *later
+    tensors = shading.first_layer.contiguous(), pack_weights(weights, precision), *later
     widths = [shading.direction_weight.shape[1], *(weight.shape[0] for weight in weights)]
-    constants = sizes(widths) | {"FREQUENCY": shading.encoding == "frequency", "PRECISION": kind}
+    constants = kernel_widths(widths) | {"FREQUENCY": shading.encoding == "frequency", "PRECISION": precision}
     return tensors, constants
 
 
 def shade(positions: Tensor, viewpoint: Tensor, shading: Shading) -> Tensor:
-    """As `hyrfpack.ops.shade.shade`."""
-    tensors, constants = shading.operands
+    """Compute the colours of `hyrfpack.ops.shade.shade`."""
+    tensors, constants = shading.kernel_arguments
     colors = torch.empty_like(positions, memory_format=torch.contiguous_format)
     if len(positions):
         block, warps = launch_size(shading.mixed)

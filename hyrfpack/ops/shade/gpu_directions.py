@@ -1,4 +1,7 @@
-"""Encoding viewing directions: `encode_block` for kernels that decode colours, and a kernel that does no more."""
+"""Encodes viewing directions in Triton.
+
+Kernels that decode colours call `encode_block`; `encode_views` launches a kernel that only encodes.
+"""
 
 from __future__ import annotations
 
@@ -8,19 +11,22 @@ from torch import Tensor
 
 from hyrfpack.ops.shade.directions import DIRECTION_FEATURES
 
-_BLOCK = 128
+_POINTS_PER_PROGRAM = 128
 
 
 @triton.jit
-def unit_block(x, y, z):
-    """Blocks of vectors, of length 1."""
+def normalize_block(x, y, z):
+    """Return blocks of vectors scaled to length 1."""
     inverse = 1 / tl.maximum(tl.sqrt(x * x + y * y + z * z), 1e-12)
     return x * inverse, y * inverse, z * inverse
 
 
 @triton.jit
 def _sin_of_turns(turns):
-    """sin(2 pi t) for t in [-1/2, 3/4], to 1e-7 (the library's sine keeps a table in memory for huge arguments)."""
+    """Return sin(2 pi t) for t in [-1/2, 3/4], with an absolute error of 1e-7.
+
+    The library's sine would keep a table in memory for huge arguments.
+    """
     turns = tl.where(turns > 0.25, 0.5 - turns, tl.where(turns < -0.25, -0.5 - turns, turns))
     square = turns * turns
     polynomial = ((39.7598271 * square - 76.5811727) * square + 81.6024764) * square - 41.3416806
@@ -29,8 +35,11 @@ def _sin_of_turns(turns):
 
 @triton.jit
 def encode_block(x, y, z, FREQUENCY: tl.constexpr, FIRST: tl.constexpr, HEIGHT: tl.constexpr):
-    """Rows FIRST to FIRST + HEIGHT of `directions.encode_directions` of unit vectors [BLOCK], as a tile
-    [HEIGHT, BLOCK]; past the last true row, anything finite."""
+    """Encode unit vectors [BLOCK] as `directions.encode_directions` does.
+
+    Returns:
+        Features FIRST to FIRST + HEIGHT as a tile [HEIGHT, BLOCK]; rows past the last feature are finite padding.
+    """
     row = FIRST + tl.arange(0, HEIGHT)[:, None]
     x, y, z = x[None, :], y[None, :], z[None, :]
     if FREQUENCY:
@@ -51,14 +60,16 @@ def encode_block(x, y, z, FREQUENCY: tl.constexpr, FIRST: tl.constexpr, HEIGHT: 
 
 
 @triton.jit(do_not_specialize=["total"])
-def encode_seen(points, viewpoint, total, out, ROWS: tl.constexpr, FREQUENCY: tl.constexpr, BLOCK: tl.constexpr):
-    """Write what is encoded of the directions from a viewpoint (3,) to points (N, 3), planar (ROWS, N)."""
+def encode_views_kernel(
+    points, viewpoint, total, out, ROWS: tl.constexpr, FREQUENCY: tl.constexpr, BLOCK: tl.constexpr
+):
+    """Write the encoded directions, planar (ROWS, N), from a viewpoint (3,) to points (N, 3)."""
     index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live, at = index < total, points + index * 3
     x = tl.load(at, mask=live, other=0.0) - tl.load(viewpoint)
     y = tl.load(at + 1, mask=live, other=0.0) - tl.load(viewpoint + 1)
     z = tl.load(at + 2, mask=live, other=0.0) - tl.load(viewpoint + 2)
-    x, y, z = unit_block(x, y, z)
+    x, y, z = normalize_block(x, y, z)
     for first in tl.static_range(0, ROWS, 16):
         row = first + tl.arange(0, 16)[:, None]
         encoded = encode_block(x, y, z, FREQUENCY, first, 16)
@@ -66,12 +77,12 @@ def encode_seen(points, viewpoint, total, out, ROWS: tl.constexpr, FREQUENCY: tl
 
 
 def encode_views(points: Tensor, viewpoint: Tensor, encoding: str) -> Tensor:
-    """As `directions.encode_views`, where no gradient is wanted; stored by columns, as hash features are."""
+    """Compute `directions.encode_views` without gradients; the result is stored planar, as hash features are."""
     rows, total = DIRECTION_FEATURES[encoding], len(points)
     encoded = points.new_empty(rows, total)
     if total:
-        encode_seen[(triton.cdiv(total, _BLOCK),)](
+        encode_views_kernel[(triton.cdiv(total, _POINTS_PER_PROGRAM),)](
             points.detach().contiguous(), viewpoint.detach().contiguous(), total, encoded,
-            ROWS=rows, FREQUENCY=encoding == "frequency", BLOCK=_BLOCK, num_warps=4, enable_fp_fusion=True,
+            ROWS=rows, FREQUENCY=encoding == "frequency", BLOCK=_POINTS_PER_PROGRAM, num_warps=4, enable_fp_fusion=True,
         )  # fmt: skip
     return encoded.T

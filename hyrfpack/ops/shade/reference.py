@@ -1,4 +1,4 @@
-"""Shading in plain torch, any device and dtype: the definition of right."""
+"""Implements shading in plain torch for any device and dtype. This reference defines the correct result."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 
 def shade(positions: Tensor, viewpoint: Tensor, shading: Shading) -> Tensor:
-    """As `hyrfpack.ops.shade.shade`."""
+    """Compute the colours of `hyrfpack.ops.shade.shade`."""
     encoded = encode_views(positions, viewpoint, shading.encoding, implementation="reference")
-    # The first layer's rest is a layer of its own without a ReLU before it: its product is of the same kind.
+    # The direction's part of the first layer is a linear layer by itself, so `mlp` rounds its factors in the same way.
     by_direction = mlp(encoded, [shading.direction_weight], [torch.zeros_like(shading.direction_weight[:, 0])],
                        mixed=shading.mixed, implementation="reference")  # fmt: skip
     first = F.relu(shading.first_layer.to(positions.dtype) + by_direction)

@@ -12,7 +12,7 @@ from web.scripts import run_script
 import hyrfpack
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.ops.background.reference import RADIUS
+from hyrfpack.ops.background.reference import BACKGROUND_RADIUS
 from hyrfpack.ops.contraction import contract
 from hyrfpack.ops.shade import encode_directions
 from hyrfpack.splats.splats import normalized_quats
@@ -88,7 +88,7 @@ def evaluated(model: HybridModel, tmp_path: Path, *inputs: np.ndarray) -> list[n
 def test_fields_are_those_of_the_model_in_float64(settings: dict, tmp_path: Path) -> None:
     model = random_model(700, **settings)
     along, behind = directions(700, 1), directions(300, 2)
-    places = (RADIUS * directions(300, 5)).astype(np.float32)
+    places = (BACKGROUND_RADIUS * directions(300, 5)).astype(np.float32)
 
     found = evaluated(model, tmp_path, along, places, behind)
 
@@ -98,7 +98,7 @@ def test_fields_are_those_of_the_model_in_float64(settings: dict, tmp_path: Path
 
 def test_a_model_of_no_gaussians_has_fields_all_the_same(tmp_path: Path) -> None:
     model, behind = random_model(0), directions(5, 2)
-    places = (RADIUS * behind).astype(np.float32)
+    places = (BACKGROUND_RADIUS * behind).astype(np.float32)
 
     *gaussians, background = evaluated(model, tmp_path, directions(0, 1), places, behind)
 
