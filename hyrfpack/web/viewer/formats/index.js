@@ -1,27 +1,27 @@
-// Files of splats that the player takes: which reader is for which, by how they begin and what they are called.
+// Chooses the reader of a file of splats by the ending of its name or by its first bytes.
 
-import { refuseSplats } from "./checked.js";
+import { rejectSplats } from "./normalize.js";
 import { decodePly } from "./ply.js";
 import { decodeSog } from "./sog.js";
 import { decodeSplat } from "./splat.js";
 import { decodeSpz } from "./spz.js";
 
-/** Endings of their names. */
+/** The endings of the names of files of splats. */
 export const SPLAT_ENDINGS = [".ply", ".spz", ".splat", ".sog"];
 
-const READERS = [decodePly, decodeSpz, decodeSplat, decodeSog];
-const MARKS = [["ply", decodePly], ["\x1f\x8b", decodeSpz], ["NGSP", decodeSpz], ["PK", decodeSog]];
+const READERS_BY_ENDING = [decodePly, decodeSpz, decodeSplat, decodeSog];
+const READERS_BY_SIGNATURE = [["ply", decodePly], ["\x1f\x8b", decodeSpz], ["NGSP", decodeSpz], ["PK", decodeSog]];
 
 /**
- * Read a file of splats. A worker is the place for it: large files take seconds.
- * @param {string} name of the file, of which the ending counts; without one, how it begins
+ * Reads a file of splats. Large files take seconds, so it should be called in a worker.
+ * @param {string} name the file's name; without a known ending, the first bytes decide
  * @param {Uint8Array} bytes
- * @returns {Promise<import("../../hyrf/harmonics.js").Splats>} axes are those of the file's world
+ * @returns {Promise<import("../../hyrf/harmonics.js").Splats>} in the axes of the file
  * @throws {import("../../hyrf/errors.js").HyrfFormatError}
  */
 export async function decodeSplats(name, bytes) {
   const ending = SPLAT_ENDINGS.findIndex((known) => name.toLowerCase().endsWith(known));
-  const starts = ([mark]) => [...mark].every((letter, k) => bytes[k] === letter.charCodeAt(0));
-  const reader = READERS[ending] ?? MARKS.find(starts)?.[1];
-  return reader ? reader(bytes) : refuseSplats(`it is none of ${SPLAT_ENDINGS.join(", ")}; convert it to one of them`);
+  const isAtStart = ([mark]) => [...mark].every((letter, k) => bytes[k] === letter.charCodeAt(0));
+  const reader = READERS_BY_ENDING[ending] ?? READERS_BY_SIGNATURE.find(isAtStart)?.[1];
+  return reader ? reader(bytes) : rejectSplats(`it is none of ${SPLAT_ENDINGS.join(", ")}; convert it to one of them`);
 }

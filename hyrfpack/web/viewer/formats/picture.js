@@ -1,44 +1,45 @@
-// Pixels of WebP and PNG pictures as they are stored: a canvas would multiply colours by alpha, and lose them.
+// Reads the stored pixels of WebP and PNG pictures. A 2D canvas would multiply colours by alpha, which loses precision.
 
 import { HyrfFormatError, groupedDigits } from "../../hyrf/errors.js";
-import { refuseSplats } from "./checked.js";
+import { rejectSplats } from "./normalize.js";
 
-const latin1 = (bytes) => String.fromCharCode(...bytes);
+const decodeLatin1 = (bytes) => String.fromCharCode(...bytes);
 
 /**
+ * Reads a picture.
  * @param {Uint8Array} bytes of a WebP or PNG file
- * @param {number} most pixels that it may have
- * @param {string} name what messages call it
+ * @param {number} maxPixels
+ * @param {string} name its name in messages
  * @returns {Promise<{width: number, height: number, pixels: Uint8Array}>} RGBA, row after row from the top
  */
-export async function readPicture(bytes, most, name) {
-  const size = pictureSize(bytes);
-  if (!size) refuseSplats(`${name} in it is not a picture that can be read; get the file again`);
+export async function readPicture(bytes, maxPixels, name) {
+  const size = parsePictureSize(bytes);
+  if (!size) rejectSplats(`${name} in it is not a picture that can be read; get the file again`);
   const { width, height } = size;
-  if (!(width > 0 && height > 0 && width * height <= most)) {
+  if (!(width > 0 && height > 0 && width * height <= maxPixels)) {
     const found = `${groupedDigits(width)} x ${groupedDigits(height)} pixels`;
-    refuseSplats(`${name} in it has ${found}, too many; it is damaged`);
+    rejectSplats(`${name} in it has ${found}, too many; it is damaged`);
   }
   try {
     const options = { premultiplyAlpha: "none", colorSpaceConversion: "none" };
     const bitmap = await createImageBitmap(new Blob([bytes]), options);
     try {
       if (bitmap.width !== width || bitmap.height !== height) throw new Error("another size");
-      return { width, height, pixels: pixelsOf(bitmap) };
+      return { width, height, pixels: readPixels(bitmap) };
     } finally {
       bitmap.close();
     }
   } catch (error) {
     if (error instanceof HyrfFormatError) throw error;
-    return refuseSplats(`${name} in it is not a picture that can be read here; get the file again`);
+    return rejectSplats(`${name} in it is not a picture that can be read here; get the file again`);
   }
 }
 
-// By the graphics card, for whom alpha is a number like any other.
-function pixelsOf(bitmap) {
+// Reads the pixels of a bitmap through WebGL, which does not change them by alpha.
+function readPixels(bitmap) {
   const { width, height } = bitmap, gl = new OffscreenCanvas(1, 1).getContext("webgl2");
   if (!gl || Math.max(width, height) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
-    refuseSplats("this browser cannot unpack its pictures; convert it to .ply or .spz");
+    rejectSplats("this browser cannot unpack its pictures; convert it to .ply or .spz");
   }
   gl.pixelStorei(gl.UNPACK_PREMULTIPLY_ALPHA_WEBGL, false);
   gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
@@ -50,20 +51,20 @@ function pixelsOf(bitmap) {
   const pixels = new Uint8Array(4 * width * height);
   gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
   const failed = gl.getError() || gl.isContextLost();
-  gl.getExtension("WEBGL_lose_context")?.loseContext(); // browsers allow but a few at once
-  if (failed) refuseSplats("this browser has no room to unpack its pictures; convert it to .ply or .spz");
+  gl.getExtension("WEBGL_lose_context")?.loseContext(); // browsers allow only a few contexts at a time
+  if (failed) rejectSplats("this browser has no room to unpack its pictures; convert it to .ply or .spz");
   return pixels;
 }
 
-// {width, height} by the header of a picture, before anything is unpacked; null where it is of neither kind.
-function pictureSize(bytes) {
+// Returns {width, height} from the header of a picture, before it is decompressed; null where it is no WebP or PNG.
+function parsePictureSize(bytes) {
   if (bytes.length < 30) return null;
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.length);
-  if (view.getUint32(0) === 0x89504e47 && latin1(bytes.subarray(12, 16)) === "IHDR") {
+  if (view.getUint32(0) === 0x89504e47 && decodeLatin1(bytes.subarray(12, 16)) === "IHDR") {
     return { width: view.getUint32(16), height: view.getUint32(20) };
   }
-  if (latin1(bytes.subarray(0, 4)) !== "RIFF" || latin1(bytes.subarray(8, 12)) !== "WEBP") return null;
-  const kind = latin1(bytes.subarray(12, 16));
+  if (decodeLatin1(bytes.subarray(0, 4)) !== "RIFF" || decodeLatin1(bytes.subarray(8, 12)) !== "WEBP") return null;
+  const kind = decodeLatin1(bytes.subarray(12, 16));
   if (kind === "VP8L" && bytes[20] === 0x2f) { // lossless: 14 bits each
     const bits = view.getUint32(21, true);
     return { width: (bits & 0x3fff) + 1, height: ((bits >>> 14) & 0x3fff) + 1 };

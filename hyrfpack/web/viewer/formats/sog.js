@@ -1,5 +1,5 @@
-// PlayCanvas SOG, version 2 (developer.playcanvas.com, "The SOG Format"): meta.json and lossless WebP pictures, bundled
-// in a zip. A pixel of a picture belongs to a Gaussian, row by row from the top left.
+// Reads PlayCanvas SOG, version 2 (developer.playcanvas.com, "The SOG Format"): meta.json and lossless WebP pictures in
+// a zip archive. Each pixel of a picture belongs to a Gaussian, row by row from the top left.
 //
 //     means_l, means_u    RGB    low and high bytes of steps between means.mins and means.maxs, 65535 of them, of
 //                                sign(x) log(1 + |x|)
@@ -13,30 +13,36 @@
 
 import { groupedDigits, quotedText } from "../../hyrf/errors.js";
 import { HIGHER_HARMONICS_BY_DEGREE, SH_BAND_0 } from "../../hyrf/harmonics.js";
-import { checkedSplats, refuseSplats } from "./checked.js";
+import { normalizeSplats, rejectSplats } from "./normalize.js";
 import { readPicture } from "./picture.js";
 import { writeQuat } from "./smallest_three.js";
 import { ZipArchive } from "./zip.js";
 
-const SOG_META = "meta.json", MOST_META = 1 << 20; // bytes
-const SOG_PICTURES = { means: 2, scales: 1, quats: 1, sh0: 1, shN: 2 }; // of each group
-const BOOK_ENTRIES = 256;
-const ABREAST = 64; // palette rows side by side
-const LARGEST_PALETTE = 65536; // that labels of 16 bits can name
-const MOST_SOG_GAUSSIANS = 1 << 26;
-const PADDED_PIXELS = 4, FREE_PIXELS = 1 << 16; // a picture has at most so many a Gaussian, and these
-const UNEARNED = 1 << 20; // Gaussians that pictures of no size may hold; more need a byte each
+const SOG_META_FILE = "meta.json";
+const MAX_SOG_META_BYTES = 1 << 20;
+const PICTURES_BY_GROUP = { means: 2, scales: 1, quats: 1, sh0: 1, shN: 2 };
+const CODEBOOK_ENTRIES = 256;
+const PALETTE_ROWS_PER_LINE = 64;
+const MAX_PALETTE_ROWS = 65536; // labels have 16 bits
+const MAX_SOG_GAUSSIANS = 1 << 26;
+// For n Gaussians a picture may have MAX_PIXELS_PER_GAUSSIAN n + BASE_PIXELS pixels.
+const MAX_PIXELS_PER_GAUSSIAN = 4;
+const BASE_PIXELS = 1 << 16;
+// Pictures of n bytes may declare n + BASE_SOG_GAUSSIANS Gaussians.
+const BASE_SOG_GAUSSIANS = 1 << 20;
 
 /**
+ * Reads the splats of a SOG file.
  * @param {Uint8Array} bytes
  * @returns {Promise<import("../../hyrf/harmonics.js").Splats>}
  * @throws {import("../../hyrf/errors.js").HyrfFormatError}
  */
 export async function decodeSog(bytes) {
-  const archive = new ZipArchive(bytes), meta = parseMeta(await archive.file(SOG_META, MOST_META));
+  const archive = new ZipArchive(bytes), meta = parseSogMeta(await archive.file(SOG_META_FILE, MAX_SOG_META_BYTES));
   const files = new Map();
-  let room = 2 * bytes.length + MOST_META, size = 0; // pictures are packed already: a zip gains little
-  for (const [group, pictures] of Object.entries(SOG_PICTURES)) {
+  // Pictures are compressed already, so that a zip saves little.
+  let room = 2 * bytes.length + MAX_SOG_META_BYTES, size = 0;
+  for (const [group, pictures] of Object.entries(PICTURES_BY_GROUP)) {
     for (let number = 0; number < pictures && (group !== "shN" || "shN" in meta); number++) {
       const name = pictureName(meta, group, number);
       if (files.has(name)) continue;
@@ -46,16 +52,17 @@ export async function decodeSog(bytes) {
     }
   }
   const { count } = meta;
-  if (!Number.isInteger(count) || count < 0 || count > Math.min(MOST_SOG_GAUSSIANS, size + UNEARNED)) {
-    refuseSplats(`its ${SOG_META} gives a wrong count of Gaussians for ${groupedDigits(size)} bytes; it is damaged`);
+  if (!Number.isInteger(count) || count < 0 || count > Math.min(MAX_SOG_GAUSSIANS, size + BASE_SOG_GAUSSIANS)) {
+    const found = `a wrong count of Gaussians for ${groupedDigits(size)} bytes`;
+    rejectSplats(`its ${SOG_META_FILE} gives ${found}; it is damaged`);
   }
-  const books = new Map([["scales", book(meta, "scales")], ["sh0", book(meta, "sh0")]]);
-  const mins = metaNumbers(meta, "means", "mins", 3), maxs = metaNumbers(meta, "means", "maxs", 3);
+  const codebooks = new Map([["scales", readCodebook(meta, "scales")], ["sh0", readCodebook(meta, "sh0")]]);
+  const mins = readMetaNumbers(meta, "means", "mins", 3), maxs = readMetaNumbers(meta, "means", "maxs", 3);
   const pixels = async (group, number = 0) => {
     const name = pictureName(meta, group, number);
-    const picture = await readPicture(files.get(name), PADDED_PIXELS * count + FREE_PIXELS, quotedText(name));
+    const picture = await readPicture(files.get(name), MAX_PIXELS_PER_GAUSSIAN * count + BASE_PIXELS, quotedText(name));
     if (picture.width * picture.height >= count) return picture.pixels;
-    return refuseSplats(`${quotedText(name)} in it has fewer pixels than it has Gaussians; it is damaged`);
+    return rejectSplats(`${quotedText(name)} in it has fewer pixels than it has Gaussians; it is damaged`);
   };
 
   const low = await pixels("means", 0), high = await pixels("means", 1), sizes = await pixels("scales");
@@ -65,74 +72,80 @@ export async function decodeSog(bytes) {
   for (let i = 0; i < count; i++) {
     const at = 4 * i;
     for (let k = 0; k < 3; k++) {
-      const steps = low[at + k] + 256 * high[at + k], drawnIn = mins[k] + (steps / 65535) * (maxs[k] - mins[k]);
-      positions[3 * i + k] = Math.sign(drawnIn) * Math.expm1(Math.abs(drawnIn));
-      scales[3 * i + k] = Math.exp(books.get("scales")[sizes[at + k]]);
-      colors[3 * i + k] = 0.5 + SH_BAND_0 * books.get("sh0")[tints[at + k]];
+      const steps = low[at + k] + 256 * high[at + k], logPosition = mins[k] + (steps / 65535) * (maxs[k] - mins[k]);
+      positions[3 * i + k] = Math.sign(logPosition) * Math.expm1(Math.abs(logPosition));
+      scales[3 * i + k] = Math.exp(codebooks.get("scales")[sizes[at + k]]);
+      colors[3 * i + k] = 0.5 + SH_BAND_0 * codebooks.get("sh0")[tints[at + k]];
     }
     opacities[i] = tints[at + 3] / 255;
     const largest = turns[at + 3] - 252;
-    if (largest < 0) refuseSplats(`a rotation has the tag ${turns[at + 3]}, not 252 to 255; its picture is damaged`);
+    if (largest < 0) rejectSplats(`a rotation has the tag ${turns[at + 3]}, not 252 to 255; its picture is damaged`);
     const part = (k) => (turns[at + k] / 127.5 - 1) * Math.SQRT1_2;
     writeQuat(largest, part(0), part(1), part(2), quats, at);
   }
-  const { degree, harmonic } = "shN" in meta ? await paletteOf(meta, files, pixels, count) : { degree: 0 };
+  const { degree, harmonic } = "shN" in meta ? await readPalette(meta, files, pixels, count) : { degree: 0 };
   const antialiased = meta.antialias === true;
-  return checkedSplats({ count, degree, antialiased, positions, scales, quats, opacities, colors }, harmonic);
+  return normalizeSplats({ count, degree, antialiased, positions, scales, quats, opacities, colors }, harmonic);
 }
 
-// The harmonics of bands 1 and up: their degree, and what gives the number `at` of those of Gaussian i.
-async function paletteOf(meta, files, pixels, count) {
-  const name = pictureName(meta, "shN", 0), values = book(meta, "shN");
-  const { width, height, pixels: entries } = await readPicture(files.get(name), LARGEST_PALETTE * 15, quotedText(name));
-  const degree = HIGHER_HARMONICS_BY_DEGREE.indexOf(width / ABREAST), rows = height * ABREAST;
-  if (degree < 1 || rows > LARGEST_PALETTE) {
-    refuseSplats(`${quotedText(name)} in it is ${width} x ${height}, no palette of degree 1 to 3; it is damaged`);
+// Reads the harmonics of bands 1 and up. Returns their degree, and the function that returns number `at` of Gaussian i.
+async function readPalette(meta, files, pixels, count) {
+  const name = pictureName(meta, "shN", 0), values = readCodebook(meta, "shN");
+  const picture = await readPicture(files.get(name), MAX_PALETTE_ROWS * 15, quotedText(name));
+  const { width, height, pixels: entries } = picture;
+  const degree = HIGHER_HARMONICS_BY_DEGREE.indexOf(width / PALETTE_ROWS_PER_LINE);
+  const rows = height * PALETTE_ROWS_PER_LINE;
+  if (degree < 1 || rows > MAX_PALETTE_ROWS) {
+    rejectSplats(`${quotedText(name)} in it is ${width} x ${height}, no palette of degree 1 to 3; it is damaged`);
   }
   const labels = await pixels("shN", 1), terms = HIGHER_HARMONICS_BY_DEGREE[degree];
   const label = (i) => labels[4 * i] + 256 * labels[4 * i + 1];
   for (let i = 0; i < count; i++) {
-    if (label(i) >= rows) refuseSplats(`a label names row ${label(i)} of ${rows} of its palette; it is damaged`);
+    if (label(i) >= rows) rejectSplats(`a label names row ${label(i)} of ${rows} of its palette; it is damaged`);
   }
-  // Pixels of a row of the palette follow one another, and rows too: 64 of them fill a line of the picture.
+  // The pixels of a palette row are adjacent, and so are the rows: 64 of them fill a line of the picture.
   return { degree, harmonic: (i, at) => values[entries[4 * (label(i) * terms + Math.floor(at / 3)) + (at % 3)]] };
 }
 
 // --- meta.json -------------------------------------------------------------------------------------------------------
 
-function parseMeta(bytes) {
+// Parses meta.json and checks its version.
+function parseSogMeta(bytes) {
   let meta;
   try {
     meta = JSON.parse(new TextDecoder().decode(bytes));
   } catch {
-    refuseSplats(`its ${SOG_META} is not JSON; get the file again`);
+    rejectSplats(`its ${SOG_META_FILE} is not JSON; get the file again`);
   }
   if (typeof meta !== "object" || meta === null || Array.isArray(meta)) {
-    refuseSplats(`its ${SOG_META} holds no SOG; it is damaged`);
+    rejectSplats(`its ${SOG_META_FILE} holds no SOG; it is damaged`);
   }
-  if (meta.version !== 2) refuseSplats("it is not of version 2 of SOG, the one that is read; convert it");
+  if (meta.version !== 2) rejectSplats("it is not of version 2 of SOG, the one that is read; convert it");
   return meta;
 }
 
-// The name of a picture.
+// Returns the file name of a picture of a group.
 function pictureName(meta, group, number) {
   const name = meta[group]?.files?.[number];
   if (typeof name === "string" && name && name !== ".." && !/[/\\:\p{C}]/u.test(name)) return name;
-  return refuseSplats(`its ${SOG_META} names no picture ${number + 1} of ${group}; it is damaged`);
+  return rejectSplats(`its ${SOG_META_FILE} names no picture ${number + 1} of ${group}; it is damaged`);
 }
 
-// Finite numbers that float32 can hold.
-function metaNumbers(meta, group, key, length) {
+// Returns a list of numbers of meta.json that are finite in float32.
+function readMetaNumbers(meta, group, key, length) {
   const values = meta[group]?.[key];
   if (Array.isArray(values) && values.length === length) {
-    const numbers = [...values], lost = length === BOOK_ENTRIES && numbers[0] === null; // by old writers
-    if (lost) numbers[0] = 0;
+    const numbers = [...values];
+    const isFirstLost = length === CODEBOOK_ENTRIES && numbers[0] === null; // old writers lost the first entry
+    if (isFirstLost) numbers[0] = 0;
     if (numbers.every((value) => typeof value === "number" && Math.abs(value) < 1e38)) {
-      if (lost) numbers[0] = numbers[1] + (numbers[1] - numbers[length - 1]) / 255; // as PlayCanvas puts it back
+      // PlayCanvas restores a lost entry as this value.
+      if (isFirstLost) numbers[0] = numbers[1] + (numbers[1] - numbers[length - 1]) / 255;
       return numbers;
     }
   }
-  return refuseSplats(`its ${SOG_META} needs ${length} finite numbers as ${group}.${key}; it is damaged`);
+  return rejectSplats(`its ${SOG_META_FILE} needs ${length} finite numbers as ${group}.${key}; it is damaged`);
 }
 
-const book = (meta, group) => Float32Array.from(metaNumbers(meta, group, "codebook", BOOK_ENTRIES));
+// Returns the codebook of a group.
+const readCodebook = (meta, group) => Float32Array.from(readMetaNumbers(meta, group, "codebook", CODEBOOK_ENTRIES));

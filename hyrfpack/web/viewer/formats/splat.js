@@ -1,35 +1,36 @@
-// The .splat format of antimatter15's viewer: 32 bytes a Gaussian, little-endian, and nothing else: position and scale
-// as 3 float32 each, colour and opacity as 4 bytes, the rotation wxyz as 4 bytes (q * 128 + 128).
+// Reads the .splat format of antimatter15's viewer: 32 bytes a Gaussian, little-endian, and nothing else: position and
+// scale as 3 float32 each, colour and opacity as 4 bytes, the rotation wxyz as 4 bytes (q * 128 + 128).
 
 import { groupedDigits } from "../../hyrf/errors.js";
-import { checkedSplats, refuseSplats } from "./checked.js";
+import { normalizeSplats, rejectSplats } from "./normalize.js";
 
-const SPLAT_BYTES = 32;
+const BYTES_PER_SPLAT = 32;
 
 /**
+ * Reads the splats of a .splat file.
  * @param {Uint8Array} bytes
  * @returns {Promise<import("../../hyrf/harmonics.js").Splats>} of degree 0
  * @throws {import("../../hyrf/errors.js").HyrfFormatError}
  */
 export async function decodeSplat(bytes) {
-  if (bytes.length % SPLAT_BYTES) {
+  if (bytes.length % BYTES_PER_SPLAT) {
     const length = groupedDigits(bytes.length);
     const found = `${length} bytes are not a whole number of Gaussians of 32 bytes`;
-    refuseSplats(`${found}; this is not a .splat file, or it is truncated`);
+    rejectSplats(`${found}; this is not a .splat file, or it is truncated`);
   }
-  const count = bytes.length / SPLAT_BYTES, view = new DataView(bytes.buffer, bytes.byteOffset, bytes.length);
+  const count = bytes.length / BYTES_PER_SPLAT, view = new DataView(bytes.buffer, bytes.byteOffset, bytes.length);
   const positions = new Float64Array(3 * count), scales = new Float32Array(3 * count);
   const quats = new Float32Array(4 * count), opacities = new Float32Array(count), colors = new Float32Array(3 * count);
-  for (let i = 0, at = 0; i < count; i++, at += SPLAT_BYTES) {
+  for (let i = 0, at = 0; i < count; i++, at += BYTES_PER_SPLAT) {
     for (let k = 0; k < 3; k++) {
       positions[3 * i + k] = view.getFloat32(at + 4 * k, true);
       const scale = view.getFloat32(at + 12 + 4 * k, true);
-      if (scale < 0) refuseSplats("a scale is negative; this is not a .splat file, or it is damaged");
+      if (scale < 0) rejectSplats("a scale is negative; this is not a .splat file, or it is damaged");
       scales[3 * i + k] = scale;
       colors[3 * i + k] = bytes[at + 24 + k] / 255;
     }
     opacities[i] = bytes[at + 27] / 255;
     for (let k = 0; k < 4; k++) quats[4 * i + k] = (bytes[at + 28 + k] - 128) / 128;
   }
-  return checkedSplats({ count, degree: 0, antialiased: false, positions, scales, quats, opacities, colors });
+  return normalizeSplats({ count, degree: 0, antialiased: false, positions, scales, quats, opacities, colors });
 }

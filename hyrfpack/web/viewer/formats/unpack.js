@@ -1,9 +1,9 @@
-// Bytes out of compressed ones, by the browser's own decompressors, and never more of them than asked for.
+// Decompresses streams by the browser's own decompressors, and no more bytes of them than are asked for.
 
-import { refuseSplats } from "./checked.js";
+import { rejectSplats } from "./normalize.js";
 
 /**
- * Unpacks a stream as far as asked.
+ * Decompresses a stream piece by piece.
  * @param {Uint8Array} bytes
  * @param {"gzip" | "deflate-raw" | "zstd"} how
  */
@@ -13,15 +13,15 @@ export class Unpacker {
     try {
       stream = new DecompressionStream(how);
     } catch {
-      refuseSplats(`it is packed by ${how}, which this browser cannot unpack; export it in another format or version`);
+      rejectSplats(`it is packed by ${how}, which this browser cannot unpack; export it in another format or version`);
     }
     this.how = how;
     this.reader = new Blob([bytes]).stream().pipeThrough(stream).getReader();
-    this.rest = new Uint8Array(0); // unpacked, not yet taken
+    this.rest = new Uint8Array(0); // decompressed bytes that were not returned yet
   }
 
   /**
-   * The next bytes: so many, or fewer where the stream ends.
+   * Returns the next `length` bytes, or fewer where the stream ends.
    * @param {number} length
    * @returns {Promise<Uint8Array>}
    */
@@ -38,7 +38,7 @@ export class Unpacker {
   }
 
   /**
-   * Whether there is another byte.
+   * Returns whether there is another byte.
    * @returns {Promise<boolean>}
    */
   async more() {
@@ -47,7 +47,7 @@ export class Unpacker {
       try {
         next = await this.reader.read();
       } catch {
-        refuseSplats(`a stream of ${this.how} in it is damaged or truncated; fetch or export it again`);
+        rejectSplats(`a stream of ${this.how} in it is damaged or truncated; fetch or export it again`);
       }
       if (next.done) return false;
       this.rest = next.value;
@@ -55,7 +55,7 @@ export class Unpacker {
     return true;
   }
 
-  /** Unpack no more. */
+  /** Ends the decompression. */
   close() {
     this.reader.cancel().catch(() => {});
   }
