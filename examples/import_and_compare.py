@@ -35,7 +35,7 @@ def main() -> None:
     print(f"{report.bytes_source:,} -> {report.bytes_after:,} bytes, {report.psnr:.1f} dB against the Gaussians")
 
     model = hyrfpack.load(args.model)
-    original = Drawable.of(read_splats(args.splats), model.config.frame)
+    original = Drawable.from_splats(read_splats(args.splats), model.config.frame)
     rows = []
     with torch.no_grad():
         for camera in orbit(Capture(hyrfpack.describe(args.model)).viewpoint, VIEWS):

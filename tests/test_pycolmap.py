@@ -14,7 +14,7 @@ from scenes import BALL_CENTERS, ball_scene, small_model
 
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.format import save
-from hyrfpack.splats.splats import quaternion_of
+from hyrfpack.splats.splats import quaternion_from_matrix
 
 ORDER = """
 import sys
@@ -55,7 +55,7 @@ def folder(tmp_path_factory) -> Path:
     tables.mkdir(parents=True)
     images = []
     for number, view in enumerate(scene.train, start=1):
-        quat, shift = quaternion_of(view.camera.rotation), view.camera.camera_from_world[:3, 3]
+        quat, shift = quaternion_from_matrix(view.camera.rotation), view.camera.camera_from_world[:3, 3]
         images.append(" ".join(map(str, (number, *quat, *shift, 1, view.name))) + "\n\n")
         Image.fromarray(view.load().rgb).save(folder / "scene" / "images" / view.name)
     (tables / "cameras.txt").write_text("1 PINHOLE 24 24 24 24 12 12\n")

@@ -53,10 +53,10 @@ def convert(
     """
     from hyrfpack.export.conversion import convert as run
     from hyrfpack.export.conversion import format_of
-    from hyrfpack.splats.names import splats_folder
+    from hyrfpack.splats.names import sog_folder
 
     format_of(source, target)
-    Outputs(source, folder=splats_folder(source), overwrite=overwrite).file(target)
+    Outputs(source, folder=sog_folder(source), overwrite=overwrite).file(target)
     with shown_progress("convert") as progress:
         report = run(
             source,

@@ -28,7 +28,7 @@ from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
     from hyrfpack.export import ExportReport
-    from hyrfpack.splats.table import Kind
+    from hyrfpack.splats.table import FileKind
 
 
 class _Box(click.ParamType):
@@ -200,7 +200,7 @@ def export(
     _print(report)
 
 
-def _how_to_write_splats(source: Path, output: Path, kind: Kind) -> str:
+def _how_to_write_splats(source: Path, output: Path, kind: FileKind) -> str:
     """The sentence that names the command for splats of another program."""
     from hyrfpack.splats.table import FORMATS
 

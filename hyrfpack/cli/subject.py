@@ -14,8 +14,8 @@ from hyrfpack.format import describe, find_model, load
 from hyrfpack.model import HybridModel
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.files import read_splats
-from hyrfpack.splats.names import bytes_on_disk, is_splats, splats_folder
-from hyrfpack.splats.viewpoints import Weighted
+from hyrfpack.splats.names import bytes_on_disk, is_splats, sog_folder
+from hyrfpack.splats.viewpoints import WeightedSplats
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Subject:
             if allow_partial:
                 raise HyrfError(f"{path}: splats are read whole; leave out --allow-partial")
             splats = read_splats(path)
-            drawable = Drawable.of(splats, Weighted.of(splats, str(path)).frame, device)
+            drawable = Drawable.from_splats(splats, WeightedSplats.from_splats(splats, str(path)).frame, device)
             return cls(path, device, precision, None, splats=drawable)
         model, fraction = find_model(path), 1.0 if allow_partial else None
         return cls(model, device, precision, fraction, facts=describe(model, fraction))
@@ -72,7 +72,7 @@ class Subject:
     @property
     def folder(self) -> Path | None:
         """The folder all of whose files are read; None where one file is."""
-        return splats_folder(self.path) if self.splats is not None else None
+        return sog_folder(self.path) if self.splats is not None else None
 
     @property
     def bytes(self) -> int:

@@ -116,9 +116,9 @@ def distill_splats(
 ) -> DistillReport:
     """Turn splats into a hybrid model that looks like them, and pack it (profile compact).
 
-    Without cameras viewpoints are made up (`viewpoints`). The faintest Gaussians, as seen from there, are left out;
-    the fields are fitted to the others' shapes and colours (`initial_model`), the whole is fitted to pictures of the
-    original. Same splats and settings, same bytes, on the CPU: on a GPU sums of gradients vary in their last bits.
+    Without cameras viewpoints are made up (`sample_viewpoints`). The faintest Gaussians, as seen from there, are left
+    out; the fields are fitted to the others' shapes and colours (`initial_model`), the whole is fitted to pictures of
+    the original. Same splats and settings, same bytes, on the CPU: on a GPU sums of gradients vary in their last bits.
 
     Args:
         splats: in any units, anywhere.

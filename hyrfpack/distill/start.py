@@ -22,7 +22,7 @@ from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.progress import Report, no_report
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable
-from hyrfpack.splats.harmonics import BAND_0
+from hyrfpack.splats.harmonics import SH_C0
 from hyrfpack.train.config import LearningRates
 from hyrfpack.train.optimizer import Optimizer
 
@@ -119,7 +119,7 @@ def initial_model(
     scales = drawable.scales.clamp_min(SMALLEST)
     shapes = _Shapes.of(logit(scales / scale_bounds(drawable.positions, config)), drawable.quats)
     opacity_logits = logit(drawable.opacities[:, None].clamp_max(OPAQUE))
-    colors = (0.5 + BAND_0 * drawable.harmonics[:, 0]).clamp(*COLORS)
+    colors = (0.5 + SH_C0 * drawable.harmonics[:, 0]).clamp(*COLORS)
     gaussians = Gaussians(drawable.positions, logit(colors), shapes.sizes[:, None], opacity_logits)
     model = HybridModel(config, gaussians, torch.Generator().manual_seed(seed)).to(drawable.device)
     with torch.no_grad():
@@ -176,7 +176,7 @@ def _fit(
             errors = errors + SIZE_WEIGHT * opacity[:, 0].square()
             if viewpoints:
                 viewpoint = viewpoints[int(torch.randint(0, len(viewpoints), (1,), generator=generator))]
-                colors = drawable.colors_from(viewpoint, some).clamp(0, 1)
+                colors = drawable.evaluate_colors(viewpoint, some).clamp(0, 1)
                 errors = errors + COLOR_WEIGHT * (model.decode_colors(viewpoint, some) - colors).square().sum(1)
             (weights.index_select(0, some) * errors).mean().backward()
             optimizer.step(step, steps)

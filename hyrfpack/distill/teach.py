@@ -20,7 +20,7 @@ from hyrfpack.progress import Report, no_report, report_part
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.splats import Splats
-from hyrfpack.splats.viewpoints import Weighted, surrounds, viewpoints
+from hyrfpack.splats.viewpoints import WeightedSplats, has_enclosed_places, sample_viewpoints
 from hyrfpack.train.config import LARGEST_SEED, DensityConfig, LearningRates, TrainConfig
 from hyrfpack.train.trainer import Trainer
 
@@ -75,8 +75,8 @@ def teach(
         True
     """
     report("choosing viewpoints", 0.0)
-    weighted = Weighted.of(splats, name)
-    original = Drawable.of(splats, weighted.frame, device)
+    weighted = WeightedSplats.from_splats(splats, name)
+    original = Drawable.from_splats(splats, weighted.frame, device)
     train, deciding, test = _cameras(weighted, original, config, cameras)
     say(
         f"{len(splats):,} Gaussians, harmonics of degree {splats.degree}; {len(train)} viewpoints "
@@ -97,7 +97,7 @@ def teach(
 
 
 def _cameras(
-    weighted: Weighted, drawable: Drawable, config: DistillConfig, cameras: Sequence[Camera] | None
+    weighted: WeightedSplats, drawable: Drawable, config: DistillConfig, cameras: Sequence[Camera] | None
 ) -> tuple[list[Camera], list[Camera], list[Camera]]:
     """To teach with, to decide by, and held out; of fewer than two given ones, the same. None decides and scores."""
     if cameras is None:
@@ -105,9 +105,9 @@ def _cameras(
         taught = min(config.train_views, max(LIT_FROM, config.steps))
         # Seeds that no other config.seed leads to.
         seeds = 2 * config.seed, 2 * (LARGEST_SEED + 1) + config.seed, 2 * config.seed + 1
-        inside = surrounds(weighted, drawable)
+        inside = has_enclosed_places(weighted, drawable)
         train, deciding, test = (
-            viewpoints(weighted, drawable, count, config.size, seed, inside)
+            sample_viewpoints(weighted, drawable, count, config.size, seed, inside)
             for count, seed in zip((taught, DECIDING * config.test_views, config.test_views), seeds, strict=True)
         )
         return train, deciding, test

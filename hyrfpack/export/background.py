@@ -26,7 +26,7 @@ from hyrfpack.ops.shade import encode_directions
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
-from hyrfpack.splats.harmonics import BAND_0
+from hyrfpack.splats.harmonics import SH_C0
 from hyrfpack.splats.splats import Splats
 
 # The sphere is a cube's six faces, each halved in both directions again and again: 2^level cells along a side.
@@ -95,7 +95,7 @@ def background_splats(
         np.repeat(scales[:, None], 3, axis=1),  # a ball is seen as a circle on the sphere from everywhere
         np.tile((1.0, 0.0, 0.0, 0.0), (count, 1)),
         np.full(count, OPACITY),
-        ((colors - 0.5) / BAND_0)[:, None],
+        ((colors - 0.5) / SH_C0)[:, None],
         model.config.antialiased,
     )
 

@@ -26,7 +26,7 @@ from hyrfpack.parallel.pool import parallel_map, run_tasks, torch_on_one_thread
 from hyrfpack.progress import Report, no_report, report_each_call
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
-from hyrfpack.splats.harmonics import fibonacci_sphere, harmonics_basis, terms_of
+from hyrfpack.splats.harmonics import fibonacci_sphere, harmonics_basis, num_sh_bases
 from hyrfpack.splats.splats import Splats, normalized_quats
 
 SPHERE_DIRECTIONS = 32
@@ -183,10 +183,10 @@ def _fit(
 ) -> dict[int, Tensor]:
     """Harmonics (N, K, 3) of all Gaussians by degree."""
     shading, positions = model.shading(), model.gaussians.positions.detach()
-    fitted = {degree: positions.new_empty(len(model), terms_of(degree), 3) for degree in degrees}
+    fitted = {degree: positions.new_empty(len(model), num_sh_bases(degree), 3) for degree in degrees}
     highest = max(fitted)
     sphere = fibonacci_sphere(SPHERE_DIRECTIONS).float()
-    terms = terms_of(highest)
+    terms = num_sh_bases(highest)
     net = harmonics_basis(sphere, highest)
     sphere_weight = SPHERE_WEIGHT if gains is None else EXPOSED_SPHERE_WEIGHT
     around = (sphere_weight / len(sphere) * net.T).contiguous()
@@ -214,7 +214,7 @@ def _fit(
             rows.append((index - start, harmonics_basis(directions, highest), colors, weights))
         owners, basis, colors, weights = map(torch.cat, zip(*rows, strict=True))
         for degree, harmonics in fitted.items():
-            some = slice(terms_of(degree))
+            some = slice(num_sh_bases(degree))
             harmonics[here] = least_squares(owners, basis[:, some], colors, weights, gram[some, some], right[:, some])
 
     blocks = len(edges) - 1

@@ -18,12 +18,12 @@ from hyrfpack.export.measure import psnr_of_splats
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Report, no_report, report_part
 from hyrfpack.splats.draw import Drawable
-from hyrfpack.splats.files import READ, read_splats
+from hyrfpack.splats.files import READABLE_ENDINGS, read_splats
 from hyrfpack.splats.formats.hints import Hints
-from hyrfpack.splats.names import bytes_on_disk, is_splats, splats_folder
+from hyrfpack.splats.names import bytes_on_disk, is_splats, sog_folder
 from hyrfpack.splats.splats import Splats
-from hyrfpack.splats.table import FORMATS, Format
-from hyrfpack.splats.viewpoints import Weighted, viewpoints
+from hyrfpack.splats.table import FORMATS, SplatFormat
+from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 
 MEASURED_VIEWS, MEASURED_SIZE_PIXELS = 12, 400
 
@@ -96,16 +96,16 @@ def convert(
     """
     form = format_of(source, target)
     check_request(form, target, degree, crop, min_opacity)
-    Outputs(source, folder=splats_folder(source), overwrite=overwrite).file(target)
+    Outputs(source, folder=sog_folder(source), overwrite=overwrite).file(target)
     report(f"reading {Path(source).name}", 0.0)
     splats = read_splats(source)
     if not len(splats):
         raise HyrfDataError(f"{source}: there is no Gaussian in it, so there is nothing to convert; name another file")
     whole = splats if crop is None else chosen(splats, crop)
     kept = chosen(whole, None, min_opacity)
-    kept = kept.with_degree(min(kept.degree, form.degree, kept.degree if degree is None else degree))
+    kept = kept.with_degree(min(kept.degree, form.max_degree, kept.degree if degree is None else degree))
     _tell_of_limits(form, splats, kept, say)
-    weighted = Weighted.of(whole, str(source))
+    weighted = WeightedSplats.from_splats(whole, str(source))
     hints = Hints(camera=Viewpoint.from_frame(weighted.frame.center, weighted.frame.scale).camera)
     report(f"writing {len(kept):,} Gaussians as {form.ending}", 0.2)
     data = form.encode(kept, hints)
@@ -127,7 +127,7 @@ def convert(
     )
 
 
-def format_of(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> Format:
+def format_of(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> SplatFormat:
     """Return the format of splats that the ending of `target` names.
 
     Raises:
@@ -138,7 +138,9 @@ def format_of(source: str | os.PathLike[str], target: str | os.PathLike[str]) ->
             raise HyrfError(
                 f"{source}: this is a model, not splats; write it with 'hyrfpack export {source} -o {target}'"
             )
-        raise HyrfError(f"{source}: this is no file of splats; name one of {', '.join(READ)}, or the folder of a SOG")
+        raise HyrfError(
+            f"{source}: this is no file of splats; name one of {', '.join(READABLE_ENDINGS)}, or the folder of a SOG"
+        )
     name = Path(target).name.lower()
     if name.endswith(".hyrf"):
         raise HyrfError(f"{target}: a model is learnt from splats; run 'hyrfpack import {source} -o {target}'")
@@ -150,26 +152,28 @@ def format_of(source: str | os.PathLike[str], target: str | os.PathLike[str]) ->
     return form
 
 
-def _tell_of_limits(form: Format, splats: Splats, kept: Splats, say: Callable[[str], None]) -> None:
+def _tell_of_limits(form: SplatFormat, splats: Splats, kept: Splats, say: Callable[[str], None]) -> None:
     """Refuse positions that the format cannot hold, and say what else it cannot."""
     reach = float(np.abs(kept.positions).max())
-    if reach > form.farthest:
+    if reach > form.max_coordinate:
         raise HyrfError(
-            f"the splats reach {reach:,.0f} units from the origin, and {form.ending} {form.farthest:,}; name another "
-            "format, or leave the far ones out with `crop`"
+            f"the splats reach {reach:,.0f} units from the origin, and {form.ending} {form.max_coordinate:,}; "
+            "name another format, or leave the far ones out with `crop`"
         )
-    if splats.degree > form.degree:
-        say(f"{form.ending} holds no harmonics above degree {form.degree}; those of degree {splats.degree} are lost")
-    if splats.antialiased and not form.antialiased:
-        able = " or ".join(row.ending for row in FORMATS.values() if row.antialiased)
+    if splats.degree > form.max_degree:
+        say(
+            f"{form.ending} holds no harmonics above degree {form.max_degree}; those of degree {splats.degree} are lost"
+        )
+    if splats.antialiased and not form.stores_antialiased:
+        able = " or ".join(row.ending for row in FORMATS.values() if row.stores_antialiased)
         say(f"{form.ending} cannot tell that the splats are antialiased: set it where they are drawn, or choose {able}")
 
 
-def _measure(before: Splats, after: Splats, weighted: Weighted, report: Report) -> list[float]:
+def _measure(before: Splats, after: Splats, weighted: WeightedSplats, report: Report) -> list[float]:
     """PSNR of the pictures of `after` against those of `before`, by view."""
-    original, converted = (Drawable.of(splats, weighted.frame) for splats in (before, after))
+    original, converted = (Drawable.from_splats(splats, weighted.frame) for splats in (before, after))
     report("choosing viewpoints to compare at", 0.0)
-    cameras = viewpoints(weighted, original, MEASURED_VIEWS, MEASURED_SIZE_PIXELS, seed=0)
+    cameras = sample_viewpoints(weighted, original, MEASURED_VIEWS, MEASURED_SIZE_PIXELS, seed=0)
     scores = []
     for number, camera in enumerate(cameras):
         report(f"comparing view {number + 1} of {len(cameras)}", 0.3 + 0.7 * number / len(cameras))

@@ -25,7 +25,7 @@ from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.scene import Scene
-from hyrfpack.splats.files import READ, read_splats
+from hyrfpack.splats.files import READABLE_ENDINGS, read_splats
 from hyrfpack.web.gallery import Card, encode_gallery
 from hyrfpack.web.html import stage
 from hyrfpack.web.player import element_script, encode_player, encode_readme
@@ -276,7 +276,7 @@ def _names(sources: Sequence[StrPath], *, listed: bool) -> list[tuple[str, str]]
 def _ending(path: StrPath) -> str:
     """Of a file to be played: those that are not of splats are taken for models."""
     ending = Path(path).suffix.lower()
-    return ending if ending in READ else HYRF
+    return ending if ending in READABLE_ENDINGS else HYRF
 
 
 def _photos(count: int) -> str:

@@ -18,21 +18,21 @@ from hyrfpack.export.source import Source
 from hyrfpack.outputs import Outputs
 from hyrfpack.splats.harmonics import MAX_DEGREE
 from hyrfpack.splats.splats import Splats
-from hyrfpack.splats.table import FORMATS, Kind
+from hyrfpack.splats.table import FORMATS, FileKind
 
 # What is exported besides the formats of splats.
-PAGE, TRANSFORMS = Kind(ending=".html", antialiased=True), Kind(ending=".json", degree=0)
+PAGE, TRANSFORMS = FileKind(ending=".html", stores_antialiased=True), FileKind(ending=".json", max_degree=0)
 POINTS = (
-    Kind(ending=".points.ply", degree=0),
-    Kind(ending=".points.glb", degree=0, package=("trimesh", "trimesh")),
+    FileKind(ending=".points.ply", max_degree=0),
+    FileKind(ending=".points.glb", max_degree=0, package=("trimesh", "trimesh")),
 )
-COLMAP = Kind(ending="", degree=0, package=("pycolmap", "pycolmap"))  # a folder
-PLAYER = Kind(ending="")  # the same
+COLMAP = FileKind(ending="", max_degree=0, package=("pycolmap", "pycolmap"))  # a folder
+PLAYER = FileKind(ending="")  # the same
 _KINDS = {kind.ending: kind for kind in (*POINTS, *FORMATS.values(), PAGE, TRANSFORMS)}
 ENDINGS = tuple(_KINDS)
 
 
-def kind_of(target: str | os.PathLike[str], colmap: bool = False, *, others: tuple[str, ...] = ()) -> Kind:
+def kind_of(target: str | os.PathLike[str], colmap: bool = False, *, others: tuple[str, ...] = ()) -> FileKind:
     """What the ending, one of ENDINGS, says is to be written; for a folder or a name without ending a player.
 
     Args:
@@ -65,7 +65,7 @@ def kind_of(target: str | os.PathLike[str], colmap: bool = False, *, others: tup
 
 
 def check_request(
-    kind: Kind,
+    kind: FileKind,
     target: str | os.PathLike[str],
     degree: int | None = None,
     crop: Sequence[float] | None = None,
@@ -115,7 +115,7 @@ def check_place(target: str | os.PathLike[str], outputs: Outputs, colmap: bool =
 
 
 @torch.no_grad()
-def check_model(read: Source, kind: Kind, crop: Sequence[float] | None, min_opacity: float, sphere: bool) -> None:
+def check_model(read: Source, kind: FileKind, crop: Sequence[float] | None, min_opacity: float, sphere: bool) -> None:
     """Refuse a choice that leaves nothing, and a scene, with its background if `sphere`, too far away for the kind of
     file: before the bake. Raises HyrfError."""
     model, frame = read.model, read.model.config.frame
@@ -123,10 +123,10 @@ def check_model(read: Source, kind: Kind, crop: Sequence[float] | None, min_opac
     if crop is not None or min_opacity > 0:  # the bake makes no Gaussian less faint
         positions = positions[kept_of(positions, model.decode_geometry().opacities.numpy(), crop, min_opacity)]
     reach = max(float(np.abs(positions).max()), background_reach(frame) if sphere else 0.0)
-    if reach > kind.farthest:
+    if reach > kind.max_coordinate:
         raise HyrfError(
             f"the scene reaches {reach:,.0f} units from the origin with its background, and {kind.ending} "
-            f"{kind.farthest:,}; export another format, or try `background=False`"
+            f"{kind.max_coordinate:,}; export another format, or try `background=False`"
         )
 
 

@@ -57,7 +57,7 @@ def likeness(
     """
     decoded, frame = model.decode(), model.config.frame
     solid = torch.tensor(model.config.solid)
-    drawables = {name: (Drawable.of(splats, frame), behind) for name, (splats, behind) in contenders.items()}
+    drawables = {name: (Drawable.from_splats(splats, frame), behind) for name, (splats, behind) in contenders.items()}
 
     @torch.no_grad()  # of each thread
     def scores_at(place: tuple[Camera, View | None]) -> dict[str, tuple[float, float | None]]:

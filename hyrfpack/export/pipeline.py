@@ -46,7 +46,7 @@ from hyrfpack.progress import Report, no_report, report_part
 from hyrfpack.scene import Scene
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats, concatenate
-from hyrfpack.splats.table import FORMATS, Format, Kind
+from hyrfpack.splats.table import FORMATS, FileKind, SplatFormat
 from hyrfpack.web.html import decode_page
 
 COARSE = 1.0  # dB of PSNR against photos that a format may cost before something is said about it
@@ -138,7 +138,7 @@ def export(
 def _export(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
-    kind: Kind,
+    kind: FileKind,
     *,
     degree: int | None,
     data: Scene | None,
@@ -170,7 +170,7 @@ def _export(
     places = f"{len(read.fitted)} " + (
         "cameras" if read.cameras else "places around the scene, for the file keeps no cameras (`data` names photos)"
     )
-    highest = kind.degree if degree is None else min(degree, kind.degree)
+    highest = kind.max_degree if degree is None else min(degree, kind.max_degree)
     chosen_by: dict[int, float] = {}
     sights = None
     bake_starts = 0.35 if degree is None and highest else 0.0
@@ -200,7 +200,7 @@ def _export(
     del bake_as, sights  # of many Gaussians and cameras they are large
     say(f"writing {len(splats) - count:,} Gaussians{' and the background' if sphere else ''}")
     report(f"writing {len(splats) - count:,} Gaussians", 0.5)
-    if isinstance(kind, Format):
+    if isinstance(kind, SplatFormat):
         packed, shown = _pack_splats(read, splats, Path(target), kind, spz_version)
     else:
         packed, shown = _pack_page(read, splats, picture, Path(target))
@@ -238,7 +238,7 @@ def _bake_scene(
     sights: Sequence[Sight],
     crop: Sequence[float] | None,
     min_opacity: float,
-    kind: Kind,
+    kind: FileKind,
     sphere: bool,
     report: Report,
 ) -> tuple[Splats, int, np.ndarray | None]:
@@ -248,7 +248,7 @@ def _bake_scene(
         return splats, 0, None
     if kind is PAGE:
         return splats, 0, background_picture(read.model, cameras=read.fitted, sights=sights)
-    behind = background_splats(read.model, read.fitted, kind.largest_scale, sights)
+    behind = background_splats(read.model, read.fitted, kind.max_scale, sights)
     return concatenate((splats, behind)), len(behind), None
 
 
@@ -262,7 +262,9 @@ def _pack_page(read: Source, splats: Splats, picture: np.ndarray | None, target:
     return data, {"baked": (splats, picture), "file": decode_page(data, str(target))}
 
 
-def _pack_splats(read: Source, splats: Splats, target: Path, form: Format, spz_version: int) -> tuple[bytes, Shown]:
+def _pack_splats(
+    read: Source, splats: Splats, target: Path, form: SplatFormat, spz_version: int
+) -> tuple[bytes, Shown]:
     """A file's bytes, and what it shows."""
     first = read.cameras[0][1] if read.cameras else None
     data = form.encode(splats, Hints(read.up, first, spz_version))
@@ -270,7 +272,7 @@ def _pack_splats(read: Source, splats: Splats, target: Path, form: Format, spz_v
 
 
 def _measured(
-    result: ExportReport, read: Source, shown: Shown, kind: Kind, sphere: bool, say: Say, report: Report
+    result: ExportReport, read: Source, shown: Shown, kind: FileKind, sphere: bool, say: Say, report: Report
 ) -> ExportReport:
     """The result with all PSNR filled in."""
     if not read.measured:
@@ -285,8 +287,8 @@ def _measured(
     cost = _cost(before, file, read.error)
     if cost > COARSE:
         seen = "" if read.cameras else ", seen from made-up viewpoints (name photos with `data` to be sure)"
-        if read.model.config.antialiased and not kind.antialiased:
-            able = " or ".join(form.ending for form in FORMATS.values() if form.antialiased)
+        if read.model.config.antialiased and not kind.stores_antialiased:
+            able = " or ".join(form.ending for form in FORMATS.values() if form.stores_antialiased)
             say(f"{kind.ending} cannot tell that the model is antialiased: say so where it is drawn, or choose {able}")
         else:
             say(
@@ -338,7 +340,7 @@ def _export_cameras(read: Source, target: str | os.PathLike[str], overwrite: boo
 
 
 def _export_points(
-    read: Source, kind: Kind, target: str | os.PathLike[str], splats: Splats, overwrite: bool
+    read: Source, kind: FileKind, target: str | os.PathLike[str], splats: Splats, overwrite: bool
 ) -> ExportReport:
     """Centres of splats, and cameras."""
     if kind is COLMAP:

@@ -38,7 +38,7 @@ def splats_poster(splats: Splats, longest: int) -> Image.Image | None:
     except HyrfDataError:
         return None
     camera = orbit(Viewpoint.from_frame(frame.center, frame.scale), 1)[0]
-    return to_image(draw(Drawable.of(splats, frame), shrink_camera(camera, longest)).rgb)
+    return to_image(draw(Drawable.from_splats(splats, frame), shrink_camera(camera, longest)).rgb)
 
 
 def encode_poster(picture: Image.Image, form: str, most: int) -> bytes:

@@ -14,7 +14,7 @@ from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
 from hyrfpack.make.held_out import inner_view
 from hyrfpack.outputs import PICTURE_SUFFIXES, VIDEO_SUFFIXES, Outputs, StrPath
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
-from hyrfpack.splats.files import READ
+from hyrfpack.splats.files import READABLE_ENDINGS
 
 FEW, LEAST = 16, 8  # photos, of which one is held out, or none
 TEST_EVERY = 8  # of more, one in so many is
@@ -73,7 +73,7 @@ class Source:
         if not os.path.lexists(path):
             raise HyrfDataError(f"{path}: no such file or folder; check the path")
         ending = path.suffix.lower()
-        if path.is_file() and (ending == ".hyrf" or ending in READ or path.name == _LOOSE_SOG):
+        if path.is_file() and (ending == ".hyrf" or ending in READABLE_ENDINGS or path.name == _LOOSE_SOG):
             return cls(path, "model" if ending == ".hyrf" else "splats")
         if path.is_file() and not (is_archive(path) or ending in VIDEO_SUFFIXES):
             one = "this is one photo" if ending in PICTURE_SUFFIXES else "nothing can be made of this file"

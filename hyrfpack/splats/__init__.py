@@ -1,1 +1,1 @@
-"""Explicit 3D Gaussians as other programs hold them: the data, their harmonics, their files, drawing them."""
+"""Splats, the explicit 3D Gaussians of other programs: their data, spherical harmonics, file formats and rendering."""

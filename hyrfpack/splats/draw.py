@@ -1,4 +1,4 @@
-"""Splats drawn by our own rasteriser, as `hyrfpack.render` draws models: what files of other programs look like."""
+"""Rendering of splats from other programs' files with our own rasteriser, as `hyrfpack.render` renders models."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from hyrfpack.splats.splats import Splats
 
 @dataclass(frozen=True)
 class Drawable:
-    """Splats ready to be drawn many times: float32 tensors in the local units of a frame.
+    """Splats as float32 tensors in the local units of a frame, ready to be drawn many times.
 
     Attributes:
-        frame: whose local units these are; near planes follow it.
+        frame: the frame that defines the local units; near planes are in these units, too.
         positions (N, 3), scales (N, 3), quats (N, 4) wxyz, opacities (N,), harmonics (N, K, 3): as in Splats.
         antialiased: as in Splats.
     """
@@ -38,36 +38,36 @@ class Drawable:
     antialiased: bool
 
     @classmethod
-    def of(
+    def from_splats(
         cls,
         splats: Splats,
         frame: Frame,
         device: torch.device = torch.device("cpu"),  # noqa: B008 - a constant
     ) -> Drawable:
-        """Bring splats to the local units of a frame, and to a device."""
+        """Convert splats to the local units of a frame and copy them to a device."""
         positions = frame.to_local(splats.positions).astype(np.float32)
         scales = splats.scales / np.float32(frame.scale)
         arrays = positions, scales, splats.quats, splats.opacities, splats.harmonics
         means, sizes, quats, opacities, harmonics = (torch.from_numpy(array).to(device) for array in arrays)
         return cls(frame, means, sizes, quats, opacities, harmonics, splats.antialiased)
 
-    def __getitem__(self, some: Tensor | slice) -> Drawable:
-        """The splats at indices (n,) int64 on their device, or of a slice."""
+    def __getitem__(self, index: Tensor | slice) -> Drawable:
+        """Return the splats at indices (n,) int64 on the same device, or those of a slice."""
         names = "positions", "scales", "quats", "opacities", "harmonics"
-        return replace(self, **{name: getattr(self, name)[some] for name in names})
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors are."""
+        """The device of the tensors."""
         return self.positions.device
 
     @property
     def degree(self) -> int:
-        """Of the spherical harmonics."""
+        """The degree of the spherical harmonics."""
         return round(self.harmonics.shape[1] ** 0.5) - 1
 
-    def colors_from(self, viewpoint: Tensor, index: Tensor) -> Tensor:
-        """Colours (n, 3), not cut, of the splats at `index` (n,), seen from `viewpoint` (3,) local units."""
+    def evaluate_colors(self, viewpoint: Tensor, index: Tensor) -> Tensor:
+        """Evaluate the colours (n, 3), not clamped, of the splats at `index` (n,) seen from `viewpoint` (3,), local."""
         directions = torch.nn.functional.normalize(self.positions[index] - viewpoint, dim=-1, eps=1e-12)
         return torch.einsum("nk,nkc->nc", harmonics_basis(directions, self.degree), self.harmonics[index]) + 0.5
 
@@ -82,14 +82,16 @@ def draw(
     black: bool = False,
     depth: bool = False,
 ) -> Rasterization:
-    """Draw splats as a camera sees them, over black; `transmittance` of the result says what lies behind.
+    """Render splats from a camera over a black background.
+
+    `transmittance` of the result is the share of a background's light that reaches each pixel.
 
     Args:
-        drawable: what to draw.
-        camera: from where, in world units.
-        settings: near plane (local units), culling and transmittance as in `hyrfpack.render`.
-        black: without colours, for what is covered alone.
-        depth: also return depth, (H, W) in world units.
+        drawable: the splats.
+        camera: a camera in world units.
+        settings: near plane (local units), culling and transmittance, as in `hyrfpack.render`.
+        black: draw all splats black, which is faster where only the transmittance is needed.
+        depth: also return the depth, (H, W) in world units.
     """
     pose = torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32)
     size = camera.intrinsics, camera.width, camera.height
@@ -101,7 +103,7 @@ def draw(
         drawable.quats[index],
         drawable.scales[index],
         drawable.opacities[index],
-        torch.zeros_like(positions) if black else drawable.colors_from(viewpoint, index).clamp_min(0),
+        torch.zeros_like(positions) if black else drawable.evaluate_colors(viewpoint, index).clamp_min(0),
         pose,
         *size,
         near=settings.near,

@@ -1,4 +1,4 @@
-"""Real spherical harmonics with the Condon-Shortley phase, bands 0 to 3, as files of 3D Gaussians hold colours."""
+"""Real spherical harmonics of bands 0 to 3 with the Condon-Shortley phase, as used in files of 3D Gaussians."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from torch import Tensor
 from hyrfpack.ops.shade.directions import spherical_harmonics
 
 MAX_DEGREE = 3
-BAND_0 = 0.28209479177387814  # Y00 = 1 / (2 sqrt(pi))
+SH_C0 = 0.28209479177387814  # Y00 = 1 / (2 sqrt(pi))
 
 
-def terms_of(degree: int) -> int:
-    """How many basis functions the bands 0 to `degree` have: (degree + 1)^2."""
+def num_sh_bases(degree: int) -> int:
+    """Return the number of basis functions of bands 0 to `degree`: (degree + 1)^2."""
     return (degree + 1) ** 2
 
 
 def harmonics_basis(directions: Tensor, degree: int = MAX_DEGREE) -> Tensor:
-    """The basis at directions, orthonormal on the unit sphere.
+    """Evaluate the spherical harmonics, which are orthonormal on the unit sphere, at directions.
 
     Within a band l the order is m = -l ... l. With the Condon-Shortley phase Y1-1, Y10, Y11 are proportional to
     -y, z, -x.
@@ -28,15 +28,15 @@ def harmonics_basis(directions: Tensor, degree: int = MAX_DEGREE) -> Tensor:
         degree: highest band, 0 to 3.
 
     Returns:
-        (N, (degree + 1)^2).
+        (N, (degree + 1)^2) values of the basis functions.
     """
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     phase = directions.new_tensor((1, -1, 1, -1, 1, -1, 1, -1, 1))
     lower = spherical_harmonics(directions) * phase
     if degree < MAX_DEGREE:
-        return lower[:, : terms_of(degree)]
-    third = (
+        return lower[:, : num_sh_bases(degree)]
+    band_3 = (
         -0.5900435899266435 * y * (3 * xx - yy),
         2.890611442640554 * x * y * z,
         -0.4570457994644658 * y * (5 * zz - 1),
@@ -45,33 +45,34 @@ def harmonics_basis(directions: Tensor, degree: int = MAX_DEGREE) -> Tensor:
         1.445305721320277 * z * (xx - yy),
         -0.5900435899266435 * x * (xx - 3 * yy),
     )
-    return torch.cat((lower, torch.stack(third, -1)), -1)
+    return torch.cat((lower, torch.stack(band_3, -1)), -1)
 
 
 def harmonics_rotation(rotation: np.ndarray, degree: int) -> np.ndarray:
-    """What a rotation of space does to coefficients: M with M k the coefficients of d -> f(R^T d), f those of k.
+    """Compute the matrix that rotates coefficients of spherical harmonics.
 
-    Harmonics of one band turn into one another, so M solves B(R^T d) = B(d) M at enough directions d, exactly.
+    If k are the coefficients of a function f, then M k are those of the rotated function d -> f(R^T d). A rotation maps
+    each band to itself, so M solves B(R^T d) = B(d) M exactly, with the basis B at enough directions d.
 
     Args:
         rotation: (3, 3) proper rotation R.
         degree: highest band, 0 to 3.
 
     Returns:
-        (K, K) float64, K = (degree + 1)^2; orthogonal, block-diagonal by bands.
+        (K, K) float64 matrix M, K = (degree + 1)^2; orthogonal and block-diagonal by bands.
     """
-    directions = fibonacci_sphere(64).numpy()  # well-conditioned for 16 unknowns
+    directions = fibonacci_sphere(64).numpy()  # enough to be well-conditioned for 16 unknowns
     turned = directions @ np.asarray(rotation, np.float64)  # rows R^T d
     before, after = (harmonics_basis(torch.from_numpy(rows), degree).numpy() for rows in (turned, directions))
-    blocks = np.zeros((terms_of(degree), terms_of(degree)))
+    blocks = np.zeros((num_sh_bases(degree), num_sh_bases(degree)))
     for band in range(degree + 1):
-        own = slice(band**2, terms_of(band))
-        blocks[own, own] = np.linalg.lstsq(after[:, own], before[:, own], rcond=None)[0]
+        in_band = slice(band**2, num_sh_bases(band))
+        blocks[in_band, in_band] = np.linalg.lstsq(after[:, in_band], before[:, in_band], rcond=None)[0]
     return blocks
 
 
 def fibonacci_sphere(count: int) -> Tensor:
-    """(count, 3) float64 unit vectors spread evenly over the sphere: points of a Fibonacci lattice."""
+    """Return (count, 3) float64 unit vectors that a Fibonacci lattice spreads evenly over the sphere."""
     numbers = torch.arange(count, dtype=torch.float64)
     heights, angles = 1 - (2 * numbers + 1) / count, torch.pi * (1 + 5**0.5) * numbers
     radii = (1 - heights.square()).sqrt()

@@ -1,7 +1,7 @@
-"""Where files that have a scene graph (glTF, USD) place splats: upright, and near their own origin.
+"""Placement of splats in files with a scene graph (glTF, USD): upright, and near an origin of their own.
 
-Such a file keeps the splats in the input's axes. A transform beside them turns the scene upright and carries what
-float32 positions cannot: how far it lies from the origin.
+Such a file stores the splats in the input's axes. A transform in the scene graph turns the scene upright and holds its
+distance from the origin, which float32 positions cannot hold precisely.
 """
 
 from __future__ import annotations
@@ -11,32 +11,33 @@ import numpy as np
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.splats import Splats
 
-# Beyond so many times its own size from the origin a scene gets an origin of its own: float32 still tells apart
-# 1/2,000,000 of the scene's size there.
-_FAR = 8
+# A scene farther from the origin than this gets an origin of its own. Up to there, float32 resolves at least
+# 1/2,000,000 of the scene's size.
+_MAX_DISTANCE_IN_SCENE_SIZES = 8
 
 
-def upright_rotation(up: np.ndarray, to: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation that takes `up` to `to`.
+def upright_rotation(up: np.ndarray, target_up: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation that takes `up` to `target_up`.
 
-    Where they point apart, the half turn about x comes first, as between the axes of OpenCV and OpenGL: the shortest
-    turn alone would face another way with every little change of `up`.
+    Where the two point in opposite directions, a half turn about x comes first, as between the axes of OpenCV and
+    OpenGL. The shortest rotation alone would change its heading with every small change of `up`.
 
     Args:
         up: (3,) which way is up in the scene.
         to: (3,) which way is up in the file: +y or +z. Both unit vectors.
     """
-    up, to = (np.asarray(vector, np.float64) for vector in (up, to))
-    if up @ to < 0:
+    up, target_up = (np.asarray(vector, np.float64) for vector in (up, target_up))
+    if up @ target_up < 0:
         half_turn = np.diag([1.0, -1.0, -1.0])
-        return _shortest_turn(half_turn @ up, to) @ half_turn
-    return _shortest_turn(up, to)
+        return _shortest_rotation(half_turn @ up, target_up) @ half_turn
+    return _shortest_rotation(up, target_up)
 
 
 def local_origin(positions: np.ndarray) -> np.ndarray:
-    """(3,) float64: the point that positions are to be stored relative to, so that float32 holds them well.
+    """Choose the origin (3,) float64 relative to which float32 positions are stored.
 
-    The world's origin, unless the scene is far from it compared to its size; then a round number near its middle.
+    It is the world's origin, unless the scene is far from that compared to its size. Then it is a point with round
+    coordinates near the scene's middle.
 
     Args:
         positions: (N, 3), world units.
@@ -45,17 +46,17 @@ def local_origin(positions: np.ndarray) -> np.ndarray:
         return np.zeros(3)
     middle = np.median(positions, axis=0)
     size = np.median(np.abs(positions - middle), axis=0).max()
-    if np.abs(middle).max() <= _FAR * size:
+    if np.abs(middle).max() <= _MAX_DISTANCE_IN_SCENE_SIZES * size:
         return np.zeros(3)
     step = 2.0 ** np.floor(np.log2(size)) if size > 0 else 0.0
     return np.round(middle / step) * step if step else middle
 
 
 def local_positions(splats: Splats, origin: np.ndarray) -> np.ndarray:
-    """(N, 3) float32 positions relative to `origin`.
+    """Return the positions (N, 3) relative to `origin` as float32.
 
     Raises:
-        HyrfDataError: float32 cannot hold them.
+        HyrfDataError: a position is beyond the range of float32.
     """
     with np.errstate(over="ignore"):
         positions = (splats.positions - origin).astype(np.float32)
@@ -64,19 +65,19 @@ def local_positions(splats: Splats, origin: np.ndarray) -> np.ndarray:
     return positions
 
 
-def placed(splats: Splats, matrix: np.ndarray, turn: np.ndarray, name: str) -> Splats:
-    """Splats as a transform moves them, turned afterwards.
+def apply_transform(splats: Splats, matrix: np.ndarray, turn: np.ndarray, name: str) -> Splats:
+    """Apply a transform of the scene graph to splats, followed by a rotation about the origin.
 
     Args:
-        splats: as the file holds them.
-        matrix: (4, 4) float64, column vectors: a rotation, a uniform scale and a translation.
-        turn: (3, 3) rotation to follow.
-        name: what error messages call the file.
+        splats: the splats as stored in the file.
+        matrix: (4, 4) float64 for column vectors: a rotation, a uniform scale and a translation.
+        turn: (3, 3) rotation that is applied last.
+        name: the file's name in error messages.
 
     Raises:
-        HyrfDataError: the transform is another.
+        HyrfDataError: the transform mirrors, skews or scales axes differently, or makes a number infinite.
     """
-    scale, rotation = rotation_of(matrix, name)
+    scale, rotation = decompose_similarity(matrix, name)
     rotation = turn @ rotation
     if not np.allclose(rotation, np.eye(3), rtol=0, atol=1e-12):
         splats = splats.rotated(rotation)
@@ -94,8 +95,12 @@ def placed(splats: Splats, matrix: np.ndarray, turn: np.ndarray, name: str) -> S
         raise HyrfDataError(f"{name}: moved as its transform says, {error}; correct the transform") from error
 
 
-def rotation_of(matrix: np.ndarray, name: str) -> tuple[float, np.ndarray]:
-    """The uniform scale and the (3, 3) rotation in a transform (4, 4). Raises HyrfDataError when there are none."""
+def decompose_similarity(matrix: np.ndarray, name: str) -> tuple[float, np.ndarray]:
+    """Return the uniform scale and the rotation (3, 3) of a transform (4, 4).
+
+    Raises:
+        HyrfDataError: the transform mirrors, skews or scales axes differently.
+    """
     linear = matrix[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear))) if np.isfinite(matrix).all() else 0.0
     if scale > 0:
@@ -107,8 +112,8 @@ def rotation_of(matrix: np.ndarray, name: str) -> tuple[float, np.ndarray]:
     )
 
 
-def matrices_of(quats: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) rotations of unit quaternions (N, 4) wxyz, in their precision."""
+def rotation_matrices(quats: np.ndarray) -> np.ndarray:
+    """Convert unit quaternions (N, 4) wxyz to rotation matrices (N, 3, 3) of the same dtype."""
     w, x, y, z = quats.T
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -118,8 +123,8 @@ def matrices_of(quats: np.ndarray) -> np.ndarray:
     return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
 
 
-def _shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Rodrigues' formula for unit vectors that do not point apart."""
+def _shortest_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the shortest rotation between unit vectors that are not opposite, by Rodrigues' formula."""
     x, y, z = np.cross(start, end)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + cross + cross @ cross / (1 + start @ end)

@@ -1,4 +1,4 @@
-"""Splats: explicit 3D Gaussians as the files of other programs hold them. Numpy; knows nothing of models."""
+"""The class Splats, explicit 3D Gaussians as numpy arrays, and operations on it; independent of models."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hyrfpack.splats.harmonics import BAND_0, MAX_DEGREE, harmonics_rotation, terms_of
+from hyrfpack.splats.harmonics import MAX_DEGREE, SH_C0, harmonics_rotation, num_sh_bases
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Splats:
         quats: (N, 4) float32 wxyz, unit length.
         opacities: (N,) float32 in [0, 1].
         harmonics: (N, (degree + 1)^2, 3) float32, degree 0 to 3.
-        antialiased: opacities are meant to be compensated for the rasteriser's low-pass filter (Mip-Splatting).
+        antialiased: whether opacities are meant to be compensated for the rasteriser's low-pass filter (Mip-Splatting).
 
     Raises:
         ValueError: shapes do not fit together, or a number is not finite or out of its range.
@@ -42,7 +42,7 @@ class Splats:
     def __post_init__(self) -> None:
         count = len(self.positions)
         shapes = {"positions": (count, 3), "scales": (count, 3), "quats": (count, 4), "opacities": (count,)}
-        shapes["harmonics"] = (count, terms_of(self.degree), 3)
+        shapes["harmonics"] = (count, num_sh_bases(self.degree), 3)
         for name, shape in shapes.items():
             values = getattr(self, name)
             if values.shape != shape:
@@ -61,41 +61,41 @@ class Splats:
         return len(self.positions)
 
     def __getitem__(self, index: np.ndarray | slice) -> Splats:
-        """Those at `index`: integers, booleans or a slice."""
+        """Return the splats at `index`: integers, booleans or a slice."""
         names = ("positions", "scales", "quats", "opacities", "harmonics")
         return replace(self, **{name: getattr(self, name)[index] for name in names})
 
     @property
     def degree(self) -> int:
-        """Of the spherical harmonics."""
+        """The degree of the spherical harmonics."""
         return round(self.harmonics.shape[1] ** 0.5) - 1
 
     @property
     def base_colors(self) -> np.ndarray:
-        """(N, 3) float32 colours of degree 0, what directions have in common, cut to [0, 1]."""
-        return np.clip(0.5 + np.float32(BAND_0) * self.harmonics[:, 0], 0, 1)
+        """The colours of degree 0, which do not depend on the direction: (N, 3) float32, clamped to [0, 1]."""
+        return np.clip(0.5 + np.float32(SH_C0) * self.harmonics[:, 0], 0, 1)
 
     def with_degree(self, degree: int) -> Splats:
-        """The same with harmonics cut, or filled up with zeros, to another degree."""
-        terms = terms_of(degree)
+        """Return a copy whose harmonics are truncated, or padded with zeros, to another degree."""
+        terms = num_sh_bases(degree)
         harmonics = self.harmonics[:, :terms]
         missing = ((0, 0), (0, terms - harmonics.shape[1]), (0, 0))
         return replace(self, harmonics=np.pad(harmonics, missing))
 
     def rotated(self, rotation: np.ndarray) -> Splats:
-        """Turned about the origin: positions, axes and colours.
+        """Return a copy rotated about the origin: positions, axes and colours.
 
         Args:
-            rotation: (3, 3) proper rotation R; a point x comes to R x.
+            rotation: (3, 3) proper rotation R, which moves a point x to R x.
         """
-        turn = quaternion_of(rotation)
-        quats = _multiply(turn, self.quats.astype(np.float64))
+        turn = quaternion_from_matrix(rotation)
+        quats = _multiply_quats(turn, self.quats.astype(np.float64))
         harmonics = np.einsum("jk,nkc->njc", harmonics_rotation(rotation, self.degree), self.harmonics)
         return replace(self, positions=self.positions @ np.asarray(rotation).T, quats=quats, harmonics=harmonics)
 
 
 def concatenate(parts: Sequence[Splats]) -> Splats:
-    """All splats of the parts, one after the other, at the highest degree among them. `antialiased` as the first."""
+    """Join parts into one, in order, at their highest degree; `antialiased` is that of the first part."""
     degree = max(part.degree for part in parts)
     same = [part.with_degree(degree) for part in parts]
     return replace(
@@ -109,17 +109,17 @@ def concatenate(parts: Sequence[Splats]) -> Splats:
 
 
 def normalized_quats(quats: np.ndarray) -> np.ndarray:
-    """Quaternions (N, 4) wxyz to unit length and w >= 0, float32; those without length become no rotation."""
+    """Normalise quaternions (N, 4) wxyz to unit length and w >= 0, float32; zero quaternions become the identity."""
     quats = np.array(quats, np.float64)
     lengths = np.linalg.norm(quats, axis=1, keepdims=True)
     quats = np.where(lengths > 0, quats / np.where(lengths > 0, lengths, 1), [1.0, 0.0, 0.0, 0.0])
     return np.where(quats[:, :1] < 0, -quats, quats).astype(np.float32)
 
 
-def quaternion_of(rotation: np.ndarray) -> np.ndarray:
-    """(4,) float64 wxyz, unit length and w >= 0, of a proper rotation (3, 3)."""
+def quaternion_from_matrix(rotation: np.ndarray) -> np.ndarray:
+    """Convert a proper rotation (3, 3) to a unit quaternion (4,) float64 wxyz with w >= 0."""
     r = np.asarray(rotation, np.float64)
-    # Its outer product with itself: the column of the largest diagonal entry has no cancellation.
+    # The outer product of the quaternion with itself; the column of the largest diagonal entry has no cancellation.
     outer = np.empty((4, 4))
     outer[0, 0] = 1 + r[0, 0] + r[1, 1] + r[2, 2]
     outer[1, 1] = 1 + r[0, 0] - r[1, 1] - r[2, 2]
@@ -136,8 +136,8 @@ def quaternion_of(rotation: np.ndarray) -> np.ndarray:
     return -quat if quat[0] < 0 else quat
 
 
-def _multiply(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Hamilton products (N, 4) of a quaternion (4,) and quaternions (N, 4), wxyz."""
+def _multiply_quats(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the Hamilton products (N, 4) of a quaternion (4,) with quaternions (N, 4), all wxyz."""
     w, v = first[0], first[1:]
     s, u = second[:, :1], second[:, 1:]
     return np.concatenate((w * s - u @ v[:, None], w * u + s * v + np.cross(v, u)), axis=1)

@@ -1,4 +1,4 @@
-"""The one table of splat formats: for each ending who writes and reads it, and what it can hold."""
+"""The table of splat formats: for each file ending its encoder, its decoder and what it can hold."""
 
 from __future__ import annotations
 
@@ -14,61 +14,68 @@ from hyrfpack.splats.splats import Splats
 
 
 @dataclass(frozen=True, kw_only=True)
-class Kind:
-    """A kind of file, and what it can hold.
+class FileKind:
+    """A kind of file that an export writes, and what it can hold.
 
     Attributes:
-        ending: of its names, lower case.
-        degree: highest of the spherical harmonics.
-        package: what is imported for it alone: the module, and what pip calls it.
-        farthest: coordinate of a position, units; infinite where that of float32 or more is.
-        largest_scale: units.
-        antialiased: whether it can say that splats are.
+        ending: ending of the file names, in lower case.
+        max_degree: highest degree of spherical harmonics that the file can hold.
+        package: the module and the pip name of a package that only this kind needs, or None.
+        max_coordinate: largest absolute coordinate of a position, world units. Infinite means the range of float32 or
+            more.
+        max_scale: largest scale, world units.
+        stores_antialiased: whether the file can mark splats as antialiased.
     """
 
     ending: str
-    degree: int = MAX_DEGREE
+    max_degree: int = MAX_DEGREE
     package: tuple[str, str] | None = None
-    farthest: float = math.inf
-    largest_scale: float = math.inf
-    antialiased: bool = False
+    max_coordinate: float = math.inf
+    max_scale: float = math.inf
+    stores_antialiased: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
-class Format(Kind):
-    """A format of files that hold splats. All are written.
+class SplatFormat(FileKind):
+    """A file format for splats, with its encoder and decoder.
 
     Attributes:
-        encode: splats, in the input's axes and units, to the bytes of a file. Raises HyrfError.
-        decode: the bytes of a file, and what messages call it, to splats in the axes that `encode` was given. Raises
-            HyrfDataError where they are no such file or damaged.
-        read: whether `read_splats` takes it; the others are read to measure what was written.
+        encode: turns splats, in the input's axes and units, into the bytes of a file. Raises HyrfError.
+        decode: turns the bytes of a file, and its name in error messages, into splats in the axes that `encode` was
+            given. Raises HyrfDataError where the bytes are damaged or of another format.
+        is_readable: whether `read_splats` accepts the format. The others are decoded only to measure what was written.
     """
 
     encode: Callable[[Splats, Hints], bytes]
     decode: Callable[[bytes, str], Splats]
-    read: bool = False
+    is_readable: bool = False
 
 
-def _usd(extension: usd.Extension) -> Format:
+def _usd_format(extension: usd.Extension) -> SplatFormat:
     encode, decode = partial(usd.encode, extension=extension), partial(usd.decode, extension=extension)
-    return Format(ending=f".{extension}", encode=encode, decode=decode, package=usd.REQUIRED_PACKAGE)
+    return SplatFormat(ending=f".{extension}", encode=encode, decode=decode, package=usd.REQUIRED_PACKAGE)
 
 
 _ROWS = (
-    Format(ending=".ply", encode=ply.encode, decode=ply.decode, read=True),
-    Format(ending=".splat", encode=splat.encode, decode=splat.decode, read=True, degree=splat.MAX_HARMONICS_DEGREE),
-    Format(
+    SplatFormat(ending=".ply", encode=ply.encode, decode=ply.decode, is_readable=True),
+    SplatFormat(
+        ending=".splat",
+        encode=splat.encode,
+        decode=splat.decode,
+        is_readable=True,
+        max_degree=splat.MAX_HARMONICS_DEGREE,
+    ),
+    SplatFormat(
         ending=".spz",
         encode=spz.encode,
         decode=spz.decode,
-        read=True,
-        farthest=spz.MAX_COORDINATE,
-        largest_scale=spz.MAX_SCALE,
-        antialiased=True,
+        is_readable=True,
+        max_coordinate=spz.MAX_COORDINATE,
+        max_scale=spz.MAX_SCALE,
+        stores_antialiased=True,
     ),
-    Format(ending=".glb", encode=gltf.encode, decode=gltf.decode),
-    *map(_usd, usd.EXTENSIONS),
-    Format(ending=".sog", encode=sog.encode, decode=sog.decode, read=True, antialiased=True),
+    SplatFormat(ending=".glb", encode=gltf.encode, decode=gltf.decode),
+    *map(_usd_format, usd.EXTENSIONS),
+    SplatFormat(ending=".sog", encode=sog.encode, decode=sog.decode, is_readable=True, stores_antialiased=True),
 )
 FORMATS = {row.ending: row for row in _ROWS}

@@ -1,4 +1,4 @@
-"""Where splats are looked at from when nobody says: cameras that see much of them and stand in nobody's way."""
+"""Sampling of cameras for splats that come without any: cameras that see much of the scene from clear positions."""
 
 from __future__ import annotations
 
@@ -16,45 +16,56 @@ from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.splats import Splats
 
-INSIDE = 0.01, 0.99  # of what is there, along each axis, the part that the frame's box spans
-LARGEST = 0.99  # of the splats' areas: what is larger counts as no larger
-DISTANCES = 0.5, 2.2  # of outside views from what they look at, in half diagonals of the box; evenly in their logarithm
-FIELD_OF_VIEW = 50.0, 75.0  # degrees across, of views from outside and from inside
-CLEAR, ROOMY = 0.12, 0.25  # half diagonals around cameras that are free of splats, and around those in a room
-CLUTTER = 0.1  # the most of the sphere around a camera that splats so near may cover, about
-COVERED = 0.3  # the least of a picture that splats cover
-ENCLOSED = 0.75  # of all directions from the clearest places: where so many end at splats, views stand inside
-MIDDLE = 0.55  # of the box, along each axis, that views from inside stand in
-PLACES, CLEAREST = 256, 8  # that are looked at to tell
-TRIED = 6  # cameras for each that is wanted
-ENOUGH = 30_000  # splats that tell what a place is like; of more, every n-th
-THUMBNAIL = 24  # pixels a side, to see how much a picture shows
+# Distances in RADII are multiples of `WeightedSplats.radius`, half the diagonal of the box around the scene.
+FRAME_QUANTILES = 0.01, 0.99
+MAX_AREA_QUANTILE = 0.99
+OUTSIDE_DISTANCE_RANGE_RADII = 0.5, 2.2
+OUTSIDE_FIELD_OF_VIEW_DEGREES = 50.0
+INSIDE_FIELD_OF_VIEW_DEGREES = 75.0
+CLEARANCE_RADII = 0.12
+ROOM_CLEARANCE_RADII = 0.25
+MAX_CLUTTER = 0.1
+MIN_COVERAGE = 0.3
+MIN_ENCLOSED_COVERAGE = 0.75
+INSIDE_REGION_RATIO = 0.55
+ENCLOSURE_CANDIDATES = 256
+MAX_ENCLOSURE_TESTS = 8
+CANDIDATES_PER_CAMERA = 6
+MAX_SAMPLED_SPLATS = 30_000
+THUMBNAIL_SIDE_PIXELS = 24
 
 
 @dataclass(frozen=True)
-class Weighted:
-    """Splats with what they matter by.
+class WeightedSplats:
+    """Splats with the weights by which viewpoints are sampled.
 
     Attributes:
-        areas: (N,) float64 opacity times the product of the two larger scales, squared world units.
-        details: (N,) float64 opacity, times the typical area over the splat's own where that is larger: what is far
-            from all cameras, as a sky, is made of few large splats.
-        frame: the box around nearly all details.
-        targets: (N,) float64 areas, beyond the box by the fourth power less: a sky is large and far away.
+        splats: the splats.
+        areas: (N,) float64 opacity times the product of the two larger scales, squared world units, limited to their
+            MAX_AREA_QUANTILE.
+        detail_weights: (N,) float64 opacity, times the median area over the splat's own where that is larger. Large
+            splats weigh less, because they make up what is far from all cameras, such as a sky.
+        frame: the box between the FRAME_QUANTILES of the detail weights along each axis.
+        target_weights: (N,) float64 areas, divided beyond the box by the fourth power of the distance in boxes, because
+            a sky is large and far away.
     """
 
     splats: Splats
     areas: np.ndarray
-    details: np.ndarray
+    detail_weights: np.ndarray
     frame: Frame
-    targets: np.ndarray
+    target_weights: np.ndarray
 
     @classmethod
-    def of(cls, splats: Splats, name: str) -> Weighted:
-        """Weigh splats.
+    def from_splats(cls, splats: Splats, name: str) -> WeightedSplats:
+        """Compute the weights of splats.
+
+        Args:
+            splats: the splats.
+            name: the file's name in error messages.
 
         Raises:
-            HyrfDataError: none of them can be seen.
+            HyrfDataError: no splat is visible; each has opacity 0 or no area.
         """
         sides = np.sort(splats.scales.astype(np.float64), axis=1)
         discs = sides[:, 1] * sides[:, 2]
@@ -65,67 +76,75 @@ class Weighted:
             )
         seen = areas > 0
         typical = np.median(discs[seen])
-        details = np.where(seen, splats.opacities * (typical / np.maximum(discs, typical)), 0.0)
-        areas = np.minimum(areas, np.quantile(areas[seen], LARGEST))
-        frame = Frame.from_box(*_box(splats.positions[seen], sides[seen, 2], details[seen]))
+        detail_weights = np.where(seen, splats.opacities * (typical / np.maximum(discs, typical)), 0.0)
+        areas = np.minimum(areas, np.quantile(areas[seen], MAX_AREA_QUANTILE))
+        frame = Frame.from_box(*_quantile_box(splats.positions[seen], sides[seen, 2], detail_weights[seen]))
         boxes_away = np.abs(frame.to_local(splats.positions) / frame.half_extent).max(axis=1)
-        return cls(splats, areas, details, frame, areas / np.maximum(boxes_away, 1) ** 4)
+        return cls(splats, areas, detail_weights, frame, areas / np.maximum(boxes_away, 1) ** 4)
 
     @property
     def radius(self) -> float:
-        """Half the diagonal of the box, world units."""
+        """Half the diagonal of the frame's box, world units."""
         return float(np.linalg.norm(self.frame.half_extent)) * self.frame.scale
 
-    def clutter(self, place: np.ndarray, reach: float = CLEAR) -> float:
-        """About how much of the sphere around a place (3,) splats within `reach` half diagonals cover."""
-        every = _every(len(self.areas))
-        squares = ((self.splats.positions[::every] - place) ** 2).sum(axis=1)
+    def clutter(self, place: np.ndarray, reach: float = CLEARANCE_RADII) -> float:
+        """Estimate the share of the sphere around a place (3,) that splats within `reach` radii cover."""
+        stride = _choose_stride(len(self.areas))
+        squares = ((self.splats.positions[::stride] - place) ** 2).sum(axis=1)
         near = squares < (reach * self.radius) ** 2
-        areas, squares = self.areas[::every][near], squares[near]
-        # A disc of standard deviations a and b lets 2 pi a b o of light from far behind it disappear.
-        return every * float((areas / (2 * squares + areas)).sum())
+        areas, squares = self.areas[::stride][near], squares[near]
+        # A disc with standard deviations a and b and opacity o blocks an area of 2 pi a b o of distant light.
+        return stride * float((areas / (2 * squares + areas)).sum())
 
 
-def _box(positions: np.ndarray, sizes: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The corners between the quantiles INSIDE, by weight, of each axis; each splat lies at its two ends."""
+def _quantile_box(positions: np.ndarray, sizes: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of the box between the weighted FRAME_QUANTILES of each axis.
+
+    Each splat counts at both ends of its extent, its position minus and plus its size.
+    """
     ends = np.concatenate((positions - sizes[:, None], positions + sizes[:, None]))
     order = np.argsort(ends, axis=0, kind="stable")
     shares = np.cumsum(np.tile(weights, 2)[order], axis=0)
-    rows = [[np.searchsorted(column / column[-1], share) for column in shares.T] for share in INSIDE]
+    rows = [[np.searchsorted(column / column[-1], share) for column in shares.T] for share in FRAME_QUANTILES]
     low, high = (np.array([ends[order[row, axis], axis] for axis, row in enumerate(part)]) for part in rows)
     return low, high
 
 
-def viewpoints(
-    weighted: Weighted, drawable: Drawable, count: int, size: int, seed: int, inside: bool | None = None
+def sample_viewpoints(
+    weighted: WeightedSplats, drawable: Drawable, count: int, size: int, seed: int, inside: bool | None = None
 ) -> list[Camera]:
-    """Cameras all around, near and far, or inside where splats surround.
+    """Sample cameras around the scene, or inside it where splats surround the clear places, as in a room.
 
-    Views from outside look at splats, drawn as `Weighted.targets`, from all directions. Where the clearest places of
-    the box have splats all around, as in a room, views stand there instead and look at splats drawn by details, for
-    walls and skies would take most of the pictures. Either kind keeps clear of splats right before the camera and has
-    some of them in the picture, as long as such views are found.
+    Cameras outside stand in all directions and at distances spread evenly in their logarithm. They look at splats
+    sampled by `target_weights`. Cameras inside look at splats sampled by `detail_weights`, because walls and skies
+    would fill most of the pictures otherwise. Both kinds keep at most MAX_CLUTTER of the sphere around them covered by
+    near splats, and show splats on at least MIN_COVERAGE of the picture, as long as such views are found among
+    CANDIDATES_PER_CAMERA times `count` candidates.
 
     Args:
-        drawable: the splats in the frame's units.
-        count: how many.
-        size: pixels a side.
-        seed: of what is drawn; other seeds give other cameras of the same kind.
-        inside: whether views stand inside; `surrounds` says, if it is not said here.
+        weighted: the splats with their weights.
+        drawable: the same splats in the frame's units.
+        count: number of cameras.
+        size: sides of the square pictures, pixels.
+        seed: random seed; other seeds give other cameras of the same kind.
+        inside: whether cameras stand inside; None lets `has_enclosed_places` decide.
     """
     rng = np.random.default_rng(seed)
-    inside = surrounds(weighted, drawable) if inside is None else inside
+    inside = has_enclosed_places(weighted, drawable) if inside is None else inside
     found: list[Camera] = []
     others: list[tuple[float, Camera]] = []
 
     def covered(camera: Camera) -> float:
-        return -1.0 if weighted.clutter(camera.position) > CLUTTER else coverage(drawable, camera)
+        return -1.0 if weighted.clutter(camera.position) > MAX_CLUTTER else coverage(drawable, camera)
 
-    for _ in range(TRIED):
-        ends = [_inside(weighted, rng) if inside else _outside(weighted, rng) for _ in range(count)]
-        cameras = [_camera(place, target, size, FIELD_OF_VIEW[inside]) for place, target in ends]
+    field_of_view = INSIDE_FIELD_OF_VIEW_DEGREES if inside else OUTSIDE_FIELD_OF_VIEW_DEGREES
+    for _ in range(CANDIDATES_PER_CAMERA):
+        ends = [
+            _sample_inside_view(weighted, rng) if inside else _sample_outside_view(weighted, rng) for _ in range(count)
+        ]
+        cameras = [_camera_looking_at(place, target, size, field_of_view) for place, target in ends]
         for share, camera in zip(parallel_map(covered, cameras, drawable.device), cameras, strict=True):
-            if share >= COVERED:
+            if share >= MIN_COVERAGE:
                 found.append(camera)
             else:
                 others.append((share, camera))
@@ -136,60 +155,71 @@ def viewpoints(
 
 
 def coverage(drawable: Drawable, camera: Camera) -> float:
-    """How much of a camera's picture splats cover, 0 to 1, from a picture of THUMBNAIL pixels."""
-    every = _every(len(drawable.positions))
-    # Of n times as many, each like these, the n-th power gets through.
-    seen = draw(drawable[::every], shrink_camera(camera, THUMBNAIL), black=True).transmittance ** every
+    """Measure the share of a camera's picture that splats cover, 0 to 1, in a small picture of every n-th splat."""
+    stride = _choose_stride(len(drawable.positions))
+    # With n times as many splats like these, the n-th power of the transmittance would remain.
+    seen = draw(drawable[::stride], shrink_camera(camera, THUMBNAIL_SIDE_PIXELS), black=True).transmittance ** stride
     return 1 - float(seen.mean())
 
 
-def _every(count: int) -> int:
-    return max(1, -(-count // ENOUGH))
+def _choose_stride(count: int) -> int:
+    """Return the n for which every n-th of `count` splats makes at most MAX_SAMPLED_SPLATS."""
+    return max(1, -(-count // MAX_SAMPLED_SPLATS))
 
 
-def surrounds(weighted: Weighted, drawable: Drawable) -> bool:
-    """Whether there are places in the box with room around them and splats all around."""
+def has_enclosed_places(weighted: WeightedSplats, drawable: Drawable) -> bool:
+    """Return whether the box has places that are clear of near splats and have splats in nearly all directions.
+
+    The clearest of ENCLOSURE_CANDIDATES places are tested. Splats have to cover MIN_ENCLOSED_COVERAGE of all directions
+    from half of them.
+    """
     rng = np.random.default_rng(0)
-    places = [_inside(weighted, rng)[0] for _ in range(PLACES)]
-    clutter = np.array(parallel_map(lambda place: weighted.clutter(place, ROOMY), places))
+    places = [_sample_inside_view(weighted, rng)[0] for _ in range(ENCLOSURE_CANDIDATES)]
+    clutter = np.array(parallel_map(lambda place: weighted.clutter(place, ROOM_CLEARANCE_RADII), places))
     seen = []
-    for index in np.argsort(clutter, kind="stable")[:CLEAREST]:
-        if clutter[index] <= CLUTTER:
+    for index in np.argsort(clutter, kind="stable")[:MAX_ENCLOSURE_TESTS]:
+        if clutter[index] <= MAX_CLUTTER:
             axes = np.concatenate((np.eye(3), -np.eye(3)))
-            cameras = [_camera(places[index], places[index] + axis * weighted.radius, THUMBNAIL, 90.0) for axis in axes]
+            cameras = [
+                _camera_looking_at(places[index], places[index] + axis * weighted.radius, THUMBNAIL_SIDE_PIXELS, 90.0)
+                for axis in axes
+            ]
             shares = parallel_map(lambda camera: coverage(drawable, camera), cameras, drawable.device)
             seen.append(np.mean(shares))
-    return len(seen) > 0 and float(np.median(seen)) >= ENCLOSED
+    return len(seen) > 0 and float(np.median(seen)) >= MIN_ENCLOSED_COVERAGE
 
 
-def _inside(weighted: Weighted, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """A place in the middle of the box, and the splat that it looks at."""
+def _sample_inside_view(weighted: WeightedSplats, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Sample a place in the middle of the box, and the position of the splat that a camera there looks at."""
     frame = weighted.frame
-    place = np.array(frame.center) + rng.uniform(-MIDDLE, MIDDLE, 3) * np.array(frame.half_extent) * frame.scale
-    return place, _drawn(weighted, weighted.details, rng)
+    place = (
+        np.array(frame.center)
+        + rng.uniform(-INSIDE_REGION_RATIO, INSIDE_REGION_RATIO, 3) * np.array(frame.half_extent) * frame.scale
+    )
+    return place, _sample_position(weighted, weighted.detail_weights, rng)
 
 
-def _outside(weighted: Weighted, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """A place some way off, and the splat that it looks at."""
-    target = _drawn(weighted, weighted.targets, rng)
-    near, far = np.log(DISTANCES)
-    return target + weighted.radius * math.exp(rng.uniform(near, far)) * _direction(rng), target
+def _sample_outside_view(weighted: WeightedSplats, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Sample the position of a splat to look at, and a place at some distance from it; returns place, target."""
+    target = _sample_position(weighted, weighted.target_weights, rng)
+    near, far = np.log(OUTSIDE_DISTANCE_RANGE_RADII)
+    return target + weighted.radius * math.exp(rng.uniform(near, far)) * _sample_direction(rng), target
 
 
-def _drawn(weighted: Weighted, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The place (3,) of a splat, drawn by weights (N,)."""
+def _sample_position(weighted: WeightedSplats, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Sample the position (3,) of a splat with probability proportional to weights (N,)."""
     shares = np.cumsum(weights)
     return weighted.splats.positions[np.searchsorted(shares, rng.random() * shares[-1])]
 
 
-def _direction(rng: np.random.Generator) -> np.ndarray:
-    """(3,) a unit vector, all directions alike."""
+def _sample_direction(rng: np.random.Generator) -> np.ndarray:
+    """Sample a unit vector (3,) uniformly from the sphere."""
     height, angle = rng.uniform(-1, 1), rng.uniform(0, 2 * math.pi)
     side = math.sqrt(1 - height * height)
     return np.array([side * math.cos(angle), height, side * math.sin(angle)])
 
 
-def _camera(place: np.ndarray, target: np.ndarray, size: int, degrees: float) -> Camera:
+def _camera_looking_at(place: np.ndarray, target: np.ndarray, size: int, degrees: float) -> Camera:
     focal = size / 2 / math.tan(math.radians(degrees / 2))
     pose = look_at(place, target, np.array([0.0, -1.0, 0.0]))
     return Camera(size, size, focal, focal, size / 2, size / 2, pose)

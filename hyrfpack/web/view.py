@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.format import describe, find_model
-from hyrfpack.splats.names import is_splats, splats_folder
+from hyrfpack.splats.names import is_splats, sog_folder
 from hyrfpack.web.player import MODEL, SPLATS, encode_player
 from hyrfpack.web.serve import LOCAL, serve
 
@@ -51,7 +51,7 @@ def playable_file(path: str | os.PathLike[str]) -> Path:
     """
     if not is_splats(path):
         return find_model(path)
-    if splats_folder(path) is not None:
+    if sog_folder(path) is not None:
         raise HyrfDataError(f"{path}: a page plays single files; bundle these with 'hyrfpack convert {path} scene.sog'")
     return Path(path)
 

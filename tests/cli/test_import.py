@@ -13,7 +13,7 @@ from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.distill import DistillConfig
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.formats import ply
-from hyrfpack.splats.viewpoints import Weighted, viewpoints
+from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 
 QUICK = ("--steps", 2, "--size", 24)
 pytestmark = pytest.mark.usefixtures("short_imports")
@@ -28,8 +28,8 @@ def source(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def cameras(tmp_path: Path) -> Path:
-    weighted = Weighted.of(ball(40), "ball")
-    made = viewpoints(weighted, Drawable.of(ball(40), weighted.frame), 9, 48, 3)
+    weighted = WeightedSplats.from_splats(ball(40), "ball")
+    made = sample_viewpoints(weighted, Drawable.from_splats(ball(40), weighted.frame), 9, 48, 3)
     path = tmp_path / "cameras.json"
     path.write_text(cameras_to_json([(str(number), camera) for number, camera in enumerate(made)]))
     return path

@@ -18,7 +18,7 @@ from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.files import cameras_to_json
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.format import save
-from hyrfpack.splats.files import READ
+from hyrfpack.splats.files import READABLE_ENDINGS
 from hyrfpack.splats.formats import sog
 from hyrfpack.splats.formats.hints import NO_HINTS
 from hyrfpack.splats.names import SPLATS_SUFFIXES, is_splats
@@ -31,7 +31,7 @@ SPLATS = ball(60)
 def files(tmp_path_factory) -> dict[str, Path]:
     """The same splats in every format that is read, and as a loose SOG."""
     folder = tmp_path_factory.mktemp("splats")
-    paths = {ending: folder / f"ball{ending}" for ending in READ}
+    paths = {ending: folder / f"ball{ending}" for ending in READABLE_ENDINGS}
     for ending, path in paths.items():
         path.write_bytes(FORMATS[ending].encode(SPLATS, NO_HINTS))
     loose = folder / "loose"
@@ -45,7 +45,7 @@ KINDS = [*SPLATS_SUFFIXES, "loose", "meta.json"]
 
 
 def test_names_know_every_ending_that_is_read():
-    assert sorted(SPLATS_SUFFIXES) == sorted(READ)
+    assert sorted(SPLATS_SUFFIXES) == sorted(READABLE_ENDINGS)
 
 
 def test_a_folder_with_another_meta_json_is_no_splats(tmp_path):
@@ -61,7 +61,7 @@ def test_info_tells_format_count_degree_bounds_and_bytes(kind, files):
     size = sum(file.stat().st_size for file in files["loose"].iterdir()) if loose else path.stat().st_size
     assert (facts["gaussians"], facts["bytes"]) == (60, size)
     assert facts["format"] == ("sog folder" if loose else kind[1:])
-    assert facts["degree"] == min(1, FORMATS[".sog" if loose else kind].degree)
+    assert facts["degree"] == min(1, FORMATS[".sog" if loose else kind].max_degree)
     assert facts["low"] == pytest.approx(SPLATS.positions.min(0), abs=2e-3)
     assert facts["high"] == pytest.approx(SPLATS.positions.max(0), abs=2e-3)
     printed = succeeded("info", path).stdout

@@ -13,7 +13,7 @@ from scenes import ball_points, photograph, ring
 
 from hyrfpack.data import load_scene
 from hyrfpack.scene import Camera, Scene
-from hyrfpack.splats.splats import quaternion_of
+from hyrfpack.splats.splats import quaternion_from_matrix
 from tools.safety.variants.attempt import try_variant
 from tools.safety.variants.catalog import VARIANTS
 from tools.safety.variants.working_set import WorkingSet
@@ -31,7 +31,7 @@ def write_colmap(root: Path, cameras: list[Camera]) -> None:
     images, (points, colors) = [], ball_points(20)
     for number, camera in enumerate(cameras, start=1):
         name, shift = f"{number:03d}.jpg", camera.camera_from_world[:3, 3]
-        images.append(" ".join(map(str, (number, *quaternion_of(camera.rotation), *shift, 1, name))) + "\n\n")
+        images.append(" ".join(map(str, (number, *quaternion_from_matrix(camera.rotation), *shift, 1, name))) + "\n\n")
         Image.fromarray(photograph(camera).rgb).save(root / "images" / name, quality=98, subsampling=0)
     fx, fy, cx, cy = cameras[0].intrinsics
     (model / "cameras.txt").write_text(f"1 PINHOLE {WIDTH} {HEIGHT} {fx} {fy} {cx} {cy}\n")

@@ -16,16 +16,16 @@ from hyrfpack.distill.teacher import Sample, teaching_scene
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
-from hyrfpack.splats.viewpoints import Weighted, viewpoints
+from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 
 
 def test_report_says_what_is_in_the_file(tmp_path: Path) -> None:
     splats, target = ball(200), tmp_path / "ball.hyrf"
     report = distill_splats(splats, target, LITTLE)
     model = hyrfpack.load(target)
-    weighted = Weighted.of(splats, "ball")
-    original = Drawable.of(splats, weighted.frame)
-    held_out = viewpoints(weighted, original, LITTLE.test_views, LITTLE.size, 1)
+    weighted = WeightedSplats.from_splats(splats, "ball")
+    original = Drawable.from_splats(splats, weighted.frame)
+    held_out = sample_viewpoints(weighted, original, LITTLE.test_views, LITTLE.size, 1)
     scores = Sample.of(original, held_out).likeness(model)
     assert (report.psnr, report.psnr_worst) == (np.mean(scores), min(scores))
     assert (report.gaussians_before, report.gaussians_after) == (200, len(model))
@@ -61,7 +61,9 @@ def test_neither_origin_nor_unit_matters(tmp_path: Path, unit: float, offset: fl
     assert abs(here.psnr_unpacked - there.psnr_unpacked) < 0.05
     frame = hyrfpack.load(tmp_path / "x.hyrf").config.frame
     np.testing.assert_allclose(
-        frame.to_local(moved.positions), Weighted.of(splats, "").frame.to_local(splats.positions), atol=1e-5
+        frame.to_local(moved.positions),
+        WeightedSplats.from_splats(splats, "").frame.to_local(splats.positions),
+        atol=1e-5,
     )
 
 
@@ -164,7 +166,7 @@ def test_nothing_is_measured_or_drawn_twice_however_often_packing_is_tried(
 def test_a_short_import_looks_from_fewer_places_and_regresses_less(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looked = counting(monkeypatch, teach, "viewpoints")
+    looked = counting(monkeypatch, teach, "sample_viewpoints")
     started = counting(monkeypatch, teach, "initial_model")
     monkeypatch.setattr(teach, "_fit_to_pictures", lambda *args: None)
     monkeypatch.setattr(fit, "pack", _interrupt)
@@ -211,9 +213,9 @@ def test_settings_out_of_range_are_refused() -> None:
 
 def test_teacher_shows_what_is_drawn() -> None:
     splats = ball(40)
-    weighted = Weighted.of(splats, "ball")
-    original = Drawable.of(splats, weighted.frame)
-    (camera,) = viewpoints(weighted, original, 1, 32, 0)
+    weighted = WeightedSplats.from_splats(splats, "ball")
+    original = Drawable.from_splats(splats, weighted.frame)
+    (camera,) = sample_viewpoints(weighted, original, 1, 32, 0)
     scene = teaching_scene("ball", original, [camera], [])
     picture = scene.train[0].load()
     drawn = draw(original, camera)

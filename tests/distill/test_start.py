@@ -11,14 +11,14 @@ from hyrfpack.distill.start import initial_model, rotations
 from hyrfpack.distill.teacher import teaching_scene
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.splats import Splats
-from hyrfpack.splats.viewpoints import Weighted, viewpoints
+from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 
 
 def drawable_of(splats: Splats) -> tuple[Drawable, list]:
-    weighted = Weighted.of(splats, "x")
-    drawable = Drawable.of(splats, weighted.frame)
-    return drawable, viewpoints(weighted, drawable, 24, 32, 0)
+    weighted = WeightedSplats.from_splats(splats, "x")
+    drawable = Drawable.from_splats(splats, weighted.frame)
+    return drawable, sample_viewpoints(weighted, drawable, 24, 32, 0)
 
 
 def covariances(scales, quats) -> np.ndarray:
@@ -43,7 +43,7 @@ def test_fields_learn_shapes_and_colours(degree: int, monkeypatch: pytest.Monkey
         made = model.decode_geometry()
         place = torch.tensor((3.0, 1.0, 0.0))
         colors = model.decode_colors(place)
-        wanted = drawable.colors_from(place, torch.arange(100)).clamp(0, 1)
+        wanted = drawable.evaluate_colors(place, torch.arange(100)).clamp(0, 1)
     # Ellipsoids agree whatever their axes are called; sizes and opacities are stored, and exact.
     expected = covariances(drawable.scales, drawable.quats)
     error = np.linalg.norm(covariances(made.scales, made.quats) - expected, axis=(1, 2))

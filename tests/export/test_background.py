@@ -34,7 +34,7 @@ def test_cells_are_numbered_by_their_middles_and_cover_the_sphere(level):
 
 def test_an_even_background_becomes_an_even_nearly_opaque_layer():
     splats = background_splats(sky_model(0.0), ring(4))
-    drawable = Drawable.of(splats, Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0)))
+    drawable = Drawable.from_splats(splats, Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0)))
     for camera in ring(3, elevation=-2.0, width=64, height=64):
         drawn = draw(drawable, camera)
         assert drawn.transmittance.max() < 0.15 and drawn.transmittance.mean() < 0.02
@@ -45,7 +45,7 @@ def test_baked_splats_and_background_look_like_the_model():
     frame = Frame((30.0, 10.0, -5.0), 4.0, (1.0, 1.0, 0.5))
     model = sky_model(frame=frame, direction_encoding="sh")
     cameras = [camera_at(4 * c.position + frame.center, frame.center, width=48, height=48) for c in ring(6)]
-    whole = Drawable.of(concatenate((bake(model, cameras)[3], background_splats(model, cameras))), frame)
+    whole = Drawable.from_splats(concatenate((bake(model, cameras)[3], background_splats(model, cameras))), frame)
     with torch.no_grad():
         errors = [(draw(whole, camera).rgb - render(model, camera).rgb).square().mean() for camera in cameras]
     assert math.sqrt(sum(errors) / len(errors)) < 0.02
@@ -73,7 +73,7 @@ def test_splats_lie_on_the_sphere_around_the_frame():
 def test_a_narrow_view_of_an_even_background_has_no_hole():
     camera = camera_at((0, -3, 0), (0, 0, 4), width=32, height=32, focal=200)  # 9 degrees wide
     splats = background_splats(sky_model(0.0), [camera])
-    drawn = draw(Drawable.of(splats, Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))), camera)
+    drawn = draw(Drawable.from_splats(splats, Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))), camera)
     assert drawn.transmittance.max() < 0.25 and drawn.transmittance.mean() < 0.05
 
 

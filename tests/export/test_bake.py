@@ -12,7 +12,7 @@ from hyrfpack.export.bake import bake
 from hyrfpack.model import Frame
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.splats.draw import Drawable, draw
-from hyrfpack.splats.harmonics import BAND_0, harmonics_basis
+from hyrfpack.splats.harmonics import SH_C0, harmonics_basis
 
 POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (60, 3))
 ALL = RenderSettings(cull_tolerance=1e9)
@@ -25,7 +25,7 @@ def shiny_model(positions=POSITIONS, **options):
 
 def error(model, splats, cameras, how=ALL, truth=None) -> float:
     """Root mean square of what the pictures differ by."""
-    drawable = Drawable.of(splats, model.config.frame)
+    drawable = Drawable.from_splats(splats, model.config.frame)
     with torch.no_grad():
         pairs = [(draw(drawable, c, how).rgb, render(truth or model, c).rgb) for c in cameras]
     return float(torch.stack([(a - b).square().mean() for a, b in pairs]).mean().sqrt())
@@ -40,8 +40,8 @@ def test_colours_that_do_not_depend_on_direction_are_exact_at_degree_0(scale, ce
     baked = bake(model, [camera_at(scale * c.position + center, center) for c in ring(views)], (0, 3))
     color = 1 / (1 + np.exp(-logit))
     # The fit's equations are sums in float32 over views and directions: 1.4e-6 at most in 1,200 tries.
-    assert np.allclose(0.5 + BAND_0 * baked[0].harmonics[:, 0], color, atol=3e-6)
-    assert np.allclose(0.5 + BAND_0 * baked[3].harmonics[:, 0], color, atol=1e-3)
+    assert np.allclose(0.5 + SH_C0 * baked[0].harmonics[:, 0], color, atol=3e-6)
+    assert np.allclose(0.5 + SH_C0 * baked[3].harmonics[:, 0], color, atol=1e-3)
     assert np.abs(baked[3].harmonics[:, 1:]).max() < 1e-3
 
 

@@ -10,7 +10,7 @@ from explicit_balls import ball
 
 import hyrfpack
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.splats.files import READ, read_splats
+from hyrfpack.splats.files import READABLE_ENDINGS, read_splats
 from hyrfpack.splats.formats import sog
 from hyrfpack.splats.formats.hints import NO_HINTS
 from hyrfpack.splats.splats import Splats
@@ -34,7 +34,7 @@ def written(folder: Path, ending: str, splats: Splats) -> Path:
 
 
 @pytest.mark.parametrize("after", FORMATS)
-@pytest.mark.parametrize("before", READ)
+@pytest.mark.parametrize("before", READABLE_ENDINGS)
 def test_every_pair_of_formats_keeps_places_and_looks(before, after, tmp_path):
     if FORMATS[after].package:
         pytest.importorskip(FORMATS[after].package[0])
@@ -43,8 +43,8 @@ def test_every_pair_of_formats_keeps_places_and_looks(before, after, tmp_path):
     kept, back = FORMATS[before].decode(source.read_bytes(), "it"), FORMATS[after].decode(target.read_bytes(), "it")
     assert (report.bytes_before, report.bytes_after) == (source.stat().st_size, target.stat().st_size)
     assert report.gaussians_before == report.gaussians_after == len(back) == COUNT
-    assert report.degree_before == kept.degree == min(1, FORMATS[before].degree)
-    assert report.degree_after == back.degree == min(kept.degree, FORMATS[after].degree)
+    assert report.degree_before == kept.degree == min(1, FORMATS[before].max_degree)
+    assert report.degree_after == back.degree == min(kept.degree, FORMATS[after].max_degree)
     nearest = np.linalg.norm(back.positions[:, None] - kept.positions, axis=-1).min(axis=0)
     assert nearest.max() < 2e-3
     lost_harmonics = kept.degree > back.degree
@@ -127,7 +127,7 @@ def test_the_source_is_never_replaced(tmp_path):
 
 def test_splats_that_a_format_cannot_reach_are_refused_before_anything_is_written(tmp_path):
     splats = ball(5)
-    positions = splats.positions + [2 * FORMATS[".spz"].farthest, 0, 0]
+    positions = splats.positions + [2 * FORMATS[".spz"].max_coordinate, 0, 0]
     far = Splats(positions, splats.scales, splats.quats, splats.opacities, splats.harmonics)
     with pytest.raises(HyrfError, match="name another format"):
         hyrfpack.convert(written(tmp_path, ".ply", far), tmp_path / "a.spz")

@@ -22,7 +22,7 @@ from hyrfpack.format import load, save
 from hyrfpack.model.exposure import ExposureMap
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.splats.files import read_splats
-from hyrfpack.splats.harmonics import BAND_0, harmonics_basis
+from hyrfpack.splats.harmonics import SH_C0, harmonics_basis
 
 RANDOM = np.random.default_rng(0)
 LEFT, RIGHT = (RANDOM.uniform(-0.1, 0.1, (20, 3)) + (side, 0, 0) for side in (-0.6, 0.6))
@@ -66,7 +66,7 @@ def exposed_grey(gains: np.ndarray) -> np.ndarray:
 
 
 def base_colors(splats) -> np.ndarray:
-    return 0.5 + BAND_0 * splats.harmonics[:, 0]
+    return 0.5 + SH_C0 * splats.harmonics[:, 0]
 
 
 def write(path, model, cameras):

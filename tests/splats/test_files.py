@@ -9,7 +9,7 @@ import pytest
 from scenes import ring
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.splats.files import MAX_BYTES, READ, encode_splats, read_splats
+from hyrfpack.splats.files import MAX_FILE_BYTES, READABLE_ENDINGS, encode_splats, read_splats
 from hyrfpack.splats.splats import Splats, normalized_quats
 from hyrfpack.splats.table import FORMATS
 
@@ -54,7 +54,7 @@ def test_every_format_brings_as_many_gaussians_back_to_the_same_place(extension,
     assert back.degree == (0 if extension == ".splat" else 3)
 
 
-@pytest.mark.parametrize("extension", READ)
+@pytest.mark.parametrize("extension", READABLE_ENDINGS)
 def test_files_are_read_by_their_ending_in_any_case(extension, tmp_path):
     path = tmp_path / f"SCENE{extension.upper()}"
     path.write_bytes(encoded(cloud(), extension))
@@ -62,7 +62,7 @@ def test_files_are_read_by_their_ending_in_any_case(extension, tmp_path):
     assert len(read_splats(str(path))) == 50
 
 
-@pytest.mark.parametrize("extension", READ)
+@pytest.mark.parametrize("extension", READABLE_ENDINGS)
 def test_damaged_files_are_one_sentence_that_names_them(extension, tmp_path):
     path = tmp_path / f"broken{extension}"
     path.write_bytes(encoded(cloud(), extension)[:-7])
@@ -83,7 +83,7 @@ def test_no_file_and_unknown_endings_and_folders_are_one_sentence(tmp_path):
 def test_a_file_too_large_to_be_splats_is_refused_unread(tmp_path):
     path = tmp_path / "large.ply"
     path.touch()
-    os.truncate(path, MAX_BYTES + 1)  # a hole, not bytes
+    os.truncate(path, MAX_FILE_BYTES + 1)  # a hole, not bytes
     with pytest.raises(HyrfDataError, match="is larger than 4,294,967,296 bytes; split it first$"):
         read_splats(path)
 

@@ -4,7 +4,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
-from hyrfpack.splats.harmonics import BAND_0, harmonics_basis, harmonics_rotation, terms_of
+from hyrfpack.splats.harmonics import SH_C0, harmonics_basis, harmonics_rotation, num_sh_bases
 
 GENERATOR = np.random.default_rng(0)
 
@@ -41,14 +41,14 @@ def test_the_basis_is_orthonormal_on_the_sphere():
 @pytest.mark.parametrize("degree", range(4))
 def test_lower_degrees_are_the_first_columns(degree):
     d = directions_of(5)
-    assert np.array_equal(basis(d, degree), basis(d)[:, : terms_of(degree)])
-    assert np.allclose(basis(d, 0), BAND_0)
+    assert np.array_equal(basis(d, degree), basis(d)[:, : num_sh_bases(degree)])
+    assert np.allclose(basis(d, 0), SH_C0)
 
 
 @pytest.mark.parametrize("degree", range(4))
 def test_turned_coefficients_give_the_turned_function(degree):
     turn, d = Rotation.random(rng=1).as_matrix(), directions_of(40)
-    coefficients = GENERATOR.normal(size=terms_of(degree))
+    coefficients = GENERATOR.normal(size=num_sh_bases(degree))
     turned = harmonics_rotation(turn, degree) @ coefficients
     assert np.allclose(basis(d, degree) @ turned, basis(d @ turn, degree) @ coefficients, atol=1e-12)
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from hyrfpack.model import Frame
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
-from hyrfpack.splats.splats import Splats, concatenate, normalized_quats, quaternion_of
+from hyrfpack.splats.splats import Splats, concatenate, normalized_quats, quaternion_from_matrix
 
 UNIT = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
 
@@ -67,7 +67,7 @@ def test_there_may_be_no_splats_at_all():
 @pytest.mark.parametrize("turn", [*Rotation.random(8, rng=0).as_matrix(), np.eye(3), np.diag([-1.0, -1, 1])])
 def test_quaternions_of_rotations_are_scipys(turn):
     x, y, z, w = Rotation.from_matrix(turn).as_quat(canonical=True)
-    assert np.allclose(quaternion_of(turn), (w, x, y, z), atol=1e-7)
+    assert np.allclose(quaternion_from_matrix(turn), (w, x, y, z), atol=1e-7)
 
 
 def test_quaternions_without_length_become_no_rotation():
@@ -81,6 +81,6 @@ def test_turned_splats_look_as_before_to_a_camera_that_turned_along():
     turn[:3, :3] = Rotation.random(rng=3).as_matrix()
     sizes = camera.width, camera.height, *camera.intrinsics
     turned = Camera(*sizes, camera.camera_from_world @ turn.T)
-    before = draw(Drawable.of(splats, UNIT), camera).rgb
-    after = draw(Drawable.of(splats.rotated(turn[:3, :3]), UNIT), turned).rgb
+    before = draw(Drawable.from_splats(splats, UNIT), camera).rgb
+    after = draw(Drawable.from_splats(splats.rotated(turn[:3, :3]), UNIT), turned).rgb
     assert before.max() > 0.3 and (before - after).abs().max() < 1e-5

@@ -15,7 +15,7 @@ from made_up_splats import made_up
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats.hints import NO_HINTS
 from hyrfpack.splats.harmonics import MAX_DEGREE
-from hyrfpack.splats.table import FORMATS, Format
+from hyrfpack.splats.table import FORMATS, SplatFormat
 
 # The largest error of positions, logarithms of scales, components of quaternions, opacities and harmonics.
 BYTE = 0.5 / 255 * 1.01
@@ -27,7 +27,7 @@ PRECISION = dict.fromkeys((".ply", ".glb", ".usda", ".usdc", ".usdz"), FLOAT) | 
 }
 
 
-def encoded(row: Format, splats) -> bytes:
+def encoded(row: SplatFormat, splats) -> bytes:
     if row.package:
         pytest.importorskip(row.package[0])
     return row.encode(splats, NO_HINTS)
@@ -39,7 +39,7 @@ def test_what_is_encoded_decodes_to_the_same_within_the_formats_precision(ending
     row, splats = FORMATS[ending], made_up(degree=degree)
     splats = replace(splats, harmonics=np.clip(splats.harmonics, -0.95, 0.95))  # the narrowest range, that of SPZ
     back = row.decode(encoded(row, splats), "it")
-    assert len(back) == len(splats) and back.degree == min(degree, row.degree)
+    assert len(back) == len(splats) and back.degree == min(degree, row.max_degree)
     splats = splats.with_degree(back.degree)
     apart = np.linalg.norm(back.positions[:, None] - splats.positions, axis=-1)
     back = back[apart.argmin(0)]  # formats may change the order
@@ -60,21 +60,21 @@ def test_a_row_says_whether_files_say_antialiased(ending):
     row = FORMATS[ending]
     for said in (False, True):
         assert row.decode(encoded(row, replace(made_up(), antialiased=said)), "it").antialiased == (
-            said and row.antialiased
+            said and row.stores_antialiased
         )
 
 
 @pytest.mark.parametrize("ending", FORMATS)
 def test_a_row_says_how_far_positions_and_scales_reach(ending):
     row, splats = FORMATS[ending], made_up()
-    reach = min(row.farthest, 1e30)
+    reach = min(row.max_coordinate, 1e30)
     far = replace(splats, positions=np.where(np.arange(len(splats))[:, None] == 0, reach, splats.positions))
     assert row.decode(encoded(row, far), "it").positions.max() == pytest.approx(reach)
-    if np.isfinite(row.farthest):
+    if np.isfinite(row.max_coordinate):
         with pytest.raises(HyrfDataError, match="units from the origin"):
             encoded(row, replace(far, positions=far.positions * 1.01))
     large = replace(splats, scales=splats.scales * np.float32(1e6))
-    largest = min(row.largest_scale, large.scales.max())
+    largest = min(row.max_scale, large.scales.max())
     assert row.decode(encoded(row, large), "it").scales.max() == pytest.approx(largest, rel=1e-5)
 
 
@@ -95,7 +95,7 @@ def test_the_docs_list_what_is_in_the_table():
     from hyrfpack.export.kinds import ENDINGS
 
     assert endings_in("export.md", "| ending |", "\n\n") == set(ENDINGS) > set(FORMATS)
-    assert endings_in("import.md", "| read |", "\n\n") == {row.ending for row in FORMATS.values() if row.read}
+    assert endings_in("import.md", "| read |", "\n\n") == {row.ending for row in FORMATS.values() if row.is_readable}
 
 
 def test_the_table_imports_no_package_that_only_a_format_wants():

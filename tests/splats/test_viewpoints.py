@@ -9,13 +9,20 @@ from explicit_balls import ball
 from hyrfpack.splats import viewpoints as views
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.splats import Splats, concatenate
-from hyrfpack.splats.viewpoints import CLUTTER, COVERED, DISTANCES, Weighted, coverage, viewpoints
+from hyrfpack.splats.viewpoints import (
+    MAX_CLUTTER,
+    MIN_COVERAGE,
+    OUTSIDE_DISTANCE_RANGE_RADII,
+    WeightedSplats,
+    coverage,
+    sample_viewpoints,
+)
 
 
 def seen(splats: Splats, count: int = 12, seed: int = 0):
-    weighted = Weighted.of(splats, "x")
-    drawable = Drawable.of(splats, weighted.frame)
-    return weighted, drawable, viewpoints(weighted, drawable, count, 32, seed)
+    weighted = WeightedSplats.from_splats(splats, "x")
+    drawable = Drawable.from_splats(splats, weighted.frame)
+    return weighted, drawable, sample_viewpoints(weighted, drawable, count, 32, seed)
 
 
 def solid_ball() -> Splats:
@@ -39,9 +46,9 @@ def test_objects_are_seen_from_outside_and_rooms_from_inside() -> None:
 
 def test_views_show_something_and_stand_clear() -> None:
     weighted, drawable, cameras = seen(solid_ball())
-    assert min(coverage(drawable, camera) for camera in cameras) >= COVERED
-    assert max(weighted.clutter(camera.position) for camera in cameras) <= CLUTTER
-    reach = weighted.radius * DISTANCES[1] + 1
+    assert min(coverage(drawable, camera) for camera in cameras) >= MIN_COVERAGE
+    assert max(weighted.clutter(camera.position) for camera in cameras) <= MAX_CLUTTER
+    reach = weighted.radius * OUTSIDE_DISTANCE_RANGE_RADII[1] + 1
     assert max(np.linalg.norm(camera.position) for camera in cameras) <= reach
 
 
@@ -57,7 +64,7 @@ def test_far_away_splat_does_not_stretch_the_frame() -> None:
     splats = solid_ball()
     positions = splats.positions.copy()
     positions[0] = 1e5
-    assert Weighted.of(replace(splats, positions=positions), "x").frame.scale < 2
+    assert WeightedSplats.from_splats(replace(splats, positions=positions), "x").frame.scale < 2
 
 
 def test_sky_does_not_stretch_the_frame() -> None:
@@ -76,7 +83,7 @@ def test_of_many_splats_some_tell_what_a_place_is_like(monkeypatch: pytest.Monke
     covered = [coverage(drawable, camera) for camera in cameras]
     cluttered = [weighted.clutter(camera.position, 1.0) for camera in cameras]
 
-    monkeypatch.setattr(views, "ENOUGH", len(faint) // 4)
+    monkeypatch.setattr(views, "MAX_SAMPLED_SPLATS", len(faint) // 4)
 
     np.testing.assert_allclose([coverage(drawable, camera) for camera in cameras], covered, atol=0.1)
     np.testing.assert_allclose(

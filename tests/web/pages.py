@@ -99,7 +99,7 @@ def shown(browser: Browser, camera: Camera) -> np.ndarray:
 
 def drawn(splats: Splats, camera: Camera, background: np.ndarray | None = None, frame: Frame = FRAME) -> np.ndarray:
     """The same by our rasteriser."""
-    raster = draw(Drawable.of(splats, frame), camera)
+    raster = draw(Drawable.from_splats(splats, frame), camera)
     behind = np.array(SOLID) if background is None else background
     return np.clip(raster.rgb.numpy() + raster.transmittance.numpy()[..., None] * behind, 0, 1) * 255
 

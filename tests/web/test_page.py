@@ -195,10 +195,10 @@ def test_damaged_pages_give_splats_or_one_sentence():
 
 
 def test_the_viewers_endings_of_splats_are_those_that_hyrfpack_reads():
-    from hyrfpack.splats.files import READ
+    from hyrfpack.splats.files import READABLE_ENDINGS
     from hyrfpack.web.player import SPLATS
 
-    assert set(SPLATS) == set(READ)
+    assert set(SPLATS) == set(READABLE_ENDINGS)
 
 
 def test_the_page_and_its_parts_are_installed_with_the_package():

@@ -71,7 +71,7 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|")
     for name in formats:
         kind = FORMATS.get(name.split()[0], PAGE)
-        for degree in sorted({min(degree, kind.degree) for degree in arguments.degrees}):
+        for degree in sorted({min(degree, kind.max_degree) for degree in arguments.degrees}):
             row(source, name, degree, baked, whole, picture)
 
 

@@ -109,7 +109,7 @@ def converted(source: Path, target: Path) -> None:
 
 def measured(encoder: str, setting: str, file: Path, taught: Taught, seconds: float) -> Point:
     """A file of splats, beside the original."""
-    drawable = Drawable.of(read_splats(file), taught.model.config.frame)
+    drawable = Drawable.from_splats(read_splats(file), taught.model.config.frame)
     pairs = zip(taught.test.cameras, taught.test.pictures, strict=True)
     scores = [psnr(draw(drawable, camera).rgb.clamp(0, 1), picture) for camera, picture in pairs]
     return Point(encoder, setting, file.stat().st_size, float(np.mean(scores)), min(scores), seconds)

@@ -216,7 +216,7 @@ class Measure:
 
     def splats(self, splats: Splats) -> tuple[float, float, float]:
         """Scores of explicit Gaussians."""
-        drawable = Drawable.of(splats, self.model.config.frame)
+        drawable = Drawable.from_splats(splats, self.model.config.frame)
         return score((picture_of(drawable, view) for view in self.views), self.views)
 
     def _row(

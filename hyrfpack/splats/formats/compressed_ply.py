@@ -27,7 +27,7 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.ply import PlyHeader, read_elements, read_header, stack_columns
 from hyrfpack.splats.formats.smallest_three import restore_largest
 from hyrfpack.splats.formats.validation import build_valid_splats
-from hyrfpack.splats.harmonics import BAND_0
+from hyrfpack.splats.harmonics import SH_C0
 from hyrfpack.splats.splats import Splats
 
 _GAUSSIANS_PER_CHUNK = 256
@@ -90,7 +90,7 @@ def decode(data: bytes, name: str) -> Splats:
             if colored
             else color_and_opacity[:, :3]
         )
-        harmonics[:, 0] = (colors - 0.5) / BAND_0
+        harmonics[:, 0] = (colors - 0.5) / SH_C0
         if rest:
             harmonics[:, 1:] = (
                 _HARMONIC_BY_BYTE[stack_columns(rows["sh"], rest)].reshape(count, 3, len(rest) // 3).transpose(0, 2, 1)

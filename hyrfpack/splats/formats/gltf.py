@@ -28,9 +28,16 @@ import numpy as np
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.validation import build_valid_splats
-from hyrfpack.splats.harmonics import MAX_DEGREE, terms_of
-from hyrfpack.splats.placement import local_origin, local_positions, matrices_of, placed, rotation_of, upright_rotation
-from hyrfpack.splats.splats import Splats, concatenate, quaternion_of
+from hyrfpack.splats.harmonics import MAX_DEGREE, num_sh_bases
+from hyrfpack.splats.placement import (
+    apply_transform,
+    decompose_similarity,
+    local_origin,
+    local_positions,
+    rotation_matrices,
+    upright_rotation,
+)
+from hyrfpack.splats.splats import Splats, concatenate, quaternion_from_matrix
 
 SPLATTING_EXTENSION = "KHR_gaussian_splatting"
 GLTF_UP = (0.0, 1.0, 0.0)
@@ -78,7 +85,7 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     positions = attributes["POSITION"]
     accessors[0].update(min=positions.min(axis=0).tolist(), max=positions.max(axis=0).tolist())
 
-    w, x, y, z = quaternion_of(turn).tolist()
+    w, x, y, z = quaternion_from_matrix(turn).tolist()
     node = {"name": "Gaussians", "mesh": 0, "rotation": [x, y, z, w]}
     if origin.any():
         node["translation"] = (turn @ origin).tolist()
@@ -145,9 +152,10 @@ def decode(data: bytes, name: str, *, upright: bool = False) -> Splats:
         ]
         if sum(max(count, 0) for count in counts) * _MIN_BYTES_PER_SPLAT > len(data):
             raise HyrfDataError(f"{name}: its nodes show the same splats many times; export each once")
-        turn = np.eye(3) if upright else rotation_of(found[0][0], name)[1].T
+        turn = np.eye(3) if upright else decompose_similarity(found[0][0], name)[1].T
         parts = [
-            placed(_read_primitive(content, binary, primitive, name), matrix, turn, name) for matrix, primitive in found
+            apply_transform(_read_primitive(content, binary, primitive, name), matrix, turn, name)
+            for matrix, primitive in found
         ]
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise HyrfDataError(
@@ -239,7 +247,7 @@ def _local_transform(node: dict[str, Any]) -> np.ndarray:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
     quat = np.array([[w, x, y, z]])
-    rotation = matrices_of(quat / (math.hypot(*quat[0]) or 1))[0]  # hypot, because its squares cannot overflow
+    rotation = rotation_matrices(quat / (math.hypot(*quat[0]) or 1))[0]  # hypot, because its squares cannot overflow
     matrix = np.eye(4)
     matrix[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)), np.float64)
     matrix[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64)
@@ -269,7 +277,7 @@ def _read_primitive(content: dict[str, Any], binary: memoryview, primitive: dict
         read(f"{SPLATTING_EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]],
         read(f"{SPLATTING_EXTENSION}:OPACITY", 1)[:, 0],
     )
-    harmonics = np.empty((len(positions), terms_of(degree), 3), np.float32)
+    harmonics = np.empty((len(positions), num_sh_bases(degree), 3), np.float32)
     for term, semantic in enumerate(_harmonics_semantics(degree)):
         harmonics[:, term] = read(semantic, 3)
     return build_valid_splats(name, positions, scales, quats, opacities, harmonics)

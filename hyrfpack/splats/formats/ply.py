@@ -23,7 +23,7 @@ from hyrfpack.ply import read_elements, read_header, stack_columns
 from hyrfpack.splats.formats import compressed_ply
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.validation import build_valid_splats
-from hyrfpack.splats.harmonics import MAX_DEGREE, terms_of
+from hyrfpack.splats.harmonics import MAX_DEGREE, num_sh_bases
 from hyrfpack.splats.splats import Splats
 
 _POSITION_PROPERTIES = ("x", "y", "z")
@@ -49,7 +49,7 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     """
     if np.abs(splats.positions).max(initial=0) > np.finfo(np.float32).max:
         raise HyrfDataError("a Gaussian lies farther from the origin than PLY's numbers reach; move the scene there")
-    rest = 3 * (terms_of(splats.degree) - 1)
+    rest = 3 * (num_sh_bases(splats.degree) - 1)
     names = (
         *_POSITION_PROPERTIES,
         "nx",
@@ -120,7 +120,7 @@ def decode_plain(data: bytes, name: str) -> Splats:
             "counted from 0"
         )
     rows = read_elements(data, header, {"vertex"}, name)["vertex"]
-    harmonics = np.empty((len(rows), min(terms, terms_of(MAX_DEGREE)), 3), np.float32)
+    harmonics = np.empty((len(rows), min(terms, num_sh_bases(MAX_DEGREE)), 3), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # infinite results are rejected below; NaN may signal
         harmonics[:, 0] = stack_columns(rows, _COLOR_PROPERTIES)
         for channel, term in product(range(3), range(1, harmonics.shape[1])):

@@ -15,7 +15,7 @@ import numpy as np
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.validation import build_valid_splats
-from hyrfpack.splats.harmonics import BAND_0
+from hyrfpack.splats.harmonics import SH_C0
 from hyrfpack.splats.splats import Splats
 
 MAX_HARMONICS_DEGREE = 0
@@ -68,7 +68,7 @@ def decode(data: bytes, name: str) -> Splats:
         records["scale"],
         (records["rotation"] - np.float32(128)) / 128,
         colors[:, 3],
-        (colors[:, None, :3] - 0.5) / BAND_0,
+        (colors[:, None, :3] - 0.5) / SH_C0,
     )
 
 

@@ -35,7 +35,7 @@ from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.smallest_three import drop_largest, restore_largest
 from hyrfpack.splats.formats.validation import build_valid_splats
-from hyrfpack.splats.harmonics import MAX_DEGREE, harmonics_rotation, terms_of
+from hyrfpack.splats.harmonics import MAX_DEGREE, harmonics_rotation, num_sh_bases
 from hyrfpack.splats.splats import Splats
 
 WRITTEN_VERSIONS = (3, 4)
@@ -147,10 +147,10 @@ def decode(data: bytes, name: str) -> Splats:
     version, degree, bits, flags, sections = unpacked
     positions, opacities, colors, scales, quats, harmonics = (np.frombuffer(part, np.uint8) for part in sections)
     count = len(opacities)
-    rest = harmonics.reshape(count, terms_of(degree) - 1, 3)[:, : terms_of(MAX_DEGREE) - 1]
+    rest = harmonics.reshape(count, num_sh_bases(degree) - 1, 3)[:, : num_sh_bases(MAX_DEGREE) - 1]
     degree = min(degree, MAX_DEGREE)
     signs = _harmonics_signs(degree).astype(np.float32)
-    terms = np.empty((count, terms_of(degree), 3), np.float32)
+    terms = np.empty((count, num_sh_bases(degree), 3), np.float32)
     terms[:, 0] = _COLOR_BY_BYTE[colors.reshape(count, 3)]
     np.multiply(_HARMONIC_BY_BYTE[rest], signs[1:, None], out=terms[:, 1:])
     with np.errstate(invalid="ignore"):  # positions of version 1 may be NaN, which is rejected below
@@ -172,7 +172,7 @@ _UnpackedFile = tuple[int, int, int, int, list[bytes]]  # version, degree, fract
 
 def _section_lengths(version: int, count: int, degree: int) -> list[int]:
     """Return the number of raw bytes of each section."""
-    each = (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * (terms_of(degree) - 1))
+    each = (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * (num_sh_bases(degree) - 1))
     return [count * length for length in each]
 
 

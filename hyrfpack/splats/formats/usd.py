@@ -23,8 +23,15 @@ from hyrfpack.errors import HyrfDataError, needs_package
 from hyrfpack.scene import Camera
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.validation import build_valid_splats
-from hyrfpack.splats.harmonics import MAX_DEGREE, terms_of
-from hyrfpack.splats.placement import local_origin, local_positions, matrices_of, placed, rotation_of, upright_rotation
+from hyrfpack.splats.harmonics import MAX_DEGREE, num_sh_bases
+from hyrfpack.splats.placement import (
+    apply_transform,
+    decompose_similarity,
+    local_origin,
+    local_positions,
+    rotation_matrices,
+    upright_rotation,
+)
 from hyrfpack.splats.splats import Splats
 
 if TYPE_CHECKING:
@@ -157,7 +164,7 @@ def _add_splats(stage: Usd.Stage, splats: Splats) -> None:
     )
     primvar = UsdGeom.Primvar(harmonics)
     primvar.SetInterpolation(UsdGeom.Tokens.vertex)
-    primvar.SetElementSize(terms_of(splats.degree))
+    primvar.SetElementSize(num_sh_bases(splats.degree))
     # USD takes colours as linear unless a colour space is named.
     colors = Usd.ColorSpaceAPI.Apply(field.GetPrim())
     colors.CreateColorSpaceNameAttr(Gf.ColorSpaceNames.SRGBRec709)
@@ -171,7 +178,7 @@ def _compute_extent(positions: np.ndarray, scales: np.ndarray, quats: np.ndarray
     if not len(positions):
         return np.zeros((2, 3), np.float32)
     # The reach of an ellipsoid along an axis is the length of that row of rotation times scales.
-    half = 3 * np.linalg.norm(matrices_of(quats) * scales[:, None], axis=2)
+    half = 3 * np.linalg.norm(rotation_matrices(quats) * scales[:, None], axis=2)
     return np.stack(((positions - half).min(axis=0), (positions + half).max(axis=0)))
 
 
@@ -227,14 +234,14 @@ def _read_splats(prim: Usd.Prim, name: str, upright: bool) -> Splats:
         "scales": read(field.GetScalesAttr(), 3),
         "quats": read(field.GetOrientationsAttr(), 4)[:, [3, 0, 1, 2]],
         "opacities": read(field.GetOpacitiesAttr(), 1)[:, 0],
-        "harmonics": read(field.GetRadianceSphericalHarmonicsCoefficientsAttr(), terms_of(degree), 3),
+        "harmonics": read(field.GetRadianceSphericalHarmonicsCoefficientsAttr(), num_sh_bases(degree), 3),
     }
     counts = {key: len(values) for key, values in splats.items()}
     if len(set(counts.values())) > 1:
         raise HyrfDataError(f"{name}: its arrays have different lengths ({counts}); export it again")
     matrix = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())).T
-    turn = np.eye(3) if upright else rotation_of(matrix, name)[1].T
+    turn = np.eye(3) if upright else decompose_similarity(matrix, name)[1].T
     try:
-        return placed(build_valid_splats(name, **splats), matrix, turn, name)
+        return apply_transform(build_valid_splats(name, **splats), matrix, turn, name)
     except ValueError as error:
         raise HyrfDataError(f"{name}: {error}; export it again") from error

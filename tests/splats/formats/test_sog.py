@@ -18,7 +18,7 @@ from PIL import Image
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats import sog
 from hyrfpack.splats.formats.palette import build_palette, find_nearest_entries
-from hyrfpack.splats.harmonics import terms_of
+from hyrfpack.splats.harmonics import num_sh_bases
 from hyrfpack.splats.splats import Splats, normalized_quats
 
 
@@ -30,7 +30,7 @@ def some_splats(count: int, degree: int = 3) -> Splats:
         np.exp(rng.normal(-4, 1, (count, 3))),
         normalized_quats(rng.normal(size=(count, 4))),
         np.clip(rng.normal(0.5, 0.5, count), 0, 1),
-        rng.normal(0, 0.3, (count, terms_of(degree), 3)),
+        rng.normal(0, 0.3, (count, num_sh_bases(degree), 3)),
     )
 
 

@@ -24,7 +24,7 @@ from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.shade import encode_directions
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
-from hyrfpack.splats.harmonics import BAND_0, fibonacci_sphere, harmonics_basis, terms_of
+from hyrfpack.splats.harmonics import SH_C0, fibonacci_sphere, harmonics_basis, num_sh_bases
 from hyrfpack.splats.splats import Splats
 
 FIT = Path(__file__).parent / "fit.mjs"
@@ -36,12 +36,12 @@ def fitted(model: HybridModel, cameras: list[Camera] | None, degree: int, tmp_pa
     hyrfpack.save(model, file)
     viewpoints.write_text(json.dumps(None if cameras is None else [camera_to_json(camera) for camera in cameras]))
     facts: dict[str, Any] = run_script(FIT, file, viewpoints, degree, out)
-    count, others, data = facts["count"], terms_of(degree) - 1, out.read_bytes()
+    count, others, data = facts["count"], num_sh_bases(degree) - 1, out.read_bytes()
     numbers = np.frombuffer(data, "<f4", 14 * count)
     packed = np.frombuffer(data, np.uint8, offset=56 * count).reshape(count, others, 3)
     positions, scales, quats, opacities, colors = np.split(numbers, np.cumsum([3, 3, 4, 1]) * count)
     harmonics = np.empty((count, others + 1, 3), np.float32)
-    harmonics[:, 0] = (colors.reshape(count, 3) - 0.5) / BAND_0
+    harmonics[:, 0] = (colors.reshape(count, 3) - 0.5) / SH_C0
     harmonics[:, 1:] = (packed - np.float32(128)) / 128 * facts["range"]
     splats = Splats(
         positions.reshape(count, 3).astype(np.float64) * facts["unit"] + facts["center"],
@@ -76,8 +76,8 @@ def least_squares(model: HybridModel, cameras: list[Camera], degree: int) -> np.
     weights /= weights.sum(1, keepdim=True).clamp_min(1e-300)
     directions = torch.cat((directions, sphere.expand(count, -1, -1)), 1)
     weights = torch.cat((weights, torch.full((count, len(sphere)), SPHERE_WEIGHT / len(sphere))), 1).double()
-    solved = np.empty((count, terms_of(degree), 3))
-    coords, penalty = model.cube_coords(positions), RIDGE**0.5 * np.eye(terms_of(degree))[1:]
+    solved = np.empty((count, num_sh_bases(degree), 3))
+    coords, penalty = model.cube_coords(positions), RIDGE**0.5 * np.eye(num_sh_bases(degree))[1:]
     for i in range(count):
         encoded = encode_directions(directions[i], model.config.direction_encoding)
         with torch.no_grad():

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from web.scripts import run_script
 
-from hyrfpack.splats.harmonics import BAND_0, terms_of
+from hyrfpack.splats.harmonics import SH_C0, num_sh_bases
 from hyrfpack.splats.splats import Splats
 
 DECODE = Path(__file__).parent / "decode.mjs"
@@ -24,7 +24,7 @@ class PageSplats:
 
     def assert_are(self, expected: Splats) -> None:
         """They are Python's, to the precision of float32 in the page's frame and of bytes for harmonics."""
-        facts, count, terms = self.facts, len(expected), terms_of(expected.degree)
+        facts, count, terms = self.facts, len(expected), num_sh_bases(expected.degree)
         assert (facts["count"], facts["degree"]) == (count, expected.degree)
         assert facts["antialiased"] is expected.antialiased
         numbers = np.frombuffer(self.data, "<f4", 14 * count)
@@ -36,7 +36,7 @@ class PageSplats:
         np.testing.assert_allclose(scales.reshape(count, 3) * np.float64(unit), expected.scales, rtol=1e-6)
         np.testing.assert_allclose(quats.reshape(count, 4), expected.quats, atol=1e-6)
         np.testing.assert_allclose(opacities, expected.opacities, rtol=1e-6, atol=1e-7)
-        base = 0.5 + BAND_0 * expected.harmonics[:, 0].astype(np.float64)
+        base = 0.5 + SH_C0 * expected.harmonics[:, 0].astype(np.float64)
         np.testing.assert_allclose(colors.reshape(count, 3), base, rtol=1e-6, atol=1e-6)
         most = facts["range"]
         found, inside = (packed.astype(np.float64) - 128) / 128 * most, np.clip(expected.harmonics[:, 1:], -most, most)
