@@ -153,7 +153,7 @@ def test_the_command_line_trains_and_renders_on_a_gpu(gpu, tmp_path):
 @pytest.fixture
 def few_pictures(monkeypatch):
     """Calibration that compares as little as it can."""
-    for name, value in (("ROUNDS", 1), ("FEWEST", 2), ("MOST", 2)):
+    for name, value in (("MAX_CORRECTION_ROUNDS", 1), ("MIN_COMPARISON_VIEWS", 2), ("MAX_COMPARISON_VIEWS", 2)):
         monkeypatch.setattr(f"hyrfpack.compress.calibrate.{name}", value)
 
 

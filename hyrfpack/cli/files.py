@@ -118,7 +118,7 @@ def compress(
     if data is not None and no_data:
         raise click.UsageError("--data names photos and --no-data wants none; give one of them")
     from hyrfpack.compress import compress as pack
-    from hyrfpack.compress.report_page import FILES
+    from hyrfpack.compress.report_page import REPORT_FILES
     from hyrfpack.format import describe
 
     model = named_model(model)
@@ -132,7 +132,7 @@ def compress(
         outputs = Outputs(model, scene=scene, overwrite=overwrite)
         outputs.file(output, ".hyrf")
         if report is not None:
-            outputs.folder(report, FILES)
+            outputs.folder(report, REPORT_FILES)
         return scene
 
     scene = ranks.run_on_all(read)

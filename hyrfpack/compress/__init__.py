@@ -1,4 +1,4 @@
-"""Compressing models for pictures: what matters is measured, what does not is left out."""
+"""Rate-distortion compression: bits go to the numbers that change rendered pictures most."""
 
 from hyrfpack.compress.packer import compress
 

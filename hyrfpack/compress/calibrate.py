@@ -1,10 +1,14 @@
-"""What storing a model does to pictures, measured on pictures, part by part: what sensitivities alone do not see.
+"""Calibration of sensitivities: correct each part's predicted error by the error measured on rendered pictures.
 
-A sensitivity is a derivative: it foretells the error of small errors that have nothing to do with each other. Of what
-packing does, three things are neither. Gaussians that move swap their order before a camera, which adds an error in
-proportion to the step and not to its square. What pruning takes away always has the same sign. And where opacity or
-transmittance saturates, errors end early. So each part of a plan is tried by itself, drawn, compared with the model,
-and its sensitivities are multiplied by what was found over what was foretold, until they foretell it.
+A sensitivity is a derivative, so it predicts the error only for small, independent perturbations. Compression breaks
+this assumption in three ways:
+
+- Gaussians that move swap their depth order, which adds an error in proportion to the step and not to its square.
+- Pruning only ever removes light, so its errors have the same sign and add up.
+- Where opacity or transmittance saturates, a larger perturbation adds no further error.
+
+So each part of a plan is quantised by itself, rendered and compared with the model. The part's sensitivities are
+multiplied by measured over predicted error, repeatedly, until the prediction is close enough.
 """
 
 from __future__ import annotations
@@ -18,8 +22,8 @@ import torch
 from torch import Tensor
 
 from hyrfpack.cameras.view_sampling import sample_views
-from hyrfpack.compress.plan import make_plan, of_each_number, worth_keeping
-from hyrfpack.compress.quantize import opacity_error, quantize
+from hyrfpack.compress.plan import distortion_per_number, indices_to_keep, make_plan
+from hyrfpack.compress.quantize import opacity_error_model, quantize
 from hyrfpack.compress.sensitivity import PRUNED, Sensitivity, measure_sensitivity
 from hyrfpack.format.arrays import iter_parameters, to_arrays
 from hyrfpack.format.compact.plan import Plan
@@ -42,219 +46,240 @@ from hyrfpack.progress import Report, no_report, report_part, report_round
 from hyrfpack.render import render
 from hyrfpack.scene import Camera
 
-DRAWN = 1_000_000  # Gaussians drawn in the views of one comparison, about
-FEWEST, MOST = 6, 10  # views of it, half of them at cameras
-ROUNDS = 5  # of correcting
-CLOSE = 1.2  # factor within which the largest parts shall be foretold
-MINOR = 0.03  # share of the distortion below which a part is left as it is
-FARTHEST = 64.0  # factor of one correction
-# What is tried by itself. A decoder has too few numbers for an error that is more than luck: it goes with its table.
+# The number of views of one comparison is chosen so that about this many Gaussians are drawn in all of them together.
+TARGET_DRAWN_GAUSSIANS = 1_000_000
+# Half of the views are at cameras and half between them.
+MIN_COMPARISON_VIEWS = 6
+MAX_COMPARISON_VIEWS = 10
+MAX_CORRECTION_ROUNDS = 5
+PREDICTION_TOLERANCE_RATIO = 1.2
+# Parts whose error is a smaller share of the distortion are not corrected.
+MIN_CORRECTED_ERROR_RATIO = 0.03
+MAX_CORRECTION_RATIO = 64.0
+# The sections that are quantised and compared together. A decoder has so few numbers that its error depends on chance,
+# so it is calibrated together with its table.
 Part = tuple[str, ...]
-PARTS: tuple[Part, ...] = (
+CALIBRATED_PARTS: tuple[Part, ...] = (
     (POSITIONS,),
     (COLORS,),
     (SCALES, OPACITIES),
     *zip(TABLE_SECTIONS, DECODER_SECTIONS, strict=True),
 )
-# Powers of found over foretold by which sensitivities are corrected. Errors of small independent numbers fall with the
-# square of their steps: 1. Those of swapped orders fall with the step: up to 2. What is pruned adds up: from 1/2.
-LAWS: dict[Part, float] = {(POSITIONS,): 1.5, (PRUNED,): 0.7}
-LEAST_LAW, MOST_LAW = 0.25, 3.0  # that two factors are believed to tell: those near each other may tell anything
+# A correction multiplies the sensitivities by (measured error / predicted error)^exponent. The exponent is 1 where the
+# error falls with the square of the step, as for small independent perturbations. It is up to 2 where the error falls
+# with the step, as for swapped depth orders, and down to 1/2 for pruning, whose errors add up.
+CORRECTION_EXPONENTS: dict[Part, float] = {(POSITIONS,): 1.5, (PRUNED,): 0.7}
+# An exponent estimated from two factors is used only within these bounds: factors close to each other give noise.
+MIN_CORRECTION_EXPONENT = 0.25
+MAX_CORRECTION_EXPONENT = 3.0
 
 
 @dataclass
-class Factor:
-    """What a part's sensitivities are multiplied by, searched for.
+class CorrectionFactor:
+    """Iterative search for the factor that a part's sensitivities are multiplied by.
 
     Attributes:
-        law: the power of found over foretold to go on by, until two factors tell it.
-        value: the factor to be tried.
-        low, high: the greatest that was seen to be too small, and the least that was seen not to be.
-        done: whether errors are foretold well enough.
-        tried: the factor tried last, and its error found over that foretold.
+        exponent: power of measured over predicted error to multiply by; re-estimated once two factors were measured.
+        value: the factor to measure next.
+        low, high: the largest factor measured to be too small, and the smallest measured to be large enough.
+        converged: whether the errors are predicted well enough.
+        last: the factor measured last, and its ratio of measured to predicted error; None before the first.
     """
 
-    law: float
+    exponent: float
     value: float = 1.0
     low: float = 0.0
     high: float = np.inf
-    done: bool = False
-    tried: tuple[float, float] | None = None
+    converged: bool = False
+    last: tuple[float, float] | None = None
 
-    def correct(self, ratio: float) -> None:
-        """Go on, by the error found over the error foretold with `value`."""
-        if self.tried is not None and ratio > 0:  # a secant, of logarithms
-            value, before = self.tried
-            told = np.log(self.value / value) / (np.log(before / ratio) or np.inf)
-            self.law = float(told) if LEAST_LAW < told < MOST_LAW else self.law
-        self.tried = (self.value, ratio) if ratio > 0 else None
+    def update(self, ratio: float) -> None:
+        """Choose the next factor, given the ratio of measured to predicted error with the present `value`."""
+        if self.last is not None and ratio > 0:  # secant method on logarithms
+            value, before = self.last
+            estimate = np.log(self.value / value) / (np.log(before / ratio) or np.inf)
+            self.exponent = (
+                float(estimate) if MIN_CORRECTION_EXPONENT < estimate < MAX_CORRECTION_EXPONENT else self.exponent
+            )
+        self.last = (self.value, ratio) if ratio > 0 else None
         if ratio > 1:
             self.low = max(self.low, self.value)
         else:
             self.high = min(self.high, self.value)
-        if 1 / CLOSE < ratio < CLOSE:
-            self.done = True
-        elif self.high < CLOSE * self.low:
-            self.value, self.done = self.high, True
+        if 1 / PREDICTION_TOLERANCE_RATIO < ratio < PREDICTION_TOLERANCE_RATIO:
+            self.converged = True
+        elif self.high < PREDICTION_TOLERANCE_RATIO * self.low:
+            self.value, self.converged = self.high, True
         else:
-            further = self.value * min(max(ratio, 1 / FARTHEST), FARTHEST) ** self.law
-            self.value = further if self.low < further < self.high else (self.low * self.high) ** 0.5
+            corrected = self.value * min(max(ratio, 1 / MAX_CORRECTION_RATIO), MAX_CORRECTION_RATIO) ** self.exponent
+            self.value = corrected if self.low < corrected < self.high else (self.low * self.high) ** 0.5
 
     @property
     def final(self) -> float:
-        """The factor to take: one that was tried and is enough, where there is such a one."""
-        return self.value if self.done or self.high == np.inf else self.high
+        """The factor to use: one that was measured to be large enough, if there is one."""
+        return self.value if self.converged or self.high == np.inf else self.high
 
 
 @dataclass(frozen=True)
-class Tried:
-    """What a part adds to the pictures' mean squared error: as pictures show it, and as sensitivities foretell it."""
+class ErrorMeasurement:
+    """The mean squared error that a part adds to pictures: measured on renders, and predicted by sensitivities."""
 
-    found: float
-    told: float
+    measured: float
+    predicted: float
 
 
 @dataclass(frozen=True)
-class Originals:
-    """A model's pictures, that those of what is stored of it are compared with.
+class ReferenceRenders:
+    """Renders of a model before compression, against which compressed versions are compared.
 
     Attributes:
-        views: where from.
-        pictures: of each, (H, W, 3) in [0, 1].
+        views: the cameras that were rendered.
+        pictures: the render of each view, (H, W, 3) in [0, 1].
     """
 
     views: list[Camera]
     pictures: list[Tensor]
 
     @classmethod
-    def of(cls, model: HybridModel, cameras: Sequence[Camera], seed: int = 1) -> Originals:
-        """Of a model: half at some of its cameras, half between them."""
-        count = int(np.clip(DRAWN // max(len(model), 1), FEWEST, MOST)) // 2
+    def of(cls, model: HybridModel, cameras: Sequence[Camera], seed: int = 1) -> ReferenceRenders:
+        """Render a model, half of the views at some of its cameras and half between them."""
+        count = (
+            int(np.clip(TARGET_DRAWN_GAUSSIANS // max(len(model), 1), MIN_COMPARISON_VIEWS, MAX_COMPARISON_VIEWS)) // 2
+        )
         at, between = sample_views(cameras, count, seed)
-        return cls.seen([*at, *between], model)
+        return cls.at_views([*at, *between], model)
 
     @classmethod
-    def seen(cls, views: list[Camera], model: HybridModel, decoded: Decoded | None = None) -> Originals:
-        """A model's pictures from these views; `decoded` as in `error`."""
-        return cls(views, _pictures(model, views, decoded))
+    def at_views(cls, views: list[Camera], model: HybridModel, decoded: Decoded | None = None) -> ReferenceRenders:
+        """Render a model at the given views; `decoded` is as in `measure_error`."""
+        return cls(views, _render_views(model, views, decoded))
 
-    def error(self, model: HybridModel, decoded: Decoded | None = None) -> float:
-        """Mean squared difference of colours in the median view: in a single one a Gaussian may come too close.
+    def measure_error(self, model: HybridModel, decoded: Decoded | None = None) -> float:
+        """Render a model at the same views and return the median over views of the mean squared colour difference.
+
+        The median ignores single views in which a Gaussian comes very close to the camera.
 
         Args:
-            model: whose pictures are compared.
-            decoded: what `decode` says of it, where that is known.
+            model: the model to compare with the references.
+            decoded: the result of `model.decode()`, if it is known already.
         """
-        pairs = zip(_pictures(model, self.views, decoded), self.pictures, strict=True)
-        return float(np.median([float((mine - theirs).square().mean()) for mine, theirs in pairs]))
+        pairs = zip(_render_views(model, self.views, decoded), self.pictures, strict=True)
+        return float(np.median([float((shown - reference).square().mean()) for shown, reference in pairs]))
 
 
-def calibrated(
+def measure_calibrated_sensitivity(
     model: HybridModel,
     cameras: Sequence[Camera],
     distortion: float,
     prune: bool = True,
     report: Report = no_report,
-) -> tuple[Sensitivity, Originals]:
-    """A model's sensitivities for about so large a distortion, calibrated, and the pictures that they are by.
+) -> tuple[Sensitivity, ReferenceRenders]:
+    """Measure a model's sensitivities, calibrate them for a distortion, and return them with the reference renders.
 
     Args:
-        cameras: where pictures will be looked at from, about; world units.
+        cameras: viewpoints typical of how the model will be viewed; world units.
         distortion, prune: as `make_plan` takes them.
-        report: called with what is being done and the share of the work that is done, 0 to 1.
+        report: called with the name of the current task and the completed share of the work, 0 to 1.
 
     Raises:
         HyrfError: a number of the model is NaN or infinite.
     """
     sensitivity = measure_sensitivity(model, cameras, report=report_part(report, 0.0, 0.5))
     report("drawing what files are compared with", 0.5)
-    originals = Originals.of(model, cameras)
-    return calibrate(model, sensitivity, originals, distortion, prune, report_part(report, 0.55, 1.0)), originals
+    references = ReferenceRenders.of(model, cameras)
+    return calibrate(model, sensitivity, references, distortion, prune, report_part(report, 0.55, 1.0)), references
 
 
 def calibrate(
     model: HybridModel,
     sensitivity: Sensitivity,
-    originals: Originals,
+    references: ReferenceRenders,
     distortion: float,
     prune: bool = True,
     report: Report = no_report,
 ) -> Sensitivity:
-    """Sensitivities by which a plan for about so large a distortion foretells what its pictures show.
+    """Scale sensitivities so that they predict the error measured on renders, for plans of about this distortion.
 
     Args:
-        sensitivity: first-order, from `measure_sensitivity`.
-        originals: pictures of the model.
+        sensitivity: first-order sensitivities from `measure_sensitivity`.
+        references: renders of the model.
         distortion, prune: as `make_plan` takes them.
-        report: called with what is being done and the share of the work that is done, 0 to 1.
+        report: called with the name of the current task and the completed share of the work, 0 to 1.
 
     Raises:
         HyrfError: a parameter is NaN or infinite.
     """
-    each, decoded_all = of_each_number(model, distortion), model.decode()
+    per_number, decoded_all = distortion_per_number(model, distortion), model.decode()
 
-    def part_of(kept: np.ndarray) -> tuple[HybridModel, Decoded]:
+    def subset_of(kept: np.ndarray) -> tuple[HybridModel, Decoded]:
         index = torch.as_tensor(kept, device=model.gaussians.positions.device)
         return model.part(index), decoded_all[index]
 
-    # Pruning first: what the others do depends on what is left.
-    def without_pruned(scaled: Sensitivity, _: list[Part], report: Report) -> dict[Part, Tried]:
+    # Pruning is calibrated first, because the errors of the other parts depend on which Gaussians are left.
+    def measure_pruning(scaled: Sensitivity, _: list[Part], report: Report) -> dict[Part, ErrorMeasurement]:
         report("calibrating what may be pruned", 0.0)
-        kept = worth_keeping(scaled, each)
-        return {(PRUNED,): Tried(originals.error(*part_of(kept)), float(np.delete(scaled.removals, kept).sum()))}
+        kept = indices_to_keep(scaled, per_number)
+        predicted = float(np.delete(scaled.removals, kept).sum())
+        return {(PRUNED,): ErrorMeasurement(references.measure_error(*subset_of(kept)), predicted)}
 
     if prune:
-        sensitivity = _corrected(sensitivity, ((PRUNED,),), distortion, without_pruned, report_part(report, 0.0, 0.2))
-    left, decoded = part_of(worth_keeping(sensitivity, each, prune))
-    whole = Originals.seen(originals.views, left, decoded)
+        sensitivity = _correct_by_measurement(
+            sensitivity, ((PRUNED,),), distortion, measure_pruning, report_part(report, 0.0, 0.2)
+        )
+    left, decoded = subset_of(indices_to_keep(sensitivity, per_number, prune))
+    unpruned_references = ReferenceRenders.at_views(references.views, left, decoded)
     placed: tuple[np.ndarray, Plan, HybridModel] | None = None
 
-    def as_stored(scaled: Sensitivity, parts: list[Part], report: Report) -> dict[Part, Tried]:
+    def measure_quantization(scaled: Sensitivity, parts: list[Part], report: Report) -> dict[Part, ErrorMeasurement]:
         nonlocal placed
         if placed is None or not np.array_equal(placed[0], scaled.positions):
             plan = make_plan(model, scaled, distortion, prune)
             placed = scaled.positions, plan, plan.apply(model)
         _, plan, planned = placed
         quantized = quantize(planned, plan, scaled, sections=[name for part in parts for name in part])
-        told, stored = _added(planned, quantized, scaled), quantized.arrays()
-        # In the order of those that are left, so that what they decode to but for the part that changes serves again.
+        predicted, stored = _predict_quantization_errors(planned, quantized, scaled), quantized.arrays()
+        # Sorted like the Gaussians that are left, so that their decoded values can be reused for the unchanged parts.
         order = np.argsort(plan.kept)
         stored = {name: values[order] if name in LOGIT_SECTIONS else values for name, values in stored.items()}
 
-        def found(part: Part) -> float:
+        def measured_error(part: Part) -> float:
             if part == (POSITIONS,):
-                return whole.error(planned)
-            changed = _changed(left, {name: stored[name] for name in part})
-            return whole.error(changed, _decoded_anew(changed, decoded, part))
+                return unpruned_references.measure_error(planned)
+            changed = _replace_arrays(left, {name: stored[name] for name in part})
+            return unpruned_references.measure_error(changed, _update_decoded(changed, decoded, part))
 
-        tried = {}
+        measurements = {}
         for number, part in enumerate(parts):
             report(f"calibrating {' and '.join(SECTION_CONTENTS[name] for name in part)}", number / len(parts))
-            tried[part] = Tried(found(part), sum(told[name] for name in part))
-        return tried
+            measurements[part] = ErrorMeasurement(measured_error(part), sum(predicted[name] for name in part))
+        return measurements
 
-    return _corrected(sensitivity, PARTS, distortion, as_stored, report_part(report, 0.2, 1.0))
+    return _correct_by_measurement(
+        sensitivity, CALIBRATED_PARTS, distortion, measure_quantization, report_part(report, 0.2, 1.0)
+    )
 
 
-def foretold(
+def predict_errors(
     model: HybridModel, planned: HybridModel, quantized: QuantizedModel, sensitivity: Sensitivity
 ) -> dict[str, float]:
-    """What storing a model adds to the pictures' mean squared error, by section and by what is pruned; by estimate."""
+    """Predict the mean squared error that compression adds to pictures, for each section and for PRUNED."""
     removed = np.delete(sensitivity.removals, quantized.plan.kept)
-    return {PRUNED: float(removed.sum()), **_added(planned, quantized, sensitivity)}
+    return {PRUNED: float(removed.sum()), **_predict_quantization_errors(planned, quantized, sensitivity)}
 
 
-def _added(planned: HybridModel, quantized: QuantizedModel, sensitivity: Sensitivity) -> dict[str, float]:
-    """As `foretold`, by the sections that are quantised and by positions."""
+def _predict_quantization_errors(
+    planned: HybridModel, quantized: QuantizedModel, sensitivity: Sensitivity
+) -> dict[str, float]:
+    """Predict the mean squared error that each quantised section and the positions add to pictures."""
     plan = quantized.plan
-    wanted, stored, s = to_arrays(planned), quantized.arrays(), sensitivity.of(plan.kept)
+    wanted, stored, s = to_arrays(planned), quantized.arrays(), sensitivity.subset(plan.kept)
     weights = {COLORS: np.repeat(s.colors, 3), SCALES: s.scales, **s.fields}
-    # A point is anywhere in its cell.
+    # Positions are uniform within their lattice cell: variance 1/12 of the squared step for each of the three axes.
     bits = np.concatenate([layer.points.bits[layer.points.classes] for layer in plan.layers])
     errors = {POSITIONS: float((s.positions * 3 / 12 * 4.0**-bits).sum())}
     for group, values in stored.items():
         if group == OPACITIES:
-            _, error = opacity_error(planned, wanted[group][:, 0].astype(np.float64), s.opacities)
+            _, error = opacity_error_model(planned, wanted[group][:, 0].astype(np.float64), s.opacities)
             errors[group] = float(error(slice(None), values[:, 0]).sum())
         else:
             difference = values.ravel().astype(np.float64) - wanted[group].ravel()
@@ -262,45 +287,45 @@ def _added(planned: HybridModel, quantized: QuantizedModel, sensitivity: Sensiti
     return errors
 
 
-def _corrected(
+def _correct_by_measurement(
     sensitivity: Sensitivity,
     parts: Sequence[Part],
     distortion: float,
-    attempt: Callable[[Sensitivity, list[Part], Report], dict[Part, Tried]],
+    measure: Callable[[Sensitivity, list[Part], Report], dict[Part, ErrorMeasurement]],
     report: Report,
 ) -> Sensitivity:
-    """Sensitivities whose parts foretell what is found.
+    """Multiply the sensitivities of each part by a factor, so that predicted errors match measured ones.
 
     Args:
-        attempt: what is found and foretold of parts with these sensitivities.
+        measure: measures and predicts the errors of the given parts with the given sensitivities.
     """
 
     def scaled(factors: dict[Part, float]) -> Sensitivity:
-        return sensitivity.times({name: factor for part, factor in factors.items() for name in part})
+        return sensitivity.scaled_by({name: factor for part, factor in factors.items() for name in part})
 
-    factors = {part: Factor(LAWS.get(part, 1.0)) for part in parts}
-    for number in range(ROUNDS):
-        waiting = [part for part, factor in factors.items() if not factor.done]
-        if not waiting:
+    factors = {part: CorrectionFactor(CORRECTION_EXPONENTS.get(part, 1.0)) for part in parts}
+    for number in range(MAX_CORRECTION_ROUNDS):
+        remaining = [part for part, factor in factors.items() if not factor.converged]
+        if not remaining:
             break
         values = scaled({part: factor.value for part, factor in factors.items()})
-        for part, tried in attempt(values, waiting, report_round(report, number)).items():
-            if tried.told > 0 and max(tried.found, tried.told) > MINOR * distortion:
-                factors[part].correct(tried.found / tried.told)
+        for part, error in measure(values, remaining, report_round(report, number)).items():
+            if error.predicted > 0 and max(error.measured, error.predicted) > MIN_CORRECTED_ERROR_RATIO * distortion:
+                factors[part].update(error.measured / error.predicted)
             else:
-                factors[part].done = True
+                factors[part].converged = True
     return scaled({part: factor.final for part, factor in factors.items()})
 
 
-def _changed(model: HybridModel, arrays: dict[str, np.ndarray]) -> HybridModel:
-    """A model with other numbers in some sections."""
+def _replace_arrays(model: HybridModel, arrays: dict[str, np.ndarray]) -> HybridModel:
+    """Return a copy of a model with other numbers in some sections."""
     changed = deepcopy(model)
     changed.load_state_dict(dict(iter_parameters(arrays, changed)), strict=False)
     return changed
 
 
-def _decoded_anew(model: HybridModel, before: Decoded, part: Part) -> Decoded:
-    """What a model decodes to, by what it did before these of its sections changed."""
+def _update_decoded(model: HybridModel, before: Decoded, part: Part) -> Decoded:
+    """Decode a changed model again, reusing what it decoded to before where the changed sections do not matter."""
     if GEOMETRY_TABLE in part or OPACITIES in part:
         return replace(before, geometry=model.decode_geometry())
     if before.shading is None:
@@ -311,10 +336,10 @@ def _decoded_anew(model: HybridModel, before: Decoded, part: Part) -> Decoded:
 
 
 @torch.no_grad()
-def _pictures(model: HybridModel, cameras: Sequence[Camera], decoded: Decoded | None = None) -> list[Tensor]:
+def _render_views(model: HybridModel, cameras: Sequence[Camera], decoded: Decoded | None = None) -> list[Tensor]:
     decoded = decoded or model.decode()
 
-    @torch.no_grad()  # of this thread
+    @torch.no_grad()  # gradient mode is kept per thread
     def picture(camera: Camera) -> Tensor:
         return render(model, camera, decoded=decoded).rgb
 

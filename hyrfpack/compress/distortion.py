@@ -1,23 +1,27 @@
-"""How much packing may add to pictures, as mean squared error of colours in [0, 1]."""
+"""Default and limits of the distortion: the mean squared error, of colours in [0, 1], that compression may add."""
 
 from __future__ import annotations
 
 from hyrfpack.evaluate.metrics import stated_error
 
-# dB that a file may cost, by estimate, unless told otherwise. Of as many bytes, a model of more Gaussians with coarser
-# numbers is better than one of fewer with finer ones: docs/design-choices.md.
-PSNR_DROP = 0.1
-FINETUNED = 2.5  # times as much for so many steps of fine-tuning, which take most of it back
-FULLY_FINETUNED = 1000
-LIMITS = (1e-8, 1e-2)  # least and largest that files are made for
+# Estimated loss of PSNR by default. At equal size, a model of more Gaussians with coarser numbers is better than one of
+# fewer Gaussians with finer numbers: docs/design-choices.md.
+DEFAULT_PSNR_DROP_DB = 0.1
+# Fine-tuning of at least FULL_FINETUNING_STEPS recovers most of the loss, so it starts from a larger distortion.
+FINETUNED_DISTORTION_RATIO = 2.5
+FULL_FINETUNING_STEPS = 1000
+DISTORTION_RANGE = (1e-8, 1e-2)
 
 
 def default_distortion(provenance: dict, finetune_steps: int = 0) -> float:
-    """What costs PSNR_DROP before fine-tuning takes something back: errors of photos and of quantising add up.
+    """Return the distortion that costs DEFAULT_PSNR_DROP_DB of PSNR against photos, before fine-tuning.
+
+    The model's own error E against its photos and the distortion D are taken to be independent. They then add up, so
+    D = E (10^(drop / 10) - 1).
 
     Args:
-        provenance: of the model; it says how well it fits its photos.
-        finetune_steps: that a file gets; the more, the coarser it may start.
+        provenance: provenance of the model, which states how well it fits its photos.
+        finetune_steps: steps of fine-tuning that the file will get; more steps allow a larger distortion.
     """
-    coarser = FINETUNED ** min(1.0, finetune_steps / FULLY_FINETUNED)
-    return coarser * stated_error(provenance) * (10 ** (PSNR_DROP / 10) - 1)
+    ratio = FINETUNED_DISTORTION_RATIO ** min(1.0, finetune_steps / FULL_FINETUNING_STEPS)
+    return ratio * stated_error(provenance) * (10 ** (DEFAULT_PSNR_DROP_DB / 10) - 1)

@@ -1,4 +1,4 @@
-"""Quantisation-aware fine-tuning: train on, seeing through the quantiser, with the bits in the loss."""
+"""Quantisation-aware fine-tuning: continue training with quantised parameters and the rate in the loss."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.compress.plan import at_cells, follow
+from hyrfpack.compress.plan import replan_moved, snap_to_lattice
 from hyrfpack.compress.quantize import quantize
-from hyrfpack.compress.rate_distortion import ERROR_PER_BIT
+from hyrfpack.compress.rate_distortion import LAMBDA_PER_DISTORTION
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload
@@ -35,15 +35,17 @@ from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.together import averaged
 from hyrfpack.train.trainer import shuffled
 
-RATES = LearningRates(
-    positions=(1e-4, 1e-6),  # cells that are left late cost the other numbers what they have settled to
+FINETUNING_RATES = LearningRates(
+    positions=(1e-4, 1e-6),  # a Gaussian that changes its cell late invalidates what its other numbers converged to
     fields=(2e-3, 2e-4),
     color_logits=(6e-3, 6e-4),
     scale_logits=(8e-3, 8e-4),
     opacity_logits=(2e-2, 2e-3),
 )
-FULL_RATES = 500  # steps from which on rates are these; in fewer there is no time to settle after large ones
-LOSS_PER_ERROR = 40.0  # what the photometric loss rises by for a small mean squared error added to the picture
+# Shorter runs have no time to converge after large steps, so their rates are lower in proportion to their length.
+FULL_RATE_STEPS = 500
+# A small mean squared error e added to a picture raises the photometric loss by about LOSS_PER_MSE * e.
+LOSS_PER_MSE = 40.0
 
 
 def finetune(
@@ -59,32 +61,32 @@ def finetune(
     report: Callable[[int, float], None] = lambda step, loss: None,
     ranks: Ranks = SINGLE_PROCESS,
 ) -> tuple[HybridModel, Plan]:
-    """Fit a model's numbers to the photos as they will be decoded.
+    """Fit a model's numbers to the photos while they are quantised as in the file.
 
-    Each step renders the model as it is after quantising (rounding passes gradients straight through) and adds
+    Each step renders the model with quantised numbers (a straight-through estimator passes the gradients) and adds
 
-        LOSS_PER_ERROR * 2 ln 2 D * bits
+        LOSS_PER_MSE * 2 ln 2 D * bits
 
-    to the photometric loss, the exchange rate of `quantize`; a number q steps from its prediction is taken to cost
-    |q| / (b ln 2) bits, b being the mean of |q| in its group (the ideal code of a Laplace distribution). Positions move
-    on the lattice; classes and their steps stay.
+    to the photometric loss, with the same lambda as `quantize`. The rate of a number q steps from its prediction is
+    |q| / (b ln 2) bits, where b is the mean of |q| in its group (the ideal code of a Laplace distribution). Positions
+    move on the lattice; classes and their steps stay fixed.
 
     Args:
         model: a trained model; not changed.
-        plan: its plan.
-        sensitivity: that the plan was made by.
+        plan: the model's plan.
+        sensitivity: the sensitivities that the plan was made from.
         views: photos to fit.
-        steps: optimiser steps of one process, one view each; several take as many views together.
-        seed: of the order of views.
-        gains: of each photo, that renders as photographed are exposed by before they are compared, see
-            `gains_of_photos`; None compares renders as they are.
-        cache: holds decoded photos.
+        steps: number of views to fit; one process takes one view per optimiser step, several take one each.
+        seed: random seed of the order of views.
+        gains: residual gains of each photo, applied to the render before it is compared, see `fit_residual_gains`; None
+            compares renders as they are.
+        cache: cache of decoded photos.
         report: called after each step with its number, from 1, and the photometric loss.
-        ranks: processes that fit the same model together, as in `Trainer`; all get the same.
+        ranks: processes that fit the same model together, as in `Trainer`; all get the same result.
 
     Returns:
-        The fitted part of the model that is stored, to be quantised with `reach` 0, for its numbers sit where they
-        shall be rounded to; and its plan.
+        The stored part of the model, fitted, and its plan. It must be quantised with `reach` 0, because its numbers
+        were fitted to be rounded to the nearest symbol.
 
     Raises:
         HyrfTrainingError: the loss or a gradient is not finite.
@@ -92,8 +94,10 @@ def finetune(
     tuned = plan.apply(model)
     tuned.load_state_dict({"gaussians.positions": model.gaussians.positions.detach()[plan.kept]}, strict=False)
     tuned.requires_grad_(True)
-    share = min(1.0, steps / FULL_RATES)
-    rates = {name: (share * first, share * last) for name, (first, last) in dataclasses.asdict(RATES).items()}
+    share = min(1.0, steps / FULL_RATE_STEPS)
+    rates = {
+        name: (share * first, share * last) for name, (first, last) in dataclasses.asdict(FINETUNING_RATES).items()
+    }
     optimizer = Optimizer(tuned, LearningRates(**rates), ranks.size)
     steps = -(-steps // ranks.size)
     quantized: QuantizedModel | None = None
@@ -102,24 +106,24 @@ def finetune(
     order = shuffled(views, seed, range(ranks.rank, steps * ranks.size, ranks.size))
     with closing((cache or PictureCache()).stream(order)) as pictures, torch_on_one_thread():
         for step in range(steps):
-            quantized = quantize(tuned, plan, sensitivity, reach=0, like=quantized)
+            quantized = quantize(tuned, plan, sensitivity, reach=0, previous=quantized)
             exact = {name: value.clone() for name, value in tuned.state_dict().items()}
-            decoded = {**quantized.arrays(), POSITIONS: _on_lattice(tuned, plan)}
+            decoded = {**quantized.arrays(), POSITIONS: _lattice_positions(tuned, plan)}
             tuned.load_state_dict(dict(iter_parameters(decoded, tuned)), strict=False)
             problem: HyrfError | None = None
             try:
-                loss = _fit(tuned, photos, *next(pictures), gains)
-            except HyrfError as refusal:
+                loss = _backpropagate_view(tuned, photos, *next(pictures), gains)
+            except HyrfError as error:
                 if ranks.is_single:
                     raise
-                problem, loss = refusal, tuned.gaussians.positions.new_zeros(())
+                problem, loss = error, tuned.gaussians.positions.new_zeros(())
             if not ranks.is_single:
-                said = averaged(ranks, list(tuned.parameters()), loss.new_tensor((loss, problem is not None)))
-                loss, problems = said / ranks.size
+                sums = averaged(ranks, list(tuned.parameters()), loss.new_tensor((loss, problem is not None)))
+                loss, problems = sums / ranks.size
                 if problems:
                     ranks.raise_if_any(problem)
             tuned.load_state_dict(exact)
-            _add_rate(tuned, quantized, LOSS_PER_ERROR * ERROR_PER_BIT * plan.distortion_per_number)
+            _add_rate_gradients(tuned, quantized, LOSS_PER_MSE * LAMBDA_PER_DISTORTION * plan.distortion_per_number)
             broken = optimizer.step(step, steps)
             if not torch.isfinite(loss) or broken.any():
                 views_of_step = shuffled(views, seed, range(step * ranks.size, (step + 1) * ranks.size))
@@ -129,14 +133,14 @@ def finetune(
                     "finite; compress without `finetune_steps`"
                 )
             report(step + 1, float(loss))
-    plan, placed = follow(plan, tuned)
+    plan, placed = replan_moved(plan, tuned)
     return placed, plan
 
 
-def _fit(
+def _backpropagate_view(
     model: HybridModel, photos: Photos, view: View, picture: Picture, gains: Mapping[str, Tensor] | None
 ) -> Tensor:
-    """Add the gradients of a view's photometric loss; the loss, a scalar."""
+    """Backpropagate the photometric loss of a view and return the loss, a detached scalar."""
     solid = None if model.config.background else np.array(model.config.solid, np.float32)
     target, mask = photos.get(view.name, picture, solid)
     image = render(model, view.camera).rgb
@@ -148,16 +152,18 @@ def _fit(
 
 
 @torch.no_grad()
-def gains_of_photos(model: HybridModel, views: Sequence[View], cache: PictureCache | None = None) -> dict[str, Tensor]:
-    """Fit the residual gains of each photo: those of `expose` that bring the render as photographed to the photo.
+def fit_residual_gains(
+    model: HybridModel, views: Sequence[View], cache: PictureCache | None = None
+) -> dict[str, Tensor]:
+    """Fit the residual gains of each photo: the gains of `expose` that match the render as photographed to the photo.
 
     With the gains g_map of the model's exposure map and the residual gains g of a photo,
 
         photo = expose(expose(consistent, g_map), g) + e = expose(consistent, g_map g) + e
 
-    so that a model which is fitted to photos with these gains keeps its consistent exposure and its map: what the map
-    does not explain of a photo's exposure goes into g. Without a map, g holds all of it. A photo that is nearly black
-    or white has gains of one, the exposure that the map predicts.
+    A model that is fitted to photos with these gains keeps its consistent exposure and its map, because g absorbs what
+    the map does not explain of a photo's exposure. Without a map, g holds the whole exposure. The gains of a photo that
+    is nearly black or white are one, so the exposure that the map predicts is used.
 
     Returns:
         (3,) gains on the model's device, by the name of the photo.
@@ -174,31 +180,34 @@ def gains_of_photos(model: HybridModel, views: Sequence[View], cache: PictureCac
 
 
 @torch.no_grad()
-def _on_lattice(model: HybridModel, plan: Plan) -> np.ndarray:
-    """The positions (M, 3) that a planned model's Gaussians would be stored at."""
+def _lattice_positions(model: HybridModel, plan: Plan) -> np.ndarray:
+    """Return the positions (M, 3) at which a planned model's Gaussians would be stored."""
     cube = model.cube_coords(model.gaussians.positions.double()).cpu().numpy()
     places, start = [], 0
     for points in (layer.points for layer in plan.layers):
         part = slice(start, start := start + len(points.classes))
-        places.append(lattice_to_local(at_cells(cube[part], points.classes, points.bits), model.config.frame))
+        places.append(lattice_to_local(snap_to_lattice(cube[part], points.classes, points.bits), model.config.frame))
     return np.concatenate(places)
 
 
 @torch.no_grad()
-def _add_rate(model: HybridModel, quantized: QuantizedModel, price: float) -> None:
-    """Add the gradient of price * bits to the parameters' gradients."""
+def _add_rate_gradients(model: HybridModel, quantized: QuantizedModel, price: float) -> None:
+    """Add the gradient of price * rate to the gradients of the parameters; `price` is the loss per bit."""
     parameters, plan, slopes = dict(model.named_parameters()), quantized.plan, {}
     for group in quantized.channels[0]:
         values = np.concatenate(
             [
-                np.stack([_slope(c.residuals, layer.points.classes, len(c.codes), c.codes) for c in channels[group]], 1)
+                np.stack(
+                    [_rate_gradient(c.residuals, layer.points.classes, len(c.codes), c.codes) for c in channels[group]],
+                    1,
+                )
                 for layer, channels in zip(plan.layers, quantized.channels, strict=True)
             ]
         )
         slopes[group] = values @ plan.basis.T.astype(np.float64) if group == COLORS else values
     for group, chosen in quantized.groups.items():
         groups = plan.groups[group]
-        slopes[group] = _slope(chosen.symbols, groups.index, groups.count, chosen.codes)
+        slopes[group] = _rate_gradient(chosen.symbols, groups.index, groups.count, chosen.codes)
     slopes = {group: (price * values).astype(np.float32) for group, values in slopes.items()}
     for name, slope in iter_parameters(slopes, model):
         gradient = parameters[name].grad
@@ -206,8 +215,8 @@ def _add_rate(model: HybridModel, quantized: QuantizedModel, price: float) -> No
             gradient += slope.to(gradient)
 
 
-def _slope(symbols: np.ndarray, index: np.ndarray, count: int, codes: np.ndarray) -> np.ndarray:
-    """d bits / d number: sign(q) / (b ln 2 step), (n,) float64."""
+def _rate_gradient(symbols: np.ndarray, index: np.ndarray, count: int, codes: np.ndarray) -> np.ndarray:
+    """Return d rate / d number = sign(q) / (b ln 2 step) in bits, (n,) float64."""
     members = np.maximum(np.bincount(index, minlength=count), 1)
     spread = np.bincount(index, np.abs(symbols), count) / members + 0.1
     slope = 1 / (spread * np.log(2) * (step_of(codes) / ONE))

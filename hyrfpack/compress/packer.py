@@ -1,4 +1,4 @@
-"""Compressing a file: measure, plan, perhaps search and fine-tune, write."""
+"""Compression of a file: measure sensitivities, plan, fine-tune or search if asked for, and write."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ import torch
 
 from hyrfpack.cameras.capture import Capture, has_mean_exposure, quantized_provenance
 from hyrfpack.checks import check_type
-from hyrfpack.compress.calibrate import Originals, calibrated, foretold
-from hyrfpack.compress.distortion import LIMITS, PSNR_DROP, default_distortion
-from hyrfpack.compress.finetune import finetune, gains_of_photos
+from hyrfpack.compress.calibrate import ReferenceRenders, measure_calibrated_sensitivity, predict_errors
+from hyrfpack.compress.distortion import DEFAULT_PSNR_DROP_DB, DISTORTION_RANGE, default_distortion
+from hyrfpack.compress.finetune import finetune, fit_residual_gains
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.quantize import quantize
-from hyrfpack.compress.search import coarsest, fullest
+from hyrfpack.compress.search import find_coarsest, find_fullest
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.device import choose_own_device
@@ -44,29 +44,38 @@ from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Report, no_report, report_part, report_round
 from hyrfpack.scene import Scene, evenly_spaced
 
-TOLERATED_DROP, DROP_VIEWS = 1.5, 8  # factor from the dB aimed at, and training photos that these are measured on
-TOLERATED, MENDED = 1.2, 3  # factor from the distortion asked for, and how often another file is made beyond it
-COARSER, FINER = 2.0, 16.0  # factors at most that another file differs by
-TRIALS, FINETUNED_TRIALS = 9, 4  # of a search
-# Shares of the whole work at which sensitivities are measured and the first file is made: alone, and of many.
-ENCODING_STARTS, SEARCH_STARTS = 0.7, 0.3
+# A file that loses more than this many times the intended PSNR on training photos is encoded again, finer.
+PSNR_DROP_TOLERANCE_RATIO = 1.5
+PSNR_DROP_VIEWS = 8
+# A file is encoded again if the measured error is off by more than this ratio from the intended one.
+DISTORTION_TOLERANCE_RATIO = 1.2
+MAX_CORRECTIONS = 3
+# Largest change of the distortion from one file to the next.
+MAX_COARSENING_RATIO = 2.0
+MAX_REFINING_RATIO = 16.0
+# Fine-tuning takes long, so a search over fine-tuned files makes fewer.
+SEARCH_TRIALS = 9
+FINETUNED_SEARCH_TRIALS = 4
+# Share of the progress at which sensitivities are measured and encoding starts, for a single file and for a search.
+ENCODING_START_SHARE = 0.7
+SEARCH_ENCODING_START_SHARE = 0.3
 
 
 @dataclass(frozen=True)
-class Trial:
-    """A file that was made.
+class EncodedCandidate:
+    """An encoded file of the model, and how far its pictures are off.
 
     Attributes:
-        data: its bytes.
-        errors: what it adds to the pictures' mean squared error by section and by what is pruned, foretold.
-        error: what it adds to it, where pictures were compared.
-        lost: dB of PSNR, where that was measured.
+        data: the bytes of the file.
+        predicted_errors: predicted mean squared error that compression adds to pictures, by section and for PRUNED.
+        measured_error: mean squared error measured on renders; 0 if it was not measured.
+        psnr_drop: measured loss of PSNR in dB; 0 if it was not measured.
     """
 
     data: bytes
-    errors: dict[str, float]
-    error: float = 0.0
-    lost: float = 0.0
+    predicted_errors: dict[str, float]
+    measured_error: float = 0.0
+    psnr_drop: float = 0.0
 
 
 def compress(
@@ -87,35 +96,37 @@ def compress(
     ranks: Ranks = SINGLE_PROCESS,
     **settings: Any,
 ) -> CompressionReport:
-    """Pack a `.hyrf` file into a smaller one.
+    """Compress a `.hyrf` file into a smaller one.
 
-    Profile "compact" measures what each number does to pictures, at the cameras of `data` or those that the file
-    keeps, and spends bits where they show. By itself it aims at a loss of `hyrfpack.compress.distortion.PSNR_DROP`;
-    the rest is for when that is not what is wanted. "paper" and "raw" do what they always do, and take none of it.
+    Profile "compact" measures how much each number of the model affects pictures, at the cameras of `data` or those
+    stored in the file, and spends bits accordingly. By default it aims at a loss of
+    `hyrfpack.compress.distortion.DEFAULT_PSNR_DROP_DB`. Profiles "paper" and "raw" have fixed recipes and accept none
+    of `data`, `finetune_steps`, `target_bytes`, `max_psnr_drop` and `distortion`.
 
     Args:
         source: a file of any profile, best "raw", or the folder of a run.
         target: the file to write.
         profile: "compact", "paper" or "raw".
         data: photos of the scene.
-        finetune_steps: steps of fitting the quantised model to the photos of `data`; buys smaller files with time.
-        prune: leave out Gaussians that cost more in bytes than they give to pictures.
-        target_bytes: make the file as good as can be within so many bytes.
-        max_psnr_drop: make the file as small as can be for so many dB of mean PSNR on the held-out photos of `data`.
-        distortion: mean squared error that pictures may get, by estimate; instead of a search.
-        overwrite: replace a file at `target`. Without it, one that is there is an error, and one that appears in the
-            meantime is kept: the result gets a free name beside it, which the report names.
-        device: where pictures are drawn, see `hyrfpack.device.choose_device`. On the CPU the same input gives the same
-            bytes; on a GPU sums of gradients vary in their last bits, and bytes with them.
-        say: told what is going on.
-        report: called with what is being done and the share of the work that is done, 0 to 1.
+        finetune_steps: steps of fitting the quantised model to the photos of `data`; takes longer, gives smaller files.
+        prune: leave out Gaussians whose removal saves more rate than it costs in distortion.
+        target_bytes: write the best file of at most this many bytes.
+        max_psnr_drop: write the smallest file that loses at most this many dB of mean PSNR on the held-out photos of
+            `data`.
+        distortion: estimated mean squared error that compression may add to pictures; replaces a search.
+        overwrite: replace a file at `target`. If False, an existing file is an error. A file that appears in the
+            meantime is kept, and the result is written beside it under a free name, which the report names.
+        device: device that renders, see `hyrfpack.device.choose_device`. On the CPU the same input gives the same
+            bytes. On a GPU sums of gradients vary in their last bits, and so may the bytes.
+        say: called with a sentence for each step of the work.
+        report: called with the name of the current task and the completed share of the work, 0 to 1.
         ranks: processes that share the photos of fine-tuning; rank 0 writes the file.
-        settings: of "paper", see `hyrfpack.format.paper`; `noise` is the old word for `distortion`.
+        settings: settings of "paper", see `hyrfpack.format.paper`; `noise` is the deprecated name of `distortion`.
 
     Raises:
-        HyrfError: a file cannot be read or written, the target is what is read, the options do not go together, or
-            what is asked for cannot be had.
-        TypeError: `data` is no Scene.
+        HyrfError: a file cannot be read or written, source and target are the same file, the options exclude each
+            other, or no file meets the limits.
+        TypeError: `data` is not a Scene.
 
     Example:
         >>> import hyrfpack
@@ -129,7 +140,7 @@ def compress(
     if data is not None:
         check_type("data", data, Scene)
     source = find_model(source)
-    # The main process alone looks, and the others wait for it: what it has written is no reason to refuse.
+    # Only the main process checks the target, while the others wait. They must not mistake its output for an old file.
     outputs = Outputs(source, scene=data, overwrite=overwrite)
     ranks.run_on_all(lambda: outputs.file(target) if ranks.is_main else None)
     if profile != "compact":
@@ -154,35 +165,45 @@ def compress(
     if target_bytes is not None:
         check_target_bytes(target_bytes, kept, model.exposure)
     model = model.to(choose_own_device(device, ranks, say))
-    model.precision = "float32"  # what is looked for is smaller than what a GPU rounds away otherwise
+    model.precision = "float32"  # quantisation errors are smaller than the rounding of lower precisions on a GPU
     if len(model) == 0:
         raise HyrfError(f"{source}: there is no Gaussian in it, so there is nothing to measure; use profile 'paper'")
     cameras = Capture(describe(source), data).cameras
     say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
     start = distortion or default_distortion(provenance, finetune_steps)
-    encoding_starts = SEARCH_STARTS if finetune_steps or target_bytes or max_psnr_drop is not None else ENCODING_STARTS
-    measuring = report_part(report, 0.0, encoding_starts)
-    sensitivity, originals = calibrated(model, cameras, start, prune, measuring)
-    sensitivity = ranks.broadcast(sensitivity)  # on GPUs those of others differ in their last bits
-    encoding = report_part(report, encoding_starts, 1.0)
-    packer = Packer(model, kept, sensitivity, data, finetune_steps, prune, say, encoding, ranks=ranks)
+    encoding_start = (
+        SEARCH_ENCODING_START_SHARE
+        if finetune_steps or target_bytes or max_psnr_drop is not None
+        else ENCODING_START_SHARE
+    )
+    measuring_report = report_part(report, 0.0, encoding_start)
+    sensitivity, references = measure_calibrated_sensitivity(model, cameras, start, prune, measuring_report)
+    sensitivity = ranks.broadcast(sensitivity)  # on GPUs the other ranks' values differ in their last bits
+    encoding_report = report_part(report, encoding_start, 1.0)
+    packer = Packer(model, kept, sensitivity, data, finetune_steps, prune, say, encoding_report, ranks=ranks)
     if target_bytes is not None:
-        trial, found = packer.within_bytes(target_bytes, start)
+        candidate, search_result = packer.encode_within_bytes(target_bytes, start)
     elif max_psnr_drop is not None:
-        trial, found = packer.within_drop(max_psnr_drop, start)
+        candidate, search_result = packer.encode_within_psnr_drop(max_psnr_drop, start)
     else:
-        aim = PSNR_DROP if distortion is None else None
-        trial = packer.attempt(start, encoding) if finetune_steps else packer.settled(start, originals, aim)
-        found = ""
-    written = ranks.run_on_all(lambda: write_model(trial.data, target, overwrite=overwrite) if ranks.is_main else None)
+        target_drop = DEFAULT_PSNR_DROP_DB if distortion is None else None
+        candidate = (
+            packer.encode(start, encoding_report)
+            if finetune_steps
+            else packer.encode_to_distortion(start, references, target_drop)
+        )
+        search_result = ""
+    written = ranks.run_on_all(
+        lambda: write_model(candidate.data, target, overwrite=overwrite) if ranks.is_main else None
+    )
     result = cast(CompressionReport, ranks.broadcast(written))
-    total = sum(trial.errors.values())
-    shares = {part: error / (total or 1.0) for part, error in trial.errors.items()}
+    total = sum(candidate.predicted_errors.values())
+    shares = {part: error / (total or 1.0) for part, error in candidate.predicted_errors.items()}
     return dataclasses.replace(
         result,
         shares=shares,
-        error=trial.error or total,
-        found=found,
+        error=candidate.measured_error or total,
+        found=search_result,
         finetuned=finetune_steps > 0,
         sensitivity=sensitivity,
     )
@@ -190,18 +211,18 @@ def compress(
 
 @dataclass
 class Packer:
-    """Makes files of one model, finer and coarser; what its numbers do to pictures is measured once, before.
+    """Encodes one model at different distortions, from sensitivities that were measured once.
 
     Attributes:
-        model: the model.
-        provenance: that the files tell.
-        sensitivity: of the model, see `calibrated`.
-        scene: photos to fine-tune on; None where there are none.
-        finetune_steps: of each file.
-        prune: leave out Gaussians that cost more in bytes than they give to pictures.
-        say: told what is going on.
-        report: told what is being done, and the share of all files' making that is done.
-        cache: of the photos.
+        model: the model to encode.
+        provenance: provenance to store in the files.
+        sensitivity: calibrated sensitivities of the model, see `measure_calibrated_sensitivity`.
+        scene: photos to fine-tune on and to measure losses on; None if there are none.
+        finetune_steps: steps of fine-tuning for each file; 0 for none.
+        prune: leave out Gaussians whose removal saves more rate than it costs in distortion.
+        say: called with a sentence for each step of the work.
+        report: called with the name of the current task and the completed share of encoding all files, 0 to 1.
+        cache: cache of decoded photos.
         ranks: processes that fine-tune together.
     """
 
@@ -216,8 +237,8 @@ class Packer:
     cache: PictureCache = field(default_factory=PictureCache)
     ranks: Ranks = SINGLE_PROCESS
 
-    def attempt(self, distortion: float, report: Report = no_report) -> Trial:
-        """A file that adds about so large a mean squared error to pictures."""
+    def encode(self, distortion: float, report: Report = no_report) -> EncodedCandidate:
+        """Encode a file that adds about `distortion` to the mean squared error of pictures, by estimate."""
         report("planning quantisation", 0.0)
         model, steps = self.model, self.finetune_steps
         plan = make_plan(model, self.sensitivity, distortion, self.prune)
@@ -227,10 +248,10 @@ class Packer:
 
             own_steps = -(-steps // self.ranks.size)
 
-            def stepped(step: int, loss: float) -> None:
+            def report_step(step: int, loss: float) -> None:
                 report(f"fine-tuning, step {step:,} of {own_steps:,}", 0.9 * step / own_steps)
 
-            fit = partial(finetune, gains=self._gains, cache=self.cache, report=stepped, ranks=self.ranks)
+            fit = partial(finetune, gains=self._gains, cache=self.cache, report=report_step, ranks=self.ranks)
             planned, plan = fit(model, plan, self.sensitivity, self.scene.train, steps)
         else:
             planned = plan.apply(model)
@@ -238,119 +259,151 @@ class Packer:
         quantized = quantize(planned, plan, self.sensitivity, reach=0 if steps else 1)
         report("coding", 0.95 if steps else 0.6)
         data = encode_model(planned, "compact", self.provenance, quantized=quantized)
-        return Trial(data, foretold(self.model, planned, quantized, self.sensitivity))
+        return EncodedCandidate(data, predict_errors(self.model, planned, quantized, self.sensitivity))
 
-    def settled(self, wanted: float, originals: Originals, aim: float | None = None) -> Trial:
-        """A file whose pictures are off by about as much as is `wanted`, and cost about `aim` dB on training photos.
+    def encode_to_distortion(
+        self, target: float, references: ReferenceRenders, target_drop: float | None = None
+    ) -> EncodedCandidate:
+        """Encode a file whose measured error is about `target`, and limit its PSNR drop on training photos.
 
-        What packing adds to the error of photos is taken to be `wanted`, which it is where the two errors have nothing
-        to do with each other. Those of a model that has hardly been trained have: packing shifts the colours of whole
-        pictures, whose exposure the model does not hit, either. Where there are photos the loss is measured on some,
-        and a file that costs more than TOLERATED_DROP times `aim` is made finer.
+        The distortion adds to the model's error against photos only if the two are independent. In a model that was
+        hardly trained they are not: compression shifts the colours of whole pictures, whose exposure the model does not
+        match either. So the drop is measured on some training photos, if there are any. A file that loses more than
+        PSNR_DROP_TOLERANCE_RATIO times `target_drop` (dB) is encoded again with a smaller distortion.
         """
-        if self.scene is None or aim is None:
-            return self._settled(wanted, originals, self.report)[0]
-        trial, distortion = self._settled(wanted, originals, report_part(self.report, 0.0, 0.3))
-        views = evenly_spaced(self.scene.train, DROP_VIEWS)
+        if self.scene is None or target_drop is None:
+            return self._encode_to_distortion(target, references, self.report)[0]
+        candidate, distortion = self._encode_to_distortion(target, references, report_part(self.report, 0.0, 0.3))
+        views = evenly_spaced(self.scene.train, PSNR_DROP_VIEWS)
         try:
             before = evaluate(self.model, views, report=report_part(self.report, 0.3, 0.6)).psnr
-            for number in range(MENDED):
+            for number in range(MAX_CORRECTIONS):
                 report = report_round(report_part(self.report, 0.6, 1.0), number)
-                lost = before - evaluate(self.decoded(trial), views, report=report).psnr
-                if lost <= TOLERATED_DROP * aim:
+                psnr_drop = before - evaluate(self.decode(candidate), views, report=report).psnr
+                if psnr_drop <= PSNR_DROP_TOLERANCE_RATIO * target_drop:
                     break
-                distortion *= max(aim / lost, 1 / FINER)
-                self.say(f"training photos lose {lost:.2f} instead of {aim:g} dB: finer, for {distortion:.2g}")
-                trial = self.attempt(distortion)
-                trial = dataclasses.replace(trial, error=originals.error(self.decoded(trial)))
-        except HyrfError as error:  # a photo that cannot be read, or masks that leave nothing
+                distortion *= max(target_drop / psnr_drop, 1 / MAX_REFINING_RATIO)
+                self.say(
+                    f"training photos lose {psnr_drop:.2f} instead of {target_drop:g} dB: finer, for {distortion:.2g}"
+                )
+                candidate = self.encode(distortion)
+                candidate = dataclasses.replace(
+                    candidate, measured_error=references.measure_error(self.decode(candidate))
+                )
+        except HyrfError as error:  # a photo cannot be read, or masks leave no pixel to score
             self.say(f"{error}; the loss on training photos is not measured")
-        return trial
+        return candidate
 
-    def _settled(self, wanted: float, originals: Originals, report: Report) -> tuple[Trial, float]:
-        """A file whose pictures are off by about as much as is `wanted`, and the distortion that it was made for.
+    def _encode_to_distortion(
+        self, target: float, references: ReferenceRenders, report: Report
+    ) -> tuple[EncodedCandidate, float]:
+        """Encode a file whose measured error is about `target`; return it and the distortion it was planned for.
 
-        Its parts were calibrated one by one; together they may do a little more or less.
+        The parts were calibrated separately, so their errors together may differ a little from the prediction.
         """
 
-        def attempt(distortion: float, number: int) -> Trial:
-            trying = report_round(report, number)
-            trial = self.attempt(distortion, report_part(trying, 0.0, 0.5))
-            trying("comparing pictures of the file with the model's", 0.5)
-            return dataclasses.replace(trial, error=originals.error(self.decoded(trial)))
+        def attempt(distortion: float, number: int) -> EncodedCandidate:
+            candidate_report = report_round(report, number)
+            candidate = self.encode(distortion, report_part(candidate_report, 0.0, 0.5))
+            candidate_report("comparing pictures of the file with the model's", 0.5)
+            return dataclasses.replace(candidate, measured_error=references.measure_error(self.decode(candidate)))
 
-        trial, distortion = attempt(wanted, 0), wanted
-        for number in range(MENDED):
-            off = trial.error / wanted
-            if off == 0 or 1 / TOLERATED < off < TOLERATED:
+        candidate, distortion = attempt(target, 0), target
+        for number in range(MAX_CORRECTIONS):
+            error = candidate.measured_error
+            error_ratio = error / target
+            if error_ratio == 0 or 1 / DISTORTION_TOLERANCE_RATIO < error_ratio < DISTORTION_TOLERANCE_RATIO:
                 break
-            distortion /= min(max(off, 1 / COARSER), FINER)
-            kind = "finer" if off > 1 else "coarser"
-            self.say(f"pictures are off by {trial.error:.2g} instead of {wanted:.2g}: {kind}, for {distortion:.2g}")
+            distortion /= min(max(error_ratio, 1 / MAX_COARSENING_RATIO), MAX_REFINING_RATIO)
+            kind = "finer" if error_ratio > 1 else "coarser"
+            self.say(f"pictures are off by {error:.2g} instead of {target:.2g}: {kind}, for {distortion:.2g}")
             other = attempt(distortion, number + 1)
-            if off > 1:
-                trial = other
+            if error_ratio > 1:
+                candidate = other
                 continue
-            # Once: what no view sees has a limit, too.
-            return (other, distortion) if other.error < TOLERATED * wanted else (trial, wanted)
-        return trial, distortion
+            # Coarsen only once, because the errors that the comparison views do not show must stay bounded, too.
+            return (
+                (other, distortion)
+                if other.measured_error < DISTORTION_TOLERANCE_RATIO * target
+                else (candidate, target)
+            )
+        return candidate, distortion
 
-    def within_bytes(self, limit: int, start: float) -> tuple[Trial, str]:
+    def encode_within_bytes(self, limit: int, start: float) -> tuple[EncodedCandidate, str]:
+        """Search for the best file of at most `limit` bytes, from distortion `start`; return it and a description.
+
+        Raises:
+            HyrfSizeError: even the largest distortion gives a larger file.
+        """
         rounds = count()
 
-        def attempt(distortion: float) -> Trial:
-            trial = self.attempt(distortion, report_round(self.report, next(rounds)))
-            self.say(f"distortion {distortion:.2g}: {len(trial.data):,} bytes")
-            return trial
+        def attempt(distortion: float) -> EncodedCandidate:
+            candidate = self.encode(distortion, report_round(self.report, next(rounds)))
+            self.say(f"distortion {distortion:.2g}: {len(candidate.data):,} bytes")
+            return candidate
 
-        answer = fullest(attempt, lambda trial: len(trial.data), limit, start, self._trials(), LIMITS)
+        answer = find_fullest(
+            attempt, lambda candidate: len(candidate.data), limit, start, self._max_trials(), DISTORTION_RANGE
+        )
         if answer is None:
-            smallest = len(self.attempt(LIMITS[1]).data)
+            smallest = len(self.encode(DISTORTION_RANGE[1]).data)
             raise HyrfSizeError(
                 f"the model does not fit into {limit:,} bytes, the least is about {smallest:,}; "
                 "ask for more, or train with fewer Gaussians (`max_gaussians`)",
                 smallest,
             )
-        distortion, trial = answer
-        return trial, f"distortion {distortion:.2g} gives {len(trial.data):,} of {limit:,} bytes"
+        distortion, candidate = answer
+        return candidate, f"distortion {distortion:.2g} gives {len(candidate.data):,} of {limit:,} bytes"
 
-    def within_drop(self, limit: float, start: float) -> tuple[Trial, str]:
+    def encode_within_psnr_drop(self, limit: float, start: float) -> tuple[EncodedCandidate, str]:
+        """Search for the smallest file that loses at most `limit` dB of PSNR; return it and a description.
+
+        The loss is measured on the held-out photos, or on the training photos if none are held out.
+
+        Raises:
+            HyrfError: even the smallest distortion loses more.
+        """
         assert self.scene is not None
         views = self.scene.test or self.scene.train
         self.report("scoring the model", 0.0)
         before = evaluate(self.model, views).psnr
         rounds = count()
 
-        def attempt(distortion: float) -> Trial:
+        def attempt(distortion: float) -> EncodedCandidate:
             report = report_round(self.report, next(rounds))
-            trial = self.attempt(distortion, report_part(report, 0.0, 0.7))
+            candidate = self.encode(distortion, report_part(report, 0.0, 0.7))
             report("scoring the file", 0.7)
-            lost = before - evaluate(self.decoded(trial), views).psnr
-            trial = dataclasses.replace(trial, lost=lost)
-            self.say(f"distortion {distortion:.2g}: {len(trial.data):,} bytes, {lost:+.3f} dB lost")
-            return trial
+            psnr_drop = before - evaluate(self.decode(candidate), views).psnr
+            candidate = dataclasses.replace(candidate, psnr_drop=psnr_drop)
+            self.say(f"distortion {distortion:.2g}: {len(candidate.data):,} bytes, {psnr_drop:+.3f} dB lost")
+            return candidate
 
-        answer = coarsest(attempt, lambda trial: trial.lost <= limit, start, self._trials(), LIMITS)
+        answer = find_coarsest(
+            attempt, lambda candidate: candidate.psnr_drop <= limit, start, self._max_trials(), DISTORTION_RANGE
+        )
         if answer is None:
             raise HyrfError(
                 f"even the finest file loses more than {limit:g} dB of PSNR; allow more, or use profile 'raw'"
             )
-        distortion, trial = answer
-        return trial, f"distortion {distortion:.2g} loses {trial.lost:+.3f} of {limit:g} dB on {len(views)} photos"
+        distortion, candidate = answer
+        return (
+            candidate,
+            f"distortion {distortion:.2g} loses {candidate.psnr_drop:+.3f} of {limit:g} dB on {len(views)} photos",
+        )
 
     @cached_property
     def _gains(self) -> dict[str, torch.Tensor] | None:
-        """Residual gains of the photos to fine-tune on; None where no per-image gains were learnt with the model."""
+        """Residual gains of the photos to fine-tune on; None if the model was trained without per-image gains."""
         assert self.scene is not None
         if self.model.exposure is None and not has_mean_exposure(self.provenance):
             return None
-        return gains_of_photos(self.model, self.scene.train, self.cache)
+        return fit_residual_gains(self.model, self.scene.train, self.cache)
 
-    def decoded(self, trial: Trial) -> HybridModel:
-        """What a file holds, where the model is and as precise."""
-        model = decode_model(trial.data).to(self.model.gaussians.positions.device)
+    def decode(self, candidate: EncodedCandidate) -> HybridModel:
+        """Decode a file, on the device and at the precision of the model."""
+        model = decode_model(candidate.data).to(self.model.gaussians.positions.device)
         model.precision = self.model.precision
         return model
 
-    def _trials(self) -> int:
-        return FINETUNED_TRIALS if self.finetune_steps else TRIALS
+    def _max_trials(self) -> int:
+        return FINETUNED_SEARCH_TRIALS if self.finetune_steps else SEARCH_TRIALS

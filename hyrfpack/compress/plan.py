@@ -1,4 +1,4 @@
-"""What is stored of a model, and how finely: the decisions that come before any number is quantised."""
+"""Planning of compression: which Gaussians are kept, their order, importance classes and position lattice."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from hyrfpack.compress.rate_distortion import ERROR_PER_BIT
+from hyrfpack.compress.rate_distortion import LAMBDA_PER_DISTORTION
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.compact.channels import MAX_ABS_CHANNEL_VALUE
@@ -17,32 +17,39 @@ from hyrfpack.model import HybridModel
 from hyrfpack.quant.morton import MAX_BITS
 from hyrfpack.quant.points import Points, encode_points
 
-CLASSES = 6
-CLASS_WIDTH = 3.0  # log2 of sensitivity that a class spans: classes much narrower or wider cost more
-ABOVE_MEAN = 2  # classes for what matters more than the mean
-BITS_OF_A_GAUSSIAN = 16  # that pruning counts as saved: those it takes are cheap ones
-LEAST_OF_LAYER = 5000, 8  # Gaussians of a layer: at least so many, and so much of all; smaller ones cost over 1 %
+IMPORTANCE_CLASS_COUNT = 6
+# Each class spans this much log2 of sensitivity; much narrower or wider classes give larger files.
+CLASS_WIDTH_LOG2 = 3.0
+# This many classes are for Gaussians that are more important than the mean.
+CLASSES_ABOVE_MEAN = 2
+# Pruning a Gaussian is taken to save this many bits. It is low, because the Gaussians that are pruned are cheap ones.
+PRUNED_GAUSSIAN_BITS = 16
+# A layer has at least MIN_LAYER_GAUSSIANS and at least 1 / MAX_LAYERS of all Gaussians; smaller layers cost over 1 %.
+MIN_LAYER_GAUSSIANS = 5000
+MAX_LAYERS = 8
 
 
 def make_plan(model: HybridModel, sensitivity: Sensitivity, distortion: float, prune: bool = True) -> Plan:
-    """Decide what is stored, and how finely, so that pictures get about `distortion` mean squared error.
+    """Plan what is stored, and how finely, so that compression adds about `distortion` to the pictures' error.
 
     Args:
-        distortion: of colours in [0, 1]; 1e-5 is 50 dB between pictures before and after.
-        prune: leave out Gaussians that cost more in bytes than they give to pictures.
+        model: the model to compress.
+        sensitivity: sensitivities of the model.
+        distortion: mean squared error of colours in [0, 1]; 1e-5 is 50 dB between pictures before and after.
+        prune: leave out Gaussians whose removal saves more rate than it costs in distortion.
 
     Raises:
         HyrfError: a parameter is NaN or infinite.
     """
-    each = of_each_number(model, distortion)
-    kept = worth_keeping(sensitivity, each, prune)
-    of_kept = sensitivity.of(kept)
-    cube, classes = _cube(model), importance_classes(of_kept)
-    bits = position_bits(of_kept.positions, classes, each)
+    per_number = distortion_per_number(model, distortion)
+    kept = indices_to_keep(sensitivity, per_number, prune)
+    kept_sensitivity = sensitivity.subset(kept)
+    cube, classes = _cube_coords(model), importance_classes(kept_sensitivity)
+    bits = position_bits(kept_sensitivity.positions, classes, per_number)
     layers, order = [], []
-    for kinds in _layer_classes(np.bincount(classes, minlength=CLASSES)):
+    for kinds in _group_classes_into_layers(np.bincount(classes, minlength=IMPORTANCE_CLASS_COUNT)):
         members = np.flatnonzero(np.isin(classes, kinds))
-        layer, index = _layer(cube[kept[members]], classes[members], bits)
+        layer, index = _encode_layer(cube[kept[members]], classes[members], bits)
         layers.append(layer)
         order.append(members[index])
     kept = kept[np.concatenate(order)]
@@ -51,74 +58,78 @@ def make_plan(model: HybridModel, sensitivity: Sensitivity, distortion: float, p
         group: build_step_groups(group, model.config, layers[0].points)
         for group in (*TABLE_SECTIONS, *DECODER_SECTIONS)
     }
-    return Plan(kept, tuple(layers), basis, groups, each)
+    return Plan(kept, tuple(layers), basis, groups, per_number)
 
 
-def of_each_number(model: HybridModel, distortion: float) -> float:
-    """What each number of a model may add to the pictures' mean squared error."""
+def distortion_per_number(model: HybridModel, distortion: float) -> float:
+    """Return D, the mean squared error of pictures that each number of a model may add."""
     return distortion / sum(parameter.numel() for parameter in model.parameters())
 
 
-def worth_keeping(sensitivity: Sensitivity, each: float, prune: bool = True) -> np.ndarray:
-    """Indices (n,), ascending, of the Gaussians that give more to pictures than they cost in bytes.
+def indices_to_keep(sensitivity: Sensitivity, per_number: float, prune: bool = True) -> np.ndarray:
+    """Return the ascending indices (n,) of the Gaussians whose removal would cost more distortion than rate.
 
     Args:
-        sensitivity: of all Gaussians (N,).
-        each: what each number may add, see `of_each_number`.
-        prune: without, all are kept.
+        sensitivity: sensitivities of all N Gaussians.
+        per_number: D, the error that each number may add, see `distortion_per_number`.
+        prune: if False, all Gaussians are kept.
     """
     removals = sensitivity.removals
-    return np.flatnonzero(removals >= ERROR_PER_BIT * each * BITS_OF_A_GAUSSIAN) if prune else np.arange(len(removals))
+    return (
+        np.flatnonzero(removals >= LAMBDA_PER_DISTORTION * per_number * PRUNED_GAUSSIAN_BITS)
+        if prune
+        else np.arange(len(removals))
+    )
 
 
 @torch.no_grad()
-def _cube(model: HybridModel) -> np.ndarray:
-    """Where Gaussians are in the contracted cube, (N, 3) float64."""
+def _cube_coords(model: HybridModel) -> np.ndarray:
+    """Return the Gaussians' coordinates in the contracted cube, (N, 3) float64."""
     return model.cube_coords(model.gaussians.positions.double()).cpu().numpy()
 
 
-def follow(plan: Plan, model: HybridModel) -> tuple[Plan, HybridModel]:
-    """The plan of Gaussians that have moved, and they in its order, on the lattice.
+def replan_moved(plan: Plan, model: HybridModel) -> tuple[Plan, HybridModel]:
+    """Update a plan to the new positions of its Gaussians; return it and the model, reordered and on the lattice.
 
-    Each stays in its layer and class; places and order are new, and with them which rows of the tables are read.
+    Each Gaussian stays in its layer and class. Lattice points and order are computed anew, and with them which rows of
+    the hash tables are read.
 
     Args:
-        plan: `plan.apply` made the model, in whose order it is.
-        model: the part of a model that is stored, moved.
+        plan: the plan before the Gaussians moved.
+        model: the stored part of a model, in the order of `plan` (made by `plan.apply`), after its Gaussians moved.
     """
-    cube = _cube(model)
+    cube = _cube_coords(model)
     layers, order, start = [], [], 0
     for points in (layer.points for layer in plan.layers):
         members = np.arange(start, start := start + len(points.classes))
-        layer, index = _layer(cube[members], points.classes, points.bits)
+        layer, index = _encode_layer(cube[members], points.classes, points.bits)
         layers.append(layer)
         order.append(members[index])
     places = np.concatenate(order)
     groups = {group: build_step_groups(group, model.config, layers[0].points) for group in plan.groups}
-    there = replace(plan, kept=places, layers=tuple(layers), groups=groups)
-    return replace(there, kept=plan.kept[places]), there.apply(model)
+    moved = replace(plan, kept=places, layers=tuple(layers), groups=groups)
+    return replace(moved, kept=plan.kept[places]), moved.apply(model)
 
 
-def _layer(cube: np.ndarray, classes: np.ndarray, bits: np.ndarray) -> tuple[Layer, np.ndarray]:
-    """A layer of the points (n, 3) of the cube, and which of them comes at each place."""
+def _encode_layer(cube: np.ndarray, classes: np.ndarray, bits: np.ndarray) -> tuple[Layer, np.ndarray]:
+    """Encode points (n, 3) of the cube as a layer; return it and the index of the point at each place of the layer."""
     while True:
-        data, order, points = encode_points(at_cells(cube, classes, bits))
-        # A class coarser than all share was made finer: its points are placed anew, in the middle of their cells.
+        data, order, points = encode_points(snap_to_lattice(cube, classes, bits))
+        # The encoder refines classes coarser than its base resolution, so their points are assigned to cells again.
         if (points.bits == bits).all():
             return Layer(points, data), order
         bits = points.bits
 
 
-def at_cells(cube: np.ndarray, classes: np.ndarray, bits: np.ndarray) -> Points:
-    """The lattice points of the cells that points (n, 3) of the cube are in."""
+def snap_to_lattice(cube: np.ndarray, classes: np.ndarray, bits: np.ndarray) -> Points:
+    """Return the lattice points of the cells that contain the points (n, 3) of the cube."""
     side = (1 << bits)[classes][:, None]
     return Points(np.clip(np.floor(cube * side), 0, side - 1).astype(np.int64), classes, bits)
 
 
-def _layer_classes(members: np.ndarray) -> list[list[int]]:
-    """The classes of each layer, from the numbers of their members: in order, and no layer with few Gaussians."""
-    fewest, share = LEAST_OF_LAYER
-    least = max(fewest, members.sum() / share)
+def _group_classes_into_layers(members: np.ndarray) -> list[list[int]]:
+    """Group consecutive classes into layers that are large enough, given the number of Gaussians in each class."""
+    least = max(MIN_LAYER_GAUSSIANS, members.sum() / MAX_LAYERS)
     layers: list[list[int]] = [[]]
     for kind in range(len(members)):
         if members[layers[-1]].sum() >= least and members[kind:].sum() >= least:
@@ -128,7 +139,10 @@ def _layer_classes(members: np.ndarray) -> list[list[int]]:
 
 
 def importance_classes(sensitivity: Sensitivity) -> np.ndarray:
-    """(N,) uint8, 0 for the Gaussians that matter most: by the geometric mean of the sensitivities of all 8 numbers."""
+    """Return each Gaussian's importance class (N,) uint8, 0 for the most important ones.
+
+    The class follows from the geometric mean of the sensitivities of a Gaussian's 8 numbers, relative to their means.
+    """
     logs = np.zeros(len(sensitivity.positions))
     for values, numbers in (
         (sensitivity.positions, 3),
@@ -138,12 +152,14 @@ def importance_classes(sensitivity: Sensitivity) -> np.ndarray:
     ):
         if len(values):
             logs += numbers / 8 * np.log2(np.maximum(values, 1e-300) / max(float(values.mean()), 1e-300))
-    return np.clip(np.round(-logs / CLASS_WIDTH) + ABOVE_MEAN, 0, CLASSES - 1).astype(np.uint8)
+    return np.clip(np.round(-logs / CLASS_WIDTH_LOG2) + CLASSES_ABOVE_MEAN, 0, IMPORTANCE_CLASS_COUNT - 1).astype(
+        np.uint8
+    )
 
 
 def position_bits(sensitivity: np.ndarray, classes: np.ndarray, distortion: float) -> np.ndarray:
-    """(CLASSES,) bits of an axis for each class: the lattice step nearest to sqrt(12 D / s)."""
-    bits = np.ones(CLASSES, np.int64)
+    """Return the bits per axis, (classes,) int64, that give each class the lattice step nearest to sqrt(12 D / s)."""
+    bits = np.ones(IMPORTANCE_CLASS_COUNT, np.int64)
     for kind in np.unique(classes):
         step = np.sqrt(12 * distortion / max(float(sensitivity[classes == kind].mean()), 1e-300))
         bits[kind] = np.clip(np.round(-np.log2(max(step, 2.0**-MAX_BITS))), 1, MAX_BITS)
@@ -151,12 +167,12 @@ def position_bits(sensitivity: np.ndarray, classes: np.ndarray, distortion: floa
 
 
 def color_basis(colors: np.ndarray) -> np.ndarray:
-    """The eigenvectors of the covariance of colour logits (N, 3), as columns (3, 3) float32, most varied first.
+    """Return the eigenvectors of the covariance of colour logits (N, 3) as columns (3, 3) float32, largest first.
 
-    In it the channels do not repeat each other (Karhunen-Loeve transform).
+    The channels are uncorrelated in this basis (Karhunen-Loeve transform).
     """
     if len(colors) < 2:
         return np.eye(3, dtype=np.float32)
-    within = np.clip(colors.T.astype(np.float64), -MAX_ABS_CHANNEL_VALUE / 2, MAX_ABS_CHANNEL_VALUE / 2)
-    basis = np.linalg.eigh(np.cov(within))[1][:, ::-1]
+    clamped = np.clip(colors.T.astype(np.float64), -MAX_ABS_CHANNEL_VALUE / 2, MAX_ABS_CHANNEL_VALUE / 2)
+    basis = np.linalg.eigh(np.cov(clamped))[1][:, ::-1]
     return (basis * np.where(basis.sum(axis=0) < 0, -1, 1)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""A model's numbers as they will be stored: what is decided, by rate and distortion, before any byte is written."""
+"""Quantisation of a planned model: choose all steps and symbols by rate and distortion, before they are coded."""
 
 from __future__ import annotations
 
@@ -22,12 +22,14 @@ from hyrfpack.format.sections import COLORS, DECODER_SECTIONS, LOGIT_SECTIONS, O
 from hyrfpack.model import HybridModel
 from hyrfpack.parallel.pool import run_jobs
 
-SATURATED = 8.0  # an opacity's total logit beyond it looks like it: sigmoid is within 3.4e-4 of its end
-OPACITY_REACH = 4  # where opacity is near 0 or 1 logits may move far
+# Total opacity logits are clamped to this magnitude, where the sigmoid is within 3.4e-4 of 0 or 1.
+SATURATION_LOGIT = 8.0
+# Opacity logits are searched further from the nearest symbol, because near opacity 0 or 1 they hardly matter.
+OPACITY_REACH_STEPS = 4
 
 
 def decide(model: HybridModel, sensitivity: Sensitivity, distortion: float, prune: bool = True) -> QuantizedModel:
-    """Plan a model and quantise it, ready to be encoded. Arguments as `make_plan`."""
+    """Plan a model and quantise it, ready to be encoded. The arguments are those of `make_plan`."""
     plan = make_plan(model, sensitivity, distortion, prune)
     return quantize(plan.apply(model), plan, sensitivity)
 
@@ -38,22 +40,24 @@ def quantize(
     sensitivity: Sensitivity,
     *,
     reach: int = 1,
-    like: QuantizedModel | None = None,
+    previous: QuantizedModel | None = None,
     sections: Collection[str] = (*LOGIT_SECTIONS, *TABLE_SECTIONS, *DECODER_SECTIONS),
 ) -> QuantizedModel:
     """Quantise a planned model (`plan.apply`) by rate and distortion.
 
     Args:
-        sensitivity: that the plan was made by.
-        reach: how many steps from the nearest symbol are tried; 0 takes the nearest.
-        like: an earlier result of the same plan, whose weights of predictions are taken over.
-        sections: what to quantise; a file takes all.
+        model: the planned model.
+        plan: its plan.
+        sensitivity: the sensitivities that the plan was made from.
+        reach: distance in steps of the furthest candidate from the nearest symbol; 0 takes the nearest.
+        previous: an earlier result for the same plan, whose prediction weights are reused.
+        sections: the sections to quantise; a file needs all of them.
 
     Raises:
         HyrfError: a parameter is NaN or infinite.
     """
     arrays = {group: values.astype(np.float64) for group, values in to_arrays(model).items()}
-    sensitivity, d = sensitivity.of(plan.kept), plan.distortion_per_number
+    sensitivity, d = sensitivity.subset(plan.kept), plan.distortion_per_number
     jobs: dict[str, Callable[[], Any]] = {
         group: partial(quantize_groups, arrays[group].ravel(), groups, sensitivity.fields[group], d, reach)
         for group, groups in plan.groups.items()
@@ -62,24 +66,24 @@ def quantize(
     logits = [group for group in LOGIT_SECTIONS if group in sections]
     weights = {COLORS: sensitivity.colors, SCALES: sensitivity.scales, OPACITIES: sensitivity.opacities}
     error: ErrorModel | None = None
-    if COLORS in logits:  # cut before it is turned: a colour far outside would come back as another
+    if COLORS in logits:  # clamped before the change of basis, since clamping in the basis would change the hue
         arrays[COLORS] = np.clip(
             arrays[COLORS], -MAX_ABS_CHANNEL_VALUE / 2, MAX_ABS_CHANNEL_VALUE / 2
         ) @ plan.basis.astype(np.float64)
     if OPACITIES in logits:
-        numbers, error = opacity_error(model, arrays[OPACITIES][:, 0], sensitivity.opacities)
+        numbers, error = opacity_error_model(model, arrays[OPACITIES][:, 0], sensitivity.opacities)
         arrays[OPACITIES] = numbers[:, None]
     stop = 0
     for layer, classes in enumerate(layer.points.classes for layer in plan.layers):
-        part = slice(stop, stop := stop + len(classes))
+        members = slice(stop, stop := stop + len(classes))
         for group in logits:
-            opaque = group == OPACITIES
-            cost = partial(_of_later, error, part.start) if opaque and error else None
-            far = reach and OPACITY_REACH if opaque else reach
-            for column, values in enumerate(arrays[group][part].T):
-                weight = None if like is None else like.channels[layer][group][column].weight
+            is_opacity = group == OPACITIES
+            cost = partial(_offset_error, error, members.start) if is_opacity and error else None
+            own_reach = reach and OPACITY_REACH_STEPS if is_opacity else reach
+            for column, values in enumerate(arrays[group][members].T):
+                weight = None if previous is None else previous.channels[layer][group][column].weight
                 jobs[f"{group} {layer} {column}"] = partial(
-                    quantize_channel, values, classes, weights[group][part], d, cost, far, weight
+                    quantize_channel, values, classes, weights[group][members], d, cost, own_reach, weight
                 )
     done = run_jobs(jobs)
     channels = [
@@ -89,14 +93,25 @@ def quantize(
     return QuantizedModel(plan, channels, {group: done[group] for group in plan.groups if group in sections})
 
 
-def _of_later(error: ErrorModel, start: int, places: Any, candidates: np.ndarray) -> np.ndarray:
-    """The error of Gaussians that are counted from `start` on."""
+def _offset_error(error: ErrorModel, start: int, places: Any, candidates: np.ndarray) -> np.ndarray:
+    """Evaluate an error model at places that are counted from `start`."""
     return error(places + start, candidates)
 
 
 @torch.no_grad()
-def opacity_error(model: HybridModel, logits: np.ndarray, sensitivity: np.ndarray) -> tuple[np.ndarray, ErrorModel]:
-    """Opacity logits (M,) without tails that nobody sees, and the error of candidates, counted in opacity."""
+def opacity_error_model(
+    model: HybridModel, logits: np.ndarray, sensitivity: np.ndarray
+) -> tuple[np.ndarray, ErrorModel]:
+    """Clamp opacity logits (M,) where the opacity is saturated, and return an error model that works on opacities.
+
+    Args:
+        model: the planned model, whose geometry field adds to the explicit logits.
+        logits: (M,) explicit opacity logits.
+        sensitivity: (M,) sensitivities by the explicit opacity logits.
+
+    Returns:
+        (M,) clamped logits; and the model that maps (places, candidate logits) to errors.
+    """
     neural = model.geometry(model.cube_coords(model.gaussians.positions))[:, 0].double().cpu().numpy()
     opacities = expit(neural + logits)
     weights = sensitivity / np.maximum(opacities * (1 - opacities), 1e-4) ** 2
@@ -104,4 +119,4 @@ def opacity_error(model: HybridModel, logits: np.ndarray, sensitivity: np.ndarra
     def error(places: Any, candidates: np.ndarray) -> np.ndarray:
         return weights[places] * (expit(neural[places] + candidates) - opacities[places]) ** 2
 
-    return np.clip(logits, -SATURATED - neural, SATURATED - neural), error
+    return np.clip(logits, -SATURATION_LOGIT - neural, SATURATION_LOGIT - neural), error

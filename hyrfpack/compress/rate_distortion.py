@@ -1,7 +1,7 @@
-"""Rate-distortion quantisation: each number gets the multiple of its step that costs least, bits counted as error.
+"""Rate-distortion quantisation: choose for each number the symbol with the lowest cost, error + lambda * bits.
 
-At the optimum every number adds the same error D to the pictures, and a bit less anywhere costs 2 ln 2 D (from
-D ~ 4^-bits). So a step is sqrt(12 D / s) for sensitivity s, and a choice is worth its error + 2 ln 2 D * its bits.
+At the optimum every number adds the same error D to the pictures. Saving one bit then adds the error 2 ln 2 D, because
+D ~ 4^-bits, so lambda = 2 ln 2 D. The step that adds D on average is sqrt(12 D / s) for a number of sensitivity s.
 """
 
 from __future__ import annotations
@@ -12,38 +12,45 @@ import numpy as np
 
 from hyrfpack.quant.steps import step_code
 
-ERROR_PER_BIT = 2 * np.log(2)  # in D
-_WIDEST = 4096  # symbols told apart in a table of costs; the tails are rare, and share one
+LAMBDA_PER_DISTORTION = 2 * np.log(2)
+# A table of code lengths has at most this many symbols. Those beyond its ends are rare and share the last entry.
+_MAX_TABLE_SYMBOLS = 4096
 
 
-def best_steps(sensitivity: np.ndarray, distortion: float) -> np.ndarray:
-    """Step codes, uint8, for mean sensitivities (n,) above 0: uniform errors then add `distortion` (D) each."""
+def choose_step_codes(sensitivity: np.ndarray, distortion: float) -> np.ndarray:
+    """Choose step codes (n,) uint8 for mean sensitivities (n,) > 0, so that rounding adds the error D per number."""
     return step_code(np.sqrt(12 * distortion / np.maximum(sensitivity, 1e-300)))
 
 
-def code_bits(symbols: np.ndarray, classes: np.ndarray, count: int, reach: int) -> tuple[np.ndarray, int]:
-    """What a symbol costs in its class, estimated from (n,) symbols like those to be coded.
+def estimate_code_bits(symbols: np.ndarray, classes: np.ndarray, count: int, reach: int) -> tuple[np.ndarray, int]:
+    """Estimate the code length of each symbol in each class from the histogram of similar symbols (n,).
+
+    Args:
+        symbols: (n,) int64, distributed like those to be coded.
+        classes: (n,) class of each symbol.
+        count: number of classes.
+        reach: the table has room for this many more symbols on both sides.
 
     Returns:
-        (count, S) bits of the symbols from `least` to `least` + S - 1, room for `reach` on both sides; and `least`.
+        (count, S) bits of the symbols from `lowest_symbol` to `lowest_symbol` + S - 1; and `lowest_symbol`.
     """
-    least = int(symbols.min(initial=0)) - reach
-    width = int(symbols.max(initial=0)) + reach + 1 - least
-    if width > _WIDEST:
-        least, width = -_WIDEST // 2, _WIDEST
-    index = np.clip(symbols - least, 0, width - 1)
+    lowest_symbol = int(symbols.min(initial=0)) - reach
+    width = int(symbols.max(initial=0)) + reach + 1 - lowest_symbol
+    if width > _MAX_TABLE_SYMBOLS:
+        lowest_symbol, width = -_MAX_TABLE_SYMBOLS // 2, _MAX_TABLE_SYMBOLS
+    index = np.clip(symbols - lowest_symbol, 0, width - 1)
     index += classes.astype(np.int64) * width
     histogram = np.bincount(index, minlength=count * width).reshape(count, width) + 0.25
-    return -np.log2(histogram / histogram.sum(axis=1, keepdims=True)), least
+    return -np.log2(histogram / histogram.sum(axis=1, keepdims=True)), lowest_symbol
 
 
-def bits_of(symbols: np.ndarray, classes: np.ndarray, bits: tuple[np.ndarray, int]) -> np.ndarray:
-    """What each of (n,) symbols costs by `code_bits`."""
-    table, least = bits
-    return table[classes, np.clip(symbols - least, 0, table.shape[1] - 1)]
+def look_up_bits(symbols: np.ndarray, classes: np.ndarray, bits: tuple[np.ndarray, int]) -> np.ndarray:
+    """Look up the bits of each of (n,) symbols in the table of `estimate_code_bits`."""
+    table, lowest_symbol = bits
+    return table[classes, np.clip(symbols - lowest_symbol, 0, table.shape[1] - 1)]
 
 
-def cheapest(
+def choose_symbols(
     nearest: np.ndarray,
     error: Callable[[np.ndarray], np.ndarray],
     classes: np.ndarray,
@@ -51,22 +58,27 @@ def cheapest(
     distortion: float,
     reach: int,
 ) -> np.ndarray:
-    """The best of the symbols within `reach` of the nearest (n,) int64.
+    """Choose for each number the symbol with the lowest rate-distortion cost within `reach` of the nearest one.
 
     Args:
-        error: of candidates (n,): what each would add to the pictures' mean squared error.
-        classes: (n,) of each symbol.
-        bits: from `code_bits`.
-        distortion: D.
+        nearest: (n,) int64 symbols closest to the numbers.
+        error: maps candidate symbols (n,) to the mean squared error (n,) that each would add to the pictures.
+        classes: (n,) class of each symbol.
+        bits: table from `estimate_code_bits`.
+        distortion: D, the error that each number may add.
+        reach: distance of the furthest candidate from the nearest symbol.
+
+    Returns:
+        (n,) int64 symbols.
     """
-    table, least = bits
+    table, lowest_symbol = bits
     width = table.shape[1]
-    rates = (ERROR_PER_BIT * distortion * table).ravel()
+    rates = (LAMBDA_PER_DISTORTION * distortion * table).ravel()
     rows = classes.astype(np.int64) * width
     best, least_cost = nearest.copy(), np.full(len(nearest), np.inf)
     for shift in sorted(range(-reach, reach + 1), key=abs):
         candidate = nearest + shift
-        places = candidate - least
+        places = candidate - lowest_symbol
         np.clip(places, 0, width - 1, out=places)
         places += rows
         cost = error(candidate) + rates.take(places)

@@ -1,4 +1,4 @@
-"""The page about a compressed file: what it takes, what it lost, what else it could have been."""
+"""The compression report: measure a compressed file and its alternatives, and write the page about them."""
 
 from __future__ import annotations
 
@@ -15,11 +15,21 @@ import torch
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.capture import Capture, quantized_provenance
-from hyrfpack.compress.calibrate import calibrated
-from hyrfpack.compress.distortion import LIMITS, default_distortion
+from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
+from hyrfpack.compress.distortion import DISTORTION_RANGE, default_distortion
 from hyrfpack.compress.quantize import decide
-from hyrfpack.compress.report_page import FILES, PAGE, PLOT, SHOWN, Findings, Point, ShownView, page, picture_names
-from hyrfpack.compress.report_plot import draw
+from hyrfpack.compress.report_page import (
+    MAX_SHOWN_VIEWS,
+    PAGE_FILE,
+    PLOT_FILE,
+    REPORT_FILES,
+    Findings,
+    MeasuredFile,
+    ShownView,
+    build_page,
+    picture_names,
+)
+from hyrfpack.compress.report_plot import draw_plot
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import Evaluation, evaluate
@@ -40,13 +50,18 @@ from hyrfpack.render import render
 from hyrfpack.render.files import save_picture, to_image
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 
-FACTORS = (1 / 16, 1 / 4, 1, 4, 16)  # of the file's distortion, for the curve
-LARGE = 200_000  # Gaussians from which on the curve takes the middle three alone
-PHOTOS, VIEWPOINTS = 24, 12  # scored at most
-VISIBLE = 0.4  # rms difference that the worst shown view is amplified to, at most
-MOST_AMPLIFIED = 64
-TURNS = 3  # of timing each file
-CHOSEN, SAME = "this file", "compact, the same distortion"
+# Distortions of the rate-distortion curve, relative to that of the file.
+CURVE_DISTORTION_RATIOS = (1 / 16, 1 / 4, 1, 4, 16)
+# From this many Gaussians on the curve has only the middle three points, because each takes long to encode and score.
+SHORT_CURVE_MIN_GAUSSIANS = 200_000
+MAX_SCORED_PHOTOS = 24
+MAX_SCORED_VIEWPOINTS = 12
+# The RMS of the worst shown difference picture is at most this after amplification.
+MAX_AMPLIFIED_RMS = 0.4
+MAX_AMPLIFICATION = 64
+DECODE_TIMING_TURNS = 3
+WRITTEN_FILE_NAME = "this file"
+SAME_DISTORTION_NAME = "compact, the same distortion"
 
 
 def write_report(
@@ -62,29 +77,29 @@ def write_report(
 ) -> Path:
     """Write `folder/index.html` about a compressed file, and its pictures beside it.
 
-    Scores are those of decoded files on the held-out photos of the scene, on those it was trained on where none are
-    held out, and without photos against the uncompressed model's own renders.
+    Decoded files are scored on the held-out photos of the scene, or on its training photos if none are held out.
+    Without photos they are scored against renders of the uncompressed model.
 
     Args:
-        folder: made if missing.
+        folder: folder of the report; created if missing.
         source: the file that was compressed.
-        packed: the file it became.
-        report: what `hyrfpack.compress` returned.
-        scene: photos.
-        command: what was run, for people to run it again.
-        overwrite: replace files of an earlier page; without it, they are an error.
-        say: told what is going on.
+        packed: the compressed file.
+        report: the result of `hyrfpack.compress`.
+        scene: photos of the scene.
+        command: command line shown on the page as the way to make the file again.
+        overwrite: replace files of an earlier page; if False, they are an error.
+        say: called with a sentence for each step of the work.
 
     Returns:
-        The page, written last: where it is, all that it shows is there.
+        The path of the page. It is written last, so if it exists, all pictures that it shows exist.
 
     Raises:
-        HyrfError: a file cannot be read, the folder cannot be written, or another call is at work in it.
+        HyrfError: a file cannot be read, the folder cannot be written, or another call is writing into it.
     """
     folder, source, packed = Path(folder), Path(source), Path(packed)
-    Outputs(source, packed, scene=scene, overwrite=True).folder(folder, FILES)
+    Outputs(source, packed, scene=scene, overwrite=True).folder(folder, REPORT_FILES)
     with exclusive_folder(folder, "another folder with `report`"):
-        Outputs(source, packed, scene=scene, overwrite=overwrite).folder(folder, FILES)
+        Outputs(source, packed, scene=scene, overwrite=overwrite).folder(folder, REPORT_FILES)
         return _write_report(folder, source, packed, report, scene, command, overwrite, say)
 
 
@@ -98,54 +113,60 @@ def _write_report(
     overwrite: bool,
     say: Callable[[str], None],
 ) -> Path:
-    """As `write_report`, into a folder that this call holds."""
+    """Do the work of `write_report` in a folder that this call has locked."""
     model, provenance = load_with_provenance(source)
-    views, words = _views(model, source, scene)
-    say(f"comparing pictures with {words}, for the page")
+    views, views_in_words = _views_to_score(model, source, scene)
+    say(f"comparing pictures with {views_in_words}, for the page")
     before = evaluate(model, views)
-    facts, data = describe(packed), _read(packed)
+    facts, data = describe(packed), _read_bytes(packed)
     scored = [view for view in views if view.name not in before.skipped]
 
-    profiles = _profiles(model, provenance, report.profile)
+    profiles = _encode_other_profiles(model, provenance, report.profile)
     curve = {}
     if len(model):
-        distortion = _distortion(facts, model, provenance)
+        distortion = _distortion_of_file(facts, model, provenance)
         sensitivity = report.sensitivity
         if sensitivity is None:
-            sensitivity, _ = calibrated(model, Capture(describe(source), scene).cameras, distortion)
-        # The file itself stands for the one of its distortion, unless it was fine-tuned, and so is off the curve.
-        itself = data if report.profile == "compact" and not report.finetuned else None
-        curve = _finer_and_coarser(model, provenance, sensitivity, distortion, itself)
-    same = [name for name, other in curve.items() if other is data]
-    files = {CHOSEN: data, **profiles, **{name: other for name, other in curve.items() if name not in same}}
-    points, decoded = _measured(files, scored)
+            sensitivity, _ = measure_calibrated_sensitivity(model, Capture(describe(source), scene).cameras, distortion)
+        # The written file is the curve's point at its distortion, unless fine-tuning moved it off the curve.
+        written_file = data if report.profile == "compact" and not report.finetuned else None
+        curve = _encode_curve(model, provenance, sensitivity, distortion, written_file)
+    at_same_distortion = [name for name, other in curve.items() if other is data]
+    files = {
+        WRITTEN_FILE_NAME: data,
+        **profiles,
+        **{name: other for name, other in curve.items() if name not in at_same_distortion},
+    }
+    points, decoded = _measure_files(files, scored)
 
-    shown, amplified = _write_pictures(folder, model, decoded[CHOSEN], scored, before, points[CHOSEN].scores, overwrite)
+    shown, amplified = _write_pictures(
+        folder, model, decoded[WRITTEN_FILE_NAME], scored, before, points[WRITTEN_FILE_NAME].scores, overwrite
+    )
     findings = Findings(
-        views=words,
+        views=views_in_words,
         has_photos=scene is not None,
         before=before,
-        chosen=points[CHOSEN],
+        chosen=points[WRITTEN_FILE_NAME],
         profiles=[points[name] for name in profiles],
-        curve=[points[CHOSEN if name in same else name] for name in curve],
+        curve=[points[WRITTEN_FILE_NAME if name in at_same_distortion else name] for name in curve],
         shown=shown,
         amplified=amplified,
         gaussians=len(model),
         machine=format_machine(describe_machine()),
         writer=facts["writer"],
     )
-    draw(findings, folder / PLOT, overwrite=overwrite)
-    path = folder / PAGE
-    text = page(source, packed, report, findings, command).encode()
+    draw_plot(findings, folder / PLOT_FILE, overwrite=overwrite)
+    path = folder / PAGE_FILE
+    text = build_page(source, packed, report, findings, command).encode()
     return write_atomic(path, text, overwrite=overwrite, rename=False)
 
 
-def _views(model: HybridModel, source: Path, scene: Scene | None) -> tuple[list[View], str]:
-    """What pictures are compared with, and that in words."""
+def _views_to_score(model: HybridModel, source: Path, scene: Scene | None) -> tuple[list[View], str]:
+    """Return the views to score against, and a description of them."""
     if scene is None:
         with torch.no_grad():
             decoded = model.decode()
-            cameras = evenly_spaced(Capture(describe(source)).cameras, VIEWPOINTS)
+            cameras = evenly_spaced(Capture(describe(source)).cameras, MAX_SCORED_VIEWPOINTS)
             renders = [to_image(render(model, camera, decoded=decoded).rgb) for camera in cameras]
         views = [
             View(f"viewpoint {number}", camera, partial(Picture, np.asarray(picture)))
@@ -153,52 +174,61 @@ def _views(model: HybridModel, source: Path, scene: Scene | None) -> tuple[list[
         ]
         return views, f"what the uncompressed model shows from {len(views)} viewpoints"
     views, kind = (scene.test, "held-out") if scene.test else (scene.train, "training")
-    chosen = evenly_spaced(views, PHOTOS)
+    chosen = evenly_spaced(views, MAX_SCORED_PHOTOS)
     count = f"{len(chosen)}" if len(chosen) == len(views) else f"{len(chosen)} of {len(views)}"
     return chosen, f"{count} {kind} {'photo' if len(views) == 1 else 'photos'}"
 
 
-def _distortion(facts: dict, model: HybridModel, provenance: dict) -> float:
-    """What the packed file allows pictures, as `make_plan` takes it; of other profiles the default."""
-    each = facts["settings"].get("distortion")
-    if not isinstance(each, float) or not each > 0:
+def _distortion_of_file(facts: dict, model: HybridModel, provenance: dict) -> float:
+    """Return the distortion that the file was planned for, or the default if it has another profile than "compact"."""
+    per_number = facts["settings"].get("distortion")
+    if not isinstance(per_number, float) or not per_number > 0:
         return default_distortion(provenance)
-    return each * sum(parameter.numel() for parameter in model.parameters())
+    return per_number * sum(parameter.numel() for parameter in model.parameters())
 
 
-def _profiles(model: HybridModel, provenance: dict, done: str) -> dict[str, bytes]:
-    """The model in the profiles without settings to choose, but for the one that is done."""
+def _encode_other_profiles(model: HybridModel, provenance: dict, written_profile: str) -> dict[str, bytes]:
+    """Encode the model in the profiles that have no settings, except the profile that was written already."""
     files = {}
     for profile, kept in (("raw", provenance), ("paper", quantized_provenance(provenance, model.config.frame.scale))):
-        with suppress(HyrfError):  # half precision does not hold every model
-            if profile != done:
+        with suppress(HyrfError):  # half precision cannot represent every model
+            if profile != written_profile:
                 files[profile] = encode_model(model, profile, kept)
     return files
 
 
-def _finer_and_coarser(
-    model: HybridModel, provenance: dict, sensitivity: Sensitivity, distortion: float, same: bytes | None
+def _encode_curve(
+    model: HybridModel, provenance: dict, sensitivity: Sensitivity, distortion: float, at_same_distortion: bytes | None
 ) -> dict[str, bytes]:
-    """The model in profile "compact", finest first; `same` is the file of this distortion, where there is one."""
+    """Encode the model in profile "compact" at each distortion of the curve, smallest distortion first.
+
+    Args:
+        at_same_distortion: the file of exactly this distortion, if it exists already.
+    """
     files = {}
-    for factor in FACTORS if len(model) < LARGE else FACTORS[1:-1]:
-        if factor == 1 and same is not None:
-            files[SAME] = same
+    for factor in CURVE_DISTORTION_RATIOS if len(model) < SHORT_CURVE_MIN_GAUSSIANS else CURVE_DISTORTION_RATIOS[1:-1]:
+        if factor == 1 and at_same_distortion is not None:
+            files[SAME_DISTORTION_NAME] = at_same_distortion
             continue
         share = f"{Fraction(factor)} of the distortion" if factor < 1 else f"{factor} times the distortion"
-        quantized = decide(model, sensitivity, float(np.clip(factor * distortion, *LIMITS)))
-        name = SAME if factor == 1 else f"compact, {share}"
+        quantized = decide(model, sensitivity, float(np.clip(factor * distortion, *DISTORTION_RANGE)))
+        name = SAME_DISTORTION_NAME if factor == 1 else f"compact, {share}"
         files[name] = encode_model(
             model, "compact", quantized_provenance(provenance, model.config.frame.scale), quantized=quantized
         )
     return files
 
 
-def _measured(files: dict[str, bytes], views: Sequence[View]) -> tuple[dict[str, Point], dict[str, HybridModel]]:
-    """Decode files in turns, and score what comes out."""
-    times, decoded = time_alternately({name: partial(decode_model, data) for name, data in files.items()}, TURNS)
+def _measure_files(
+    files: dict[str, bytes], views: Sequence[View]
+) -> tuple[dict[str, MeasuredFile], dict[str, HybridModel]]:
+    """Time the decoding of all files in turns, and score the decoded models."""
+    times, decoded = time_alternately(
+        {name: partial(decode_model, data) for name, data in files.items()}, DECODE_TIMING_TURNS
+    )
     points = {
-        name: Point(name, len(data), evaluate(decoded[name], views), times[name].ms) for name, data in files.items()
+        name: MeasuredFile(name, len(data), evaluate(decoded[name], views), times[name].ms)
+        for name, data in files.items()
     }
     return points, decoded
 
@@ -213,25 +243,25 @@ def _write_pictures(
     after: Evaluation,
     overwrite: bool,
 ) -> tuple[list[ShownView], int]:
-    """Renders of both models and their difference, from the view that loses most to the one that loses least.
+    """Write renders of both models and their difference, from the view that loses most to the one that loses least.
 
     Returns:
-        The views, and how many times the differences are amplified.
+        The shown views, and the amplification of the differences.
     """
     scored = sorted(zip(views, before.views, after.views, strict=True), key=lambda item: item[2].psnr - item[1].psnr)
-    chosen = evenly_spaced(scored, SHOWN)
-    both = model.decode(), packed.decode()
+    chosen = evenly_spaced(scored, MAX_SHOWN_VIEWS)
+    decoded_models = model.decode(), packed.decode()
     pairs = [
         (
-            to_8bit(render(model, view.camera, decoded=both[0]).rgb),
-            to_8bit(render(packed, view.camera, decoded=both[1]).rgb),
+            to_8bit(render(model, view.camera, decoded=decoded_models[0]).rgb),
+            to_8bit(render(packed, view.camera, decoded=decoded_models[1]).rgb),
         )
         for view, *_ in chosen
     ]
-    between = [psnr(new, old) for old, new in pairs]
-    amplified = amplification(min(between))
+    psnr_between = [psnr(new, old) for old, new in pairs]
+    amplified = amplification(min(psnr_between))
     shown = []
-    for number, ((view, old, new), pair, distance) in enumerate(zip(chosen, pairs, between, strict=True), 1):
+    for number, ((view, old, new), pair, distance) in enumerate(zip(chosen, pairs, psnr_between, strict=True), 1):
         names = picture_names(number)
         for name, picture in zip(names, (*pair, amplified * (pair[1] - pair[0]).abs()), strict=True):
             save_picture(folder / name, to_image(picture), overwrite=overwrite, rename=False)
@@ -239,13 +269,20 @@ def _write_pictures(
     return shown, amplified
 
 
-def amplification(between: float) -> int:
-    """The power of two that makes a difference of so many dB visible, 1 to MOST_AMPLIFIED."""
-    rms = 10 ** (-between / 20)
-    return 2 ** max(0, min(math.floor(math.log2(VISIBLE / rms)), int(math.log2(MOST_AMPLIFIED))))
+def amplification(psnr_between: float) -> int:
+    """Return the amplification that makes the difference between two renders visible.
+
+    Args:
+        psnr_between: PSNR between the renders, dB.
+
+    Returns:
+        A power of two, 1 to MAX_AMPLIFICATION.
+    """
+    rms = 10 ** (-psnr_between / 20)
+    return 2 ** max(0, min(math.floor(math.log2(MAX_AMPLIFIED_RMS / rms)), int(math.log2(MAX_AMPLIFICATION))))
 
 
-def _read(path: Path) -> bytes:
+def _read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:

@@ -1,4 +1,4 @@
-"""What `hyrfpack compress --report` found out, as one HTML page that needs no network and no scripts."""
+"""The HTML page of `hyrfpack compress --report`, which needs no network and no scripts."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
 from hyrfpack.format import CompressionReport
 from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, group_and_layer
 
-PLOT = "size_against_loss.png"
-SHOWN = 4  # views whose pictures stand on the page, at most
-KINDS = ("before", "after", "difference")  # of pictures, for each of them
-STYLE = """
+PLOT_FILE = "size_against_loss.png"
+MAX_SHOWN_VIEWS = 4
+PICTURE_KINDS = ("before", "after", "difference")
+PAGE_CSS = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #202124; max-width: 68rem; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 2rem; margin-bottom: 0; }
 h2 { font-size: 1.3rem; margin-top: 2.5rem; }
@@ -36,23 +36,27 @@ pre { background: #f1f3f4; padding: .8rem; white-space: pre-wrap; overflow-wrap:
 
 
 def picture_names(number: int) -> list[str]:
-    """The pictures of a shown view, counted from 1, one of each of KINDS."""
-    return [f"view{number}_{kind}.png" for kind in KINDS]
+    """Return the file names of the pictures of a shown view, in the order of PICTURE_KINDS; `number` counts from 1."""
+    return [f"view{number}_{kind}.png" for kind in PICTURE_KINDS]
 
 
-PAGE = "index.html"
-FILES = (PAGE, PLOT, *(name for number in range(1, SHOWN + 1) for name in picture_names(number)))
+PAGE_FILE = "index.html"
+REPORT_FILES = (
+    PAGE_FILE,
+    PLOT_FILE,
+    *(name for number in range(1, MAX_SHOWN_VIEWS + 1) for name in picture_names(number)),
+)
 
 
 @dataclass(frozen=True)
-class Point:
-    """A file that the model can be written as.
+class MeasuredFile:
+    """Size, scores and decoding time of one file that the model can be written as.
 
     Attributes:
-        name: in words.
-        bytes: of the whole file.
-        scores: of the decoded file.
-        decode_ms: median time to decode it, in milliseconds.
+        name: name of the file on the page.
+        bytes: size of the whole file.
+        scores: scores of the decoded file.
+        decode_ms: median decoding time in milliseconds.
     """
 
     name: str
@@ -63,13 +67,13 @@ class Point:
 
 @dataclass(frozen=True)
 class ShownView:
-    """A view whose pictures stand on the page.
+    """A view whose pictures are shown on the page.
 
     Attributes:
-        name: of the photo, or which viewpoint it is.
+        name: name of the photo, or the number of the viewpoint.
         before, after: PSNR of the model before and after compression against the photo, dB.
         between: PSNR between the two renders, dB.
-        files: before, after and difference, relative to the page.
+        files: paths of the pictures before, after and difference, relative to the page.
     """
 
     name: str
@@ -81,28 +85,28 @@ class ShownView:
 
 @dataclass(frozen=True)
 class Findings:
-    """What was measured for the page.
+    """The measurements that the page shows.
 
     Attributes:
-        views: what was rendered, in words.
-        has_photos: views are scored against photos; else against the renders of the uncompressed model.
-        before: the uncompressed model.
+        views: description of the scored views.
+        has_photos: True if views are scored against photos, False if against renders of the uncompressed model.
+        before: scores of the uncompressed model.
         chosen: the file that was written.
-        profiles: the model in the other profiles that have no settings to choose.
-        curve: the model in profile "compact" at other levels of distortion, finest first.
-        shown: views to look at, the one that loses most first.
-        amplified: how many times the difference pictures show the difference.
-        gaussians: how many the uncompressed model has.
-        machine: that the times belong to.
-        writer: the program and its version.
+        profiles: the model in the other profiles, which have no settings.
+        curve: the model in profile "compact" at several distortions, smallest distortion first.
+        shown: views whose pictures are shown, the one that loses most first.
+        amplified: amplification of the difference pictures.
+        gaussians: number of Gaussians of the uncompressed model.
+        machine: the machine on which times were measured.
+        writer: the program that wrote the file, and its version.
     """
 
     views: str
     has_photos: bool
     before: Evaluation
-    chosen: Point
-    profiles: list[Point]
-    curve: list[Point]
+    chosen: MeasuredFile
+    profiles: list[MeasuredFile]
+    curve: list[MeasuredFile]
     shown: list[ShownView]
     amplified: int
     gaussians: int
@@ -110,40 +114,40 @@ class Findings:
     writer: str
 
     @property
-    def points(self) -> list[Point]:
-        """All files, largest first; the chosen one may be on the curve."""
+    def points(self) -> list[MeasuredFile]:
+        """All files, largest first; the chosen file may also be a point of the curve."""
         others = [point for point in (*self.profiles, *self.curve) if point is not self.chosen]
         return sorted([self.chosen, *others], key=lambda point: -point.bytes)
 
     def is_exact(self, scores: Evaluation) -> bool:
-        """Without photos: pictures are the same in every pixel."""
+        """Whether renders before and after are identical in every pixel; always False with photos."""
         return not self.has_photos and scores.psnr == IDENTICAL_PSNR
 
     def fidelity(self, scores: Evaluation) -> float:
-        """With photos how much PSNR is lost, else the PSNR against the uncompressed model's renders; dB."""
+        """Return the loss of PSNR against photos, or without photos the PSNR against the uncompressed model; dB."""
         return self.before.psnr - scores.psnr if self.has_photos else scores.psnr
 
 
-def page(source: Path, packed: Path, report: CompressionReport, findings: Findings, command: str) -> str:
-    """The page as HTML. Words out of files are text in a tree of elements, so none of them can become markup."""
+def build_page(source: Path, packed: Path, report: CompressionReport, findings: Findings, command: str) -> str:
+    """Return the page as HTML. Texts from files become text nodes of an element tree, so they cannot inject markup."""
     title = headline(report, findings)
     head = _element(
         "head",
         _element("meta", charset="utf-8"),
         _element("meta", name="viewport", content="width=device-width, initial-scale=1"),
         _element("title", f"{packed.name}: {title}"),
-        _element("style", STYLE),
+        _element("style", PAGE_CSS),
     )
     body = _element(
         "body",
         _element("h1", title),
         *_summary(source, packed, report, findings),
         _element("h2", "What each part takes"),
-        *_parts(report),
+        *_section_sizes(report),
         _element("h2", "Size, loss and speed"),
-        *_choices(findings),
+        *_alternatives(findings),
         _element("h2", "Before and after"),
-        *_pictures(findings),
+        *_view_pictures(findings),
         *([_element("h2", "How to make this file again"), _element("pre", command)] if command else []),
         _element("p", f"Written by {findings.writer}. Times were measured on this machine: {findings.machine}."),
     )
@@ -153,7 +157,7 @@ def page(source: Path, packed: Path, report: CompressionReport, findings: Findin
 
 
 def headline(report: CompressionReport, findings: Findings) -> str:
-    """What came of it, in a few words: "183 kB, 5.8 times smaller, 0.04 dB lost"."""
+    """Summarise the result in a few words: "183 kB, 5.8 times smaller, 0.04 dB lost"."""
     size = size_in_words(report.bytes_after)
     if report.profile == "raw":
         return f"{size}, every number exact, nothing lost"
@@ -162,7 +166,7 @@ def headline(report: CompressionReport, findings: Findings) -> str:
 
 
 def size_in_words(count: float) -> str:
-    """Bytes with three digits that matter; k, M and G are powers of 1000."""
+    """Format a number of bytes with three significant digits; k, M and G are powers of 1000."""
     for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= 0.9995 * factor:
             return f"{count / factor:.3g} {unit}"
@@ -208,8 +212,8 @@ def _summary(source: Path, packed: Path, report: CompressionReport, findings: Fi
     return [_element("p", sentence) for sentence in sentences]
 
 
-def _parts(report: CompressionReport) -> list[Element]:
-    """The bytes of each section, all layers together."""
+def _section_sizes(report: CompressionReport) -> list[Element]:
+    """Return a table of the bytes of each section, summed over layers, and a note on it."""
     sizes: dict[str, list[int]] = {}
     names = {part.type: part.holds for part in report.sections}
     for part in report.sections:
@@ -240,8 +244,8 @@ def _parts(report: CompressionReport) -> list[Element]:
     return [_table(header, [row[: len(header)] for row in rows]), _element("p", note)]
 
 
-def _choices(findings: Findings) -> list[Element]:
-    """The plot, and the same numbers as a table."""
+def _alternatives(findings: Findings) -> list[Element]:
+    """Return the plot of all files, and the same numbers as a table."""
     measure = "PSNR lost (dB)" if findings.has_photos else "PSNR (dB)"
     rows = [
         [
@@ -262,7 +266,9 @@ def _choices(findings: Findings) -> list[Element]:
     return [
         _element(
             "figure",
-            _element("img", src=PLOT, alt="Bytes of each file against its loss, and against the time to decode it"),
+            _element(
+                "img", src=PLOT_FILE, alt="Bytes of each file against its loss, and against the time to decode it"
+            ),
             _element("figcaption", caption),
         ),
         _table(
@@ -273,21 +279,21 @@ def _choices(findings: Findings) -> list[Element]:
     ]
 
 
-def _pictures(findings: Findings) -> list[Element]:
+def _view_pictures(findings: Findings) -> list[Element]:
     labels = ("before", "after", f"difference, {findings.amplified} times as strong")
     figures = []
     for view in findings.shown:
-        told = f"{view.name}: {view.between:.1f} dB between before and after"
+        caption = f"{view.name}: {view.between:.1f} dB between before and after"
         if view.between == IDENTICAL_PSNR:
-            told = f"{view.name}: before and after are identical"
+            caption = f"{view.name}: before and after are identical"
         if findings.has_photos:
-            told += f"; {view.before:.2f} dB before and {view.after:.2f} dB after against the photo"
+            caption += f"; {view.before:.2f} dB before and {view.after:.2f} dB after against the photo"
         pictures = [
             _element("a", _element("img", src=file, alt=f"{view.name}, {label}"), _element("div", label), href=file)
             for file, label in zip(view.files, labels, strict=True)
         ]
         figures.append(
-            _element("figure", _element("div", *pictures, **{"class": "views"}), _element("figcaption", told))
+            _element("figure", _element("div", *pictures, **{"class": "views"}), _element("figcaption", caption))
         )
     intro = (
         "Rendered by the model before compression, and from the file after it. The third picture shows how far the two "
@@ -316,11 +322,11 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]], chosen: int | N
 
 
 def _element(tag: str, *content: str | Element, **attributes: str) -> Element:
-    """An element with text, or with other elements, inside."""
-    made = Element(tag, {name: printable(value) for name, value in attributes.items()})
+    """Return an element that contains text or other elements."""
+    element = Element(tag, {name: printable(value) for name, value in attributes.items()})
     for part in content:
         if isinstance(part, Element):
-            made.append(part)
+            element.append(part)
         else:
-            made.text = part if tag == "style" else printable(part)
-    return made
+            element.text = part if tag == "style" else printable(part)
+    return element

@@ -1,4 +1,4 @@
-"""Size, loss and speed of the files that a model can be, as one picture."""
+"""The plot of the compression report: size, loss and decoding time of all files."""
 
 from __future__ import annotations
 
@@ -7,17 +7,19 @@ import os
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from hyrfpack.compress.report_page import Findings, Point, size_in_words
+from hyrfpack.compress.report_page import Findings, MeasuredFile, size_in_words
 from hyrfpack.evaluate.figures import blank_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-BLUE, RED, GREY = "#1a73e8", "#d93025", "#5f6368"
+CURVE_COLOR = "#1a73e8"
+PAPER_COLOR = "#d93025"
+RAW_COLOR = "#5f6368"
 
 
-def draw(findings: Findings, path: str | os.PathLike[str], *, overwrite: bool = True) -> None:
-    """Plot bytes against loss, and below that against the time to decode; "compact" is joined, the file itself ringed.
+def draw_plot(findings: Findings, path: str | os.PathLike[str], *, overwrite: bool = True) -> None:
+    """Plot loss and decoding time over bytes. A line joins the "compact" files, and a ring marks the written file.
 
     Raises:
         HyrfError: the file cannot be written, or not without `overwrite`.
@@ -29,10 +31,10 @@ def draw(findings: Findings, path: str | os.PathLike[str], *, overwrite: bool = 
     _scatter(above, findings, finite, lambda point: findings.fidelity(point.scores))
     _scatter(below, findings, findings.points, lambda point: point.decode_ms)
     for point in finite:
-        _name(above, findings, point, (point.bytes, findings.fidelity(point.scores)), "data")
-    for point in exact:  # infinitely good: at any height
-        above.axvline(point.bytes, color=_color(findings, point), linestyle=":")
-        _name(above, findings, point, (point.bytes, 0.5), ("data", "axes fraction"))
+        _label_point(above, findings, point, (point.bytes, findings.fidelity(point.scores)), "data")
+    for point in exact:  # an exact file has infinite PSNR, so it is a vertical line
+        above.axvline(point.bytes, color=_point_color(findings, point), linestyle=":")
+        _label_point(above, findings, point, (point.bytes, 0.5), ("data", "axes fraction"))
     above.set_ylabel("PSNR lost (dB): less is better" if findings.has_photos else "PSNR (dB): more is better")
     below.set(xscale="log", xlabel="size of the file", ylabel="decoding (ms)")
     below.set_ylim(bottom=0)
@@ -42,11 +44,13 @@ def draw(findings: Findings, path: str | os.PathLike[str], *, overwrite: bool = 
     save_figure(path, figure, overwrite=overwrite, rename=False, format="png", metadata={"Software": None})
 
 
-def _scatter(axes: Axes, findings: Findings, points: Sequence[Point], height: Callable[[Point], float]) -> None:
+def _scatter(
+    axes: Axes, findings: Findings, points: Sequence[MeasuredFile], height: Callable[[MeasuredFile], float]
+) -> None:
     curve = sorted((point for point in findings.curve if point in points), key=lambda point: point.bytes)
-    axes.plot([point.bytes for point in curve], [height(point) for point in curve], color=BLUE, linewidth=1)
+    axes.plot([point.bytes for point in curve], [height(point) for point in curve], color=CURVE_COLOR, linewidth=1)
     for point in points:
-        color = _color(findings, point)
+        color = _point_color(findings, point)
         axes.scatter(point.bytes, height(point), s=25, color=color, zorder=3)
         if point is findings.chosen:
             axes.scatter(point.bytes, height(point), s=140, facecolors="none", edgecolors=color, linewidths=1.5)
@@ -55,23 +59,23 @@ def _scatter(axes: Axes, findings: Findings, points: Sequence[Point], height: Ca
     axes.margins(x=0.12, y=0.15)
 
 
-def _name(axes: Axes, findings: Findings, point: Point, place: tuple[float, float], system: Any) -> None:
-    """Write beside a point what it is, unless the line says so; on the side where the line is not."""
+def _label_point(axes: Axes, findings: Findings, point: MeasuredFile, place: tuple[float, float], system: Any) -> None:
+    """Label a point, unless it lies on the line; the label is on the side away from the line."""
     if point is findings.chosen or point in findings.profiles:
         words = f"{point.name}: exact" if findings.is_exact(point.scores) else point.name
         offset = (8, 8) if findings.has_photos else (8, -16)
-        color = _color(findings, point)
+        color = _point_color(findings, point)
         axes.annotate(words, place, offset, system, "offset points", color=color, weight="bold", annotation_clip=False)
 
 
-def _color(findings: Findings, point: Point) -> str:
+def _point_color(findings: Findings, point: MeasuredFile) -> str:
     if point in findings.profiles:
-        return GREY if point.name == "raw" else RED
-    return BLUE
+        return RAW_COLOR if point.name == "raw" else PAPER_COLOR
+    return CURVE_COLOR
 
 
 def _round_sizes(low: float, high: float) -> list[float]:
-    """1, 2 and 5 times powers of ten, between two sizes."""
+    """Return the sizes of 1, 2 and 5 times powers of ten between two limits."""
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     sizes = [digit * 10.0**power for power in powers for digit in (1, 2, 5)]
     return [size for size in sizes if low <= size <= high]

@@ -1,4 +1,4 @@
-"""Finding how coarse a file may be: a monotone search for one number."""
+"""Search for the largest distortion whose file meets a limit on size or loss, both monotone in the distortion."""
 
 from __future__ import annotations
 
@@ -7,109 +7,130 @@ from collections.abc import Callable
 from typing import TypeVar
 
 Trial = TypeVar("Trial")
-FACTOR = 4.0  # that the distortion is changed by until the answer is between two trials
-ENOUGH, AIM = 0.97, 0.985  # of a limit on bytes: what need not be improved upon, and what is aimed at
-SLOPE = -0.22  # d log bytes / d log distortion, about
-FARTHEST = math.log(256)  # of the second trial from the first
-EDGE, PATIENCE = 20, 5  # parts of what is left that a trial keeps from its ends; trials after which it is halved
-NARROWEST = math.log(1.01)  # distortions between which there is nothing to be found: sizes move in jumps
+# Until trials bracket the answer, the distortion is multiplied or divided by this ratio.
+BRACKETING_RATIO = 4.0
+# Trials aim at TARGET_SIZE_RATIO of the size limit. One of at least ACCEPTED_SIZE_RATIO of the limit ends the search.
+ACCEPTED_SIZE_RATIO = 0.97
+TARGET_SIZE_RATIO = 0.985
+# Typical d log bytes / d log distortion, used while there is only one trial.
+LOG_SIZE_SLOPE = -0.22
+MAX_LOG_STEP = math.log(256)
+# A trial stays away from the ends of the bracket by 1 / BRACKET_MARGIN_PARTS of its width.
+BRACKET_MARGIN_PARTS = 20
+# After this many trials the bracket is halved instead of interpolated.
+MAX_INTERPOLATED_TRIALS = 5
+# Sizes change in jumps, so a narrower bracket is not searched.
+MIN_BRACKET_LOG_WIDTH = math.log(1.01)
 
 
-def coarsest(
+def find_coarsest(
     attempt: Callable[[float], Trial],
     fits: Callable[[Trial], bool],
     start: float,
     trials: int,
-    ends: tuple[float, float],
+    bounds: tuple[float, float],
 ) -> tuple[float, Trial] | None:
-    """The largest distortion whose trial fits, as far as a number of trials tells.
+    """Find the largest distortion whose trial fits, by bracketing and bisection of its logarithm.
 
     Args:
-        attempt: distortion -> trial; a smaller one fits if a larger does.
-        fits: whether a trial is fine enough.
-        start: distortion to begin with.
-        trials: how many may be made, at least 2.
-        ends: least and largest distortion.
+        attempt: makes the trial of a distortion; if a trial fits, those of smaller distortions fit too.
+        fits: tells whether a trial is good enough.
+        start: distortion of the first trial.
+        trials: maximum number of trials, at least 2.
+        bounds: smallest and largest distortion.
 
     Returns:
-        The distortion and its trial, None when not even the least distortion fits.
+        The distortion and its trial; None if not even the smallest distortion fits.
     """
-    low: float | None = None  # the coarsest that fits
-    high: float | None = None  # the finest that does not
-    distortion, best = min(max(start, ends[0]), ends[1]), None
+    low: float | None = None  # the largest distortion that fits
+    high: float | None = None  # the smallest distortion that does not fit
+    distortion, best = min(max(start, bounds[0]), bounds[1]), None
     for _ in range(trials):
         trial = attempt(distortion)
         if fits(trial):
             low, best = distortion, (distortion, trial)
         else:
             high = distortion
-        if low == ends[1] or high == ends[0]:
+        if low == bounds[1] or high == bounds[0]:
             break
         if low is not None and high is not None:
             distortion = (low * high) ** 0.5
         else:
-            distortion = min(distortion * FACTOR, ends[1]) if high is None else max(distortion / FACTOR, ends[0])
-    if best is None and high != ends[0] and fits(trial := attempt(ends[0])):
-        best = ends[0], trial
+            distortion = (
+                min(distortion * BRACKETING_RATIO, bounds[1])
+                if high is None
+                else max(distortion / BRACKETING_RATIO, bounds[0])
+            )
+    if best is None and high != bounds[0] and fits(trial := attempt(bounds[0])):
+        best = bounds[0], trial
     return best
 
 
-def fullest(
+def find_fullest(
     attempt: Callable[[float], Trial],
     size: Callable[[Trial], int],
     limit: int,
     start: float,
     trials: int,
-    ends: tuple[float, float],
+    bounds: tuple[float, float],
 ) -> tuple[float, Trial] | None:
-    """A distortion whose trial takes at most `limit` bytes and at least ENOUGH of them; usually in two or three trials.
+    """Find a distortion whose trial takes at most `limit` bytes and at least ACCEPTED_SIZE_RATIO of them.
 
-    Bytes fall about as a power of the distortion: a line through two trials in logarithms, or through one with the
-    slope that most models have, tells where to look next.
+    The size falls roughly as a power of the distortion. The next distortion is found by interpolation through the last
+    trials in logarithms, or from one trial with the typical slope. Two or three trials usually suffice.
 
     Args:
-        size: bytes of a trial; a larger distortion gives no more of them.
-        limit: of the bytes.
-        attempt, start, trials, ends: as of `coarsest`.
+        size: returns the bytes of a trial; a larger distortion never takes more bytes.
+        limit: maximum size in bytes.
+        attempt, start, trials, bounds: as for `find_coarsest`.
 
     Returns:
-        The distortion and the trial with the most bytes of those that fit; None where none does.
+        The distortion and the largest trial that fits; None if none does.
     """
-    ends = math.log(ends[0]), math.log(ends[1])
-    wanted, place = math.log(AIM * limit), min(max(_log(start), ends[0]), ends[1])
+    bounds = math.log(bounds[0]), math.log(bounds[1])
+    wanted, place = math.log(TARGET_SIZE_RATIO * limit), min(max(_log(start), bounds[0]), bounds[1])
     best: tuple[float, Trial] | None = None
-    fitting: tuple[float, float] | None = None  # logarithms of the least distortion that fits, and of its bytes
-    larger: tuple[float, float] | None = None  # of the greatest that does not
-    made: list[tuple[float, float]] = []  # logarithms of distortions and bytes
+    fitting: tuple[float, float] | None = None  # logarithms of the smallest distortion that fits, and of its bytes
+    too_large: tuple[float, float] | None = (
+        None  # logarithms of the largest distortion that does not fit, and of its bytes
+    )
+    measured: list[tuple[float, float]] = []  # logarithms of the distortion and the bytes of each trial
     for _ in range(trials):
         distortion = math.exp(place)
         trial = attempt(distortion)
-        made.append((place, math.log(max(size(trial), 1))))
+        measured.append((place, math.log(max(size(trial), 1))))
         if size(trial) <= limit:
-            fitting, best = made[-1], (distortion, trial)
+            fitting, best = measured[-1], (distortion, trial)
         else:
-            larger = made[-1]
-        if fitting and (fitting[1] >= math.log(ENOUGH * limit) or fitting[0] <= ends[0]):
+            too_large = measured[-1]
+        if fitting and (fitting[1] >= math.log(ACCEPTED_SIZE_RATIO * limit) or fitting[0] <= bounds[0]):
             break
-        if larger and larger[0] >= ends[1]:
+        if too_large and too_large[0] >= bounds[1]:
             break
-        if fitting and larger and fitting[0] - larger[0] < NARROWEST:
+        if fitting and too_large and fitting[0] - too_large[0] < MIN_BRACKET_LOG_WIDTH:
             break
-        place = _further(made, wanted)
-        low, high = larger[0] if larger else ends[0], fitting[0] if fitting else ends[1]
-        if fitting and larger:
-            edge = (high - low) / EDGE
-            place = (low + high) / 2 if len(made) > PATIENCE else min(max(place, low + edge), high - edge)
+        place = _interpolate(measured, wanted)
+        low, high = too_large[0] if too_large else bounds[0], fitting[0] if fitting else bounds[1]
+        if fitting and too_large:
+            edge = (high - low) / BRACKET_MARGIN_PARTS
+            place = (
+                (low + high) / 2
+                if len(measured) > MAX_INTERPOLATED_TRIALS
+                else min(max(place, low + edge), high - edge)
+            )
         place = min(max(place, low), high)
     return best
 
 
-def _further(made: list[tuple[float, float]], wanted: float) -> float:
-    """Where y = wanted on the curve x(y) through the last points (x, y): a parabola, or less where there are fewer."""
-    points = made[-3:]
+def _interpolate(measured: list[tuple[float, float]], wanted: float) -> float:
+    """Return x(wanted) of the Lagrange polynomial x(y) through the last three points (x, y), or two.
+
+    From a single point, or from points of equal y, it extrapolates with LOG_SIZE_SLOPE by at most MAX_LOG_STEP.
+    """
+    points = measured[-3:]
     if len(points) < 2 or len({y for _, y in points}) < len(points):
-        x, y = made[-1]
-        return x + min(max((wanted - y) / SLOPE, -FARTHEST), FARTHEST)
+        x, y = measured[-1]
+        return x + min(max((wanted - y) / LOG_SIZE_SLOPE, -MAX_LOG_STEP), MAX_LOG_STEP)
     terms = (
         x * math.prod((wanted - other) / (y - other) for k, (_, other) in enumerate(points) if k != n)
         for n, (x, y) in enumerate(points)

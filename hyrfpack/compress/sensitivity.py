@@ -1,4 +1,4 @@
-"""How much each number of a model matters to pictures, measured on renders: the weights of rate and distortion."""
+"""Sensitivities: mean squared derivatives of rendered pictures by each number of a model, measured on renders."""
 
 from __future__ import annotations
 
@@ -16,30 +16,38 @@ from hyrfpack.progress import Report, no_report
 from hyrfpack.render import render
 from hyrfpack.scene import Camera
 
-DRAWN = 3_000_000  # Gaussians drawn in all views together, about: more views of smaller models
-FEWEST, MOST = 6, 96  # views
-FIELD_VIEWS = 1 / 2  # share of the views that the fields are measured on; each counts for many Gaussians there
-TRUSTED = 8.0  # views that the guess from size, opacity and place counts for
-CELLS = 32  # of the cube, along each axis, in which guess and measurement are brought together
-NEAREST = 0.05  # local units
-LEAST = 1e-2  # of a decoder's number, against the mean of its decoder
-WITHOUT = 1e-6  # error that zeros for a whole decoder add at least: where all is saturated, no slope tells
-PRUNED = "pruned"  # what is not stored, beside the sections
+# The number of views is chosen so that about this many Gaussians are drawn in all views together.
+TARGET_DRAWN_GAUSSIANS = 3_000_000
+MIN_SENSITIVITY_VIEWS = 6
+MAX_SENSITIVITY_VIEWS = 96
+# Fields need fewer views than Gaussians, because each of their numbers affects many Gaussians in a view.
+FIELD_VIEW_SHARE = 1 / 2
+# The estimate from size, opacity and position has the weight of this many measured views.
+PRIOR_WEIGHT_VIEWS = 8.0
+# The estimate is scaled to the measurement in each cell of a grid over the contracted cube.
+PRIOR_CELLS_PER_AXIS = 32
+MIN_CAMERA_DISTANCE_LOCAL = 0.05
+# Lower bound of the sensitivity of a decoder's number, as a share of the mean of its decoder.
+MIN_RELATIVE_DECODER_SENSITIVITY = 1e-2
+# Setting a whole decoder to zero is taken to add at least this error, because gradients vanish under saturation.
+MIN_ZEROED_DECODER_ERROR = 1e-6
+# Key of the Gaussians that are left out, beside the names of the sections.
+PRUNED = "pruned"
 
 
 @dataclass(frozen=True)
 class Sensitivity:
     """Mean squared derivatives of pictures by each number of a model.
 
-    For a number x it is s = mean over views, pixels and channels of (d colour / d x)^2, so that an error e in x adds
-    about s e^2 to the pictures' mean squared error. All are float64, 0 or more.
+    The sensitivity of a number x is s = mean over views, pixels and channels of (d colour / d x)^2. An error e in x
+    adds about s e^2 to the pictures' mean squared error. All values are float64, 0 or more.
 
     Attributes:
         positions: (N,) by a coordinate in the contracted cube, mean of the three axes.
         colors: (N,) by a colour logit, mean of the three.
         scales, opacities: (N,) by the explicit logits.
-        removals: (N,) what leaving out a Gaussian adds to the mean squared error itself, see `removal_error`.
-        fields: by the numbers of each hash table and decoder, laid out as in the file, by section.
+        removals: (N,) mean squared error that leaving out a Gaussian adds, see `removal_error`.
+        fields: by section, the sensitivities of each hash table and decoder, in the order of the file.
     """
 
     positions: np.ndarray
@@ -49,13 +57,13 @@ class Sensitivity:
     removals: np.ndarray
     fields: dict[str, np.ndarray]
 
-    def of(self, index: np.ndarray | slice) -> Sensitivity:
-        """That of the Gaussians at `index` (n,) int64, and of all fields."""
+    def subset(self, index: np.ndarray | slice) -> Sensitivity:
+        """Return the sensitivities of the Gaussians at `index` (n,) int64, and of all fields."""
         positions, colors, scales = self.positions[index], self.colors[index], self.scales[index]
         return Sensitivity(positions, colors, scales, self.opacities[index], self.removals[index], self.fields)
 
-    def times(self, factors: dict[str, float]) -> Sensitivity:
-        """Each section's, and what is PRUNED, multiplied by its factor; 1 where there is none."""
+    def scaled_by(self, factors: dict[str, float]) -> Sensitivity:
+        """Multiply each section, and the removals (PRUNED), by its factor; sections without a factor stay the same."""
         positions, colors, scales, opacities, removals = (
             values * factors.get(group, 1.0)
             for group, values in (
@@ -75,34 +83,37 @@ def measure_sensitivity(
 ) -> Sensitivity:
     """Estimate the mean squared derivatives of pictures by every number of a model.
 
-    With v a picture of random signs, the derivative of (picture . v) by a number x is a sum of random signs times the
-    pixels' derivatives by x; its square is on average the sum of their squares (Hutchinson 1990). One such v a view,
-    half of the views at cameras and half between them.
+    Let v be a picture of random signs. The derivative of (picture . v) by a number x is the sum of the pixels'
+    derivatives by x with random signs, and the expectation of its square is the sum of their squares (Hutchinson 1990).
+    One v is drawn for each view. Half of the views are at cameras and half between them.
 
-    A Gaussian is measured in few views, or in none, and still may be seen in others. So what is measured is blended
-    with a guess from its size, opacity and place, which is right on average where it stands.
+    A Gaussian may be visible in few of the measured views, or in none, and still be visible in others. So measurements
+    are averaged with an estimate from size, opacity and position, which is scaled to match the measurements nearby.
 
     Args:
-        cameras: where pictures will be looked at from, about; world units.
-        seed: of the signs and of the views between cameras.
-        report: told of each view, and the share of the work that is done.
+        model: the model to measure.
+        cameras: viewpoints typical of how the model will be viewed; world units.
+        seed: random seed of the signs and of the views between cameras.
+        report: called before each view with a description and the completed share of the work, 0 to 1.
 
     Raises:
         HyrfError: a number of the model is NaN or infinite.
     """
-    count = int(np.clip(DRAWN // max(len(model), 1), FEWEST, MOST)) // 2
+    count = (
+        int(np.clip(TARGET_DRAWN_GAUSSIANS // max(len(model), 1), MIN_SENSITIVITY_VIEWS, MAX_SENSITIVITY_VIEWS)) // 2
+    )
     at, between = sample_views(cameras, count, seed)
     views = [view for pair in zip(at, between, strict=True) for view in pair]
-    every = max(1, round(1 / FIELD_VIEWS))
+    field_interval = max(1, round(1 / FIELD_VIEW_SHARE))
     generator = torch.Generator().manual_seed(seed)
     squares = {name: torch.zeros_like(parameter) for name, parameter in model.named_parameters()}
-    stretch = _stretch(model)
-    wanted = {name: parameter.requires_grad for name, parameter in model.named_parameters()}
+    jacobian = _cube_jacobian(model)
+    required = {name: parameter.requires_grad for name, parameter in model.named_parameters()}
     pixels, field_pixels = 0, 0
     for number, camera in enumerate(views):
         report(f"measuring sensitivities, view {number + 1} of {len(views)}", number / len(views))
-        # Pairs alternate, so a field's views fall on cameras and between them.
-        with_fields = number % (2 * every) < 2
+        # Views at and between cameras alternate, so both kinds are among the views of the fields.
+        with_fields = number % (2 * field_interval) < 2
         for name, parameter in model.named_parameters():
             parameter.requires_grad_(with_fields or name.startswith("gaussians"))
             parameter.grad = None
@@ -117,75 +128,86 @@ def measure_sensitivity(
             if gradient is None:
                 continue
             if name == "gaussians.positions":
-                gradient = (stretch * gradient[:, :, None]).sum(1)
+                gradient = (jacobian * gradient[:, :, None]).sum(1)
             squares[name] += gradient.square()
             parameter.grad = None
     for name, parameter in model.named_parameters():
-        parameter.requires_grad_(wanted[name])
-    return _gathered(model, squares, pixels, field_pixels, at, stretch)
+        parameter.requires_grad_(required[name])
+    return _combine(model, squares, pixels, field_pixels, at, jacobian)
 
 
 @torch.no_grad()
-def _gathered(
+def _combine(
     model: HybridModel,
     squares: dict[str, torch.Tensor],
     pixels: int,
     field_pixels: int,
     cameras: Sequence[Camera],
-    stretch: torch.Tensor,
+    jacobian: torch.Tensor,
 ) -> Sensitivity:
+    """Average the accumulated squared gradients, combine them with the prior estimate, and apply lower bounds."""
     geometry = model.decode_geometry()
-    expected = _expected(model, geometry, cameras, stretch)
+    expected = _expected_sensitivity(model, geometry, cameras, jacobian)
     views = len(cameras) * 2
     explicit = []
     for name, guess in expected.items():
         measured = squares[f"gaussians.{name}"].double().mean(dim=1).cpu().numpy() / pixels
-        # What is measured in few views is shaky, and a Gaussian that none shows may be seen in others.
+        # Few views give a noisy measurement, and a Gaussian that none of them shows may be visible in others.
         explicit.append(
-            np.maximum((views * measured + TRUSTED * _local(model, measured, guess)) / (views + TRUSTED), 1e-30)
+            np.maximum(
+                (views * measured + PRIOR_WEIGHT_VIEWS * _fit_prior(model, measured, guess))
+                / (views + PRIOR_WEIGHT_VIEWS),
+                1e-30,
+            )
         )
     fields = {
         group: np.concatenate([squares[name].double().cpu().numpy().ravel() for name in SECTION_PARAMETERS[group]])
         / field_pixels
         for group in (*TABLE_SECTIONS, *DECODER_SECTIONS)
     }
-    # Both numbers of a row are read together.
+    # Both numbers of a row are read together, so they get the same sensitivity.
     fields |= {group: fields[group].reshape(-1, 2).mean(axis=1).repeat(2) for group in TABLE_SECTIONS}
     parameters = dict(model.named_parameters())
     for group in DECODER_SECTIONS:
         size = sum(float(parameters[name].detach().double().square().sum()) for name in SECTION_PARAMETERS[group])
-        fields[group] = np.maximum(fields[group], max(LEAST * fields[group].mean(), WITHOUT / max(size, 1e-30)))
+        fields[group] = np.maximum(
+            fields[group],
+            max(MIN_RELATIVE_DECODER_SENSITIVITY * fields[group].mean(), MIN_ZEROED_DECODER_ERROR / max(size, 1e-30)),
+        )
     positions, colors, scales, opacities = explicit
     removals = removal_error(geometry.opacities.double().cpu().numpy(), opacities)
     return Sensitivity(positions, colors, scales, opacities, removals, fields)
 
 
-def removal_error(opacities: np.ndarray, by_logit: np.ndarray) -> np.ndarray:
-    """(N,) what leaving out each Gaussian adds to the pictures' mean squared error.
+def removal_error(opacities: np.ndarray, logit_sensitivity: np.ndarray) -> np.ndarray:
+    """Estimate the mean squared error (N,) that leaving out each Gaussian adds to the pictures.
 
-    By the opacity o itself the sensitivity is s / (o (1 - o))^2, s being that by its logit.
+    If s is the sensitivity by the opacity logit, the sensitivity by the opacity o itself is s / (o (1 - o))^2, and
+    setting o to 0 adds o^2 times that.
 
     Args:
         opacities: (N,) in [0, 1].
-        by_logit: (N,) sensitivities by explicit opacity logits.
+        logit_sensitivity: (N,) sensitivities by explicit opacity logits.
     """
-    return by_logit / np.maximum(opacities * (1 - opacities), 1e-4) ** 2 * opacities**2
+    return logit_sensitivity / np.maximum(opacities * (1 - opacities), 1e-4) ** 2 * opacities**2
 
 
-def _local(model: HybridModel, measured: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """The guess (N,), scaled so that it agrees with what was measured (N,) in each part of space and in all."""
+def _fit_prior(model: HybridModel, measured: np.ndarray, guess: np.ndarray) -> np.ndarray:
+    """Scale the estimate (N,) so that it matches the measurements (N,) in each cell of the cube and overall."""
     cube = model.cube_coords(model.gaussians.positions.detach()).cpu().numpy()
-    cells = np.minimum((cube * CELLS).astype(np.int64), CELLS - 1) @ np.array((1, CELLS, CELLS**2))
-    sums = [np.bincount(cells, values, CELLS**3) for values in (measured, guess)]
+    cells = np.minimum((cube * PRIOR_CELLS_PER_AXIS).astype(np.int64), PRIOR_CELLS_PER_AXIS - 1) @ np.array(
+        (1, PRIOR_CELLS_PER_AXIS, PRIOR_CELLS_PER_AXIS**2)
+    )
+    sums = [np.bincount(cells, values, PRIOR_CELLS_PER_AXIS**3) for values in (measured, guess)]
     overall = measured.sum() / max(guess.sum(), 1e-300)
-    # A part where little was seen leans on all of space.
+    # A cell with few measurements takes the ratio of all cells.
     weight = guess.sum() / max(np.count_nonzero(sums[1]), 1)
     return guess * ((sums[0] + overall * weight) / (sums[1] + weight))[cells]
 
 
 @torch.enable_grad()
-def _stretch(model: HybridModel) -> torch.Tensor:
-    """(N, 3, 3): d local position / d cube coordinate, rows local axes, columns cube axes."""
+def _cube_jacobian(model: HybridModel) -> torch.Tensor:
+    """Return d local position / d cube coordinate, (N, 3, 3): rows are local axes, columns are cube axes."""
     cube = model.cube_coords(model.gaussians.positions.detach().double()).requires_grad_()
     local = expand(cube) * cube.new_tensor(model.config.frame.half_extent)
     rows = [torch.autograd.grad(local[:, axis].sum(), cube, retain_graph=True)[0] for axis in range(3)]
@@ -193,13 +215,14 @@ def _stretch(model: HybridModel) -> torch.Tensor:
 
 
 @torch.no_grad()
-def _expected(
-    model: HybridModel, geometry: Geometry, cameras: Sequence[Camera], stretch: torch.Tensor
+def _expected_sensitivity(
+    model: HybridModel, geometry: Geometry, cameras: Sequence[Camera], jacobian: torch.Tensor
 ) -> dict[str, np.ndarray]:
-    """(N,) each: what a Gaussian's numbers would do to pictures, up to a factor, if nothing stood before it.
+    """Estimate the sensitivities (N,) of each kind of number of unoccluded Gaussians, up to a common factor.
 
-    Each pixel under a Gaussian of opacity o and standard deviations a, b (the larger two) depends on its colour by o at
-    most, and there are pi f^2 a b / z^2 of them; on its opacity logit by o (1 - o); on its place by o / (a b)^(1/2).
+    A Gaussian of opacity o and standard deviations a, b (the larger two) at depth z covers pi f^2 a b / z^2 pixels.
+    The derivative of such a pixel is at most o by the Gaussian's colour, o (1 - o) by its opacity logit, and
+    o / (a b)^(1/2) by its position.
     """
     sides = geometry.scales.double().sort(dim=1).values
     area, opacities = sides[:, 1] * sides[:, 2], geometry.opacities.double()
@@ -208,10 +231,10 @@ def _expected(
     positions = model.gaussians.positions.double()
     for camera in cameras:
         place = torch.as_tensor((camera.position - np.array(frame.center)) / frame.scale).to(positions)
-        distance = torch.linalg.vector_norm(positions - place, dim=1).clamp_min(NEAREST)
+        distance = torch.linalg.vector_norm(positions - place, dim=1).clamp_min(MIN_CAMERA_DISTANCE_LOCAL)
         total += (area * (camera.fx * camera.fy / (camera.width * camera.height)) / distance**2).clamp_max(1)
     seen = total * opacities**2
-    stretched = stretch.double().square().sum(dim=(1, 2))
+    stretched = jacobian.double().square().sum(dim=(1, 2))
     guesses = {
         "positions": seen * stretched / area.clamp_min(1e-12),
         "color_logits": seen,

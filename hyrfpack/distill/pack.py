@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from hyrfpack.cameras.paths import Viewpoint
-from hyrfpack.compress.calibrate import calibrated
+from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.packer import Packer
 from hyrfpack.distill.teach import Taught
 from hyrfpack.progress import Report, no_report, report_part, report_round
@@ -49,20 +49,22 @@ def pack(
     room = max(allowed - error, min(LEAST_ADDED * error, HOPELESS * allowed))
     say(f"measuring what each number does to pictures, at {len(taught.train)} cameras and between them")
     wanted = PACKED * added_to_each(_mse(likeness), error + room)
-    sensitivity, originals = calibrated(model, taught.train, wanted, report=report_part(report, 0.0, 0.7))
+    sensitivity, originals = measure_calibrated_sensitivity(
+        model, taught.train, wanted, report=report_part(report, 0.0, 0.7)
+    )
     provenance = {**provenance, "viewpoint": Viewpoint.from_cameras(taught.train).to_json()}
     making = report_part(report, 0.7, 0.85)
     packer = Packer(model, provenance, sensitivity, scene=None, finetune_steps=0, prune=True, say=say, report=making)
-    trial = packer.settled(wanted, originals)
+    trial = packer.encode_to_distortion(wanted, originals)
     for number in range(TRIALS):
         trying = report_round(report_part(report, 0.85, 1.0), number)
         trying("comparing the file with the original", 0.0)
-        off = _mse(np.mean(taught.deciding.likeness(packer.decoded(trial)))) - error
+        off = _mse(np.mean(taught.deciding.likeness(packer.decode(trial)))) - error
         if off <= room:
             break
         wanted *= max(PACKED * room / off, 1 / 16)
         say(f"packing adds {off:.2g} to the error instead of {room:.2g}: finer, for {wanted:.2g}")
-        trial = packer.attempt(wanted, report_part(trying, 0.5, 1.0))
+        trial = packer.encode(wanted, report_part(trying, 0.5, 1.0))
     return trial.data
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from hyrfpack.compress.sensitivity import DRAWN, FEWEST, MOST
+from hyrfpack.compress.sensitivity import MAX_SENSITIVITY_VIEWS, MIN_SENSITIVITY_VIEWS, TARGET_DRAWN_GAUSSIANS
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.train.config import FULL_STEPS, TrainConfig
 from hyrfpack.train.decisions import MAX_PILOT_STEPS, MIN_BUDGET_STEPS, max_pilot_steps
@@ -97,7 +97,7 @@ class Plan:
 
 def passes(gaussians: int) -> int:
     """How many views packing draws and follows back."""
-    return int(np.clip(DRAWN // max(gaussians, 1), FEWEST, MOST))
+    return int(np.clip(TARGET_DRAWN_GAUSSIANS // max(gaussians, 1), MIN_SENSITIVITY_VIEWS, MAX_SENSITIVITY_VIEWS))
 
 
 def megapixels(scene: Scene) -> float:

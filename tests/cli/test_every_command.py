@@ -264,13 +264,13 @@ def _make_blender(root: Path, photos: list[Path], frames: list[dict]) -> None:
 
 def _make_foreign(folder: Path, photo: str) -> None:
     """Files that other programs made, named as the commands' own."""
-    from hyrfpack.compress.report_page import FILES
+    from hyrfpack.compress.report_page import REPORT_FILES
     from hyrfpack.demo.run import FILES as DEMO
 
     scored = f"{Path(photo).stem}.png"
     names = [f"a{ending}" for ending in (".hyrf", ".png", ".json", ".md", *KINDS)]
     names += ["colmap/sparse/0/cameras.bin", "player/index.html", "gallery/index.html"]
-    names += ["pictures/0000.png", f"pictures/{scored}", f"report/{FILES[0]}"]
+    names += ["pictures/0000.png", f"pictures/{scored}", f"report/{REPORT_FILES[0]}"]
     for path in (*(f"old/{name}" for name in names), f"old/demo/{DEMO[0]}", "run/metrics.json"):
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_bytes(b"of another program")

@@ -28,7 +28,8 @@ def whole(tmp_path_factory) -> Path:
     )
     path = tmp_path_factory.mktemp("layers") / "whole.hyrf"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plan, "LEAST_OF_LAYER", (1, 100))
+        patch.setattr(plan, "MIN_LAYER_GAUSSIANS", 1)
+        patch.setattr(plan, "MAX_LAYERS", 100)
         path.write_bytes(encode(model, "compact", PROVENANCE, prune=False))
     return path
 

@@ -10,14 +10,14 @@ import torch
 from scenes import ball_points, ring, small_model
 
 from hyrfpack.compress.calibrate import (
-    CLOSE,
-    PARTS,
-    ROUNDS,
-    Factor,
-    Originals,
-    _decoded_anew,
+    CALIBRATED_PARTS,
+    MAX_CORRECTION_ROUNDS,
+    PREDICTION_TOLERANCE_RATIO,
+    CorrectionFactor,
+    ReferenceRenders,
+    _update_decoded,
     calibrate,
-    foretold,
+    predict_errors,
 )
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.quantize import decide
@@ -47,8 +47,8 @@ def forecast(model: HybridModel, sensitivity: Sensitivity, distortion: float) ->
     """What a file adds to pictures by estimate, and at viewpoints that no estimate has seen."""
     quantized = decide(model, sensitivity, distortion)
     decoded = decode_model(encode_model(model, "compact", quantized=quantized))
-    told = foretold(model, quantized.plan.apply(model), quantized, sensitivity)
-    return sum(told.values()), Originals.of(model, ELSEWHERE).error(decoded)
+    told = predict_errors(model, quantized.plan.apply(model), quantized, sensitivity)
+    return sum(told.values()), ReferenceRenders.of(model, ELSEWHERE).measure_error(decoded)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def first_order(model) -> Sensitivity:
 
 @pytest.mark.parametrize("distortion", [1e-3, 1e-5])
 def test_where_gaussians_swap_their_order_the_loss_is_foretold_to_a_third(distortion, model, first_order):
-    sensitivity = calibrate(model, first_order, Originals.of(model, CAMERAS), distortion)
+    sensitivity = calibrate(model, first_order, ReferenceRenders.of(model, CAMERAS), distortion)
 
     told, found = forecast(model, sensitivity, distortion)
 
@@ -77,10 +77,10 @@ def test_without_it_the_loss_is_not_foretold(model, first_order):
 
 
 def test_what_is_right_already_stays(model, first_order):
-    originals = Originals.of(model, CAMERAS)
-    once = calibrate(model, first_order, originals, 1e-4)
+    references = ReferenceRenders.of(model, CAMERAS)
+    once = calibrate(model, first_order, references, 1e-4)
 
-    again = calibrate(model, once, originals, 1e-4)
+    again = calibrate(model, once, references, 1e-4)
 
     for part in ("colors", "scales", "opacities"):
         np.testing.assert_allclose(getattr(again, part), getattr(once, part), rtol=0.3)
@@ -89,7 +89,7 @@ def test_what_is_right_already_stays(model, first_order):
 def test_factors_go_to_their_parts():
     sensitivity = Sensitivity(*np.ones((5, 3)), {"RTAB": np.ones(4)})
 
-    scaled = sensitivity.times({POSITIONS: 2.0, OPACITIES: 4.0, "RTAB": 3.0, PRUNED: 5.0})
+    scaled = sensitivity.scaled_by({POSITIONS: 2.0, OPACITIES: 4.0, "RTAB": 3.0, PRUNED: 5.0})
 
     assert [values.tolist() for values in (scaled.positions, scaled.colors, scaled.opacities)] == [
         [2.0] * 3,
@@ -111,7 +111,7 @@ def test_where_pruning_darkens_pictures_more_than_the_sum_of_squares_less_is_pru
     sensitivity = measure_sensitivity(model, CAMERAS)
     distortion = 1e-4
 
-    calibrated = calibrate(model, sensitivity, Originals.of(model, CAMERAS), distortion)
+    calibrated = calibrate(model, sensitivity, ReferenceRenders.of(model, CAMERAS), distortion)
 
     assert len(make_plan(model, calibrated, distortion).kept) > 2 * len(make_plan(model, sensitivity, distortion).kept)
     told, found = forecast(model, calibrated, distortion)
@@ -119,10 +119,10 @@ def test_where_pruning_darkens_pictures_more_than_the_sum_of_squares_less_is_pru
 
 
 def test_a_single_view_that_is_far_off_does_not_decide(model):
-    originals = Originals.of(model, CAMERAS)
-    broken = [torch.ones_like(picture) if n == 0 else picture for n, picture in enumerate(originals.pictures)]
+    references = ReferenceRenders.of(model, CAMERAS)
+    broken = [torch.ones_like(picture) if n == 0 else picture for n, picture in enumerate(references.pictures)]
 
-    assert Originals(originals.views, broken).error(model) == 0.0
+    assert ReferenceRenders(references.views, broken).measure_error(model) == 0.0
 
 
 def test_parts_that_do_nothing_are_left_alone():
@@ -130,7 +130,7 @@ def test_parts_that_do_nothing_are_left_alone():
     model = small_model(ball_points(40)[0] * 0.1 + np.array([0.0, 0.0, 500.0]))
     sensitivity = measure_sensitivity(model, CAMERAS)
 
-    calibrated = calibrate(model, sensitivity, Originals.of(model, CAMERAS), 1e-4)
+    calibrated = calibrate(model, sensitivity, ReferenceRenders.of(model, CAMERAS), 1e-4)
 
     for name in ("positions", "colors", "scales", "opacities"):
         np.testing.assert_array_equal(getattr(calibrated, name), getattr(sensitivity, name))
@@ -138,9 +138,9 @@ def test_parts_that_do_nothing_are_left_alone():
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_one_and_two_cameras_will_do(count, model, first_order):
-    originals = Originals.of(model, CAMERAS[:count])
+    references = ReferenceRenders.of(model, CAMERAS[:count])
 
-    calibrated = calibrate(model, first_order, originals, 1e-4)
+    calibrated = calibrate(model, first_order, references, 1e-4)
 
     assert all(np.isfinite(values).all() for values in (calibrated.positions, calibrated.colors))
     assert COLORS not in calibrated.fields
@@ -153,31 +153,31 @@ def test_one_and_two_cameras_will_do(count, model, first_order):
 @pytest.mark.parametrize("power", [0.6, 1.0, 1.4, 2.0])
 @pytest.mark.parametrize("law", [0.7, 1.0, 1.5])
 def test_errors_that_fall_by_any_power_are_met_in_three_tries(law, power, at_first):
-    factor, tries = Factor(law), 0
-    while not factor.done:
-        factor.correct(at_first * factor.value**-power)
+    factor, tries = CorrectionFactor(law), 0
+    while not factor.converged:
+        factor.update(at_first * factor.value**-power)
         tries += 1
-    assert tries <= 3 and at_first * factor.final**-power < CLOSE
+    assert tries <= 3 and at_first * factor.final**-power < PREDICTION_TOLERANCE_RATIO
 
 
 def test_errors_that_jump_are_bracketed():
-    factor = Factor(0.7)
+    factor = CorrectionFactor(0.7)
     for _ in range(20):
-        if factor.done:
+        if factor.converged:
             break
-        factor.correct(3.0 if factor.value < 5 else 0.1)
-    assert factor.done and 5 <= factor.final < 5 * CLOSE
+        factor.update(3.0 if factor.value < 5 else 0.1)
+    assert factor.converged and 5 <= factor.final < 5 * PREDICTION_TOLERANCE_RATIO
 
 
 @pytest.mark.parametrize("ratio", [0.0, 1.0])
 def test_errors_that_do_not_change_end_no_search_badly(ratio):
-    factor = Factor(1.0)
-    for _ in range(ROUNDS):
-        factor.correct(ratio)
+    factor = CorrectionFactor(1.0)
+    for _ in range(MAX_CORRECTION_ROUNDS):
+        factor.update(ratio)
         assert np.isfinite(factor.final) and factor.final >= 0
 
 
-@pytest.mark.parametrize("part", PARTS[1:], ids="".join)
+@pytest.mark.parametrize("part", CALIBRATED_PARTS[1:], ids="".join)
 @pytest.mark.parametrize("says", [0.2, 0.0])
 def test_what_a_part_does_not_change_need_not_be_decoded_anew(part, says):
     before = layers(200)
@@ -189,7 +189,7 @@ def test_what_a_part_does_not_change_need_not_be_decoded_anew(part, says):
     other = {name: arrays[name] * generator.uniform(0.5, 1.5, arrays[name].shape).astype(np.float32) for name in part}
     changed.load_state_dict(dict(iter_parameters(other, changed)), strict=False)
 
-    found = Originals.of(before, CAMERAS).error(changed, _decoded_anew(changed, before.decode(), part))
+    found = ReferenceRenders.of(before, CAMERAS).measure_error(changed, _update_decoded(changed, before.decode(), part))
 
-    expected = Originals.of(before, CAMERAS).error(changed)
+    expected = ReferenceRenders.of(before, CAMERAS).measure_error(changed)
     assert found == pytest.approx(expected, rel=1e-3) and (expected > 1e-7 or not says)

@@ -186,7 +186,7 @@ def test_prediction_makes_smooth_channels_smaller(monkeypatch: pytest.MonkeyPatc
         return len(encode_channel(quantize_channel(values, classes, np.ones(5000), step_for(0.01)), classes))
 
     predicted = size()
-    monkeypatch.setattr(channels, "WEIGHTS", (0,))
+    monkeypatch.setattr(channels, "PREDICTION_WEIGHTS_SIXTEENTHS", (0,))
 
     assert predicted < 0.85 * size()
 

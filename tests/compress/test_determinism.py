@@ -87,6 +87,6 @@ def test_gaussians_in_another_order_give_the_same_file():
     quantized = drawn(model, prune=False)
     moved = dataclasses.replace(quantized.plan, kept=np.argsort(order)[quantized.plan.kept])
 
-    again = quantize(moved.apply(other), moved, drawn_sensitivity(model).of(order))
+    again = quantize(moved.apply(other), moved, drawn_sensitivity(model).subset(order))
 
     assert encode_model(other, "compact", quantized=again) == encode_model(model, "compact", quantized=quantized)

@@ -12,7 +12,7 @@ from scenes import alternating, ball_scene, exposed_scene, shown, view_of
 
 from hyrfpack.cameras.capture import has_mean_exposure
 from hyrfpack.compress import compress, packer
-from hyrfpack.compress.finetune import gains_of_photos
+from hyrfpack.compress.finetune import fit_residual_gains
 from hyrfpack.evaluate import evaluate
 from hyrfpack.evaluate.exposure import fitted_gains
 from hyrfpack.format import describe, load, save
@@ -79,14 +79,14 @@ def drift(before: Path, after: Path, scene: Scene) -> float:
 
 
 def test_without_a_map_gains_are_those_of_the_photos_about_the_mean_exposure(trained, scene):
-    gains = np.array([gains.numpy() for gains in gains_of_photos(load(trained), scene.train).values()])
+    gains = np.array([gains.numpy() for gains in fit_residual_gains(load(trained), scene.train).values()])
     np.testing.assert_allclose(np.log(gains).mean(0), 0, atol=0.05)
     np.testing.assert_allclose(np.log(gains).mean(1), np.log(GAINS / MEAN)[:, 0], atol=0.15)
 
 
 def test_with_a_map_gains_are_what_the_map_leaves_of_each_photo(trained, scene, tmp_path):
     half = with_map(trained, scene, np.sqrt(GAINS / MEAN), tmp_path / "half.hyrf")
-    gains = np.array([gains.numpy() for gains in gains_of_photos(load(half), scene.train).values()])
+    gains = np.array([gains.numpy() for gains in fit_residual_gains(load(half), scene.train).values()])
     np.testing.assert_allclose(np.log(gains).mean(1), np.log(GAINS / MEAN)[:, 0] / 2, atol=0.15)
 
 
@@ -124,7 +124,7 @@ def test_gains_are_fitted_once_for_all_files_of_a_search_and_only_where_exposure
     trained, unaware, scene, tmp_path, monkeypatch
 ):
     fitted = []
-    monkeypatch.setattr(packer, "gains_of_photos", lambda *of: fitted.append(of) or gains_of_photos(*of))
+    monkeypatch.setattr(packer, "fit_residual_gains", lambda *of: fitted.append(of) or fit_residual_gains(*of))
     mapped = with_map(unaware, scene, GAINS / MEAN, tmp_path / "mapped.hyrf")
     for source, calls in ((unaware, 0), (trained, 1), (mapped, 2)):
         compress(source, tmp_path / "small.hyrf", data=scene, finetune_steps=1, target_bytes=12_000)

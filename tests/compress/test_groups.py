@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hyrfpack.compress.groups import quantize_groups
-from hyrfpack.compress.rate_distortion import best_steps, cheapest, code_bits
+from hyrfpack.compress.rate_distortion import choose_step_codes, choose_symbols, estimate_code_bits
 from hyrfpack.format.compact.groups import (
     ENTROPY_MODEL_COUNT,
     MAX_ABS_SYMBOL,
@@ -83,7 +83,7 @@ def test_without_reach_the_error_is_half_a_step_at_most(error: float) -> None:
 
     chosen = quantize_groups(values, groups, np.ones(5000), error**2, reach=0)
 
-    steps = step_of(best_steps(np.ones(1), error**2)) / ONE
+    steps = step_of(choose_step_codes(np.ones(1), error**2)) / ONE
     assert (np.abs(chosen.values - values) <= steps / 2 + np.abs(values) * 2**-23).all()
 
 
@@ -176,7 +176,7 @@ def test_groups_that_spread_alike_share_a_model() -> None:
 def test_bits_are_code_lengths_that_a_prefix_code_could_have(symbols: list[int], kinds: int, reach: int) -> None:
     classes = np.arange(len(symbols)) % kinds
 
-    bits, least = code_bits(np.array(symbols, np.int64), classes.astype(np.uint8), kinds, reach)
+    bits, least = estimate_code_bits(np.array(symbols, np.int64), classes.astype(np.uint8), kinds, reach)
 
     np.testing.assert_allclose((2.0**-bits).sum(axis=1), 1, rtol=1e-9)  # Kraft's sum
     assert bits.size <= kinds * 4096
@@ -188,7 +188,7 @@ def test_bits_are_code_lengths_that_a_prefix_code_could_have(symbols: list[int],
 def test_bits_are_what_the_shares_of_symbols_say() -> None:
     symbols, classes = np.array([0] * 700 + [1] * 200 + [-1] * 100), np.zeros(1000, np.uint8)
 
-    bits, least = code_bits(symbols, classes, 1, 1)
+    bits, least = estimate_code_bits(symbols, classes, 1, 1)
 
     assert bits[0, -least] == pytest.approx(-math.log2(0.7), abs=0.01)
     assert bits[0, 1 - least] == pytest.approx(-math.log2(0.2), abs=0.01)
@@ -203,13 +203,13 @@ def test_the_cheapest_symbol_is_the_best_of_all_within_reach(data: st.DataObject
     values = nearest + np.array([offset for _, offset in pairs])
     reach, distortion = data.draw(st.integers(0, 4)), data.draw(st.floats(0, 2))
     classes = (np.arange(len(pairs)) % 2).astype(np.uint8)
-    bits, least = code_bits(nearest, classes, 2, reach)
+    bits, least = estimate_code_bits(nearest, classes, 2, reach)
 
     def cost(place: int, symbol: int) -> float:
         error = (symbol - values[place]) ** 2
         return error + 2 * math.log(2) * distortion * bits[classes[place], symbol - least]
 
-    chosen = cheapest(nearest, lambda symbols: (symbols - values) ** 2, classes, (bits, least), distortion, reach)
+    chosen = choose_symbols(nearest, lambda symbols: (symbols - values) ** 2, classes, (bits, least), distortion, reach)
 
     for place, symbol in enumerate(chosen.tolist()):
         candidates = range(nearest[place] - reach, nearest[place] + reach + 1)
@@ -225,10 +225,10 @@ def test_reach_never_costs_more_by_the_coders_own_measure(data: st.DataObject) -
     distortion = 10.0 ** data.draw(st.floats(-3, 2))
     near, far = (quantize_groups(values, groups, np.ones(len(values)), distortion, reach) for reach in (0, 1))
     models = far.models[groups.index]
-    bits, least = code_bits(near.symbols, models, ENTROPY_MODEL_COUNT, 1)
+    bits, least = estimate_code_bits(near.symbols, models, ENTROPY_MODEL_COUNT, 1)
 
     def cost(chosen: GroupSymbols) -> float:
-        steps = step_of(best_steps(np.ones(1), distortion)) / ONE
+        steps = step_of(choose_step_codes(np.ones(1), distortion)) / ONE
         error = ((chosen.symbols * steps - values) ** 2).sum()
         return error + 2 * math.log(2) * distortion * bits[models, chosen.symbols - least].sum()
 

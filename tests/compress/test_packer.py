@@ -197,14 +197,16 @@ def test_pictures_that_are_off_by_more_or_less_than_was_asked_for_are_mended(off
     tried: list[float] = []
     packer = running.Packer(None, {}, None, None, 0, True, lambda sentence: None)
     monkeypatch.setattr(
-        packer, "attempt", lambda distortion, report: tried.append(distortion) or running.Trial(distortion, {})
+        packer,
+        "encode",
+        lambda distortion, report: tried.append(distortion) or running.EncodedCandidate(distortion, {}),
     )
-    monkeypatch.setattr(running.Packer, "decoded", lambda packer, trial: trial.data)
+    monkeypatch.setattr(running.Packer, "decode", lambda packer, trial: trial.data)
 
-    trial = packer.settled(1e-3, SimpleNamespace(error=off))
+    trial = packer.encode_to_distortion(1e-3, SimpleNamespace(measure_error=off))
 
     assert tried == pytest.approx(made)
-    assert trial.data == pytest.approx(taken) and trial.error == off(trial.data)
+    assert trial.data == pytest.approx(taken) and trial.measured_error == off(trial.data)
 
 
 @pytest.mark.parametrize(
@@ -222,32 +224,35 @@ def test_files_that_cost_training_photos_more_than_was_aimed_at_are_made_finer(l
     scene = SimpleNamespace(train=["a photo"])
     packer = running.Packer(None, {}, None, scene, 0, True, lambda sentence: None)
     monkeypatch.setattr(
-        packer, "attempt", lambda distortion, *_: tried.append(distortion) or running.Trial(distortion, {})
+        packer, "encode", lambda distortion, *_: tried.append(distortion) or running.EncodedCandidate(distortion, {})
     )
-    monkeypatch.setattr(running.Packer, "decoded", lambda packer, trial: trial.data)
+    monkeypatch.setattr(running.Packer, "decode", lambda packer, trial: trial.data)
     monkeypatch.setattr(
         running,
         "evaluate",
         lambda shown, views, report: SimpleNamespace(psnr=30.0 if shown is None else 30.0 - lost(shown)),
     )
 
-    trial = packer.settled(1e-3, SimpleNamespace(error=lambda distortion: distortion), 0.1)
+    trial = packer.encode_to_distortion(1e-3, SimpleNamespace(measure_error=lambda distortion: distortion), 0.1)
 
     assert tried == pytest.approx(made, rel=1e-3)
-    assert trial.data == trial.error == pytest.approx(taken, rel=1e-3)
+    assert trial.data == trial.measured_error == pytest.approx(taken, rel=1e-3)
 
 
 def test_photos_that_cannot_be_read_do_not_end_the_work(monkeypatch):
     said: list[str] = []
     packer = running.Packer(None, {}, None, SimpleNamespace(train=["a photo"]), 0, True, said.append)
-    monkeypatch.setattr(packer, "attempt", lambda distortion, *_: running.Trial(distortion, {}))
-    monkeypatch.setattr(running.Packer, "decoded", lambda packer, trial: trial.data)
+    monkeypatch.setattr(packer, "encode", lambda distortion, *_: running.EncodedCandidate(distortion, {}))
+    monkeypatch.setattr(running.Packer, "decode", lambda packer, trial: trial.data)
 
     def fail(shown, views, report):
         raise HyrfError("a.png: the file is gone")
 
     monkeypatch.setattr(running, "evaluate", fail)
-    assert packer.settled(1e-3, SimpleNamespace(error=lambda distortion: distortion), 0.1).data == 1e-3
+    assert (
+        packer.encode_to_distortion(1e-3, SimpleNamespace(measure_error=lambda distortion: distortion), 0.1).data
+        == 1e-3
+    )
     assert said == ["a.png: the file is gone; the loss on training photos is not measured"]
 
 

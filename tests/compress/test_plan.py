@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from scenes import small_model
 
 from hyrfpack.compress.plan import (
-    ABOVE_MEAN,
-    BITS_OF_A_GAUSSIAN,
-    CLASS_WIDTH,
-    CLASSES,
+    CLASS_WIDTH_LOG2,
+    CLASSES_ABOVE_MEAN,
+    IMPORTANCE_CLASS_COUNT,
+    PRUNED_GAUSSIAN_BITS,
     color_basis,
     importance_classes,
     make_plan,
@@ -94,7 +94,7 @@ def test_sensitivities_and_classes_follow_the_gaussians_stored() -> None:
     plan = make_plan(model, sensitivity, 1e-4)
 
     assert 0 < len(plan.kept) < 300 and len(set(plan.kept.tolist())) == len(plan.kept)
-    of_stored = sensitivity.of(plan.kept)
+    of_stored = sensitivity.subset(plan.kept)
     for name in ("positions", "colors", "scales", "opacities"):
         np.testing.assert_array_equal(getattr(of_stored, name), getattr(sensitivity, name)[plan.kept])
     np.testing.assert_array_equal(plan.layers[0].points.classes, importance_classes(of_stored))
@@ -165,7 +165,7 @@ def test_a_plan_leaves_out_exactly_the_gaussians_that_cost_more_than_they_give()
     for n, (s, o) in enumerate(zip(sensitivity.opacities.tolist(), opacities, strict=True)):
         slope = max(o * (1 - o), 1e-4)  # of the opacity by its logit
         error_of_removal = s / slope**2 * o**2
-        assert (n in plan.kept) == (error_of_removal >= 2 * math.log(2) * 1e-4 / parameters * BITS_OF_A_GAUSSIAN)
+        assert (n in plan.kept) == (error_of_removal >= 2 * math.log(2) * 1e-4 / parameters * PRUNED_GAUSSIAN_BITS)
     assert 0 < len(plan.kept) < len(model)
 
 
@@ -186,14 +186,14 @@ def test_classes_fall_with_the_mean_sensitivity(rows: list[tuple[float, ...]]) -
 
     classes = importance_classes(sensitivity)
 
-    assert classes.dtype == np.uint8 and classes.max() < CLASSES
+    assert classes.dtype == np.uint8 and classes.max() < IMPORTANCE_CLASS_COUNT
     weights = np.array([3, 3, 1, 1]) / 8
     logs = (np.log2(rows) - np.log2(np.mean(rows, axis=0))) @ weights
     order = np.argsort(-logs)
     assert (np.diff(classes[order].astype(int))[np.diff(logs[order]) < -1e-9] >= 0).all()
     # Classes are equally wide in octaves, the mean lies in the middle of one, and the ends are open.
-    exact = ABOVE_MEAN - logs / CLASS_WIDTH
-    expected = np.clip(np.round(exact), 0, CLASSES - 1)
+    exact = CLASSES_ABOVE_MEAN - logs / CLASS_WIDTH_LOG2
+    expected = np.clip(np.round(exact), 0, IMPORTANCE_CLASS_COUNT - 1)
     unclear = np.abs(exact - np.floor(exact) - 0.5) < 1e-9
     np.testing.assert_array_equal(classes[~unclear], expected[~unclear])
 
@@ -204,7 +204,7 @@ def test_unseen_gaussians_are_in_the_last_class() -> None:
     with np.errstate(divide="ignore"):
         classes = importance_classes(Sensitivity(*[seen] * 5, {}))
 
-    assert (classes[:25] == CLASSES - 1).all() and (classes[25:] < CLASSES - 1).all()
+    assert (classes[:25] == IMPORTANCE_CLASS_COUNT - 1).all() and (classes[25:] < IMPORTANCE_CLASS_COUNT - 1).all()
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.floats(1e-12, 1e6)), max_size=30), st.floats(1e-16, 1.0))
@@ -215,7 +215,7 @@ def test_bits_make_the_lattice_as_fine_as_positions_matter(pairs: list[tuple[int
 
     bits = position_bits(sensitivity, classes, distortion)
 
-    for kind in range(CLASSES):
+    for kind in range(IMPORTANCE_CLASS_COUNT):
         members = [value for of, value in pairs if of == kind]
         if not members:
             assert bits[kind] == 1

@@ -15,7 +15,7 @@ from scenes import ball_points, ball_scene, ring, small_model
 
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.compress import compress
-from hyrfpack.compress.calibrate import calibrated
+from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.report import amplification, write_report
 from hyrfpack.compress.report_page import size_in_words
 from hyrfpack.errors import HyrfError
@@ -69,9 +69,9 @@ class Page(HTMLParser):
 def quick() -> Iterator[None]:
     """Here neither times need be fair nor sensitivities precise."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hyrfpack.compress.report.TURNS", 1)
+        patch.setattr("hyrfpack.compress.report.DECODE_TIMING_TURNS", 1)
         patch.setattr("hyrfpack.measure.timing.WARM_UP_SECONDS", 0.0)
-        patch.setattr("hyrfpack.compress.sensitivity.MOST", 24)
+        patch.setattr("hyrfpack.compress.sensitivity.MAX_SENSITIVITY_VIEWS", 24)
         yield
 
 
@@ -118,9 +118,9 @@ def test_what_packing_has_measured_is_not_measured_again(profile, measured, sour
 
     def spy(*args: object) -> object:
         asked.append(args)
-        return calibrated(*args)
+        return measure_calibrated_sensitivity(*args)
 
-    monkeypatch.setattr("hyrfpack.compress.report.calibrated", spy)
+    monkeypatch.setattr("hyrfpack.compress.report.measure_calibrated_sensitivity", spy)
     _, report, _ = reported(source, tmp_path, profile)
     assert len(asked) == measured
     assert (report.sensitivity is None) == bool(measured)

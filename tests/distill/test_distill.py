@@ -122,7 +122,7 @@ def test_interrupt_while_packing_leaves_the_file_that_was_there(
     target = tmp_path / "x.hyrf"
     target.write_bytes(b"before")
     monkeypatch.setattr(pack, "PACKED", 100.0)  # the first try will not do
-    monkeypatch.setattr(pack.Packer, "attempt", _interrupted_at_the_second(pack.Packer.attempt))
+    monkeypatch.setattr(pack.Packer, "encode", _interrupted_at_the_second(pack.Packer.encode))
     with pytest.raises(KeyboardInterrupt):
         distill_splats(ball(20), target, LITTLE)
     assert [path.name for path in tmp_path.iterdir()] == ["x.hyrf"]
@@ -153,7 +153,7 @@ def test_nothing_is_measured_or_drawn_twice_however_often_packing_is_tried(
 ) -> None:
     monkeypatch.setattr(pack, "_mse", lambda psnr: 2.0**-psnr)  # what packing adds seems to be very much
     measured = counting(monkeypatch, calibrate, "measure_sensitivity")
-    tried = counting(monkeypatch, pack.Packer, "attempt")
+    tried = counting(monkeypatch, pack.Packer, "encode")
     drawn = counting(monkeypatch, teacher, "photograph")
 
     distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, steps=12))

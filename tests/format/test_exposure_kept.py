@@ -17,7 +17,7 @@ from exposures import random_map, same_map
 from scenes import ball_points, small_model
 
 from hyrfpack.compress import plan
-from hyrfpack.compress.plan import follow
+from hyrfpack.compress.plan import replan_moved
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import decode_model, describe, load, repack, save
 from hyrfpack.format.container import MINOR_VERSION, read_container, write_container
@@ -45,7 +45,8 @@ def raw(tmp_path) -> Path:
 @pytest.fixture(scope="module")
 def in_layers() -> bytes:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plan, "LEAST_OF_LAYER", (1, 100))
+        patch.setattr(plan, "MIN_LAYER_GAUSSIANS", 1)
+        patch.setattr(plan, "MAX_LAYERS", 100)
         data = encode(exposed_model(600), "compact", prune=False)
     assert "POS1" in read_container(data)
     return data
@@ -89,7 +90,7 @@ def test_a_planned_model_keeps_its_map_also_after_its_gaussians_have_moved():
     planned = decided.apply(model)
 
     assert same_map(planned.exposure, EXPOSURE)
-    assert same_map(follow(decided, planned)[1].exposure, EXPOSURE)
+    assert same_map(replan_moved(decided, planned)[1].exposure, EXPOSURE)
 
 
 # --- files ---

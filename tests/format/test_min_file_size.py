@@ -10,7 +10,7 @@ from scenes import ball_scene
 
 from hyrfpack import compress
 from hyrfpack.cameras.capture import quantized_provenance
-from hyrfpack.compress.distortion import LIMITS
+from hyrfpack.compress.distortion import DISTORTION_RANGE
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.format.min_file_size import check_target_bytes, min_file_bytes
@@ -23,7 +23,7 @@ def tiny(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tiny")
     scene = ball_scene(6)
     train(scene, folder, TrainConfig(steps=3, max_gaussians=20), quiet=True)
-    compress(folder / "model.hyrf", folder / "small.hyrf", data=scene, distortion=LIMITS[1])
+    compress(folder / "model.hyrf", folder / "small.hyrf", data=scene, distortion=DISTORTION_RANGE[1])
     model, provenance = load_with_provenance(folder / "model.hyrf")
     return folder / "small.hyrf", quantized_provenance(provenance, model.config.frame.scale)
 

@@ -110,7 +110,8 @@ def test_files_in_layers_read_the_same(in_layers):
 @pytest.mark.parametrize("least", [None, 100], ids=["two layers", "many layers"])
 def test_the_start_of_a_file_in_layers_reads_the_same(in_layers, least, monkeypatch):
     if least:
-        monkeypatch.setattr(plan, "LEAST_OF_LAYER", (least, 100))
+        monkeypatch.setattr(plan, "MIN_LAYER_GAUSSIANS", least)
+        monkeypatch.setattr(plan, "MAX_LAYERS", 100)
         in_layers = encode(model_of(2000), "compact")
     entries = read_container(in_layers).entries
     base, top = entries["RTAB"].end, entries["OPA1"].end
@@ -229,7 +230,8 @@ def test_both_readers_bound_the_basis_alike(sign):
 def test_both_readers_refuse_the_same_damage(profile, monkeypatch):
     rng = np.random.default_rng(0)
     if profile == "compact in layers":
-        monkeypatch.setattr(plan, "LEAST_OF_LAYER", (1, 100))
+        monkeypatch.setattr(plan, "MIN_LAYER_GAUSSIANS", 1)
+        monkeypatch.setattr(plan, "MAX_LAYERS", 100)
     model = model_of(30)
     if profile.endswith("map"):
         model.exposure = random_map(2, 40)

@@ -48,7 +48,8 @@ def names(layer: int) -> list[str]:
 def compact_in_layers(model: HybridModel) -> bytes:
     """A file of profile "compact" with layers as small as can be."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plan, "LEAST_OF_LAYER", (1, 100))
+        patch.setattr(plan, "MIN_LAYER_GAUSSIANS", 1)
+        patch.setattr(plan, "MAX_LAYERS", 100)
         return encode(model, "compact", prune=False)
 
 

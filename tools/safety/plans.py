@@ -47,7 +47,8 @@ def drawn(
     model: HybridModel, distortion: float = DISTORTION, prune: bool = True, layered: bool = False
 ) -> QuantizedModel:
     """What `drawn_sensitivity` leads to; with `layered` in layers however few the Gaussians are."""
-    with patch.object(planning, "LEAST_OF_LAYER", (2, 100) if layered else planning.LEAST_OF_LAYER):
+    least, most = (2, 100) if layered else (planning.MIN_LAYER_GAUSSIANS, planning.MAX_LAYERS)
+    with patch.multiple(planning, MIN_LAYER_GAUSSIANS=least, MAX_LAYERS=most):
         return decide(model, drawn_sensitivity(model), distortion, prune)
 
 

@@ -19,10 +19,10 @@ from pathlib import Path
 
 import hyrfpack
 from hyrfpack.cameras.capture import quantized_provenance
-from hyrfpack.compress.calibrate import Originals, calibrate
+from hyrfpack.compress.calibrate import ReferenceRenders, calibrate
 from hyrfpack.compress.distortion import default_distortion
-from hyrfpack.compress.packer import Packer, Trial
-from hyrfpack.compress.search import coarsest
+from hyrfpack.compress.packer import EncodedCandidate, Packer
+from hyrfpack.compress.search import find_coarsest
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.codec import load_with_provenance
@@ -62,10 +62,15 @@ class Set:
         self.model, provenance = load_with_provenance(folder / "model.hyrf")
         self.provenance = quantized_provenance(provenance, self.model.config.frame.scale)
         self.raw = self.scores(self.model)
-        self.held_out = Originals.seen([view.camera for view in evenly_spaced(self.scene.test, HELD_OUT)], self.model)
+        self.held_out = ReferenceRenders.at_views(
+            [view.camera for view in evenly_spaced(self.scene.test, HELD_OUT)], self.model
+        )
         start = time.perf_counter()
         cameras = [view.camera for view in self.scene.train]
-        self.sensitivity, self.originals = measure_sensitivity(self.model, cameras), Originals.of(self.model, cameras)
+        self.sensitivity, self.originals = (
+            measure_sensitivity(self.model, cameras),
+            ReferenceRenders.of(self.model, cameras),
+        )
         self.measuring = time.perf_counter() - start
 
     def scores(self, model: HybridModel) -> tuple[float, float]:
@@ -73,13 +78,13 @@ class Set:
         scores = hyrfpack.evaluate(model, self.scene.test)
         return scores.psnr, scores.ssim
 
-    def made(self, data: bytes, distortion: float, start: float, trial: Trial | None = None) -> Made:
+    def made(self, data: bytes, distortion: float, start: float, candidate: EncodedCandidate | None = None) -> Made:
         seconds = time.perf_counter() - start
         model = decode_model(data)
         psnr, ssim = self.scores(model)
-        foretold = sum(trial.errors.values()) if trial else 0.0
+        foretold = sum(candidate.predicted_errors.values()) if candidate else 0.0
         losses = self.raw[0] - psnr, self.raw[1] - ssim
-        return Made(distortion, len(data), len(model), *losses, seconds, foretold, self.held_out.error(model))
+        return Made(distortion, len(data), len(model), *losses, seconds, foretold, self.held_out.measure_error(model))
 
     def paper(self) -> Made:
         start = time.perf_counter()
@@ -90,8 +95,8 @@ class Set:
         start = time.perf_counter()
         sensitivity = calibrate(self.model, self.sensitivity, self.originals, distortion)
         packer = Packer(self.model, self.provenance, sensitivity, self.scene, steps, True, lambda sentence: None)
-        trial = packer.attempt(distortion) if steps else packer.settled(distortion, self.originals)
-        return self.made(trial.data, distortion, start, trial)
+        candidate = packer.encode(distortion) if steps else packer.encode_to_distortion(distortion, self.originals)
+        return self.made(candidate.data, distortion, start, candidate)
 
     def measure(self, steps: int, matched: bool) -> dict:
         """The row of this set."""
@@ -104,7 +109,7 @@ class Set:
             return made.drop <= paper.drop and made.ssim_drop <= paper.ssim_drop
 
         if matched:
-            found = coarsest(self.compact, fits, distortion, 9, ENDS)
+            found = find_coarsest(self.compact, fits, distortion, 9, ENDS)
             row["matched"] = found and found[1]
         if steps:
             row["finetuned"] = self.compact(default_distortion(self.provenance, steps), steps)
