@@ -1,4 +1,4 @@
-"""Readers: a folder of posed photos, or a .zip of it -> Scene, one file a format."""
+"""Readers that turn a folder of posed photos, or a .zip of it, into a Scene; one module for each format."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from hyrfpack.data.archive import is_archive, naming_archives, unpacked
+from hyrfpack.data.archive import archive_paths_in_errors, is_archive, unpack
 from hyrfpack.data.cache import PictureCache
 from hyrfpack.data.folder import list_photos, list_raw_photos
 from hyrfpack.data.layouts import LAYOUTS
-from hyrfpack.data.places import find_set
-from hyrfpack.data.unusable import explain_no_photos, refuse_one_photo
+from hyrfpack.data.search import find_set
+from hyrfpack.data.unusable import explain_no_photos, raise_if_single_photo
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
 from hyrfpack.outputs import VIDEO_SUFFIXES
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
@@ -32,35 +32,35 @@ def load_scene(
     max_size: int = DEFAULT_MAX_SIZE,
     held_out: Collection[str] | None = None,
 ) -> Scene:
-    """Read posed photos; pictures are decoded later, one by one, by `View.load`.
+    """Read posed photos. Pictures are decoded later, one by one, by `View.load`.
 
     Args:
-        path: the folder, or a .zip (.r3d) of it, which is unpacked among the user's caches. Known layouts: COLMAP
+        path: the folder, or a .zip (.r3d) of it, which is unpacked into the user's cache folder. Known layouts: COLMAP
             (`sparse/0`, `sparse`, or `colmap/sparse/0`, binary or text, beside `images/`), Blender
             (`transforms_train.json`), nerfstudio and instant-ngp (`transforms.json`), LLFF (`poses_bounds.npy`),
             Metashape (cameras as .xml), Bundler (`bundle.out`), RealityScan (camera parameters as .csv), Polycam
-            (`keyframes/`) and Record3D (`metadata`). Where it holds no poses itself but one folder in it does, that is
-            read. Panoramas of the whole sphere become six photos.
-            Masks in `masks/` beside the photos are honoured (0 = ignored pixel).
-        test_every: hold out every n-th of the sorted names, beginning with the first; 0 holds out none.
-            A split of the set's own counts instead.
-        images: take the photos from this folder ("images_2"); intrinsics follow the size of its files.
-        layout: one of LAYOUTS, "colmap" or "nerfstudio" for instance; None takes the first of them that is there and
-            says so in `Scene.notes` when there was a choice.
-        model: name of the folder of a COLMAP model ("1" for `sparse/1`); None takes the one with the most photos and
-            says so in `Scene.notes` when there was a choice.
-        max_size: shrink photos with more pixels than this on the longer side to so many, as they are decoded; cameras
-            and masks follow. 0 keeps them as they are. `Scene.notes` says how many are shrunk.
-        held_out: names of the views to hold out, instead of `test_every` and of a split of the set's own.
+            (`keyframes/`) and Record3D (`metadata`). If the folder itself holds no poses but exactly one folder in it
+            does, that one is read. Panoramas of the whole sphere become six photos each.
+            Masks in `masks/` beside the photos are applied (0 = ignored pixel).
+        test_every: hold out every n-th view of the sorted names, beginning with the first; 0 holds out none.
+            If the dataset has its own split, that split is used instead.
+        images: take the photos from this folder ("images_2"); intrinsics are scaled to the size of its files.
+        layout: one of LAYOUTS, for instance "colmap" or "nerfstudio". None takes the first layout that is found;
+            `Scene.notes` names it if there are several.
+        model: name of the folder of a COLMAP model ("1" for `sparse/1`). None takes the model with the most photos;
+            `Scene.notes` names it if there are several.
+        max_size: shrink photos whose longer side has more pixels to this length when they are decoded; cameras and
+            masks are scaled with them. 0 keeps the stored size. `Scene.notes` states how many photos are shrunk.
+        held_out: names of the views to hold out, instead of `test_every` and of the dataset's own split.
 
     Returns:
-        The scene in the frame and units of its files.
+        The scene in the coordinate frame and units of its files.
 
     Raises:
-        HyrfNoPosesError: there are photos, or it is a video, and there are no poses.
-        HyrfDataError: the folder cannot be used, or `held_out` names no photo or all; one sentence says what, where,
-            and what to do.
-        ValueError: an unknown `layout`, a negative `test_every` or `max_size`.
+        HyrfNoPosesError: the path holds photos, or is a video, and there are no poses.
+        HyrfDataError: the folder cannot be used, or `held_out` names an unknown photo or all photos. The message says
+            what is wrong, where, and what to do.
+        ValueError: an unknown `layout`, or a negative `test_every` or `max_size`.
 
     Example:
         >>> import hyrfpack
@@ -76,21 +76,21 @@ def load_scene(
         raise ValueError(f"no layout '{layout}'; there are {', '.join(LAYOUTS)}")
     given = Path(path)
     notes: list[str] = []
-    top = _folder_of(given, notes)
+    top = _open_folder(given, notes)
     reading = {"test_every": test_every, "images": images, "layout": layout, "model": model, "max_size": max_size}
-    with naming_archives():
+    with archive_paths_in_errors():
         return _read(given, top, notes, reading, held_out)
 
 
 def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any], held_out: Collection[str] | None) -> Scene:
-    """`load_scene` of a folder.
+    """Read the scene in a folder, see `load_scene`.
 
     Args:
         given: the folder or archive that the user named.
-        top: the folder.
+        top: that folder, or the one that the archive was unpacked into.
         notes: sentences for the user so far.
-        reading: the other arguments of `load_scene`, but `held_out`.
-        held_out: as of `load_scene`.
+        reading: the arguments of `load_scene` except `path` and `held_out`.
+        held_out: as in `load_scene`.
     """
     layout, images, model = reading["layout"], reading["images"], reading["model"]
     folder, found = _find_set(top, layout, notes)
@@ -119,26 +119,29 @@ def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any], hel
     return replace(scene, files=files, reading={"path": os.path.abspath(given), **reading})
 
 
-def _folder_of(given: Path, notes: list[str]) -> Path:
-    """The folder that was given, or that the archive that was given is unpacked into, which a note says."""
-    if not os.path.exists(given):  # methods of Path raise where a name is too long
+def _open_folder(given: Path, notes: list[str]) -> Path:
+    """Return the folder that the user named, or unpack the archive that was named and return its folder with a note."""
+    if not os.path.exists(given):  # the methods of Path raise if a name is too long
         raise HyrfDataError(f"{given}: no such folder; check the path")
     if is_archive(given):
-        folder = unpacked(given)
+        folder = unpack(given)
         notes.append(f"{given.name} was unpacked into {folder}, where it is found again")
         return folder
     if not os.path.isdir(given):
         if given.suffix.lower() in VIDEO_SUFFIXES:
             raise HyrfNoPosesError(f"{given}: a video has no poses; {pose_commands(given)}")
-        refuse_one_photo(given)
+        raise_if_single_photo(given)
         raise HyrfDataError(f"{given}: a file, not a folder; give the folder that holds photos and poses, or its .zip")
     return given
 
 
 def _find_set(folder: Path, layout: str | None, notes: list[str]) -> tuple[Path, list[str]]:
-    """The folder itself, or the one in it that holds poses, which a note says; and the layouts that they are there as.
+    """Find the folder with poses, which is `folder` or the only one below it that has some.
 
-    Where a layout is asked for, one that holds poses of that layout.
+    If a layout is given, only poses of that layout count. A note is added if the folder is below `folder`.
+
+    Returns:
+        The folder, and the names of all layouts whose poses it holds.
     """
 
     def holds(folder: Path) -> bool:
@@ -152,26 +155,26 @@ def _find_set(folder: Path, layout: str | None, notes: list[str]) -> tuple[Path,
 
 
 def _layouts_in(folder: Path) -> list[str]:
-    """The layouts that a folder's poses are there as."""
-    return [name for name, reader in LAYOUTS.items() if reader.is_there(folder)]
+    """List the layouts whose poses a folder holds."""
+    return [name for name, reader in LAYOUTS.items() if reader.is_present(folder)]
 
 
 def _no_poses(given: Path, folder: Path, layout: str | None, other: bool) -> HyrfDataError:
-    """What is to be raised where no poses are found, or just others than those of the layout that was asked for."""
+    """Return the exception for a folder without poses, or without poses of the requested layout."""
     photos = [] if other or layout else list_photos(folder)
     if photos:
         return HyrfNoPosesError(f"{given}: no poses found for the {len(photos)} photos; {pose_commands(given)}")
     if not (other or layout) and list_raw_photos(folder):
         return HyrfDataError(explain_no_photos(given, folder))
-    marks = [LAYOUTS[layout].mark] if layout else [reader.mark for reader in LAYOUTS.values()]
+    files = [LAYOUTS[layout].files] if layout else [reader.files for reader in LAYOUTS.values()]
     kind = f"{layout} " if layout else ""
     return HyrfDataError(
-        f"{given}: no {kind}poses found (looked for {', '.join(marks)}); give the folder that holds them"
+        f"{given}: no {kind}poses found (looked for {', '.join(files)}); give the folder that holds them"
     )
 
 
 def pose_commands(path: str | os.PathLike[str]) -> str:
-    """The commands that photos or a video without poses want, in words for the end of a sentence.
+    """Name the commands that process photos or a video without poses, as the end of a sentence.
 
     Example:
         >>> pose_commands("a.mp4")

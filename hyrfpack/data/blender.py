@@ -1,23 +1,23 @@
-"""NeRF-synthetic sets: transforms_{train,val,test}.json beside folders of RGBA renders."""
+"""Read NeRF-synthetic datasets: transforms_{train,val,test}.json beside folders of RGBA renders."""
 
 from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
 
-from hyrfpack.data.assemble import Photo, check_found, make_scene
+from hyrfpack.data.assemble import Photo, make_scene, missing_photos_notes
 from hyrfpack.data.names import PictureIndex
 from hyrfpack.data.pictures import read_header
-from hyrfpack.data.transforms import focal_from_angle, number, pose_from_opengl, read_json
+from hyrfpack.data.transforms import finite_number, focal_from_angle, pose_from_opengl, read_transforms
 from hyrfpack.data.undistort import Lens
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Scene
 
 
 def read_blender(path: Path, *, test_every: int, max_size: int) -> Scene:
-    """Read a Blender-style set; the world is the file's (z up), pictures keep straight alpha.
+    """Read a Blender-style dataset. The world is that of the files (z up), and pictures keep straight alpha.
 
-    The set's own split counts: train, and test (val where there is no test). `test_every` is for sets with neither.
-    `max_size` is `load_scene`'s.
+    The dataset's own split is used: train, and test (val if there is no test). `test_every` applies to datasets with
+    neither. `max_size` is that of `load_scene`.
 
     Raises:
         HyrfDataError: a file is missing or cannot be used.
@@ -48,9 +48,10 @@ def read_blender(path: Path, *, test_every: int, max_size: int) -> Scene:
 
 
 def _read_split(path: Path, split: str, notes: list[str]) -> list[Photo]:
+    """Read the photos of one transforms file."""
     file = path / f"transforms_{split}.json"
-    content = read_json(file)
-    angle = number(content, "camera_angle_x", file)
+    content = read_transforms(file)
+    angle = finite_number(content, "camera_angle_x", file)
     if angle is None:
         raise HyrfDataError(f"{file}: has no 'camera_angle_x', so the focal length is unknown; add it")
     photos: list[Photo] = []
@@ -65,8 +66,8 @@ def _read_split(path: Path, split: str, notes: list[str]) -> list[Photo]:
         header = read_header(picture)
         focal = focal_from_angle(angle, header.width, file)
         lens = Lens(header.width, header.height, focal, focal, header.width / 2, header.height / 2)
-        name = index.name_of(picture, frame["file_path"])
+        name = index.photo_name(picture, frame["file_path"])
         photos.append(Photo(name, picture, header, lens, pose_from_opengl(frame, file)))
     notes += matches.notes
-    notes += check_found(path, photos, missing, file.name, matches.unclear)
+    notes += missing_photos_notes(path, photos, missing, file.name, matches.ambiguous)
     return photos

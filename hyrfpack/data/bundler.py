@@ -1,10 +1,10 @@
-"""Bundler's bundle.out (version 0.3), which many programs export, and the list of photos that belongs to it.
+"""Read Bundler's bundle.out (version 0.3), which many programs export, and its list of photos.
 
 After the line `# Bundle file v0.3` and the numbers of cameras and points, each camera has five lines: f k1 k2, three
-rows of R and t, with P = R X + t. It looks along -z, y is up, and the picture's middle is the principal point: with
+rows of R and t, with P = R X + t. It looks along -z, y is up, and the picture's centre is the principal point: with
 p = -P / P.z the pixel is f (1 + k1 |p|^2 + k2 |p|^4) p from there, y up. f = 0 marks a photo without a pose. Each point
-has three lines: position, colour (0 to 255) and where it was seen. Photos are in the order of the list. The size of the
-photos is not said, so smaller copies of them cannot be told from the photos themselves.
+has three lines: position, colour (0 to 255) and observations. Photos are in the order of the list. The file does not
+state the size of the photos, so that smaller copies cannot be distinguished from the photos themselves.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from pathlib import Path
 import numpy as np
 
 from hyrfpack.data.assemble import make_scene
-from hyrfpack.data.beside import Entry, listed_folder, photos_beside, picture_folder
-from hyrfpack.data.folder import times_smaller
-from hyrfpack.data.pictures import Header
-from hyrfpack.data.undistort import Lens, brown
+from hyrfpack.data.folder import downscale_factor
+from hyrfpack.data.pictures import PictureHeader
+from hyrfpack.data.sidecar_files import PoseEntry, find_listed_folder, find_listed_photos, find_picture_folder
+from hyrfpack.data.undistort import Lens, brown_coefficients
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Scene
 
-_MARK = b"# Bundle file v0.3"
-_LISTS = ("list.txt", "*.list.txt", "*list*.txt", "*.lst")
+_FILE_SIGNATURE = b"# Bundle file v0.3"
+_LIST_PATTERNS = ("list.txt", "*.list.txt", "*list*.txt", "*.lst")
 
 
 def find_bundle(path: Path) -> Path | None:
-    """The bundle file in a folder or in `bundle/` below it: bundle.out, or the first by name."""
+    """Find the bundle file in a folder or in `bundle/` below it: bundle.out, or the first by name."""
     for folder in (path, path / "bundle"):
         try:
             files = sorted(f for f in folder.iterdir() if f.suffix.lower() == ".out" and f.is_file() and _is_bundle(f))
@@ -40,7 +40,7 @@ def find_bundle(path: Path) -> Path | None:
 
 
 def read_bundler(path: Path, *, test_every: int, max_size: int) -> Scene:
-    """Read a bundle file, its list and the photos.
+    """Read a bundle file, its list of photos, and the headers of the photos.
 
     Args:
         path: the scene folder, with the photos in it or in `images/`.
@@ -58,7 +58,7 @@ def read_bundler(path: Path, *, test_every: int, max_size: int) -> Scene:
         raise HyrfDataError(
             f"{bundle}: holds {len(cameras)} cameras, but {listing.name} lists {len(names)} photos; export both again"
         )
-    entries: list[Entry] = []
+    entries: list[PoseEntry] = []
     for name, camera in zip(names, cameras, strict=True):
         focal, k1, k2 = camera[0]
         if focal == 0:
@@ -67,8 +67,8 @@ def read_bundler(path: Path, *, test_every: int, max_size: int) -> Scene:
         pose[:3, :3], pose[:3, 3] = camera[1:4], camera[4]
         pose[1:3] *= -1
         entries.append((name, partial(_lens, focal, k1, k2), pose))
-    folder = listed_folder(path, names) or _full_size(picture_folder(path, None))
-    photos, masks, notes = photos_beside(path, folder, entries, bundle.name)
+    folder = find_listed_folder(path, names) or _check_full_size(find_picture_folder(path, None))
+    photos, masks, notes = find_listed_photos(path, folder, entries, bundle.name)
     if len(entries) < len(names):
         notes.append(f"{len(names) - len(entries)} photos were never registered and were skipped")
     return make_scene(
@@ -85,9 +85,9 @@ def read_bundler(path: Path, *, test_every: int, max_size: int) -> Scene:
     )
 
 
-def _full_size(folder: Path) -> Path:
-    """The folder, which must not be one of smaller copies, unless the list says that those were posed."""
-    if times_smaller(folder.name):
+def _check_full_size(folder: Path) -> Path:
+    """Return the folder of the photos; raise HyrfDataError if its name is that of a folder of smaller copies."""
+    if downscale_factor(folder.name):
         raise HyrfDataError(
             f"{folder}: a Bundler file does not say how large its photos are, so copies of another size cannot be "
             "used; put the photos that were posed into images"
@@ -95,36 +95,36 @@ def _full_size(folder: Path) -> Path:
     return folder
 
 
-def _lens(focal: float, k1: float, k2: float, _: Path, header: Header) -> Lens:
+def _lens(focal: float, k1: float, k2: float, _: Path, header: PictureHeader) -> Lens:
     width, height = header.size
-    return Lens(width, height, focal, focal, width / 2, height / 2, "brown", brown(k1, k2))
+    return Lens(width, height, focal, focal, width / 2, height / 2, "brown", brown_coefficients(k1, k2))
 
 
 def _is_bundle(file: Path) -> bool:
     try:
         with file.open("rb") as stream:
-            return stream.read(len(_MARK)) == _MARK
+            return stream.read(len(_FILE_SIGNATURE)) == _FILE_SIGNATURE
     except OSError:
         return False
 
 
 def _read_list(path: Path, bundle: Path) -> tuple[list[str], Path]:
-    """The photos' names in the order of cameras, and the file that lists them."""
+    """Read the photos' names in the order of the cameras; also return the file that lists them."""
     folders = dict.fromkeys((bundle.parent, path))
-    lists = (file for folder in folders for pattern in _LISTS for file in sorted(folder.glob(pattern)))
+    lists = (file for folder in folders for pattern in _LIST_PATTERNS for file in sorted(folder.glob(pattern)))
     listing = next((file for file in lists if file.is_file()), None)
     if listing is None:
         raise HyrfDataError(
             f"{bundle}: the list of its photos is missing (looked for list.txt and *.lst beside it); export it, too"
         )
     lines = _text(listing).splitlines()
-    # Bundler's own lists say more of a photo behind its name: 0 and the focal length from EXIF.
+    # Lists that Bundler itself writes have 0 and the focal length from EXIF after each name.
     names = [re.sub(r"\s+0\s+[\d.eE+-]+$", "", line.strip()) for line in lines]
     return [name for name in names if name and not name.startswith("#")], listing
 
 
 def _read_bundle(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(N, 5, 3) rows of the cameras, (P, 3) points and (P, 3) colours in [0, 1]."""
+    """Read the (N, 5, 3) rows of the cameras, (P, 3) points and (P, 3) colours in [0, 1]."""
     lines = [line for line in _text(file).splitlines() if line.strip() and not line.startswith("#")]
     try:
         cameras, points = map(int, lines[0].split()[:2])
@@ -145,7 +145,7 @@ def _read_bundle(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _numbers(lines: list[str], file: Path) -> np.ndarray:
-    """(N, 3) float64 of lines with three numbers each."""
+    """Parse lines of three numbers each to (N, 3) float64."""
     try:
         rows = [tuple(map(float, line.split())) for line in lines]
     except ValueError:

@@ -1,4 +1,4 @@
-"""Decoded photos within a memory limit, and decoding ahead of need."""
+"""Cache decoded photos within a memory limit, and decode photos in advance."""
 
 from __future__ import annotations
 
@@ -14,28 +14,32 @@ from hyrfpack.scene import Picture, View
 
 
 class PictureCache:
-    """Keeps the pictures used last, up to a number of bytes. Safe to share between threads.
+    """A cache of the pictures used last, up to a number of bytes. Threads may share it.
 
     Attributes:
-        limit_bytes: the most it holds; a picture larger than that is decoded but not kept.
-        nbytes: what it holds now.
+        limit_bytes: size limit of the cache; a larger picture is decoded but not cached.
+        nbytes: current size of the cache in bytes.
     """
 
     def __init__(self, limit_bytes: int | None = None) -> None:
-        """Args: limit_bytes: None takes a quarter of the memory this process may use."""
+        """Create an empty cache.
+
+        Args:
+            limit_bytes: size limit; None takes a quarter of the memory that this process may use.
+        """
         self.limit_bytes = memory_bytes() // 4 if limit_bytes is None else limit_bytes
         self.nbytes = 0
         self._pictures: OrderedDict[Callable[[], Picture], Picture] = OrderedDict()
         self._lock = Lock()
 
     def get(self, view: View) -> Picture:
-        """The view's picture, decoded if it is not at hand. Raises what `view.load` raises."""
+        """Return the view's picture, and decode it if it is not cached. Raises what `view.load` raises."""
         with self._lock:
             picture = self._pictures.get(view.load)
             if picture is not None:
                 self._pictures.move_to_end(view.load)
                 return picture
-        # Decoded outside the lock: two threads may then decode the same photo, but none waits for another's.
+        # Decode outside the lock, so that no thread waits for another; two threads may decode the same photo.
         picture = view.load()
         with self._lock:
             if view.load not in self._pictures and picture.nbytes <= self.limit_bytes:
@@ -46,14 +50,16 @@ class PictureCache:
         return picture
 
     def stream(self, views: Iterable[View], depth: int = 4) -> Generator[tuple[View, Picture]]:
-        """Yield each view with its picture, decoding up to `depth` of them ahead in one thread.
+        """Yield each view with its picture, and decode the next pictures in another thread meanwhile.
+
+        Leaving the loop or closing the iterator ends the thread.
 
         Args:
-            views: in the order they are needed, may be endless; pulled in the caller's thread, `depth` ahead.
-            depth: pictures in flight, held beside the cache's limit.
+            views: views in the order of use; may be endless. The caller's thread takes them `depth` in advance.
+            depth: pictures that are decoded in advance; their memory is not part of the cache's limit.
 
         Raises:
-            What `View.load` raises, when its turn comes. Leaving the loop or closing the iterator ends the thread.
+            What `View.load` raises, when the picture's turn comes.
         """
         upcoming = iter(views)
         with ThreadPoolExecutor(1, thread_name_prefix="hyrfpack-photos") as executor:
@@ -70,7 +76,10 @@ class PictureCache:
 
 
 def memory_bytes() -> int:
-    """Memory this process may use: the machine's, or its container's if that is less; 8 GiB where neither tells."""
+    """Return the memory that this process may use: the machine's, or its container's limit if that is less.
+
+    It is 8 GiB if neither is known.
+    """
     try:
         total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, OSError, ValueError):

@@ -1,4 +1,4 @@
-"""COLMAP reconstructions (`sparse/0` and the like with cameras, images, points3D as .bin or .txt), read by pycolmap."""
+"""Read COLMAP reconstructions (cameras, images and points3D as .bin or .txt, usually in `sparse/0`) with pycolmap."""
 
 from __future__ import annotations
 
@@ -10,27 +10,30 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hyrfpack.data.assemble import Photo, check_found, make_scene
+from hyrfpack.data.assemble import Photo, make_scene, missing_photos_notes
 from hyrfpack.data.colmap_binary import check_binary_model
-from hyrfpack.data.colmap_tidy import names_in_text, tidied
-from hyrfpack.data.folder import times_smaller
-from hyrfpack.data.masks import mask_folder
+from hyrfpack.data.colmap_repair import read_image_names, readable_model
+from hyrfpack.data.folder import downscale_factor
+from hyrfpack.data.masks import find_mask_folder
 from hyrfpack.data.names import PictureIndex, safe_name
 from hyrfpack.data.pictures import read_header
-from hyrfpack.data.places import TABLES, find_photo_folder, find_workspace, folders_of
-from hyrfpack.data.points import read_ply
-from hyrfpack.data.undistort import Lens, brown
+from hyrfpack.data.points import read_ply_points
+from hyrfpack.data.search import COLMAP_TABLES, describe_subfolders, find_photo_folder, find_workspace
+from hyrfpack.data.undistort import Lens, brown_coefficients
 from hyrfpack.errors import HyrfDataError, needs_package, short_reason
 from hyrfpack.scene import Scene
 
 
 class _Image(NamedTuple):
-    """A registered photo as a model has it: `sees` are rows of its points, None where these are not its own."""
+    """A registered photo of a model.
+
+    `visible_points` are rows of the model's points, None if the points come from another file.
+    """
 
     name: str
     camera: int
     camera_from_world: np.ndarray
-    sees: np.ndarray | None
+    visible_points: np.ndarray | None
 
 
 def read_colmap(path: Path, *, test_every: int, images: str | None, model: str | None, max_size: int) -> Scene:
@@ -39,12 +42,12 @@ def read_colmap(path: Path, *, test_every: int, images: str | None, model: str |
     Args:
         path: the scene folder.
         test_every, max_size: see `load_scene`.
-        images: the folder of photos; None takes the one that `find_photo_folder` finds. Intrinsics follow the size of
-            the files in it.
-        model: name of the folder of the model; None takes the one with the most photos.
+        images: the folder of photos; None takes the one that `find_photo_folder` finds. Intrinsics are scaled to the
+            size of the files in it.
+        model: name of the folder of the model; None takes the model with the most photos.
 
     Returns:
-        The scene, in the frame and units of the model.
+        The scene, in the coordinate frame and units of the model.
 
     Raises:
         HyrfDataError: the model or the photos cannot be used.
@@ -54,12 +57,12 @@ def read_colmap(path: Path, *, test_every: int, images: str | None, model: str |
     cameras, posed, unposed, points, colors = _read_model(tables)
     names = [safe_name(image.name) for image in posed]
     folder = _photo_folder(path, base, images, names)
-    shown = Path(os.path.relpath(folder, path))  # which may lie elsewhere
+    relative_folder = Path(os.path.relpath(folder, path))  # may start with ".."
     if base not in (path, path / "colmap"):
         notes.append(f"poses were taken from {tables.relative_to(path)}")
-    if images is None and shown != Path("images"):
-        smaller = ", smaller copies that intrinsics are brought to the size of" if times_smaller(folder.name) else ""
-        notes.append(f"photos were taken from {'the folder itself' if folder == path else shown}{smaller}")
+    if images is None and relative_folder != Path("images"):
+        smaller = ", smaller copies that intrinsics are brought to the size of" if downscale_factor(folder.name) else ""
+        notes.append(f"photos were taken from {'the folder itself' if folder == path else relative_folder}{smaller}")
     if unposed:
         notes.append(f"{unposed} photos were never registered and were skipped")
     if not len(points):
@@ -73,12 +76,14 @@ def read_colmap(path: Path, *, test_every: int, images: str | None, model: str |
     for name, image in zip(names, posed, strict=True):
         file = matches.found.get(name)
         if file is None:
-            missing.append(str(PurePosixPath(shown) / name))
+            missing.append(str(PurePosixPath(relative_folder) / name))
             continue
         lens, pose = cameras[image.camera], image.camera_from_world
-        photos.append(Photo(pictures.name_of(file, name), file, read_header(file), lens, pose, sees=image.sees))
+        listed_name = pictures.photo_name(file, name)
+        visible = image.visible_points
+        photos.append(Photo(listed_name, file, read_header(file), lens, pose, visible_points=visible))
     notes += matches.notes
-    notes += check_found(path, photos, missing, str(tables.relative_to(path)), matches.unclear)
+    notes += missing_photos_notes(path, photos, missing, str(tables.relative_to(path)), matches.ambiguous)
     return make_scene(
         path,
         "colmap",
@@ -88,24 +93,25 @@ def read_colmap(path: Path, *, test_every: int, images: str | None, model: str |
         points=points,
         point_colors=colors,
         tables=sorted(file for file in tables.iterdir() if file.is_file()),
-        masks=mask_folder(path if folder == path else folder.parent, folder.name),
+        masks=find_mask_folder(path if folder == path else folder.parent, folder.name),
         notes=notes,
     )
 
 
 def _photo_folder(path: Path, base: Path, images: str | None, names: Sequence[str]) -> Path:
+    """Find the folder of the photos: `images` if it is given, otherwise one in the workspace or in the scene folder."""
     if images is not None:
-        there = next((place / images for place in (path, base) if os.path.isdir(place / images)), None)
-        if there is None:
-            raise HyrfDataError(f"{path}: no photo folder '{images}'; {folders_of(path)}")
-        return there
+        named = next((parent / images for parent in (path, base) if os.path.isdir(parent / images)), None)
+        if named is None:
+            raise HyrfDataError(f"{path}: no photo folder '{images}'; {describe_subfolders(path)}")
+        return named
     found = find_photo_folder(base) or find_photo_folder(path)
-    if found is None:  # several folders of photos: those of the cameras of a rig, where the names begin with them
-        found = next((place for place in (base, path) if any(os.path.isfile(place / name) for name in names)), None)
+    if found is None:  # the cameras of a rig have one folder each, and the listed names begin with these folders
+        found = next((parent for parent in (base, path) if any(os.path.isfile(parent / name) for name in names)), None)
     if found is None:
         raise HyrfDataError(
             f"{path}: no photo folder 'images' beside the COLMAP model, and no other that is clearly meant; "
-            f"{folders_of(path)}; name the one of the photos with `images`, or give the folder that holds both"
+            f"{describe_subfolders(path)}; name the one of the photos with `images`, or give the folder that holds both"
         )
     return found
 
@@ -116,7 +122,7 @@ def _choose_model(path: Path, models: Sequence[Path], name: str | None) -> tuple
         raise HyrfDataError(f"{path}: no COLMAP model in sparse or colmap/sparse; run the reconstruction first")
     if name is None and len(models) == 1:
         return models[0], []
-    sizes = {model: _registered(model) for model in models}
+    sizes = {model: _count_registered_photos(model) for model in models}
     there = ", ".join(f"{model.name} ({size} photos)" for model, size in sizes.items())
     chosen = max(models, key=lambda model: sizes[model])  # the first of the largest
     why = "with the most photos; `model` takes another"
@@ -128,8 +134,11 @@ def _choose_model(path: Path, models: Sequence[Path], name: str | None) -> tuple
     return chosen, [f"there are {len(models)} COLMAP models: {there}; {chosen.name} was taken, {why}"]
 
 
-def _registered(model: Path) -> int:
-    """How many photos a model says that it has posed; 0 where it does not, which reading it finds the reason for."""
+def _count_registered_photos(model: Path) -> int:
+    """Return the number of registered photos that a model states, 0 if it cannot be read.
+
+    Reading the model later reports why it cannot be read.
+    """
     try:
         if (model / "images.bin").is_file():
             with (model / "images.bin").open("rb") as table:
@@ -138,21 +147,21 @@ def _registered(model: Path) -> int:
         if stated is not None:
             return stated
         with (model / "images.txt").open(encoding="utf-8-sig", errors="replace") as lines:
-            return (sum(not line.startswith("#") for line in lines) + 1) // 2  # two lines a photo
+            return (sum(not line.startswith("#") for line in lines) + 1) // 2  # each photo has two lines
     except OSError:
         return 0
 
 
 def lens_from_colmap(model: str, width: int, height: int, params: np.ndarray) -> Lens:
-    """Translate a COLMAP camera.
+    """Convert a COLMAP camera to a lens.
 
     Args:
         model: COLMAP's name of the camera model.
-        width, height: pixels.
-        params: in COLMAP's order for that model.
+        width, height: picture size in pixels.
+        params: parameters in COLMAP's order for that model.
 
     Raises:
-        HyrfDataError: a model that is no perspective or fisheye polynomial.
+        HyrfDataError: the model is neither a perspective nor a fisheye polynomial.
     """
     p = [float(value) for value in params]
     match model:
@@ -161,9 +170,9 @@ def lens_from_colmap(model: str, width: int, height: int, params: np.ndarray) ->
         case "PINHOLE":
             return Lens(width, height, p[0], p[1], p[2], p[3])
         case "SIMPLE_RADIAL" | "RADIAL":
-            return Lens(width, height, p[0], p[0], p[1], p[2], "brown", brown(*p[3:]))
+            return Lens(width, height, p[0], p[0], p[1], p[2], "brown", brown_coefficients(*p[3:]))
         case "OPENCV" | "FULL_OPENCV":
-            return Lens(width, height, p[0], p[1], p[2], p[3], "brown", brown(*p[4:]))
+            return Lens(width, height, p[0], p[1], p[2], p[3], "brown", brown_coefficients(*p[4:]))
         case "SIMPLE_RADIAL_FISHEYE" | "RADIAL_FISHEYE":
             k1, k2 = (*p[3:], 0.0)[:2]
             return Lens(width, height, p[0], p[0], p[1], p[2], "fisheye", (k1, k2, 0.0, 0.0))
@@ -173,20 +182,20 @@ def lens_from_colmap(model: str, width: int, height: int, params: np.ndarray) ->
 
 
 def _read_model(model: Path) -> tuple[dict[int, Lens], list[_Image], int, np.ndarray, np.ndarray]:
-    """Cameras by id, the registered photos, the count of the others, points and their colours."""
+    """Read lenses by camera id, the registered photos, the number of other photos, points and their colours."""
     kind = _model_kind(model)
     if kind == ".bin":
         check_binary_model(model)
     with needs_package("pycolmap", f"{model}: reading COLMAP models"):
         import pycolmap
-    names = names_in_text(model / "images.txt") if kind == ".txt" else {}
+    names = read_image_names(model / "images.txt") if kind == ".txt" else {}
     try:
-        with tidied(model, kind) as folder:
+        with readable_model(model, kind) as folder:
             reconstruction = pycolmap.Reconstruction(str(folder))
         images = reconstruction.images
         ids = np.array(sorted(reconstruction.points3D), np.uint64)
         posed = [
-            _Image(names[key] if key in names else image.name, image.camera_id, _pose(image), _rows(image, ids))
+            _Image(names[key] if key in names else image.name, image.camera_id, _pose(image), _visible_rows(image, ids))
             for key, image in images.items()
             if image.has_pose
         ]
@@ -199,16 +208,16 @@ def _read_model(model: Path) -> tuple[dict[int, Lens], list[_Image], int, np.nda
         colors = np.array([point.color for point in table], np.float32).reshape(-1, 3) / 255
     except HyrfDataError as error:
         raise HyrfDataError(f"{model}: {error}") from error
-    except Exception as error:  # pycolmap hands on whatever its C++ checks throw.
+    except Exception as error:  # pycolmap raises what its C++ checks throw, of many types
         raise HyrfDataError(
             f"{model}: the model's tables do not fit together ({short_reason(error, 160)}); export it again"
         ) from error
     if kind == ".txt":
-        for name, count in zip(TABLES, (len(cameras), len(images), len(points)), strict=True):
+        for name, count in zip(COLMAP_TABLES, (len(cameras), len(images), len(points)), strict=True):
             _check_text_count(model / f"{name}.txt", count)
     if not len(points) and (model / "points3D.ply").is_file():
-        points, colors = read_ply(model / "points3D.ply")
-        posed = [image._replace(sees=None) for image in posed]
+        points, colors = read_ply_points(model / "points3D.ply")
+        posed = [image._replace(visible_points=None) for image in posed]
     unknown = next((image.name for image in posed if image.camera not in cameras), None)
     if unknown is not None:
         raise HyrfDataError(f"{model}: photo {unknown} has a camera that the model lacks; export the model again")
@@ -216,32 +225,36 @@ def _read_model(model: Path) -> tuple[dict[int, Lens], list[_Image], int, np.nda
 
 
 def _model_kind(model: Path) -> str:
-    """What the tables end in. Points may be missing: some programs write them as PLY, some leave them out."""
+    """Return the extension of a model's tables.
+
+    The table of points may be missing, because some programs write points as PLY or leave them out.
+    """
 
     def missing(kind: str) -> list[str]:
-        return [f"{table}{kind}" for table in TABLES[:2] if not (model / f"{table}{kind}").is_file()]
+        return [f"{table}{kind}" for table in COLMAP_TABLES[:2] if not (model / f"{table}{kind}").is_file()]
 
     for kind in (".bin", ".txt"):
         if not missing(kind):
             return kind
-    kind = ".bin" if any((model / f"{table}.bin").is_file() for table in TABLES) else ".txt"
+    kind = ".bin" if any((model / f"{table}.bin").is_file() for table in COLMAP_TABLES) else ".txt"
     raise HyrfDataError(f"{model / missing(kind)[0]}: missing; export the whole COLMAP model again")
 
 
-def _rows(image, ids: np.ndarray) -> np.ndarray:
-    """Where the points that a photo sees stand among the ascending ids of all."""
-    seen = np.array([point.point3D_id for point in image.get_observation_points2D()], np.uint64)
-    return np.searchsorted(ids, seen[np.isin(seen, ids)]).astype(np.int64)
+def _visible_rows(image, ids: np.ndarray) -> np.ndarray:
+    """Return the rows of a photo's points among the ascending ids of all points."""
+    visible_ids = np.array([point.point3D_id for point in image.get_observation_points2D()], np.uint64)
+    return np.searchsorted(ids, visible_ids[np.isin(visible_ids, ids)]).astype(np.int64)
 
 
 def _pose(image) -> np.ndarray:
+    """Return the (4, 4) camera_from_world of a pycolmap image."""
     pose = np.eye(4)
     pose[:3] = image.cam_from_world().matrix()
     return pose
 
 
 def _stated_count(file: Path) -> int | None:
-    """The number of entries that a text table states in a comment, None where it does not."""
+    """Read the number of entries that a text table states in a comment, None if it states none."""
     with file.open(encoding="utf-8", errors="replace") as lines:
         comments = "".join(
             line for line, _ in zip(lines, range(8), strict=False) if line.lstrip("\ufeff").startswith("#")
@@ -251,7 +264,7 @@ def _stated_count(file: Path) -> int | None:
 
 
 def _check_text_count(file: Path, count: int) -> None:
-    """The stated count is the one way to notice that lines are lost."""
+    """Check that a text table has as many entries as it states; otherwise lost lines would go unnoticed."""
     stated = _stated_count(file) if file.is_file() else None
     if stated is not None and stated != count:
         raise HyrfDataError(f"{file}: says {stated} entries but holds {count}; the file is truncated, export it again")

@@ -1,8 +1,8 @@
-"""Walks COLMAP's binary tables before pycolmap is let at them.
+"""Validate COLMAP's binary tables before pycolmap reads them.
 
-pycolmap trusts the counts in these files: a cut-off file gives silent zeros, a forged count an endless loop.
-The walk checks that every count fits the bytes that are there; little-endian throughout, layouts as COLMAP
-documents them (src/colmap/scene/reconstruction_io).
+pycolmap trusts the counts in these files: a truncated file is read as zeros without an error, and a forged count leads
+to an endless loop. This module checks that every count fits the size of the file. All numbers are little-endian, and
+the layouts are those that COLMAP documents (src/colmap/scene/reconstruction_io).
 """
 
 from __future__ import annotations
@@ -12,36 +12,49 @@ from pathlib import Path
 
 from hyrfpack.errors import HyrfDataError
 
-_U32 = struct.Struct("<I")
-_U64 = struct.Struct("<Q")
-_CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters as float64
+_U32_STRUCT = struct.Struct("<I")
+_U64_STRUCT = struct.Struct("<Q")
+_CAMERA_STRUCT = struct.Struct("<IiQQ")  # id, model, width, height; the parameters follow as float64
 _POSE_BYTES = 7 * 8
 _SENSOR_BYTES = 4 + 4
-_PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16}  # by COLMAP's model id
+_PARAMETER_COUNTS = {
+    0: 3,
+    1: 4,
+    2: 4,
+    3: 5,
+    4: 8,
+    5: 8,
+    6: 12,
+    7: 5,
+    8: 4,
+    9: 5,
+    10: 12,
+    11: 16,
+}  # keys are COLMAP's model ids
 
 
 def check_binary_model(model: Path) -> None:
     """Check the tables of a binary model (and its rigs and frames, if any).
 
     Raises:
-        HyrfDataError: a table ends early, goes on after its last record, or names an unknown camera model.
+        HyrfDataError: a table is truncated, has bytes after its last record, or names an unknown camera model.
     """
-    walks = {
-        "cameras.bin": _walk_cameras,
-        "images.bin": _walk_images,
-        "points3D.bin": _walk_points,
-        "rigs.bin": _walk_rigs,
-        "frames.bin": _walk_frames,
+    checks = {
+        "cameras.bin": _check_cameras,
+        "images.bin": _check_images,
+        "points3D.bin": _check_points,
+        "rigs.bin": _check_rigs,
+        "frames.bin": _check_frames,
     }
-    for name, walk in walks.items():
+    for name, check in checks.items():
         if (model / name).is_file():
-            table = _Table(model / name)
-            walk(table)
+            table = _TableReader(model / name)
+            check(table)
             table.finish()
 
 
-class _Table:
-    """A file read front to back; a step past the end is a HyrfDataError."""
+class _TableReader:
+    """Reads a file from front to back; reading past the end raises HyrfDataError."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -49,68 +62,72 @@ class _Table:
             self.data = path.read_bytes()
         except OSError as error:
             raise HyrfDataError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-        self.at = 0
+        self.offset = 0
 
     def skip(self, size: int) -> int:
-        """Step over `size` bytes and return where they start."""
-        start, self.at = self.at, self.at + size
-        if self.at > len(self.data):
+        """Skip `size` bytes and return the offset at which they start."""
+        start, self.offset = self.offset, self.offset + size
+        if self.offset > len(self.data):
             raise HyrfDataError(
                 f"{self.path}: the file ends after {len(self.data)} bytes, inside a record that goes on to "
-                f"{self.at}; it is truncated or damaged, export the model again"
+                f"{self.offset}; it is truncated or damaged, export the model again"
             )
         return start
 
     def read(self, layout: struct.Struct) -> tuple:
+        """Read one record."""
         return layout.unpack_from(self.data, self.skip(layout.size))
 
-    def count(self, layout: struct.Struct = _U64) -> range:
+    def read_count(self, layout: struct.Struct = _U64_STRUCT) -> range:
+        """Read the number of records that follow, as a range to iterate over."""
         return range(self.read(layout)[0])
 
     def skip_name(self) -> None:
-        end = self.data.find(b"\0", self.at)
-        name = self.data[self.at : end]
-        self.skip(end + 1 - self.at if end >= 0 else len(self.data) + 1 - self.at)
+        """Skip a zero-terminated name after a check that it is UTF-8."""
+        end = self.data.find(b"\0", self.offset)
+        name = self.data[self.offset : end]
+        self.skip(end + 1 - self.offset if end >= 0 else len(self.data) + 1 - self.offset)
         try:
             name.decode()
         except UnicodeDecodeError as error:
             raise HyrfDataError(f"{self.path}: a photo's name is not UTF-8 text; export the model again") from error
 
     def finish(self) -> None:
-        if self.at != len(self.data):
+        """Check that no bytes follow the last record."""
+        if self.offset != len(self.data):
             raise HyrfDataError(
-                f"{self.path}: {len(self.data) - self.at} bytes follow the last record that its count announces; "
+                f"{self.path}: {len(self.data) - self.offset} bytes follow the last record that its count announces; "
                 "it is damaged, export the model again"
             )
 
 
-def _walk_cameras(table: _Table) -> None:
-    for _ in table.count():
-        _, model, _, _ = table.read(_CAMERA)
-        if model not in _PARAMETERS:
+def _check_cameras(table: _TableReader) -> None:
+    for _ in table.read_count():
+        _, model, _, _ = table.read(_CAMERA_STRUCT)
+        if model not in _PARAMETER_COUNTS:
             raise HyrfDataError(
                 f"{table.path}: camera model number {model} is not supported; undistort the photos with COLMAP first"
             )
-        table.skip(8 * _PARAMETERS[model])
+        table.skip(8 * _PARAMETER_COUNTS[model])
 
 
-def _walk_images(table: _Table) -> None:
-    for _ in table.count():
+def _check_images(table: _TableReader) -> None:
+    for _ in table.read_count():
         table.skip(4 + _POSE_BYTES + 4)  # id, pose, camera
         table.skip_name()
-        table.skip(24 * table.read(_U64)[0])  # x, y, 3D point
+        table.skip(24 * table.read(_U64_STRUCT)[0])  # x, y, 3D point
 
 
-def _walk_points(table: _Table) -> None:
-    for _ in table.count():
+def _check_points(table: _TableReader) -> None:
+    for _ in table.read_count():
         table.skip(8 + 24 + 3 + 8)  # id, position, colour, error
-        table.skip(8 * table.read(_U64)[0])  # image, index of its 2D point
+        table.skip(8 * table.read(_U64_STRUCT)[0])  # image, index of its 2D point
 
 
-def _walk_rigs(table: _Table) -> None:
-    for _ in table.count():
+def _check_rigs(table: _TableReader) -> None:
+    for _ in table.read_count():
         table.skip(4)
-        sensors = table.count(_U32)
+        sensors = table.read_count(_U32_STRUCT)
         if sensors:
             table.skip(_SENSOR_BYTES)  # the reference sensor has no pose
         for _ in sensors[1:]:
@@ -119,7 +136,7 @@ def _walk_rigs(table: _Table) -> None:
             table.skip(_POSE_BYTES if has_pose else 0)
 
 
-def _walk_frames(table: _Table) -> None:
-    for _ in table.count():
+def _check_frames(table: _TableReader) -> None:
+    for _ in table.read_count():
         table.skip(4 + 4 + _POSE_BYTES)  # id, rig, pose
-        table.skip((_SENSOR_BYTES + 8) * table.read(_U32)[0])
+        table.skip((_SENSOR_BYTES + 8) * table.read(_U32_STRUCT)[0])

@@ -1,12 +1,12 @@
-"""Panoramas of the whole sphere (equirectangular): cut into square pinhole pictures, the faces of a cube.
+"""Cut panoramas of the whole sphere (equirectangular) into square pinhole pictures, the faces of a cube.
 
-A panorama's camera has the axes of all others, x right, y down, z forward, and forward is its middle. Its pixel (u, v)
-of W x H, H = W / 2, looks along
+A panorama's camera has the axes of every camera, x right, y down, z forward; the picture's centre looks forward. Pixel
+(u, v) of a W x H picture, H = W / 2, looks along
 
     longitude = 2 pi (u / W - 1/2) = atan2(x, z),   latitude = pi (v / H - 1/2) = atan2(y, sqrt(x^2 + z^2)),
 
-longitude to the right and latitude downwards. So nerfstudio (EQUIRECTANGULAR, in OpenGL axes) and Metashape (spherical)
-have it, too.
+with longitude to the right and latitude downwards. nerfstudio (EQUIRECTANGULAR, in OpenGL axes) and Metashape
+(spherical) use the same convention.
 """
 
 from __future__ import annotations
@@ -20,14 +20,21 @@ from pathlib import Path
 import numpy as np
 
 from hyrfpack.atomic import replace_file
-from hyrfpack.data.archive import given_path
-from hyrfpack.data.pictures import Header, read_header, read_mask, read_pixels, same_aspect, says_panorama
+from hyrfpack.data.archive import display_path
+from hyrfpack.data.pictures import (
+    PictureHeader,
+    has_same_aspect,
+    is_tagged_panorama,
+    read_header,
+    read_mask,
+    read_pixels,
+)
 from hyrfpack.data.undistort import Lens
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Picture
 
-_QUALITY = 95  # of JPEG files, colours in full
-_GLANCE = (256, 128)  # pixels that a picture is looked at with to tell whether it is a panorama
+_JPEG_QUALITY = 95
+_PREVIEW_SIZE_PIXELS = (256, 128)  # width and height at which `is_panorama` examines a picture
 
 
 @dataclass(frozen=True)
@@ -36,8 +43,8 @@ class Face:
 
     Attributes:
         name: front, right, back, left, up or down.
-        axes: the face's right, down and forward in the panorama's camera: the rows of the rotation that takes a
-            direction from there into the camera of the face.
+        axes: the face's right, down and forward axes in the panorama's camera. They are the rows of the rotation from
+            the panorama's camera to the face's camera.
     """
 
     name: str
@@ -45,7 +52,7 @@ class Face:
 
     @property
     def rotation(self) -> np.ndarray:
-        """(3, 3) face from panorama."""
+        """(3, 3) rotation from the panorama's camera to the face's camera."""
         return np.array(self.axes, np.float64)
 
 
@@ -54,7 +61,9 @@ FACES = (
     Face("right", ((0, 0, -1), (0, 1, 0), (1, 0, 0))),
     Face("back", ((-1, 0, 0), (0, 1, 0), (0, 0, -1))),
     Face("left", ((0, 0, 1), (0, 1, 0), (-1, 0, 0))),
-    Face("up", ((1, 0, 0), (0, 0, 1), (0, -1, 0))),  # the camera tilted up: what was in front is below
+    Face(
+        "up", ((1, 0, 0), (0, 0, 1), (0, -1, 0))
+    ),  # camera tilted up: what is in front appears below the face's centre
     Face("down", ((1, 0, 0), (0, 0, -1), (0, 1, 0))),
 )
 
@@ -65,9 +74,9 @@ class FaceFile:
 
     Attributes:
         path: the panorama.
-        stored: (width, height) of it.
-        face: which one.
-        size: pixels of each side of the face.
+        stored: (width, height) of the panorama in pixels.
+        face: the face to cut out.
+        size: side of the face in pixels.
         mask: the file of the panorama's mask, if any.
     """
 
@@ -80,12 +89,12 @@ class FaceFile:
     def __call__(self) -> Picture:
         rgb, alpha = read_pixels(self.path)
         if rgb.shape[1::-1] != self.stored:
-            shown = given_path(self.path)
+            shown = display_path(self.path)
             raise HyrfDataError(f"{shown}: the picture changed its size since the scene was read; read it again")
         mask = None
         if self.mask is not None:
             whole = read_mask(self.mask, *rgb.shape[:2])
-            row, column = _places(self.face, self.size, *whole.shape)
+            row, column = _source_coordinates(self.face, self.size, *whole.shape)
             mask = whole[
                 np.clip(np.rint(row), 0, len(whole) - 1).astype(int), np.rint(column).astype(int) % rgb.shape[1]
             ]
@@ -97,25 +106,30 @@ class FaceFile:
 
 
 def face_size(width: int) -> int:
-    """Pixels of a face's side at which its middle is as fine as a panorama `width` pixels wide: width / pi."""
+    """Return the side of a face in pixels, width / pi, at which its centre has the resolution of the panorama.
+
+    Args:
+        width: width of the panorama in pixels.
+    """
     return max(1, round(width / math.pi))
 
 
 def face_lens(size: int) -> Lens:
-    """The pinhole camera of a face of `size` x `size` pixels: 90 degrees both ways."""
+    """Return the pinhole lens of a face of `size` x `size` pixels, with fields of view of 90 degrees."""
     return Lens(size, size, size / 2, size / 2, size / 2, size / 2)
 
 
 def cut_face(panorama: np.ndarray, face: Face, size: int) -> np.ndarray:
-    """One face of a panorama as a pinhole picture.
+    """Cut one face out of a panorama as a pinhole picture.
 
-    The panorama is shrunk first where it is finer than the face (Lanczos, across its left and right edge), its rows
-    near the poles are averaged over as many columns as a pixel of the face covers, and then it is sampled (bilinear).
+    First, a panorama that is finer than the face is shrunk (Lanczos, wrapped at the left and right edges). Then its
+    rows near the poles are averaged over as many columns as a pixel of the face covers. Finally it is sampled
+    (bilinear).
 
     Args:
         panorama: (H, 2 H, C) uint8.
         face: one of FACES.
-        size: pixels of each side of the face.
+        size: side of the face in pixels.
 
     Returns:
         (size, size, C) uint8.
@@ -129,18 +143,18 @@ def cut_face(panorama: np.ndarray, face: Face, size: int) -> np.ndarray:
         >>> cut_face(sky, FACES[4], 32).shape
         (32, 32, 3)
     """
-    if not same_aspect(panorama.shape[1], panorama.shape[0], 2, 1):
+    if not has_same_aspect(panorama.shape[1], panorama.shape[0], 2, 1):
         raise ValueError(f"a panorama is twice as wide as high, not {panorama.shape[1]} x {panorama.shape[0]}")
-    panorama = _shrunk(panorama, max(2, 2 * round(size * math.pi / 2)))
+    panorama = _shrink(panorama, max(2, 2 * round(size * math.pi / 2)))
     if face.name in ("up", "down"):
-        panorama = _even_pole(panorama, 0 if face.name == "up" else 1, size)
+        panorama = _smooth_pole(panorama, 0 if face.name == "up" else 1, size)
     height, width = panorama.shape[:2]
-    row, column = _places(face, size, height, width)
+    row, column = _source_coordinates(face, size, height, width)
     top, left = np.floor(row).astype(np.intp), np.floor(column).astype(np.intp)
     a, b = (column - left)[..., None].astype(np.float32), (row - top)[..., None].astype(np.float32)
 
     def pixels(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        beyond = (rows < 0) | (rows >= height)  # a pole, behind which the other side comes
+        beyond = (rows < 0) | (rows >= height)  # beyond a pole, the opposite meridian continues
         return panorama[np.clip(rows, 0, height - 1), (columns + beyond * (width // 2)) % width]
 
     above = pixels(top, left) * (1 - a) + pixels(top, left + 1) * a
@@ -157,16 +171,16 @@ def cut_panorama(
 ) -> list[Path]:
     """Write the faces of a panorama as JPEG files, "pano_front.jpg" and so on, for structure-from-motion.
 
-    All have the one camera of `face_lens(size)`, and stand at one place: the rotations between them are those of FACES.
+    All faces share the lens `face_lens(size)` and the centre of projection; FACES gives the rotations between them.
 
     Args:
         path: the panorama.
-        folder: to write into; made if it is missing. Files of these names are replaced.
-        size: pixels of each side; None takes `face_size` of the panorama.
-        faces: which ones.
+        folder: folder to write into; created if it is missing. Existing files of these names are replaced.
+        size: side of each face in pixels; None takes `face_size` of the panorama.
+        faces: the faces to write.
 
     Returns:
-        The files, in the order of `faces`.
+        Paths of the files, in the order of `faces`.
 
     Raises:
         HyrfDataError: the file cannot be read, or is not twice as wide as high.
@@ -189,15 +203,19 @@ def cut_panorama(
         file = Path(folder, f"{path.stem}_{face.name}.jpg")
         picture = Image.fromarray(cut_face(rgb, face, size or face_size(width)))
         with replace_file(file) as temporary:
-            picture.save(temporary, "JPEG", quality=_QUALITY, subsampling=0)
+            picture.save(temporary, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
         written.append(file)
     return written
 
 
-def panorama_lens(path: Path, header: Header) -> Lens:
-    """The lens of a panorama that is to be cut. Raises HyrfDataError: it is not twice as wide as high."""
+def panorama_lens(path: Path, header: PictureHeader) -> Lens:
+    """Return the lens of a panorama, which `make_scene` cuts into faces.
+
+    Raises:
+        HyrfDataError: the picture is not twice as wide as high.
+    """
     width, height = header.size
-    if not same_aspect(width, height, 2, 1):
+    if not has_same_aspect(width, height, 2, 1):
         raise HyrfDataError(
             f"{path}: an equirectangular picture is twice as wide as high, but this one is {width} x {height}; use the "
             "whole panorama"
@@ -207,8 +225,10 @@ def panorama_lens(path: Path, header: Header) -> Lens:
 
 
 def is_panorama(path: str | os.PathLike[str]) -> bool:
-    """Whether a picture shows the whole sphere: it is twice as wide as high, and says so, or its left edge continues
-    its right one, and its first and its last row, which show one point each, have hardly more than one colour.
+    """Whether a picture is a panorama of the whole sphere.
+
+    It is one if it is twice as wide as high, and either its XMP data say so, or its content fits: the left edge
+    continues the right edge, and the first and the last row, which show one point each, have nearly uniform colour.
 
     Raises:
         HyrfDataError: the file is no picture.
@@ -219,22 +239,27 @@ def is_panorama(path: str | os.PathLike[str]) -> bool:
         False
     """
     header = read_header(Path(path))
-    if header.width != 2 * header.height or header.height < _GLANCE[1]:
+    if header.width != 2 * header.height or header.height < _PREVIEW_SIZE_PIXELS[1]:
         return False
-    if says_panorama(Path(path)):
+    if is_tagged_panorama(Path(path)):
         return True
-    rgb = read_pixels(Path(path), _GLANCE if header.size != _GLANCE else None)[0].astype(np.float32)
-    steps = np.abs(np.diff(rgb, axis=1)).mean(axis=(0, 2))  # between neighbouring columns
+    rgb = read_pixels(Path(path), _PREVIEW_SIZE_PIXELS if header.size != _PREVIEW_SIZE_PIXELS else None)[0].astype(
+        np.float32
+    )
+    steps = np.abs(np.diff(rgb, axis=1)).mean(axis=(0, 2))  # mean difference of neighbouring columns
     seam = np.abs(rgb[:, 0] - rgb[:, -1]).mean()
-    spread = rgb.std(axis=1).mean(axis=1)  # of the colours of each row
-    # A row at a pole shows what is within a degree of one point: little is left of the spread of other rows.
+    spread = rgb.std(axis=1).mean(axis=1)  # standard deviation of the colours in each row
+    # A row at a pole shows what is within a degree of one point, so its colours vary less than those of other rows.
     return bool(seam <= 1.5 * steps.mean() and max(spread[0], spread[-1]) <= max(0.5 * spread.max(), 2.0))
 
 
-def _places(face: Face, size: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column of a panorama, pixel centres at integers, that each pixel of a face sees: (size, size) each."""
-    along = ((np.arange(size) + 0.5) * (2 / size) - 1).astype(np.float32)  # good to a thousandth of a pixel
-    right, down = np.broadcast_arrays(along[None, :], along[:, None])
+def _source_coordinates(face: Face, size: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the (size, size) rows and (size, size) columns of the panorama that the pixels of a face show.
+
+    Pixel centres are at integers. float32 is accurate to a thousandth of a pixel.
+    """
+    tangents = ((np.arange(size) + 0.5) * (2 / size) - 1).astype(np.float32)
+    right, down = np.broadcast_arrays(tangents[None, :], tangents[:, None])
     x, y, z = np.moveaxis(
         np.stack((right, down, np.ones_like(right)), axis=-1) @ face.rotation.astype(np.float32), -1, 0
     )
@@ -243,14 +268,14 @@ def _places(face: Face, size: int, height: int, width: int) -> tuple[np.ndarray,
     return row, column
 
 
-def _shrunk(panorama: np.ndarray, width: int) -> np.ndarray:
-    """The panorama at most `width` pixels wide, filtered across the edge where it closes."""
+def _shrink(panorama: np.ndarray, width: int) -> np.ndarray:
+    """Shrink a panorama to at most `width` pixels in width, with a filter that wraps at the left and right edges."""
     from PIL import Image
 
     height, stored = panorama.shape[:2]
     if stored <= width:
         return panorama
-    margin = min(stored, 4 * -(-stored // width))  # a Lanczos filter reaches three pixels of the result
+    margin = min(stored, 4 * -(-stored // width))  # a Lanczos filter reaches three pixels of the result to each side
     padded = np.concatenate((panorama[:, -margin:], panorama, panorama[:, :margin]), axis=1)
     box = (margin, 0, margin + stored, height)
     parts = [Image.fromarray(padded[..., channel]) for channel in range(panorama.shape[2])]
@@ -258,9 +283,11 @@ def _shrunk(panorama: np.ndarray, width: int) -> np.ndarray:
     return np.stack([np.asarray(part) for part in shrunk], axis=-1)
 
 
-def _even_pole(panorama: np.ndarray, pole: int, size: int) -> np.ndarray:
-    """The panorama with rows near a pole (0 above, 1 below) averaged over the columns that a face's pixel covers:
-    W / (pi size cos(latitude)) of them."""
+def _smooth_pole(panorama: np.ndarray, pole: int, size: int) -> np.ndarray:
+    """Average rows near a pole (0 is above, 1 below) over the columns that a pixel of the face covers.
+
+    At a given latitude these are W / (pi size cos(latitude)) columns.
+    """
     panorama = panorama.copy()
     height, width = panorama.shape[:2]
     for distance in range(height // 3):

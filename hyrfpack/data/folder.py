@@ -1,4 +1,4 @@
-"""A folder of photos before anything is known of their poses: which files they are, and what their headers say."""
+"""List the photos in a folder and read their headers, without poses."""
 
 from __future__ import annotations
 
@@ -12,33 +12,43 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from hyrfpack.data.pictures import is_picture_name, opened, read_header, read_orientation
+from hyrfpack.data.pictures import is_picture_name, open_picture, read_header, read_orientation
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.outputs import RAW_PHOTO_SUFFIXES, StrPath
 
-# Folders of pictures that are no photos: masks, previews, what depth sensors and other programs leave.
-_NO_PHOTOS = re.compile(r"masks?(_.*)?|thumb(nail)?s?|depths?(_maps?)?|normals?|confidence", re.IGNORECASE)
-_HIDDEN = re.compile(r"\..*|__.*|@eadir", re.IGNORECASE)  # __MACOSX, and the previews of a Synology
-_SMALLER = re.compile(r"images_(\d{1,4})", re.IGNORECASE)  # copies of what is in images/
-_RESULT = re.compile(r"poses\.json|metrics\.json|.*\.hyrf")  # a folder that holds one of these is of our making
-_DIAGONAL_35MM = math.hypot(36, 24)  # mm; what equivalent focal lengths relate to (CIPA DCG-001)
-_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of EXIF's FocalPlaneResolutionUnit
-_MAKE, _MODEL, _EXIF = 0x010F, 0x0110, 0x8769
-_FOCAL, _FOCAL_35MM, _TAKEN, _SUBSECOND = 0x920A, 0xA405, 0x9003, 0x9291
-_PLANE_X, _PLANE_UNIT, _PIXELS_X, _PIXELS_Y = 0xA20E, 0xA210, 0xA002, 0xA003
+# Folders of pictures that are not photos: masks, previews, and output of depth sensors and other programs.
+_NON_PHOTO_FOLDER = re.compile(r"masks?(_.*)?|thumb(nail)?s?|depths?(_maps?)?|normals?|confidence", re.IGNORECASE)
+_HIDDEN_FOLDER = re.compile(r"\..*|__.*|@eadir", re.IGNORECASE)  # such as __MACOSX, and @eaDir of Synology
+_DOWNSCALED_FOLDER = re.compile(r"images_(\d{1,4})", re.IGNORECASE)  # smaller copies of the photos in images/
+_RESULT_FILE = re.compile(r"poses\.json|metrics\.json|.*\.hyrf")  # hyrfpack wrote a folder that holds one of these
+_FULL_FRAME_DIAGONAL_MM = math.hypot(36, 24)  # equivalent focal lengths refer to it (CIPA DCG-001)
+_MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # keys are values of EXIF's FocalPlaneResolutionUnit
+# Numbers of EXIF tags.
+_MAKE_TAG = 0x010F
+_MODEL_TAG = 0x0110
+_EXIF_IFD_TAG = 0x8769
+_FOCAL_LENGTH_TAG = 0x920A
+_FOCAL_LENGTH_35MM_TAG = 0xA405
+_DATETIME_ORIGINAL_TAG = 0x9003
+_SUBSEC_TIME_ORIGINAL_TAG = 0x9291
+_FOCAL_PLANE_X_RESOLUTION_TAG = 0xA20E
+_FOCAL_PLANE_RESOLUTION_UNIT_TAG = 0xA210
+_PIXEL_X_DIMENSION_TAG = 0xA002
+_PIXEL_Y_DIMENSION_TAG = 0xA003
 
 
 @dataclass(frozen=True)
 class PhotoFacts:
-    """What a photo's header says.
+    """Facts from a photo's header.
 
     Attributes:
         path: the file.
-        size: (width, height) in pixels of the upright picture.
-        orientation: EXIF's, 1 to 8; 1 is a picture that is stored upright, 5 to 8 one that is stored on its side.
-        focal: focal length in pixels of that picture, or None where the header does not tell.
-        device: "Apple iPhone 12"; "" where the header does not tell.
-        taken: seconds, by the camera's clock; only differences mean something. None where the header does not tell.
+        size: (width, height) of the upright picture in pixels.
+        orientation: EXIF orientation, 1 to 8; 1 means stored upright, 5 to 8 stored on its side.
+        focal: focal length in pixels of the upright picture; None if the header does not state it.
+        device: for instance "Apple iPhone 12"; "" if the header does not state it.
+        taken: time of capture in seconds by the camera's clock; only differences are meaningful. None if the header
+            does not state it.
     """
 
     path: Path
@@ -50,41 +60,42 @@ class PhotoFacts:
 
 
 def list_photos(folder: StrPath) -> list[Path]:
-    """The photos in a folder and the folders in it.
+    """List the photos in a folder and its subfolders.
 
-    Left out are hidden files, folders of masks, depth maps and thumbnails, the smaller copies in images_2, images_4
-    and so on beside images/, and folders in it that hold results of ours.
+    Hidden files, folders of masks, depth maps and thumbnails, the smaller copies in images_2, images_4 and so on
+    beside images/, and subfolders with results of hyrfpack are left out.
 
     Args:
-        folder: to look in. Links to folders are followed.
+        folder: the folder to search. Links to folders are followed.
 
     Returns:
-        Files with a picture's ending in any case, sorted by their paths below the folder; none is opened.
+        Files with the extension of a picture in any letter case, sorted by their paths below the folder. No file is
+        opened.
 
     Raises:
-        HyrfDataError: there is no such folder, or it cannot be read.
+        HyrfDataError: the folder does not exist or cannot be read.
 
     Example:
         >>> [path.name for path in list_photos("photos/bonsai")][:2]
         ['0000.png', '0001.png']
     """
-    return _listed(Path(folder), is_picture_name, photos=True)
+    return _list_files(Path(folder), is_picture_name, photos_only=True)
 
 
 def list_raw_photos(folder: StrPath) -> list[Path]:
-    """The raw files of cameras (.CR3, .NEF and so on) where `list_photos` looks for photos; they are never read.
+    """List the raw files of cameras (.CR3, .NEF and so on) in the folders that `list_photos` searches.
 
-    Args, order and errors are those of `list_photos`.
+    Raw files are never read. Args, order and errors are those of `list_photos`.
 
     Example:
         >>> list_raw_photos("photos/bonsai")
         []
     """
-    return _listed(Path(folder), is_raw_name, photos=True)
+    return _list_files(Path(folder), is_raw_name, photos_only=True)
 
 
 def list_pictures(folder: StrPath) -> list[Path]:
-    """All pictures in a folder and the folders in it, masks, previews and results among them; hidden ones are not.
+    """List all pictures in a folder and its subfolders, including masks, previews and results, without hidden ones.
 
     Args, order and errors are those of `list_photos`.
 
@@ -92,137 +103,146 @@ def list_pictures(folder: StrPath) -> list[Path]:
         >>> [path.name for path in list_pictures("photos/bonsai/images")][:2]
         ['0000.png', '0001.png']
     """
-    return _listed(Path(folder), is_picture_name, photos=False)
+    return _list_files(Path(folder), is_picture_name, photos_only=False)
 
 
 def is_raw_name(name: str) -> bool:
-    """Whether a file is called like a camera's raw photo, and is not hidden."""
+    """Whether a file name has the extension of a camera's raw photo and is not hidden."""
     return name.lower().endswith(RAW_PHOTO_SUFFIXES) and not name.startswith(".")
 
 
 def may_hold_photos(name: str) -> bool:
-    """Whether a folder of this name is looked into for photos: not if it is one of masks, previews or depth maps."""
-    return not (_HIDDEN.fullmatch(name) or _NO_PHOTOS.fullmatch(name))
+    """Whether a folder of this name is searched for photos, which folders of masks, previews and depth maps are not."""
+    return not (_HIDDEN_FOLDER.fullmatch(name) or _NON_PHOTO_FOLDER.fullmatch(name))
 
 
-def times_smaller(name: str) -> int:
-    """How many times smaller the photos in a folder of this name are: 4 for "images_4"; 0 if it is called otherwise."""
-    copy = _SMALLER.fullmatch(name)
-    return int(copy[1]) if copy else 0
+def downscale_factor(name: str) -> int:
+    """Return the factor by which a folder's photos are downscaled: 4 for the name "images_4", 0 for other names."""
+    match = _DOWNSCALED_FOLDER.fullmatch(name)
+    return int(match[1]) if match else 0
 
 
-def _listed(root: Path, is_wanted: Callable[[str], bool], photos: bool) -> list[Path]:
-    if not os.path.isdir(root):  # Path.is_dir raises where a name is too long
+def _list_files(root: Path, is_wanted: Callable[[str], bool], photos_only: bool) -> list[Path]:
+    """List the files below a folder whose names are wanted, sorted by their relative paths."""
+    if not os.path.isdir(root):  # Path.is_dir raises if a name is too long
         what = "is a file, not a folder of photos" if os.path.exists(root) else "there is no such folder"
         raise HyrfDataError(f"{root}: {what}; name the folder that holds the photos")
     try:
-        found = list(_pictures_below(root, set(), is_wanted, photos))
+        found = list(_walk_files(root, set(), is_wanted, photos_only))
     except OSError as error:
         raise HyrfDataError(f"{root}: the folder cannot be read ({error.strerror}); check its permissions") from error
     return sorted(found, key=lambda path: path.relative_to(root).as_posix())
 
 
-def _pictures_below(folder: Path, seen: set[str], is_wanted: Callable[[str], bool], photos: bool) -> Iterator[Path]:
-    """Files by their names, in no order; `seen` are the folders that were looked into, which none is twice.
+def _walk_files(folder: Path, visited: set[str], is_wanted: Callable[[str], bool], photos_only: bool) -> Iterator[Path]:
+    """Yield wanted files of a folder and its subfolders in no particular order.
 
     Args:
-        photos: leave out folders that hold no photos.
+        folder: the folder to search.
+        visited: real paths of the folders searched so far, each of which is searched once.
+        is_wanted: decides by a file's name.
+        photos_only: leave out folders that hold pictures other than photos.
     """
-    place = os.path.realpath(folder)
+    real_path = os.path.realpath(folder)
     with os.scandir(folder) as listing:
         entries = list(listing)
     names = {entry.name.casefold() for entry in entries}
-    if place in seen or (photos and seen and any(_RESULT.fullmatch(name) for name in names)):
+    if real_path in visited or (photos_only and visited and any(_RESULT_FILE.fullmatch(name) for name in names)):
         return
-    seen.add(place)
+    visited.add(real_path)
     folders = []
     for entry in entries:
         if entry.is_dir():
             folders.append(entry)
         elif is_wanted(entry.name) and entry.is_file():
             yield folder / entry.name
-    for entry in sorted(folders, key=lambda entry: (entry.is_symlink(), entry.name)):  # by their own names first
-        copies = times_smaller(entry.name) and "images" in names
-        if _HIDDEN.fullmatch(entry.name) or (photos and (copies or not may_hold_photos(entry.name))):
+    for entry in sorted(folders, key=lambda entry: (entry.is_symlink(), entry.name)):  # links last
+        is_downscaled = downscale_factor(entry.name) and "images" in names
+        if _HIDDEN_FOLDER.fullmatch(entry.name) or (photos_only and (is_downscaled or not may_hold_photos(entry.name))):
             continue
         with suppress(PermissionError):
-            yield from _pictures_below(folder / entry.name, seen, is_wanted, photos)
+            yield from _walk_files(folder / entry.name, visited, is_wanted, photos_only)
 
 
-def first_readable(photos: Iterable[StrPath]) -> PhotoFacts | None:
-    """The facts of the first photo whose header can be read; None where none can.
+def first_readable_photo(photos: Iterable[StrPath]) -> PhotoFacts | None:
+    """Return the facts of the first photo whose header can be read, None if no header can be read.
 
     Example:
-        >>> first_readable(["missing.jpg", "photos/bonsai/images/0000.png"]).size
+        >>> first_readable_photo(["missing.jpg", "photos/bonsai/images/0000.png"]).size
         (48, 48)
     """
     for photo in photos:
         with suppress(HyrfDataError):
-            return photo_facts(photo)
+            return read_photo_facts(photo)
     return None
 
 
-def photo_facts(path: StrPath) -> PhotoFacts:
-    """Read a photo's header: size, orientation, focal length, camera, time. No pixel is decoded.
+def read_photo_facts(path: StrPath) -> PhotoFacts:
+    """Read a photo's size, orientation, focal length, camera and time of capture from its header.
 
-    The focal length is EXIF's 35 mm equivalent, f = f35 / 43.27 mm * diagonal in pixels, or else the focal length in
-    mm times the pixels per mm of the sensor.
+    The focal length follows from EXIF's 35 mm equivalent, f = f35 / 43.27 mm * diagonal in pixels. Without that it is
+    the focal length in mm times the pixels per mm of the sensor. No pixel is decoded.
 
     Args:
-        path: of the photo.
-
-    Returns:
-        Its facts.
+        path: the photo.
 
     Raises:
         HyrfDataError: the file is missing, empty, or no picture that can be read.
 
     Example:
-        >>> photo_facts("photos/bonsai/images/0000.png").size
+        >>> read_photo_facts("photos/bonsai/images/0000.png").size
         (48, 48)
     """
     path = Path(path)
     orientation, header = read_orientation(path), read_header(path)
     upright = header.turned(orientation).size
-    with opened(path) as image:
+    with open_picture(path) as image:
         try:
             exif = image.getexif()
-            tags: dict[int, Any] = {**exif, **exif.get_ifd(_EXIF)}
-        except Exception:  # Pillow's parsers raise whatever damaged tags make of them; the picture is good without
+            tags: dict[int, Any] = {**exif, **exif.get_ifd(_EXIF_IFD_TAG)}
+        except (
+            Exception
+        ):  # damaged tags make Pillow raise many types of exceptions, and the picture is usable without tags
             tags = {}
-    return PhotoFacts(path, upright, orientation, _focal_in_pixels(tags, *header.size), _device(tags), _time(tags))
+    return PhotoFacts(
+        path, upright, orientation, _focal_in_pixels(tags, *header.size), _device_name(tags), _capture_time(tags)
+    )
 
 
 def _focal_in_pixels(tags: dict[int, Any], width: int, height: int) -> float | None:
-    equivalent, diagonal = _positive(tags.get(_FOCAL_35MM)), math.hypot(width, height)
+    """Work out the focal length in pixels from EXIF tags, None if they do not state it."""
+    equivalent, diagonal = _positive(tags.get(_FOCAL_LENGTH_35MM_TAG)), math.hypot(width, height)
     if equivalent:
-        return equivalent / _DIAGONAL_35MM * diagonal
-    focal, density = _positive(tags.get(_FOCAL)), _positive(tags.get(_PLANE_X))
-    unit = _UNIT_MM.get(tags.get(_PLANE_UNIT, 2))
+        return equivalent / _FULL_FRAME_DIAGONAL_MM * diagonal
+    focal, density = _positive(tags.get(_FOCAL_LENGTH_TAG)), _positive(tags.get(_FOCAL_PLANE_X_RESOLUTION_TAG))
+    unit = _MM_PER_RESOLUTION_UNIT.get(tags.get(_FOCAL_PLANE_RESOLUTION_UNIT_TAG, 2))
     if not (focal and density and unit):
         return None
-    # Those of the photo as it was taken: a copy may have been shrunk since.
-    taken_wide = max(_positive(tags.get(_PIXELS_X)), _positive(tags.get(_PIXELS_Y))) or max(width, height)
-    pixels = focal * density / unit * max(width, height) / taken_wide
-    return pixels if 0.1 < pixels / diagonal < 50 else None  # some cameras write densities of prints
+    # The density refers to the photo as it was taken, and this file may be a smaller copy.
+    dimensions = _positive(tags.get(_PIXEL_X_DIMENSION_TAG)), _positive(tags.get(_PIXEL_Y_DIMENSION_TAG))
+    original_side = max(dimensions) or max(width, height)
+    pixels = focal * density / unit * max(width, height) / original_side
+    return pixels if 0.1 < pixels / diagonal < 50 else None  # some cameras state the density of prints instead
 
 
 def _positive(value: Any) -> float:
-    """A tag as a positive number, or 0 where it is none."""
+    """Convert a tag to a positive finite number, or to 0 if it is none."""
     with suppress(TypeError, ValueError, ZeroDivisionError):
         number = float(value)
         return number if 0 < number < math.inf else 0.0
     return 0.0
 
 
-def _device(tags: dict[int, Any]) -> str:
-    make, model = (str(tags.get(tag) or "").replace("\0", "").strip() for tag in (_MAKE, _MODEL))
+def _device_name(tags: dict[int, Any]) -> str:
+    """Join the make and the model of a camera, without repeating the make."""
+    make, model = (str(tags.get(tag) or "").replace("\0", "").strip() for tag in (_MAKE_TAG, _MODEL_TAG))
     return model if model.lower().startswith(make.lower()) else f"{make} {model}".strip()
 
 
-def _time(tags: dict[int, Any]) -> float | None:
+def _capture_time(tags: dict[int, Any]) -> float | None:
+    """Convert the time of capture to seconds, None if the tags do not state it."""
     with suppress(ValueError, OverflowError):
-        seconds = datetime.strptime(str(tags.get(_TAKEN)).strip("\0 "), "%Y:%m:%d %H:%M:%S").timestamp()
-        fraction = str(tags.get(_SUBSECOND) or "").strip("\0 ")
+        seconds = datetime.strptime(str(tags.get(_DATETIME_ORIGINAL_TAG)).strip("\0 "), "%Y:%m:%d %H:%M:%S").timestamp()
+        fraction = str(tags.get(_SUBSEC_TIME_ORIGINAL_TAG) or "").strip("\0 ")
         return seconds + (float(f"0.{fraction}") if fraction.isdecimal() else 0.0)
     return None

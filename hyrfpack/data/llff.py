@@ -1,8 +1,8 @@
-"""LLFF sets: poses_bounds.npy beside folders of photos.
+"""Read LLFF datasets: poses_bounds.npy beside folders of photos.
 
 Each row has 17 numbers: a 3 x 5 matrix, row by row, and the nearest and the farthest depth. Its first three columns are
 the camera's axes down, right and backwards in the world, the fourth its position, and the fifth the picture's height,
-width and focal length, all in pixels of the photos that were posed. Rows are in the order of the photos' names.
+width and focal length, all in pixels of the photos whose poses were estimated. Rows are sorted by the photos' names.
 """
 
 from __future__ import annotations
@@ -13,29 +13,29 @@ from pathlib import Path
 import numpy as np
 
 from hyrfpack.data.assemble import make_scene
-from hyrfpack.data.beside import Entry, photos_beside, picture_folder
 from hyrfpack.data.pictures import is_picture_name
-from hyrfpack.data.transforms import inverted
+from hyrfpack.data.sidecar_files import PoseEntry, find_listed_photos, find_picture_folder
+from hyrfpack.data.transforms import pose_from_camera_axes
 from hyrfpack.data.undistort import Lens
 from hyrfpack.errors import HyrfDataError, short_reason
 from hyrfpack.scene import Scene
 
-TABLE = "poses_bounds.npy"
+POSES_FILE = "poses_bounds.npy"
 
 
 def read_llff(path: Path, *, test_every: int, images: str | None, max_size: int) -> Scene:
-    """Read a folder with a poses_bounds.npy; there are no points.
+    """Read a folder with a poses_bounds.npy, which contains no points.
 
     Args:
         path: the scene folder.
         test_every, max_size: see `load_scene`.
-        images: the folder of photos; None takes the one that `picture_folder` finds.
+        images: the folder of photos; None takes the one that `find_picture_folder` finds.
 
     Raises:
         HyrfDataError: the table or the photos cannot be used, or they differ in number.
     """
-    rows = _read_table(path / TABLE)
-    folder, notes = picture_folder(path, images), []
+    rows = _read_table(path / POSES_FILE)
+    folder, notes = find_picture_folder(path, images), []
     if images is None and folder.name != "images":
         notes.append(f"photos were taken from {folder.name}")
     try:
@@ -44,35 +44,35 @@ def read_llff(path: Path, *, test_every: int, images: str | None, max_size: int)
         raise HyrfDataError(f"{folder}: the folder cannot be read ({error.strerror}); check its permissions") from error
     if len(names) != len(rows):
         raise HyrfDataError(
-            f"{path / TABLE}: holds the poses of {len(rows)} photos, but {folder.name} holds {len(names)}, and photos "
-            "are matched by their order; leave just those that were posed in that folder"
+            f"{path / POSES_FILE}: holds the poses of {len(rows)} photos, but {folder.name} holds {len(names)}, and "
+            "photos are matched by their order; leave just those that were posed in that folder"
         )
-    entries: list[Entry] = []
+    entries: list[PoseEntry] = []
     for name, row in zip(names, rows, strict=True):
         matrix = row[:15].reshape(3, 5)
         height, width, focal = matrix[:, 4]
         down, right, back = matrix[:, :3].T
         lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2)
-        entries.append((name, lens, inverted(np.stack((right, down, -back), 1), matrix[:, 3])))
-    photos, masks, found = photos_beside(path, folder, entries, TABLE)
+        entries.append((name, lens, pose_from_camera_axes(np.stack((right, down, -back), 1), matrix[:, 3])))
+    photos, masks, found = find_listed_photos(path, folder, entries, POSES_FILE)
     return make_scene(
         path,
         "llff",
         photos,
         test_every=test_every,
         max_size=max_size,
-        tables=[path / TABLE],
+        tables=[path / POSES_FILE],
         masks=masks,
         notes=notes + found,
     )
 
 
 def _read_table(file: Path) -> np.ndarray:
-    """(N, 17) float64, finite, N >= 1, with sizes of at least a pixel."""
+    """Read and check the (N, 17) float64 table: N >= 1, finite poses, and sizes of at least a pixel."""
     try:
-        # Mapped, so that a forged shape asks for no memory; no pickles.
+        # The file is mapped, so that a forged shape allocates no memory. Pickles are not allowed.
         table = np.load(file, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # numpy raises whatever the header makes it meet.
+    except Exception as error:  # a damaged header makes numpy raise exceptions of many types
         raise HyrfDataError(
             f"{file}: not a table that can be read ({short_reason(error)}); restore the file"
         ) from error

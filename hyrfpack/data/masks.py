@@ -1,4 +1,4 @@
-"""Masks beside photos: which is of which photo, and one that is of all."""
+"""Match mask files to photos, including one mask for all photos."""
 
 from __future__ import annotations
 
@@ -7,51 +7,55 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from hyrfpack.data.names import PictureIndex
-from hyrfpack.data.pictures import is_picture_name, read_header, same_aspect
+from hyrfpack.data.pictures import has_same_aspect, is_picture_name, read_header
 
 
 @dataclass(frozen=True)
-class Masks:
-    """Attributes:
-    of: photo's name -> file.
-    notes: sentences about masks of no photo, and about a mask for all.
+class MaskMatches:
+    """Masks that were found for photos.
+
+    Attributes:
+        by_photo: maps a photo's name to the file of its mask.
+        notes: sentences about masks that match no photo, and about a mask for all photos.
     """
 
-    of: dict[str, Path] = field(default_factory=dict)
+    by_photo: dict[str, Path] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
 
-def mask_folder(root: Path, picture_folder: str) -> Path:
-    """Where the masks of photos in a folder are: `masks/`, or "masks_2" for "images_2" if there is one."""
+def find_mask_folder(root: Path, picture_folder: str) -> Path:
+    """Return the folder of masks for a folder of photos: `masks/`, or "masks_2" for "images_2" if that exists."""
     suffix = picture_folder.removeprefix("images")
     return root / f"masks{suffix}" if suffix and (root / f"masks{suffix}").is_dir() else root / "masks"
 
 
-def find_masks(folder: Path, photos: Sequence[tuple[str, tuple[int, int]]], used: set[Path]) -> Masks:
-    """Masks by the names of their photos: the same, that with ".png" added or with another ending, and what else
-    `PictureIndex` knows to be the same; or the one mask there is for all photos.
+def find_masks(folder: Path, photos: Sequence[tuple[str, tuple[int, int]]], used: set[Path]) -> MaskMatches:
+    """Find the masks of photos by their names, or the only mask, which then applies to all photos.
+
+    A mask has its photo's name, with ".png" added, with another extension, or in another spelling that `PictureIndex`
+    accepts.
 
     Args:
-        folder: of masks; it may be missing, and one for all is then looked for beside it, called "mask".
-        photos: name and (width, height) of each photo that wants one.
+        folder: the folder of masks. If it does not exist, a file called "mask" beside it is the mask of all photos.
+        photos: name and (width, height) of each photo that needs a mask.
         used: masks that the poses name themselves.
     """
     index = PictureIndex(folder, photos=False)
-    stray = [file for file in index.files if file not in used]
+    unmatched = [file for file in index.files if file not in used]
     names = [name for name, _ in photos]
-    of = index.match(names).found if stray else {}
-    given = set(of.values())
-    stray = [file for file in stray if file not in given]
-    if of or used:
-        return Masks(of, _stray_notes(folder, stray, len(index.files), names))
-    for_all = stray
+    by_photo = index.match(names).found if unmatched else {}
+    matched = set(by_photo.values())
+    unmatched = [file for file in unmatched if file not in matched]
+    if by_photo or used:
+        return MaskMatches(by_photo, _unmatched_mask_notes(folder, unmatched, len(index.files), names))
+    for_all = unmatched
     if not folder.is_dir():
         for_all = [file for file in folder.parent.glob("[mM][aA][sS][kK].*") if is_picture_name(file.name)]
     if len(for_all) == 1 and len(photos) > 1:
         header, path = read_header(for_all[0]), for_all[0].relative_to(folder.parent)
-        if all(same_aspect(*header.size, *size) for _, size in photos):
-            return Masks(dict.fromkeys(names, for_all[0]), [f"{path} is the one mask and taken for all photos"])
-        return Masks(
+        if all(has_same_aspect(*header.size, *size) for _, size in photos):
+            return MaskMatches(dict.fromkeys(names, for_all[0]), [f"{path} is the one mask and taken for all photos"])
+        return MaskMatches(
             {},
             [
                 f"the mask {path} is {header.width} x {header.height}, which is not the shape of all photos, and is "
@@ -59,14 +63,15 @@ def find_masks(folder: Path, photos: Sequence[tuple[str, tuple[int, int]]], used
             ],
         )
     if not folder.is_dir() and (folder.parent / "mask").is_dir():
-        return Masks({}, [f"the folder mask is not read; masks belong into {folder.name}"])
-    return Masks({}, _stray_notes(folder, stray, len(index.files), names))
+        return MaskMatches({}, [f"the folder mask is not read; masks belong into {folder.name}"])
+    return MaskMatches({}, _unmatched_mask_notes(folder, unmatched, len(index.files), names))
 
 
-def _stray_notes(folder: Path, stray: list[Path], count: int, names: list[str]) -> list[str]:
-    if not stray:
+def _unmatched_mask_notes(folder: Path, unmatched: list[Path], count: int, names: list[str]) -> list[str]:
+    """Return a note about masks that match no photo, in a list that is empty if there are none."""
+    if not unmatched:
         return []
     return [
-        f"{len(stray)} of {count} masks in {folder.name} are of no posed photo, {stray[0].relative_to(folder)} first; "
-        f"masks are named as their photos{f', {names[0]} for one' if names else ''}"
+        f"{len(unmatched)} of {count} masks in {folder.name} are of no posed photo, {unmatched[0].relative_to(folder)} "
+        f"first; masks are named as their photos{f', {names[0]} for one' if names else ''}"
     ]

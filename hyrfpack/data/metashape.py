@@ -1,14 +1,14 @@
-"""Agisoft Metashape's cameras as XML ("Export Cameras"), beside the photos.
+"""Read Agisoft Metashape's cameras as XML ("Export Cameras"), beside the photos.
 
 A camera's `transform` is world_from_camera, row by row, in the frame of its component, with OpenCV's axes. A sensor's
-calibration has f, cx and cy from the middle of the picture, b1 and b2, in pixels, and k1 to k4, p1 and p2:
+calibration has f, cx and cy from the centre of the picture, b1 and b2, in pixels, and k1 to k4, p1 and p2:
 
     x = X / Z, y = Y / Z            (fisheye: times theta / r, theta = atan r)
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p1 (r^2 + 2 x^2) + 2 p2 x y,   y' with p1 and p2, x and y exchanged
     u = w / 2 + cx + x' (f + b1) + y' b2,   v = h / 2 + cy + y' f
 
-OpenCV's p1 is p2 here, and the other way round. A component (in older files the chunk) may have a rotation, a
-translation and a scale into the coordinates that points are exported in.
+OpenCV's p1 is Metashape's p2 and vice versa. A component (in older files the chunk) may have a rotation, a translation
+and a scale that lead to the coordinates of exported points.
 """
 
 from __future__ import annotations
@@ -23,46 +23,52 @@ from xml.etree import ElementTree
 import numpy as np
 
 from hyrfpack.data.assemble import make_scene
-from hyrfpack.data.beside import Entry, first_file, photos_beside, picture_folder, points_beside
 from hyrfpack.data.equirectangular import panorama_lens
-from hyrfpack.data.pictures import Header
-from hyrfpack.data.transforms import inverted
-from hyrfpack.data.undistort import Lens, brown
+from hyrfpack.data.pictures import PictureHeader
+from hyrfpack.data.sidecar_files import (
+    PoseEntry,
+    find_first_file,
+    find_listed_photos,
+    find_picture_folder,
+    read_sidecar_points,
+)
+from hyrfpack.data.transforms import pose_from_camera_axes
+from hyrfpack.data.undistort import Lens, brown_coefficients
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Scene
 
 Element = ElementTree.Element
 
-_FISHEYE = ("fisheye", "equidistant", "equidistant_fisheye")
-_PANORAMA = "spherical"
-_COEFFICIENTS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
-_FAR = 1e5  # units from the origin from which on a frame is the Earth's
+_FISHEYE_TYPES = ("fisheye", "equidistant", "equidistant_fisheye")
+_PANORAMA_TYPE = "spherical"
+_CALIBRATION_KEYS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+_MIN_GEOCENTRIC_COORDINATE = 1e5  # frames with a larger translation are placed on the Earth
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """The similarity x -> scale R x + t from a component to the world."""
+    """The similarity transform x -> scale R x + t from a component to the world."""
 
     rotation: np.ndarray
     translation: np.ndarray
     scale: float
 
 
-_NONE = _Frame(np.eye(3), np.zeros(3), 1.0)
+_IDENTITY_FRAME = _Frame(np.eye(3), np.zeros(3), 1.0)
 
 
 def find_metashape(path: Path) -> Path | None:
-    """The first file by name in a folder that holds Metashape's cameras."""
-    return first_file(path, ".xml", _is_ours)
+    """Find the first file by name in a folder that holds Metashape's cameras."""
+    return find_first_file(path, ".xml", _is_camera_file)
 
 
 def read_metashape(path: Path, *, test_every: int, images: str | None, max_size: int) -> Scene:
-    """Read cameras, and the points of a `.ply` file beside them that was exported in the same coordinates.
+    """Read cameras, and the points of a `.ply` file beside them if it has the same coordinates.
 
     Args:
         path: the scene folder.
         test_every, max_size: see `load_scene`.
-        images: the folder of photos; None takes the one that `picture_folder` finds.
+        images: the folder of photos; None takes the one that `find_picture_folder` finds.
 
     Raises:
         HyrfDataError: the cameras or the photos cannot be used.
@@ -73,13 +79,13 @@ def read_metashape(path: Path, *, test_every: int, images: str | None, max_size:
     chunk, notes = _choose_chunk(_parse(table), table)
     frame, component, frame_notes = _choose_frame(chunk, table)
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
-    entries: list[Entry] = []
-    lenses: dict[str | None, Lens | Callable[[Path, Header], Lens]] = {}
+    entries: list[PoseEntry] = []
+    lenses: dict[str | None, Lens | Callable[[Path, PictureHeader], Lens]] = {}
     unposed = 0
     for camera in _cameras(chunk):
         label, key = camera.get("label"), camera.get("sensor_id")
         transform = camera.findtext("transform")
-        if transform is None or not _belongs(camera, component):
+        if transform is None or not _is_in_component(camera, component):
             unposed += 1
             continue
         where = f"{table}: camera {(label or camera.get('id') or '')[:80]!r}"
@@ -93,12 +99,12 @@ def read_metashape(path: Path, *, test_every: int, images: str | None, max_size:
         with np.errstate(all="ignore"):
             axes = frame.rotation @ matrix[:3, :3]
             position = frame.scale * (frame.rotation @ matrix[:3, 3]) + frame.translation
-        entries.append((label, lenses[key], inverted(axes, position)))
-    photos, masks, found = photos_beside(path, picture_folder(path, images), entries, table.name)
+        entries.append((label, lenses[key], pose_from_camera_axes(axes, position)))
+    photos, masks, found = find_listed_photos(path, find_picture_folder(path, images), entries, table.name)
     notes += frame_notes + found
     if unposed:
         notes.append(f"{unposed} photos have no pose in the component that was taken and were skipped")
-    points, colors, tables = points_beside(path, photos, notes)
+    points, colors, tables = read_sidecar_points(path, photos, notes)
     return make_scene(
         path,
         "metashape",
@@ -113,7 +119,8 @@ def read_metashape(path: Path, *, test_every: int, images: str | None, max_size:
     )
 
 
-def _is_ours(file: Path) -> bool:
+def _is_camera_file(file: Path) -> bool:
+    """Whether a file starts like Metashape's XML."""
     try:
         with file.open("rb") as stream:
             head = stream.read(4096)
@@ -123,25 +130,26 @@ def _is_ours(file: Path) -> bool:
 
 
 def _parse(table: Path) -> Element:
+    """Parse an XML file that declares no entities."""
     try:
         data = table.read_bytes()
     except OSError as error:
         raise HyrfDataError(f"{table}: cannot be read ({error.strerror}); restore the file") from error
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # which can make gigabytes of a line
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # entities can expand a line to gigabytes
         raise HyrfDataError(f"{table}: declares entities, which Metashape does not; export the cameras again")
     try:
         return ElementTree.fromstring(data)
-    except Exception as error:  # of the parser, and of whatever encoding the file says it has
+    except Exception as error:  # raised by the parser, or by the codec of the encoding that the file declares
         raise HyrfDataError(f"{table}: not valid XML ({str(error)[:120]}); export the cameras again") from error
 
 
 def _cameras(chunk: Element) -> list[Element]:
-    """The cameras that are not switched off, those in groups, too."""
+    """List the enabled cameras, including those in groups."""
     return [camera for camera in chunk.iterfind("cameras//camera") if camera.get("enabled") not in ("false", "0")]
 
 
 def _choose_chunk(document: Element, table: Path) -> tuple[Element, list[str]]:
-    """The chunk with the most cameras that have a pose, and a note where there was a choice."""
+    """Select the chunk with the most posed cameras; also return a note if there are several chunks."""
     sizes = [(sum(c.find("transform") is not None for c in _cameras(chunk)), chunk) for chunk in document.iter("chunk")]
     most = max((size for size, _ in sizes), default=0)
     if not most:
@@ -152,14 +160,15 @@ def _choose_chunk(document: Element, table: Path) -> tuple[Element, list[str]]:
     return chosen, [f"there are {len(sizes)} chunks in {table.name}; the one with the most cameras, {most}, was taken"]
 
 
-def _belongs(camera: Element, component: str | None) -> bool:
+def _is_in_component(camera: Element, component: str | None) -> bool:
+    """Whether a camera belongs to a component, or the chunk has no components."""
     return component is None or camera.get("component_id") in (None, component)
 
 
 def _choose_frame(chunk: Element, table: Path) -> tuple[_Frame, str | None, list[str]]:
-    """The frame of the component with the most cameras, its id (None: all are in one frame), and notes.
+    """Select the component with the most cameras; return its frame, its id (None without components), and notes.
 
-    Coordinates of the Earth, where cameras stand millions of metres from the origin, are not applied.
+    Geocentric coordinates, in which cameras are millions of metres from the origin, are not applied.
     """
     ids = Counter(c.get("component_id") for c in _cameras(chunk) if c.find("transform") is not None)
     component = max((key for key in ids if key is not None), key=lambda key: ids[key], default=None)
@@ -169,7 +178,7 @@ def _choose_frame(chunk: Element, table: Path) -> tuple[_Frame, str | None, list
     elements = [c for c in chunk.iterfind("components/component") if c.get("id") == component]
     transform = next((e.find("transform") for e in (*elements, chunk) if e.find("transform") is not None), None)
     if transform is None or transform.find("rotation") is None:
-        return _NONE, component, notes
+        return _IDENTITY_FRAME, component, notes
     where = f"{table}: the transform of the {'component' if elements else 'chunk'}"
     frame = _Frame(
         _numbers(transform.findtext("rotation"), 9, where).reshape(3, 3),
@@ -178,23 +187,23 @@ def _choose_frame(chunk: Element, table: Path) -> tuple[_Frame, str | None, list
     )
     if not frame.scale > 0 or np.abs(frame.rotation @ frame.rotation.T - np.eye(3)).max() > 1e-3:
         raise HyrfDataError(f"{where} is no rotation with a positive scale; export the cameras again")
-    if np.abs(frame.translation).max() > _FAR:
+    if np.abs(frame.translation).max() > _MIN_GEOCENTRIC_COORDINATE:
         notes.append("the cameras are placed on the Earth; they were kept in the coordinates of their component")
-        return _NONE, component, notes
+        return _IDENTITY_FRAME, component, notes
     return frame, component, notes
 
 
-def _lens(sensor: Element, where: str) -> Lens | Callable[[Path, Header], Lens]:
-    """The lens of a sensor, or what makes it for panoramas."""
+def _lens(sensor: Element, where: str) -> Lens | Callable[[Path, PictureHeader], Lens]:
+    """Return the lens of a sensor, or for panoramas a function that returns it."""
     calibrations = {element.get("class"): element for element in sensor.iterfind("calibration")}
     calibration = calibrations.get("adjusted", next(iter(calibrations.values()), None))
     kind = (None if calibration is None else calibration.get("type")) or sensor.get("type") or "frame"
-    if kind == _PANORAMA:
+    if kind == _PANORAMA_TYPE:
         return panorama_lens
     if calibration is None:
         raise HyrfDataError(f"{where} has no calibration; align the photos, then export the cameras again")
-    values = dict.fromkeys(_COEFFICIENTS, 0.0)
-    for name in _COEFFICIENTS:
+    values = dict.fromkeys(_CALIBRATION_KEYS, 0.0)
+    for name in _CALIBRATION_KEYS:
         text = calibration.findtext(name)
         if text is not None:
             values[name] = float(_numbers(text, 1, where)[0])
@@ -208,19 +217,20 @@ def _lens(sensor: Element, where: str) -> Lens | Callable[[Path, Header], Lens]:
     if values["p3"] or values["p4"]:
         raise HyrfDataError(f"{where} has p3 or p4, which are not supported; calibrate without them, or undistort")
     if kind == "frame":
-        return replace(lens, model="brown", coefficients=brown(k[0], k[1], *p, k[2], 0, 0, 0, k[3]))
-    if kind in _FISHEYE:
+        return replace(lens, model="brown", coefficients=brown_coefficients(k[0], k[1], *p, k[2], 0, 0, 0, k[3]))
+    if kind in _FISHEYE_TYPES:
         return replace(lens, model="fisheye", coefficients=(*k, *p) if any(p) else tuple(k))
     raise HyrfDataError(f"{where} is of type {kind[:40]!r}, which is not supported; export undistorted photos instead")
 
 
 def _pixels(size: Element | None, side: str, where: str) -> int:
+    """Read a side of a resolution in whole pixels."""
     value = float(_numbers(None if size is None else size.get(side), 1, where)[0])
     return round(value)
 
 
 def _numbers(text: str | None, count: int, where: str) -> np.ndarray:
-    """(count,) finite float64 of a text."""
+    """Parse a text of `count` finite numbers to float64."""
     try:
         values = [float(word) for word in (text or "").split()]
     except ValueError:

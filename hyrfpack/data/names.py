@@ -1,6 +1,6 @@
-"""Which file a listed photo is: other endings, other letter cases, other machines' folders, other spellings of accents.
+"""Match listed photo names to files with another extension, letter case, folder, or Unicode form.
 
-A name is matched by what is unambiguous and by nothing else: strictest rule first, one file for one name.
+Only unambiguous matches are accepted. The strictest rule is tried first, and each file matches at most one name.
 """
 
 from __future__ import annotations
@@ -18,51 +18,51 @@ from pathlib import Path
 from hyrfpack.data.folder import is_raw_name, list_photos, list_pictures
 from hyrfpack.outputs import PICTURE_SUFFIXES, READABLE_PICTURE_SUFFIXES
 
-_ENDING = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,4}$")  # what may be left out of a listed name; ".0001" is no ending
-_DRIVE = re.compile(r"[A-Za-z]:")
+_EXTENSION_PATTERN = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,4}$")  # does not match ".0001", which is part of a name
+_DRIVE_PATTERN = re.compile(r"[A-Za-z]:")
 Key = tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Matches:
-    """What a folder's files are to a list of names.
+class NameMatches:
+    """Files of a folder that match a list of names.
 
     Attributes:
-        folder: that was looked in.
-        found: name -> file; no two names have the same.
-        loose: names whose file is called otherwise.
-        unclear: names that more than one file, or whose file more than one name, would fit; not in `found`.
+        folder: the folder that was searched.
+        found: maps names to files; no two names have the same file.
+        inexact: names in `found` whose file has another name.
+        ambiguous: names not in `found` that fit several files, or whose file fits several names.
     """
 
     folder: Path
     found: dict[str, Path]
-    loose: list[str]
-    unclear: list[str]
+    inexact: list[str]
+    ambiguous: list[str]
 
     @property
     def notes(self) -> list[str]:
-        """Sentences for the user about what was matched loosely or not at all."""
+        """Sentences for the user about inexact and ambiguous matches."""
         notes = []
-        if self.loose:
-            first = self.loose[0]
+        if self.inexact:
+            first = self.inexact[0]
             file = Path(os.path.relpath(self.found[first], self.folder)).as_posix()
-            accents = " in another form of Unicode" if _composed(file) == _composed(first) else ""
+            accents = " in another form of Unicode" if _normalize_unicode(file) == _normalize_unicode(first) else ""
             notes.append(
-                f"{len(self.loose)} of {len(self.found)} photos are called otherwise than the poses say and were "
+                f"{len(self.inexact)} of {len(self.found)} photos are called otherwise than the poses say and were "
                 f"matched by what fits one file alone: {first} is {file}{accents}"
             )
-        if self.unclear:
+        if self.ambiguous:
             notes.append(
-                f"{len(self.unclear)} photos fit more than one file, or their file more than one name, and were not "
-                f"matched, {self.unclear[0]} first; name the files as the poses do"
+                f"{len(self.ambiguous)} photos fit more than one file, or their file more than one name, and were not "
+                f"matched, {self.ambiguous[0]} first; name the files as the poses do"
             )
         return notes
 
 
 class PictureIndex:
-    """The pictures below a folder, to be found by names that others gave them.
+    """An index of the pictures below a folder, which finds them by names from other programs or machines.
 
-    Nothing is read from the folder while names fit exactly; the first that does not has it walked, once.
+    The folder is listed once, when the first name does not match a path exactly.
 
     Example:
         >>> index = PictureIndex(Path("photos/bonsai/images"))
@@ -71,10 +71,11 @@ class PictureIndex:
     """
 
     def __init__(self, folder: Path, *, photos: bool = True) -> None:
-        """
+        """Create the index without reading the folder.
+
         Args:
-            folder: may be missing, which holds no picture then.
-            photos: leave out masks, thumbnails and what else `list_photos` does.
+            folder: the folder; one that does not exist has no pictures.
+            photos: leave out masks, thumbnails and other pictures, as `list_photos` does.
         """
         self.folder = folder
         self._photos = photos
@@ -87,21 +88,21 @@ class PictureIndex:
         return list_photos(self.folder) if self._photos else list_pictures(self.folder)
 
     def find(self, name: str) -> Path | None:
-        """The one file that a name stands for, None where there is none or more than one."""
+        """Find the file of a name, None if no file or more than one matches."""
         return self.match([name]).found.get(name)
 
-    def match(self, names: Iterable[str]) -> Matches:
-        """Find files for all names together, so that none is given away twice.
+    def match(self, names: Iterable[str]) -> NameMatches:
+        """Find the files of all names together, so that no file is matched twice.
 
-        In this order: the very path; the same path in other letter cases or another form of Unicode; that without its
-        ending; the name whose path ends in the file's path, or the other way round, and of several the longest.
+        These rules apply in order: the exact path; the same path in other letter cases or another Unicode form; the
+        path without its extension; a name that ends with the file's path or vice versa, the longest match first.
         """
-        open_names = list(dict.fromkeys(names))
-        found = {name: file for name in open_names if (file := self._exact(name)) is not None}
+        wanted_names = list(dict.fromkeys(names))
+        found = {name: file for name in wanted_names if (file := self._find_exact(name)) is not None}
         exact = set(found)
-        unclear: set[str] = set()
-        for rule in () if len(found) == len(open_names) else self._rules:
-            fits = {name: rule(name) for name in open_names if name not in found and name not in unclear}
+        ambiguous: set[str] = set()
+        for rule in () if len(found) == len(wanted_names) else self._rules:
+            fits = {name: rule(name) for name in wanted_names if name not in found and name not in ambiguous}
             taken = set(found.values())
             fits = {name: [file for file in files if file not in taken] for name, files in fits.items()}
             claims = Counter(file for files in fits.values() for file in files)
@@ -109,93 +110,99 @@ class PictureIndex:
                 if len(files) == 1 and claims[files[0]] == 1:
                     found[name] = files[0]
                 elif files:
-                    unclear.add(name)
-        loose = [name for name in open_names if name in found and name not in exact]
-        return Matches(self.folder, found, loose, [name for name in open_names if name in unclear])
+                    ambiguous.add(name)
+        inexact = [name for name in wanted_names if name in found and name not in exact]
+        return NameMatches(self.folder, found, inexact, [name for name in wanted_names if name in ambiguous])
 
-    def name_of(self, file: Path, listed: str) -> str:
-        """The name of a photo: its path below the folder, or what is safe of the listed one where it lies elsewhere."""
+    def photo_name(self, file: Path, listed: str) -> str:
+        """Return a photo's name: its path below the folder, or its listed name made safe if it lies elsewhere."""
         if file.is_relative_to(self.folder) and ".." not in file.relative_to(self.folder).parts:
             return file.relative_to(self.folder).as_posix()
         return safe_name(listed)
 
-    def _exact(self, name: str) -> Path | None:
+    def _find_exact(self, name: str) -> Path | None:
+        """Find the file of exactly this path; a name without the extension of a picture may lack it."""
         path = self.folder / name.replace("\\", "/")
-        if is_raw_name(path.name):  # a picture of another ending may be there that was exported from it
+        if is_raw_name(
+            path.name
+        ):  # raw files are not read; the rules may find a picture that was exported from this one
             return None
-        candidates = [path] if path.name.lower().endswith(PICTURE_SUFFIXES) else [path, *_with_endings(path)]
+        candidates = [path] if path.name.lower().endswith(PICTURE_SUFFIXES) else [path, *_with_extensions(path)]
         return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
 
     @cached_property
     def _rules(self) -> list[Callable[[str], list[Path]]]:
-        """From strict to loose; each gives the files that a name may stand for."""
-        whole, stems, ends = defaultdict(list), defaultdict(list), defaultdict(list)
+        """Matching rules, the strictest first; each returns the files that a name may refer to."""
+        paths, stems, suffixes = defaultdict(list), defaultdict(list), defaultdict(list)
         for file in self.files:
             key = _key(file.relative_to(self.folder).as_posix())
-            stem = _without_ending(key, READABLE_PICTURE_SUFFIXES)
-            whole[key].append(file)
+            stem = _without_extension(key, READABLE_PICTURE_SUFFIXES)
+            paths[key].append(file)
             stems[stem].append(file)
             for length in range(1, len(stem) + 1):
-                ends[stem[-length:]].append(file)
+                suffixes[stem[-length:]].append(file)
 
-        def by_end(key: Key) -> list[Path]:
-            """Files whose path the name ends, or else the file that ends the name, the longest first."""
+        def by_suffix(key: Key) -> list[Path]:
+            """Return the files whose path ends with the name, otherwise those with the longest path that ends it."""
             shorter = (stems[key[-length:]] for length in range(len(key) - 1, 0, -1) if key[-length:] in stems)
-            return ends.get(key) or next(shorter, [])
+            return suffixes.get(key) or next(shorter, [])
 
         return [
-            lambda name: whole.get(_key(name), []),
-            lambda name: stems.get(_key(name), []),  # "a.jpg" is "a.jpg.png"
-            lambda name: stems.get(_without_ending(_key(name)), []),
-            lambda name: by_end(_key(name)),
-            lambda name: by_end(_without_ending(_key(name))),
+            lambda name: paths.get(_key(name), []),
+            lambda name: stems.get(_key(name), []),  # "a.jpg" matches "a.jpg.png"
+            lambda name: stems.get(_without_extension(_key(name)), []),
+            lambda name: by_suffix(_key(name)),
+            lambda name: by_suffix(_without_extension(_key(name))),
         ]
 
 
 def safe_name(text: str) -> str:
-    """A photo's name as a relative path that stays below the folder it is joined to, from any system's paths."""
-    return "/".join(parts_of(text))
+    """Convert a listed name to a relative path that stays below the folder it is joined to."""
+    return "/".join(path_parts(text))
 
 
-def parts_of(name: str) -> tuple[str, ...]:
-    """The parts of a path as any system writes it, without a drive, root or steps upwards."""
+def path_parts(name: str) -> tuple[str, ...]:
+    """Split a path of any operating system into its parts, without a drive, a root, "." or ".."."""
     parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".", "..")]
-    return tuple(parts[1:] if parts and _DRIVE.fullmatch(parts[0]) else parts)
+    return tuple(parts[1:] if parts and _DRIVE_PATTERN.fullmatch(parts[0]) else parts)
 
 
-def nearest(name: str, files: Iterable[Path]) -> Path | None:
-    """The file whose name is most like that of a photo, None where there is none."""
-    called = {_folded(file.name): file for file in files}
+def find_similar_name(name: str, files: Iterable[Path]) -> Path | None:
+    """Find the file whose name is most similar to a photo's, None if there are no files."""
+    by_name = {_fold_case(file.name): file for file in files}
     key = _key(name)
-    close = get_close_matches(key[-1], called, 1, cutoff=0) if key else []
-    return called[close[0]] if close else None
+    close = get_close_matches(key[-1], by_name, 1, cutoff=0) if key else []
+    return by_name[close[0]] if close else None
 
 
 def _key(name: str) -> Key:
-    """What two spellings of one path share: NFC, letter case folded."""
-    return tuple(_folded(part) for part in parts_of(name))
+    """Return the parts of a path with letter case folded and in Unicode form NFC, to compare spellings."""
+    return tuple(_fold_case(part) for part in path_parts(name))
 
 
-def _folded(text: str) -> str:
-    """In small letters and NFC, which folding may take apart again."""
-    return _composed(_composed(text).casefold())
+def _fold_case(text: str) -> str:
+    """Fold the letter case, and normalise to NFC before and after, because folding may decompose characters."""
+    return _normalize_unicode(_normalize_unicode(text).casefold())
 
 
-def _composed(text: str) -> str:
+def _normalize_unicode(text: str) -> str:
     return unicodedata.normalize("NFC", text)
 
 
-def _without_ending(key: Key, endings: tuple[str, ...] | None = None) -> Key:
-    """The key without the last part's ending: one of these, or whatever looks like one."""
+def _without_extension(key: Key, extensions: tuple[str, ...] | None = None) -> Key:
+    """Remove the extension of the last part: one of `extensions`, or anything that looks like an extension."""
     if not key:
         return key
     last = key[-1]
-    if endings is None:
-        stem = _ENDING.sub("", last)
+    if extensions is None:
+        stem = _EXTENSION_PATTERN.sub("", last)
     else:
-        stem = next((last[: -len(ending)] for ending in endings if last.endswith(ending)), last)
+        stem = next((last[: -len(extension)] for extension in extensions if last.endswith(extension)), last)
     return (*key[:-1], stem or last)
 
 
-def _with_endings(path: Path) -> list[Path]:
-    return [Path(f"{path}{ending}") for suffix in READABLE_PICTURE_SUFFIXES for ending in (suffix, suffix.upper())]
+def _with_extensions(path: Path) -> list[Path]:
+    """Append each extension of a readable picture to a path, in lower and in upper case."""
+    return [
+        Path(f"{path}{extension}") for suffix in READABLE_PICTURE_SUFFIXES for extension in (suffix, suffix.upper())
+    ]

@@ -1,4 +1,4 @@
-"""Points with colours out of PLY files, as photogrammetry writes them beside its poses."""
+"""Read points with colours from PLY files, which photogrammetry programs write beside poses."""
 
 from __future__ import annotations
 
@@ -9,15 +9,19 @@ import numpy as np
 from hyrfpack.errors import HyrfDataError, short_reason
 from hyrfpack.ply import read_elements, read_header, stack_columns
 
-_POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
-_GREY = 0.5
+_POSITION_PROPERTIES = ("x", "y", "z")
+_COLOR_PROPERTIES = ("red", "green", "blue")
+_DEFAULT_COLOR = 0.5
 
 
-def read_ply(ply: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(P, 3) positions and (P, 3) RGB in [0, 1], grey where the file has no colours.
+def read_ply_points(ply: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read the points of a PLY file.
+
+    Returns:
+        (P, 3) positions and (P, 3) RGB in [0, 1]; colours are grey if the file has none.
 
     Raises:
-        HyrfDataError: the file cannot be read, or holds fewer points than it says.
+        HyrfDataError: the file cannot be read, or holds fewer points than it states.
     """
     name = str(ply)
     try:
@@ -27,13 +31,13 @@ def read_ply(ply: Path) -> tuple[np.ndarray, np.ndarray]:
     header = read_header(data, name)
     vertex = header.elements.get("vertex")
     kinds = vertex.properties if vertex else {}
-    if not all(kinds.get(label) for label in _POSITION):
+    if not all(kinds.get(label) for label in _POSITION_PROPERTIES):
         raise HyrfDataError(f"{name}: it has no points, or no x, y and z of them; export them again")
     rows = read_elements(data, header, {"vertex"}, name)["vertex"]
-    points = stack_columns(rows, _POSITION).astype(np.float64)
-    if not all(kinds.get(label) for label in _COLOR):
-        return points, np.full_like(points, _GREY)
-    # The header tells what is full: rows in text come as float64, whatever they hold.
-    full = [1.0 if kinds[label][0] == "f" else np.iinfo(kinds[label]).max for label in _COLOR]
-    colors = stack_columns(rows, _COLOR).astype(np.float64) / full
+    points = stack_columns(rows, _POSITION_PROPERTIES).astype(np.float64)
+    if not all(kinds.get(label) for label in _COLOR_PROPERTIES):
+        return points, np.full_like(points, _DEFAULT_COLOR)
+    # The header gives the type of the values, because rows of text files are float64 in any case.
+    max_values = [1.0 if kinds[label][0] == "f" else np.iinfo(kinds[label]).max for label in _COLOR_PROPERTIES]
+    colors = stack_columns(rows, _COLOR_PROPERTIES).astype(np.float64) / max_values
     return points, np.clip(np.nan_to_num(colors), 0, 1)

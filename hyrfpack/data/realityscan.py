@@ -1,12 +1,12 @@
-"""RealityScan's (RealityCapture's) "Internal/External camera parameters": a .csv file beside the photos.
+"""Read RealityScan's (RealityCapture's) "Internal/External camera parameters": a .csv file beside the photos.
 
 The first line names the columns: #name, x, y, alt, heading, pitch, roll, f, px, py, k1 to k4, t1, t2. The world's axes
-are east, north and up. A camera with all three angles 0 looks down with its upper side to the north, and
+are east, north and up. A camera whose three angles are 0 looks down, with the top of its picture to the north, and
 
     world_from_camera = Rz(-heading) Rx(pitch) Ry(roll)    in OpenGL's axes (x right, y up, z backward).
 
-f is for a picture 36 wide on its longer side; px and py are parts of that side, from the middle. k1 to k4 are Brown's
-radial coefficients, as in `undistort`.
+f refers to a picture whose longer side is 36 mm; px and py are fractions of that side, from the centre. k1 to k4 are
+Brown's radial coefficients, as in `undistort`.
 """
 
 from __future__ import annotations
@@ -19,47 +19,55 @@ from pathlib import Path
 import numpy as np
 
 from hyrfpack.data.assemble import make_scene
-from hyrfpack.data.beside import Entry, first_file, photos_beside, picture_folder, points_beside
-from hyrfpack.data.pictures import Header
-from hyrfpack.data.transforms import inverted
-from hyrfpack.data.undistort import Lens, brown
+from hyrfpack.data.pictures import PictureHeader
+from hyrfpack.data.sidecar_files import (
+    PoseEntry,
+    find_first_file,
+    find_listed_photos,
+    find_picture_folder,
+    read_sidecar_points,
+)
+from hyrfpack.data.transforms import pose_from_camera_axes
+from hyrfpack.data.undistort import Lens, brown_coefficients
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Scene
 
-_POSE = ("x", "y", "alt", "heading", "pitch", "roll")
-_LENS = ("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
-_FILM = 36.0  # millimetres on the longer side that f is for
-_EARTH = (6.2e6, 6.5e6)  # metres from its centre to where people take photos, with a margin
-_INSTEAD = "export the registration as COLMAP, Bundler or NeRF transforms instead"
+_POSE_COLUMNS = ("x", "y", "alt", "heading", "pitch", "roll")
+_LENS_COLUMNS = ("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+_FILM_LONGER_SIDE_MM = 36.0
+# Distances from the Earth's centre at which photos are taken, with a margin.
+_MIN_GEOCENTRIC_RADIUS_METRES = 6.2e6
+_MAX_GEOCENTRIC_RADIUS_METRES = 6.5e6
+_EXPORT_ADVICE = "export the registration as COLMAP, Bundler or NeRF transforms instead"
 
 
 def find_realityscan(path: Path) -> Path | None:
-    """The first file by name in a folder that holds camera parameters."""
-    return first_file(path, ".csv", _is_ours)
+    """Find the first file by name in a folder that holds camera parameters."""
+    return find_first_file(path, ".csv", _is_parameter_file)
 
 
 def read_realityscan(path: Path, *, test_every: int, images: str | None, max_size: int) -> Scene:
-    """Read camera parameters, and the points of a `.ply` file beside them that was exported in the same coordinates.
+    """Read camera parameters, and the points of a `.ply` file beside them if it has the same coordinates.
 
     Args:
         path: the scene folder.
         test_every, max_size: see `load_scene`.
-        images: the folder of photos; None takes the one that `picture_folder` finds.
+        images: the folder of photos; None takes the one that `find_picture_folder` finds.
 
     Raises:
         HyrfDataError: the parameters or the photos cannot be used.
     """
     table = find_realityscan(path)
     if table is None:
-        raise HyrfDataError(f"{path}: no camera parameters of RealityScan (.csv); {_INSTEAD}")
+        raise HyrfDataError(f"{path}: no camera parameters of RealityScan (.csv); {_EXPORT_ADVICE}")
     names, values = _read_table(table)
-    poses = np.array([[row[column] for column in _POSE] for row in values])
+    poses = np.array([[row[column] for column in _POSE_COLUMNS] for row in values])
     _check_units(poses[:, :3], table)
-    entries: list[Entry] = []
+    entries: list[PoseEntry] = []
     for name, row, pose in zip(names, values, poses, strict=True):
         entries.append((name, partial(_lens, row), _pose(pose)))
-    photos, masks, notes = photos_beside(path, picture_folder(path, images), entries, table.name)
-    points, colors, tables = points_beside(path, photos, notes)
+    photos, masks, notes = find_listed_photos(path, find_picture_folder(path, images), entries, table.name)
+    points, colors, tables = read_sidecar_points(path, photos, notes)
     return make_scene(
         path,
         "realityscan",
@@ -74,28 +82,29 @@ def read_realityscan(path: Path, *, test_every: int, images: str | None, max_siz
     )
 
 
-def _is_ours(file: Path) -> bool:
+def _is_parameter_file(file: Path) -> bool:
+    """Whether the first line of a file names the columns of camera parameters."""
     try:
         with file.open("rb") as stream:
-            return _columns(stream.read(4096).decode("utf-8-sig", errors="replace").split("\n")[0]) is not None
+            return _parse_header(stream.read(4096).decode("utf-8-sig", errors="replace").split("\n")[0]) is not None
     except OSError:
         return False
 
 
-def _columns(header: str) -> list[str] | None:
-    """The names of the columns, None where a needed one is missing."""
+def _parse_header(header: str) -> list[str] | None:
+    """Return the names of the columns, None if a required one is missing."""
     columns = [name.strip().lstrip("#").lower() for name in header.strip().split(",")]
-    return columns if {"name", *_POSE, "f"} <= set(columns) else None
+    return columns if {"name", *_POSE_COLUMNS, "f"} <= set(columns) else None
 
 
 def _read_table(table: Path) -> tuple[list[str], list[dict[str, float]]]:
-    """The photos' names and what the table says of each; columns that are not there are 0."""
+    """Read the photos' names and the parameters of each; missing columns are 0."""
     try:
         text = table.read_bytes().decode("utf-8-sig", errors="replace")
     except OSError as error:
         raise HyrfDataError(f"{table}: cannot be read ({error.strerror}); restore the file") from error
     header, _, body = text.partition("\n")
-    columns = _columns(header) or []
+    columns = _parse_header(header) or []
     names, values = [], []
     try:
         rows = list(csv.reader(io.StringIO(body)))
@@ -104,9 +113,9 @@ def _read_table(table: Path) -> tuple[list[str], list[dict[str, float]]]:
     for number, row in enumerate(rows, 2):
         if not row or row[0].startswith("#"):
             continue
-        said = dict(zip(columns, row, strict=False))
+        cells = dict(zip(columns, row, strict=False))
         try:
-            line = {key: float(said.get(key) or 0.0) for key in (*_POSE, *_LENS)}
+            line = {key: float(cells.get(key) or 0.0) for key in (*_POSE_COLUMNS, *_LENS_COLUMNS)}
         except ValueError:
             line = {"f": np.nan}
         if len(row) < len(columns) or not np.isfinite(list(line.values())).all():
@@ -115,9 +124,9 @@ def _read_table(table: Path) -> tuple[list[str], list[dict[str, float]]]:
             )
         if line["t1"] or line["t2"]:
             raise HyrfDataError(
-                f"{table}: {said['name'][:80]!r} has tangential distortion, which is not read; {_INSTEAD}"
+                f"{table}: {cells['name'][:80]!r} has tangential distortion, which is not read; {_EXPORT_ADVICE}"
             )
-        names.append(said["name"].strip())
+        names.append(cells["name"].strip())
         values.append(line)
     if not names:
         raise HyrfDataError(f"{table}: lists no photo; align the photos, then export again")
@@ -125,10 +134,10 @@ def _read_table(table: Path) -> tuple[list[str], list[dict[str, float]]]:
 
 
 def _check_units(positions: np.ndarray, table: Path) -> None:
-    """Refuse positions in degrees, or from the centre of the Earth, for which the angles mean something else."""
+    """Raise HyrfDataError for geographic and geocentric positions, with which the angles have another meaning."""
     with np.errstate(all="ignore"):
         spread, middle = np.ptp(positions, axis=0), positions.mean(axis=0)
-        geocentric = _EARTH[0] < np.linalg.norm(middle) < _EARTH[1]
+        geocentric = _MIN_GEOCENTRIC_RADIUS_METRES < np.linalg.norm(middle) < _MAX_GEOCENTRIC_RADIUS_METRES
     across = max(spread[:2])
     degrees = abs(middle[0]) <= 180 and abs(middle[1]) <= 90 and np.hypot(*middle[:2]) > 100 * across
     if geocentric or (len(positions) > 1 and degrees and spread[2] > 100 * across):
@@ -139,19 +148,19 @@ def _check_units(positions: np.ndarray, table: Path) -> None:
 
 
 def _pose(pose: np.ndarray) -> np.ndarray:
-    """(4, 4) OpenCV camera_from_world of x, y, alt and heading, pitch, roll in degrees."""
+    """Return the (4, 4) OpenCV camera_from_world for x, y, alt, and heading, pitch, roll in degrees."""
     sines, cosines = np.sin(np.radians(pose[3:])), np.cos(np.radians(pose[3:]))
     (sh, sp, sr), (ch, cp, cr) = sines, cosines
     about_z = np.array([[ch, sh, 0], [-sh, ch, 0], [0, 0, 1]])
     about_x = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
     about_y = np.array([[cr, 0, sr], [0, 1, 0], [-sr, 0, cr]])
-    return inverted(about_z @ about_x @ about_y * (1, -1, -1), pose[:3])
+    return pose_from_camera_axes(about_z @ about_x @ about_y * (1, -1, -1), pose[:3])
 
 
-def _lens(row: dict[str, float], _: Path, header: Header) -> Lens:
+def _lens(row: dict[str, float], _: Path, header: PictureHeader) -> Lens:
     width, height = header.size
     side = max(width, height)
-    focal = row["f"] * side / _FILM
+    focal = row["f"] * side / _FILM_LONGER_SIDE_MM
     cx, cy = width / 2 + row["px"] * side, height / 2 + row["py"] * side
-    coefficients = brown(row["k1"], row["k2"], 0, 0, row["k3"], 0, 0, 0, row["k4"])
+    coefficients = brown_coefficients(row["k1"], row["k2"], 0, 0, row["k3"], 0, 0, 0, row["k4"])
     return Lens(width, height, focal, focal, cx, cy, "brown", coefficients)

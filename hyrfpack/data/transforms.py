@@ -1,4 +1,4 @@
-"""What the layouts that keep poses in JSON share: the file, its numbers, its poses."""
+"""Read JSON files of poses and their numbers, and convert poses from OpenGL axes; shared by several readers."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 from hyrfpack.errors import HyrfDataError
 
 
-def read_object(path: Path) -> dict[str, Any]:
+def read_json_object(path: Path) -> dict[str, Any]:
     """Read a JSON file that holds an object.
 
     Raises:
-        HyrfDataError: not to be read, not JSON, or not an object.
+        HyrfDataError: the file cannot be read, is not JSON, or does not hold an object.
     """
     try:
         content = json.loads(path.read_bytes())
@@ -29,30 +29,36 @@ def read_object(path: Path) -> dict[str, Any]:
     return content
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a transforms file and check that it has a list of frames, each with a path, which gets slashes.
+def read_transforms(path: Path) -> dict[str, Any]:
+    """Read a transforms file and check that it has a list of frames with paths.
+
+    Backslashes in `file_path` are replaced by forward slashes.
 
     Raises:
-        HyrfDataError: not to be read, not JSON, or without usable frames.
+        HyrfDataError: the file cannot be read, is not JSON, or has no usable frames.
     """
-    content = read_object(path)
+    content = read_json_object(path)
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise HyrfDataError(f"{path}: has no list of 'frames'; it is not a transforms file, or it is empty")
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise HyrfDataError(f"{path}: frame {index} has no 'file_path'; correct or remove the frame")
-        frame["file_path"] = slashed(frame["file_path"])
+        frame["file_path"] = with_forward_slashes(frame["file_path"])
     return content
 
 
-def slashed(path: str) -> str:
-    """A path of a file that may have been written on Windows: with slashes in place of backslashes."""
+def with_forward_slashes(path: str) -> str:
+    """Replace backslashes in a path, which a program on Windows may have written."""
     return path.replace("\\", "/")
 
 
-def number(entries: dict[str, Any], key: str, path: Path) -> float | None:
-    """The finite number under `key`, None where the key is absent."""
+def finite_number(entries: dict[str, Any], key: str, path: Path) -> float | None:
+    """Return the number under `key`, None if the key is absent.
+
+    Raises:
+        HyrfDataError: the value is not a finite number; the message names `path`.
+    """
     value = entries.get(key)
     if value is None:
         return None
@@ -62,8 +68,17 @@ def number(entries: dict[str, Any], key: str, path: Path) -> float | None:
 
 
 def focal_from_angle(angle: float, size: int, path: Path) -> float:
-    """Focal length in pixels of a picture `size` pixels wide that spans `angle` radians: size / (2 tan(angle / 2))."""
-    if not 0 < angle < math.pi or 0.5 * angle == 0:  # half of the smallest number is 0
+    """Convert a field of view to a focal length in pixels: size / (2 tan(angle / 2)).
+
+    Args:
+        angle: field of view in radians.
+        size: pixels that the field of view covers.
+        path: the file, for the error message.
+
+    Raises:
+        HyrfDataError: the angle is not between 0 and pi.
+    """
+    if not 0 < angle < math.pi or 0.5 * angle == 0:  # half of the smallest positive float is 0
         raise HyrfDataError(
             f"{path}: a field of view of {angle:g} radians is outside (0, pi); correct 'camera_angle_x'"
         )
@@ -71,8 +86,13 @@ def focal_from_angle(angle: float, size: int, path: Path) -> float:
 
 
 def pose_from_opengl(frame: dict[str, Any], path: Path) -> np.ndarray:
-    """(4, 4) OpenCV camera_from_world of a frame, whose `transform_matrix` is OpenGL's world_from_camera
-    (x right, y up, z backward)."""
+    """Return the (4, 4) OpenCV camera_from_world of a frame.
+
+    Its `transform_matrix` is a world_from_camera with OpenGL axes (x right, y up, z backward).
+
+    Raises:
+        HyrfDataError: the frame has no such matrix.
+    """
     try:
         matrix = np.array(frame["transform_matrix"], dtype=np.float64)
     except (KeyError, TypeError, ValueError, OverflowError):
@@ -82,18 +102,23 @@ def pose_from_opengl(frame: dict[str, Any], path: Path) -> np.ndarray:
             f"{path}: frame {frame['file_path'][:80]} has no 4 x 4 'transform_matrix' of numbers; correct or remove it"
         )
     with np.errstate(invalid="ignore", over="ignore"):
-        return inverted(matrix[:3, :3] * (1, -1, -1), matrix[:3, 3])
+        return pose_from_camera_axes(matrix[:3, :3] * (1, -1, -1), matrix[:3, 3])
 
 
-def inverted(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """(4, 4) camera_from_world of a camera with OpenCV axes in the columns of `rotation` that stands at `position`.
+def pose_from_camera_axes(axes: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return the (4, 4) camera_from_world of a camera from its axes and its position in the world.
 
-    Transposing inverts a rotation, if it is one: `make_scene` refuses a pose that is not.
+    The rotation is inverted by transposition, without a check that it is one. `make_scene` rejects poses that are not
+    rigid.
+
+    Args:
+        axes: (3, 3) matrix whose columns are the camera's OpenCV axes.
+        position: (3,) centre of projection.
     """
     pose = np.eye(4)
     with np.errstate(invalid="ignore", over="ignore"):
-        pose[:3, :3] = rotation.T
-        pose[:3, 3] = -rotation.T @ position
+        pose[:3, :3] = axes.T
+        pose[:3, 3] = -axes.T @ position
     return pose
 
 

@@ -1,8 +1,8 @@
-"""Lenses: what a calibrated camera does to a ray, and how to undo it in a photo.
+"""Lens distortion models, and the undistortion of photos.
 
-The forward distortion is all that is needed: each pixel of the undistorted picture looks up where its ray fell
-in the photo. The undistorted camera keeps the photo's size, focal lengths and principal point, so nothing is
-rescaled; its pixels whose rays fell outside the photo are masked out instead of being cropped or painted black.
+Undistortion needs only the forward distortion: each pixel of the undistorted picture takes its colour from the place in
+the photo where its ray was imaged. The undistorted camera keeps the photo's size, focal lengths and principal point, so
+that nothing is rescaled. Pixels whose rays fell outside the photo are masked out, not cropped or painted black.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from hyrfpack.scene import Picture
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics of a photo as it was taken.
+    """Intrinsics of a photo, including its lens distortion.
 
     Attributes:
         width, height: picture size in pixels.
         fx, fy, cx, cy: pinhole part, in pixels (pixel centres at .5).
         model: "pinhole" (no coefficients), "brown" (k1 k2 p1 p2 k3 k4 k5 k6, COLMAP's FULL_OPENCV, and a k7 where
-            there is one), "fisheye" (k1 k2 k3 k4 of the equidistant OPENCV_FISHEYE, and p1 p2 where there are any), or
+            there is one), "fisheye" (k1 k2 k3 k4 of the equidistant OPENCV_FISHEYE, and p1 p2 if there are any), or
             "equirectangular" (the whole sphere, which is cut into faces and never undistorted).
-        coefficients: as many as the model has, dimensionless.
-        skew: pixels that the picture is sheared to the right by for each unit of y'. What is undistorted has none.
+        coefficients: the coefficients of the model, dimensionless.
+        skew: shear of the picture to the right, in pixels for each unit of y'; undistorted pictures have none.
     """
 
     width: int
@@ -41,12 +41,15 @@ class Lens:
     skew: float = 0.0
 
     @property
-    def distorted(self) -> bool:
-        """Whether the photo differs from a pinhole picture: straight lines are bent, or squares sheared."""
+    def is_distorted(self) -> bool:
+        """Whether the photo differs from a pinhole picture, by distortion or by skew."""
         return self.model == "fisheye" or any(self.coefficients) or self.skew != 0
 
     def scaled(self, width: int, height: int) -> Lens:
-        """The same lens for a copy of the photo resized to (width, height); coefficients have no unit and stay."""
+        """Return the lens of a copy of the photo that is resized to (width, height).
+
+        The coefficients stay, because they are dimensionless.
+        """
         sx, sy = width / self.width, height / self.height
         return replace(
             self,
@@ -60,24 +63,24 @@ class Lens:
         )
 
 
-def brown(k1: float = 0, k2: float = 0, p1: float = 0, p2: float = 0, *higher: float) -> tuple[float, ...]:
-    """Pad Brown coefficients in COLMAP's order (k1 k2 p1 p2 k3 k4 k5 k6) to all eight; a ninth is k7."""
+def brown_coefficients(k1: float = 0, k2: float = 0, p1: float = 0, p2: float = 0, *higher: float) -> tuple[float, ...]:
+    """Pad Brown coefficients in COLMAP's order (k1 k2 p1 p2 k3 k4 k5 k6) with zeros to eight; a ninth is k7."""
     return (k1, k2, p1, p2, *higher, *(0.0,) * (4 - len(higher)))
 
 
 def distort(lens: Lens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bend rays as the lens does.
+    """Apply the lens distortion to rays.
 
-    With r^2 = x^2 + y^2, brown is the OpenCV rational model
+    With r^2 = x^2 + y^2, "brown" is the OpenCV rational model
 
         d = (1 + k1 r^2 + k2 r^4 + k3 r^6 + k7 r^8) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
         x' = x d + 2 p1 x y + p2 (r^2 + 2 x^2),   y' = y d + 2 p2 x y + p1 (r^2 + 2 y^2)
 
-    whose k7 is Metashape's and RealityScan's K4. Fisheye, with theta = atan r, is the same with (x, y) theta / r for
-    (x, y), and d = 1 + k1 theta^2 + ... + k4 theta^8. Skew, at last, adds skew / fx y' to x'.
+    whose k7 is Metashape's and RealityScan's K4. "fisheye", with theta = atan r, is the same with (x, y) theta / r in
+    place of (x, y), and d = 1 + k1 theta^2 + ... + k4 theta^8. Finally, skew adds skew / fx y' to x'.
 
     Args:
-        lens: the lens.
+        lens: lens of any model except "equirectangular".
         x, y: ray direction at depth 1, X/Z and Y/Z, any common shape.
 
     Returns:
@@ -92,38 +95,40 @@ def distort(lens: Lens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.nd
         bent_x, bent_y = x * scale, y * scale
         if len(lens.coefficients) > 4:
             flat = np.divide(theta, r, out=np.ones_like(r), where=r > 1e-9)
-            off_x, off_y = _decentred(lens.coefficients[4:6], x * flat, y * flat)
+            off_x, off_y = _tangential_offset(lens.coefficients[4:6], x * flat, y * flat)
             bent_x, bent_y = bent_x + off_x, bent_y + off_y
     else:
         d = _brown_factor(lens, x * x + y * y)
-        off_x, off_y = _decentred(lens.coefficients[2:4], x, y)
+        off_x, off_y = _tangential_offset(lens.coefficients[2:4], x, y)
         bent_x, bent_y = x * d + off_x, y * d + off_y
     return (bent_x + lens.skew / lens.fx * bent_y if lens.skew else bent_x), bent_y
 
 
-def _decentred(tangential: tuple[float, ...], x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What a lens that stands off the axis, by p1 and p2, adds to (x, y)."""
+def _tangential_offset(tangential: tuple[float, ...], x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the tangential distortion, by p1 and p2, that is added to (x, y)."""
     p1, p2 = tangential
     r2 = x * x + y * y
     return 2 * p1 * x * y + p2 * (r2 + 2 * x * x), 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
 
 
 def _brown_factor(lens: Lens, r2: np.ndarray) -> np.ndarray:
+    """Return the radial factor d of the Brown model for squared radii."""
     k1, k2, _, _, k3, k4, k5, k6, k7 = (*lens.coefficients, 0.0)[:9]
     with np.errstate(divide="ignore", invalid="ignore"):
         return (1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k7)))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
 
 
 def _fisheye_angle(lens: Lens, theta: np.ndarray) -> np.ndarray:
+    """Return the distorted angle theta d of the fisheye model."""
     k1, k2, k3, k4 = lens.coefficients[:4]
     t2 = theta * theta
     return theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
 
 
 def fold_radius(lens: Lens, largest: float) -> float:
-    """The radius |(x, y)| up to which the lens maps rays one to one, `largest` if that is all of them.
+    """Return the radius |(x, y)| up to which the lens maps rays one to one, at most `largest`.
 
-    Past it the polynomial bends back and would show the photo's content a second time.
+    Beyond it the polynomial decreases, so that the undistorted picture would show parts of the photo twice.
     """
     radii = np.linspace(0, largest, 4096)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -135,10 +140,14 @@ def fold_radius(lens: Lens, largest: float) -> float:
     return float(radii[folded[0]]) if folded.size else largest
 
 
-@lru_cache(maxsize=4)  # One camera for all photos is the common case; a map costs 9 bytes a pixel.
+@lru_cache(maxsize=4)  # usually all photos share one camera; a map takes 9 bytes a pixel
 def _source_map(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Where each undistorted pixel finds its colour: (H, W) float32 column and row (pixel centres at integers,
-    inside the photo), and (H, W) bool of the pixels that have one, None for all."""
+    """Return where each undistorted pixel takes its colour from in the photo.
+
+    Returns:
+        (H, W) float32 columns and (H, W) float32 rows, clipped to the photo, with pixel centres at integers; (H, W)
+        bool of the pixels whose ray is in the photo, None if all are.
+    """
     x = ((np.arange(lens.width) + 0.5 - lens.cx) / lens.fx)[None, :]
     y = ((np.arange(lens.height) + 0.5 - lens.cy) / lens.fy)[:, None]
     x, y = np.broadcast_arrays(x, y)
@@ -147,7 +156,7 @@ def _source_map(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     with np.errstate(over="ignore", invalid="ignore"):
         bent_x, bent_y = distort(lens, x, y)
         u, v = lens.fx * bent_x + lens.cx, lens.fy * bent_y + lens.cy
-        seen = (u >= 0) & (u <= lens.width) & (v >= 0) & (v <= lens.height)  # NaN compares false
+        seen = (u >= 0) & (u <= lens.width) & (v >= 0) & (v <= lens.height)  # comparisons with NaN are false
     seen &= radius <= fold_radius(lens, largest)
     column = np.where(seen, np.clip(u - 0.5, 0, lens.width - 1), 0).astype(np.float32)
     row = np.where(seen, np.clip(v - 0.5, 0, lens.height - 1), 0).astype(np.float32)
@@ -159,10 +168,11 @@ def undistort(picture: Picture, lens: Lens) -> Picture:
 
     Args:
         picture: the photo, (lens.height, lens.width).
-        lens: the lens it was taken with.
+        lens: the lens of the photo.
 
     Returns:
-        The undistorted picture. Its mask is False where the photo shows nothing or a masked pixel contributes.
+        The undistorted picture. Its mask is False for pixels outside the photo and for those that a masked pixel
+        contributes to.
     """
     column, row, seen = _source_map(lens)
     left, top = column.astype(np.int32), row.astype(np.int32)
@@ -178,7 +188,7 @@ def undistort(picture: Picture, lens: Lens) -> Picture:
     if picture.alpha is None:
         rgb = sample(picture.rgb)
     else:
-        # Straight colours under zero coverage mean nothing: weigh by coverage, then take the weight out again.
+        # Colours of transparent pixels are undefined, so they are weighted by coverage before they are mixed.
         coverage = picture.alpha[..., None].astype(np.float32)
         blended = sample(coverage)
         rgb = sample(picture.rgb * coverage) / np.maximum(blended, 1e-6)
@@ -191,4 +201,5 @@ def undistort(picture: Picture, lens: Lens) -> Picture:
 
 
 def _to_bytes(values: np.ndarray) -> np.ndarray:
+    """Round values to uint8, clipped to 0 to 255."""
     return (np.clip(values, 0, 255) + 0.5).astype(np.uint8)

@@ -1,5 +1,4 @@
-"""Photos that cannot be used: raw files, files that cannot be read, folders without any. Sentences that count and name
-them and say what to do."""
+"""Messages about photos that cannot be used: raw files, unreadable files, and folders without photos."""
 
 from __future__ import annotations
 
@@ -11,27 +10,27 @@ from hyrfpack.data.pictures import HEIC_NEEDS, HEIC_REMEDY, RAW_REMEDY
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.outputs import RAW_PHOTO_SUFFIXES, READABLE_PICTURE_SUFFIXES, VIDEO_SUFFIXES
 
-MAX_NAMED_FILES = 3  # in one sentence; the others are counted
+MAX_NAMED_FILES = 3
 
 
-def name_files(names: Sequence[str]) -> str:
-    """The first names, and how many more there are.
+def format_file_names(names: Sequence[str]) -> str:
+    """List the first MAX_NAMED_FILES names and count the others.
 
     Example:
-        >>> name_files(["a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg"])
+        >>> format_file_names(["a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg"])
         'a.jpg, b.jpg, c.jpg and 2 more'
     """
     more = len(names) - MAX_NAMED_FILES
     return ", ".join(names[:MAX_NAMED_FILES]) + (f" and {more} more" if more > 0 else "")
 
 
-def count_photos(count: int) -> str:
-    """ "1 photo", "2 photos" """
+def format_photo_count(count: int) -> str:
+    """Format a number of photos: "1 photo", "2 photos"."""
     return "1 photo" if count == 1 else f"{count:,} photos"
 
 
-def refuse_one_photo(path: Path) -> None:
-    """Raises HyrfDataError: a path that was given as photos is one photo, raw or not."""
+def raise_if_single_photo(path: Path) -> None:
+    """Raise HyrfDataError if a path is a single photo or raw file and not a folder of photos."""
     ending = path.suffix.lower()
     if ending in RAW_PHOTO_SUFFIXES and path.is_file():
         raise HyrfDataError(f"{path}: raw files are not supported; {RAW_REMEDY}")
@@ -39,23 +38,23 @@ def refuse_one_photo(path: Path) -> None:
         raise HyrfDataError(f"{path}: this is one photo, not a folder of photos; name the folder of all photos")
 
 
-def raw_photos_note(raw_photos: Sequence[Path]) -> list[str]:
-    """A note about raw files that lie beside photos and are ignored; none where there are none."""
+def raw_photos_notes(raw_photos: Sequence[Path]) -> list[str]:
+    """Return a note about raw files beside photos, which are ignored, in a list that is empty if there are none."""
     if not raw_photos:
         return []
-    files, are = ("raw file", "is") if len(raw_photos) == 1 else ("raw files", "are")
+    noun, verb = ("raw file", "is") if len(raw_photos) == 1 else ("raw files", "are")
     return [
-        f"{len(raw_photos):,} {files} ({_endings(raw_photos)}) {are} ignored, for raw files are not supported; export "
-        "those as JPEG that you want to use"
+        f"{len(raw_photos):,} {noun} ({_format_extensions(raw_photos)}) {verb} ignored, for raw files are not "
+        "supported; export those as JPEG that you want to use"
     ]
 
 
 def unreadable_sentences(reasons: Mapping[str, str], count: int) -> list[str]:
-    """Sentences about photos that cannot be read, one for each remedy.
+    """Return sentences about photos that cannot be read, one for each remedy.
 
     Args:
-        reasons: by the photo's name, why it cannot be read.
-        count: photos in all.
+        reasons: maps a photo's name to the reason why it cannot be read.
+        count: number of all photos, readable or not.
 
     Example:
         >>> unreadable_sentences({"a.jpg": "the picture file is empty"}, 40)
@@ -63,26 +62,27 @@ def unreadable_sentences(reasons: Mapping[str, str], count: int) -> list[str]:
     """
     heic = [name for name, reason in reasons.items() if reason.startswith(HEIC_NEEDS)]
     other = [name for name in reasons if name not in heic]
-    found = []
+    sentences = []
     if heic:
-        found.append(f"{_cannot_be_read(heic, count)} ({HEIC_NEEDS}); {HEIC_REMEDY}")
+        sentences.append(f"{_cannot_be_read(heic, count)} ({HEIC_NEEDS}); {HEIC_REMEDY}")
     if other:
         first, it = reasons[other[0]], "it" if len(other) == 1 else "them"
         reason = first if len({reasons[name] for name in other}) == 1 else f"{other[0]}: {first}"
-        found.append(f"{_cannot_be_read(other, count)} ({reason}); copy {it} again, or remove {it}")
-    return found
+        sentences.append(f"{_cannot_be_read(other, count)} ({reason}); copy {it} again, or remove {it}")
+    return sentences
 
 
 def _cannot_be_read(names: Sequence[str], count: int) -> str:
-    return f"{len(names):,} of {count_photos(count)} cannot be read: {name_files(names)}"
+    """Return the first part of a sentence about unreadable photos."""
+    return f"{len(names):,} of {format_photo_count(count)} cannot be read: {format_file_names(names)}"
 
 
 def explain_no_photos(given: Path, folder: Path) -> str:
-    """Why there is no photo that can be used, and what to do.
+    """Explain why a folder has no usable photo, and what to do.
 
     Args:
-        given: what the user named.
-        folder: that was looked in; the same, or where an archive was unpacked.
+        given: the path that the user named.
+        folder: the folder that was searched: the same path, or the one that an archive was unpacked into.
     """
     videos = sorted(entry.name for entry in folder.iterdir() if entry.suffix.lower() in VIDEO_SUFFIXES)
     if videos:
@@ -94,10 +94,10 @@ def explain_no_photos(given: Path, folder: Path) -> str:
             if len(raw_photos) == 1
             else f"all {len(raw_photos):,} photos here are raw files"
         )
-        return f"{given}: {photos} ({_endings(raw_photos)}), and raw files are not supported; {RAW_REMEDY}"
+        return f"{given}: {photos} ({_format_extensions(raw_photos)}), and raw files are not supported; {RAW_REMEDY}"
     return f"{given}: there are no photos here (JPEG, PNG, WebP, TIFF or HEIC); name the folder that holds them"
 
 
-def _endings(files: Iterable[Path]) -> str:
-    """The endings of files, each once."""
+def _format_extensions(files: Iterable[Path]) -> str:
+    """List the extensions of files, each once."""
     return ", ".join(sorted({file.suffix.upper() for file in files}))

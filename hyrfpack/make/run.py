@@ -13,7 +13,7 @@ import torch
 
 from hyrfpack.checks import check_choice, check_float, check_int
 from hyrfpack.data import PictureCache
-from hyrfpack.data.folder import first_readable, list_photos
+from hyrfpack.data.folder import first_readable_photo, list_photos
 from hyrfpack.device import choose_device
 from hyrfpack.format import describe
 from hyrfpack.lock import exclusive_folder
@@ -233,7 +233,7 @@ class _Making:
         """What the estimation reports of photos without poses, or of a video."""
         request, source = self.request, self.source
         photos = list_photos(source.path) if source.kind == "photos" else []
-        facts = first_readable(photos)
+        facts = first_readable_photo(photos)
         sizes = [facts.size] * len(photos) if facts else []
         forecast = forecast_photos(sizes, self._asked(), request.device)
         if request.minutes is not None:

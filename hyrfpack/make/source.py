@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from hyrfpack.data import load_scene
-from hyrfpack.data.archive import is_archive, unpacked
+from hyrfpack.data.archive import is_archive, unpack
 from hyrfpack.data.folder import list_photos
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
 from hyrfpack.make.held_out import inner_view
@@ -87,7 +87,7 @@ class Source:
                 return cls(path, "video")
             if (path / _LOOSE_SOG).is_file():
                 return cls(path, "splats")
-            archive, folder = (path, unpacked(path)) if is_archive(path) else (None, path)
+            archive, folder = (path, unpack(path)) if is_archive(path) else (None, path)
             return cls(folder / (reading.images or ""), "photos", archive=archive)
         except HyrfDataError:
             videos = (

@@ -14,15 +14,15 @@ import numpy as np
 from PIL import Image
 
 from hyrfpack.data import load_scene, pose_commands
-from hyrfpack.data.archive import given_path, is_archive, unpacked
-from hyrfpack.data.folder import PhotoFacts, list_photos, list_raw_photos, photo_facts
-from hyrfpack.data.quality import TOO_SOFT, Exposure, exposure, is_blurred, read_gray, sharpness
+from hyrfpack.data.archive import display_path, is_archive, unpack
+from hyrfpack.data.folder import PhotoFacts, list_photos, list_raw_photos, read_photo_facts
+from hyrfpack.data.quality import MIN_SHARPNESS, Exposure, is_blurred, measure_exposure, measure_sharpness, read_gray
 from hyrfpack.data.unusable import (
-    count_photos,
     explain_no_photos,
-    name_files,
-    raw_photos_note,
-    refuse_one_photo,
+    format_file_names,
+    format_photo_count,
+    raise_if_single_photo,
+    raw_photos_notes,
     unreadable_sentences,
 )
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError, strip_path
@@ -120,8 +120,8 @@ def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | Non
     tell = report or (lambda text, share: None)
     if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
         return _describe_video(path, tell)
-    refuse_one_photo(path)
-    folder = unpacked(path) if is_archive(path) else path
+    raise_if_single_photo(path)
+    folder = unpack(path) if is_archive(path) else path
     photos = list_photos(folder)
     tell("reading poses", 0.0)
     scene, problems = _scene(path, folder)
@@ -145,7 +145,7 @@ def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | Non
     problems += _light_problems(looks, light, stops, folder, scene)
     if scene is None:
         problems += _zoom_problems(facts) + _mask_problems(folder, photos)
-    notes = list(scene.notes) if scene is not None else _header_notes(facts) + raw_photos_note(list_raw_photos(folder))
+    notes = list(scene.notes) if scene is not None else _header_notes(facts) + raw_photos_notes(list_raw_photos(folder))
     if len(looks) + len(unreadable) < len(photos):
         notes.append(f"the pixels of {len(looks)} of {len(photos)} photos were looked at, evenly spread")
     preset = ": ".join(detect_preset(scene)) if scene is not None and scene.train else ""
@@ -225,7 +225,7 @@ def _headers(
     chosen = evenly_spaced(photos, MOST_OPENED)
     for done, photo in enumerate(chosen):
         try:
-            facts.append(photo_facts(photo))
+            facts.append(read_photo_facts(photo))
         except HyrfDataError as error:
             unreadable[_below(photo, folder)] = _reason(error, photo)
         read = f"reading the headers of photos, {done + 1:,} of {len(chosen):,}"
@@ -254,19 +254,19 @@ def _look(path: Path) -> _Look | str:
     except HyrfDataError as error:
         return _reason(error, path)
     small = Image.fromarray(gray).resize((_THUMBNAIL, _THUMBNAIL), Image.Resampling.BOX)
-    return _Look(path, sharpness(gray), exposure(gray), 255 * np.asarray(small))
+    return _Look(path, measure_sharpness(gray), measure_exposure(gray), 255 * np.asarray(small))
 
 
 def _reason(error: HyrfDataError, path: Path) -> str:
-    return strip_path(error, given_path(path)).partition(";")[0]
+    return strip_path(error, display_path(path)).partition(";")[0]
 
 
 def _count_problems(count: int, scene: Scene | None, posed: int, path: Path) -> list[str]:
     found = []
     if count < _FEW:
         found.append(
-            f"there {'is' if count == 1 else 'are'} only {count_photos(count)}; take {_FEW} or more, from all around "
-            "and with much overlap"
+            f"there {'is' if count == 1 else 'are'} only {format_photo_count(count)}; take {_FEW} or more, from all "
+            "around and with much overlap"
         )
     if scene is None or scene.layout == "blender":  # whose splits are used in part
         return found
@@ -302,21 +302,24 @@ def _copies(photos: list[Path], looks: list[_Look], folder: Path, tell: Callable
         return []
     first, of = (_below(item, folder) for item in copies[0])
     return [
-        f"{count_photos(len(copies))} {_is(len(copies))} a copy of another, {first} of {of} for one; remove the copies"
+        f"{format_photo_count(len(copies))} {_is(len(copies))} a copy of another, {first} of {of} for one; "
+        "remove the copies"
     ]
 
 
 def _blur_problems(looks: list[_Look], blurred: list[Path], folder: Path) -> list[str]:
     values = [look.sharpness for look in looks]
-    if np.median(values) < TOO_SOFT:
+    if np.median(values) < MIN_SHARPNESS:
         return [
             "the photos are blurred, most of them; take them again with the camera held still, in more light, and "
             "focused on what you photograph"
         ]
     if not blurred:
         return []
-    names = name_files([_below(item, folder) for item in blurred])
-    return [f"{count_photos(len(blurred))} {_is(len(blurred))} blurred ({names}); leave out or retake what is blurred"]
+    names = format_file_names([_below(item, folder) for item in blurred])
+    return [
+        f"{format_photo_count(len(blurred))} {_is(len(blurred))} blurred ({names}); leave out or retake what is blurred"
+    ]
 
 
 def _light_problems(
@@ -331,14 +334,14 @@ def _light_problems(
     dark = [_below(look.path, folder) for look, value in zip(looks, light, strict=True) if value < middle - _DARKER]
     if dark:
         found.append(
-            f"{count_photos(len(dark))} {_is(len(dark))} far darker than the others ({name_files(dark)}); leave out "
-            "what is dark"
+            f"{format_photo_count(len(dark))} {_is(len(dark))} far darker than the others ({format_file_names(dark)}); "
+            "leave out what is dark"
         )
     bright = [_below(look.path, folder) for look in looks if look.exposure.bright > _CLIPPED]
     if len(bright) > len(looks) / 4:
         found.append(
-            f"{count_photos(len(bright))} {_is(len(bright))} white over a quarter or more ({name_files(bright)}); "
-            "expose less, and lock it"
+            f"{format_photo_count(len(bright))} {_is(len(bright))} white over a quarter or more "
+            f"({format_file_names(bright)}); expose less, and lock it"
         )
     if stops > _UNEVEN:
         found.append(
@@ -374,14 +377,18 @@ def _mask_problems(folder: Path, photos: list[Path]) -> list[str]:
     stray = sorted(file.name for file in there if file.stem not in names)
     if not stray:
         return []
-    return [f"{len(stray)} of {len(there)} masks are of no photo ({name_files(stray)}); name each as its photo is"]
+    return [
+        f"{len(stray)} of {len(there)} masks are of no photo ({format_file_names(stray)}); name each as its photo is"
+    ]
 
 
 def _header_notes(facts: list[PhotoFacts]) -> list[str]:
     notes = []
     turned = sum(fact.orientation != 1 for fact in facts)
     if turned:
-        notes.append(f"{count_photos(turned)} {_is(turned)} stored on the side; 'hyrfpack poses' makes upright copies")
+        notes.append(
+            f"{format_photo_count(turned)} {_is(turned)} stored on the side; 'hyrfpack poses' makes upright copies"
+        )
     large = sum(max(fact.size) > DEFAULT_MAX_SIZE for fact in facts)
     if large:
         notes.append(
@@ -390,7 +397,9 @@ def _header_notes(facts: list[PhotoFacts]) -> list[str]:
         )
     round_ = sum(fact.size[0] == 2 * fact.size[1] for fact in facts)
     if round_:
-        notes.append(f"{count_photos(round_)} {_is(round_)} twice as wide as high, as those of 360-degree cameras are")
+        notes.append(
+            f"{format_photo_count(round_)} {_is(round_)} twice as wide as high, as those of 360-degree cameras are"
+        )
     return notes
 
 

@@ -10,10 +10,10 @@ from typing import Any
 
 from hyrfpack.checks import check_choice, check_int
 from hyrfpack.choices import MATCHING_METHODS
-from hyrfpack.data.archive import is_archive, naming_archives, unpacked
+from hyrfpack.data.archive import archive_paths_in_errors, is_archive, unpack
 from hyrfpack.data.equirectangular import FACES
 from hyrfpack.data.folder import list_photos, list_pictures, list_raw_photos
-from hyrfpack.data.unusable import raw_photos_note, refuse_one_photo, unreadable_sentences
+from hyrfpack.data.unusable import raise_if_single_photo, raw_photos_notes, unreadable_sentences
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import StrPath
@@ -121,7 +121,7 @@ def estimate_poses(
     """
     check_choice("matching", matching, MATCHING_METHODS)
     check_int("seed", seed, 0, 2**64 - 1)
-    with disk_errors(Path(out)), naming_archives():
+    with disk_errors(Path(out)), archive_paths_in_errors():
         return _Estimation(Path(photos), Path(out), matching, masks, seed, overwrite, report, say).run()
 
 
@@ -154,7 +154,7 @@ class _Estimation:
     def run(self) -> PosesReport:
         """All stages; of an estimation that finishes none nothing is left, unless it was interrupted."""
         if is_archive(self.photos):
-            self.photos = unpacked(self.photos)
+            self.photos = unpack(self.photos)
         self.output.check_place(self.photos)
         with exclusive_folder(self.out):
             self.output.check(self.photos, self.overwrite)
@@ -185,7 +185,7 @@ class _Estimation:
 
     def _prepare(self) -> Job:
         """Photos and masks where they are read from, and the job."""
-        refuse_one_photo(self.photos)
+        raise_if_single_photo(self.photos)
         video = self.is_video = self.photos.is_file()
         images = self.out / "images"
         here = not video and self._in_images(images)
@@ -223,7 +223,7 @@ class _Estimation:
             masks = {name: folder / f"{name}.png" for name in masks}
         self._note_photos(photos, masks, copied, turned=not here)
         if not video:
-            self._note_all(raw_photos_note(self._list(root if here else self.photos, list_raw_photos)))
+            self._note_all(raw_photos_notes(self._list(root if here else self.photos, list_raw_photos)))
         devices, of = devices_of(photos, in_place=not copied)
         if len(devices) > 1:
             self._note(f"{len(devices)} cameras or zooms are told apart by folder, device, size and focal length")

@@ -16,7 +16,7 @@ from PIL import Image
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.data.pictures import read_mask, read_pixels
-from hyrfpack.data.quality import sharpness
+from hyrfpack.data.quality import measure_sharpness
 from hyrfpack.errors import HyrfDataError, strip_path
 from hyrfpack.poses.database import make_database, opened
 from hyrfpack.poses.job import Job, chunks
@@ -94,9 +94,9 @@ def _make_copy(job: Job, folder: Path, size: tuple[int, int], name: str, number:
         mask.parent.mkdir(parents=True, exist_ok=True)
         usable = np.ones(size[::-1], bool)
         if name in job.masks:
-            usable = read_mask(Path(job.masks[name]), size[1], size[0], whole=True)
+            usable = read_mask(Path(job.masks[name]), size[1], size[0], require_all=True)
         Image.fromarray(usable.astype(np.uint8) * 255).save(mask, compress_level=1)
-    return float(sharpness(grey / 255)), ""
+    return float(measure_sharpness(grey / 255)), ""
 
 
 def _extract(job: Job, folder: Path, numbers: list[int], camera: int) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from hyrfpack.data.pictures import read_pixels, shrunk_size
+from hyrfpack.data.pictures import fit_size, read_pixels
 from hyrfpack.poses.choose import Candidate, choose, confirmed, doubt
 from hyrfpack.poses.compare import Poses
 from hyrfpack.poses.database import opened, verified_pairs
@@ -187,7 +187,7 @@ def _color(job: Job, model: pycolmap.Reconstruction, tell: Tell) -> None:
         if not (image.has_pose and seen):
             continue
         device = job.devices[image.camera_id - 1]
-        width, height = size = shrunk_size(device.size[0], device.size[1], _COLORED)
+        width, height = size = fit_size(device.size[0], device.size[1], _COLORED)
         rgb, _ = read_pixels(job.images / image.name, size)
         scale = np.array(size) / np.array(device.size)
         for point_id, xy in seen:

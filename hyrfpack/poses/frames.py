@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from hyrfpack.atomic import make_folder, write_atomic
-from hyrfpack.data.quality import is_blurred, sharpness
+from hyrfpack.data.quality import is_blurred, measure_sharpness
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.outputs import StrPath
 from hyrfpack.poses.motion import WIDE, distances, track
@@ -169,7 +169,7 @@ def _measure(path: Path, video: Video, tell: Report) -> _Measured:
         if small and np.abs(thumbnail.astype(np.int16) - small[-1]).mean() < _SAME:
             repeated += 1
         else:
-            sharp.append(sharpness(gray.astype(np.float32) / 255))
+            sharp.append(measure_sharpness(gray.astype(np.float32) / 255))
             small.append(thumbnail)
             numbers.append(number)
             times.append(time)

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from hyrfpack.atomic import write_atomic
-from hyrfpack.data.pictures import shrunk_size
+from hyrfpack.data.pictures import fit_size
 
 LARGEST = 1600  # pixels of the longer side of the pictures that features are found in
 GUESS = 0.8  # focal length in longer sides where nothing is known: between a phone's wide and its normal lens
@@ -29,7 +29,7 @@ class Device:
     @property
     def working_size(self) -> tuple[int, int]:
         """(width, height) of the pictures that features are found in."""
-        return shrunk_size(*self.size, LARGEST)
+        return fit_size(*self.size, LARGEST)
 
     @property
     def working_focal(self) -> float:

@@ -15,10 +15,10 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from hyrfpack.data import masks as mask_files
-from hyrfpack.data.archive import given_path
+from hyrfpack.data.archive import display_path
 from hyrfpack.data.equirectangular import FACES, Face, FaceFile, cut_panorama, face_lens, face_size, is_panorama
-from hyrfpack.data.folder import PhotoFacts, photo_facts
-from hyrfpack.data.pictures import opened, read_header
+from hyrfpack.data.folder import PhotoFacts, read_photo_facts
+from hyrfpack.data.pictures import open_picture, read_header
 from hyrfpack.errors import HyrfDataError, short_reason, strip_path
 from hyrfpack.poses.copying import copy_file
 from hyrfpack.poses.job import Device
@@ -184,8 +184,9 @@ def make_images(photos: Sequence[Photo], folder: Path, progress: Progress = lamb
 
 def find_masks(photos: Sequence[Photo], folder: Path) -> dict[str, Path]:
     """The mask of each photo that has one, by the photo's name."""
-    found = mask_files.find_masks(folder, [(photo.source, photo.facts.size) for photo in photos], set()).of
-    return {photo.name: found[photo.source] for photo in photos if photo.source in found}
+    found = mask_files.find_masks(folder, [(photo.source, photo.facts.size) for photo in photos], set())
+    by_source = found.by_photo
+    return {photo.name: by_source[photo.source] for photo in photos if photo.source in by_source}
 
 
 def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) -> dict[str, Path]:
@@ -203,7 +204,7 @@ def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) ->
             Image.fromarray(usable.astype(np.uint8) * 255).save(target)
             made[photo.name] = target
             continue
-        with opened(mask) as image:
+        with open_picture(mask) as image:
             try:
                 image.load()
             except Exception as error:  # Pillow's decoders raise whatever they meet
@@ -225,7 +226,7 @@ def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) ->
 
 def _facts_or_reason(path: Path) -> PhotoFacts | str:
     try:
-        return photo_facts(path)
+        return read_photo_facts(path)
     except HyrfDataError as error:
         return _reason(error, path)
 
@@ -240,7 +241,7 @@ def _is_panorama_or_reason(path: Path) -> bool | str:
 
 def _reason(error: HyrfDataError, path: Path) -> str:
     """Why a photo cannot be used, without its path and what to do, which is said of all such photos at once."""
-    return strip_path(error, given_path(path)).partition(";")[0]
+    return strip_path(error, display_path(path)).partition(";")[0]
 
 
 def _counted(items: Iterable[Item], progress: Progress) -> Iterator[Item]:
@@ -279,7 +280,7 @@ def _put(photo: Photo, target: Path) -> None:
     if photo.kept:
         copy_file(photo.facts.path, target)
         return
-    with opened(photo.facts.path) as image:
+    with open_picture(photo.facts.path) as image:
         try:
             upright = ImageOps.exif_transpose(image)
         except Exception:  # Pillow's decoders raise whatever they meet

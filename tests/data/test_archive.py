@@ -49,15 +49,15 @@ def test_an_archive_reads_as_its_folder(zipped):
 
 
 def test_it_is_unpacked_once_and_anew_where_a_file_is_gone_or_the_archive_is_another(zipped, cache):
-    folder = archive.unpacked(zipped)
+    folder = archive.unpack(zipped)
     first = folder / "images" / "000.png"
     about = os.stat(first)
 
-    assert archive.unpacked(zipped) == folder and os.stat(first).st_mtime_ns == about.st_mtime_ns
+    assert archive.unpack(zipped) == folder and os.stat(first).st_mtime_ns == about.st_mtime_ns
     first.unlink()
-    assert archive.unpacked(zipped) == folder and first.is_file()
+    assert archive.unpack(zipped) == folder and first.is_file()
     os.utime(zipped, ns=(1, 1))
-    assert archive.unpacked(zipped) != folder
+    assert archive.unpack(zipped) != folder
     assert sorted(path.name[:4] for path in cache.iterdir()) == ["set-", "set-"]
 
 
@@ -68,7 +68,7 @@ def test_outputs_may_lie_beside_the_archive_and_never_replace_it(zipped):
     with pytest.raises(HyrfError, match="the output is an input itself"):
         outputs.file(zipped)
     with pytest.raises(HyrfError, match="the same command reads what lies in this folder"):
-        outputs.file(archive.unpacked(zipped) / "images" / "new.hyrf")
+        outputs.file(archive.unpack(zipped) / "images" / "new.hyrf")
 
 
 def test_a_home_that_cannot_be_written_is_no_obstacle(zipped, monkeypatch, tmp_path):
@@ -76,7 +76,7 @@ def test_a_home_that_cannot_be_written_is_no_obstacle(zipped, monkeypatch, tmp_p
     monkeypatch.setattr(archive.tempfile, "gettempdir", lambda: str(tmp_path / "temporary"))
     monkeypatch.setattr(archive.tempfile, "tempdir", str(tmp_path))
 
-    assert archive.unpacked(zipped).is_relative_to(tmp_path / "temporary")
+    assert archive.unpack(zipped).is_relative_to(tmp_path / "temporary")
 
 
 def test_no_room_is_said_before_anything_is_written(zipped, cache, monkeypatch):
@@ -99,13 +99,13 @@ def test_a_disk_that_fills_up_leaves_nothing(zipped, cache, monkeypatch):
 
 
 def test_what_a_killed_process_left_is_removed_after_a_day(zipped, cache):
-    archive.unpacked(zipped)
+    archive.unpack(zipped)
     for name in (".partial-old", ".partial-new"):
         (cache / name).mkdir()
     os.utime(cache / ".partial-old", (1, 1))
     os.utime(zipped, ns=(1, 1))
 
-    archive.unpacked(zipped)
+    archive.unpack(zipped)
 
     assert not (cache / ".partial-old").exists() and (cache / ".partial-new").exists()
 
@@ -161,7 +161,7 @@ def test_no_name_writes_outside_the_folder(names, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(place / "cache"))
         try:
-            folder = archive.unpacked(place / "a.zip")
+            folder = archive.unpack(place / "a.zip")
         except HyrfDataError as error:
             assert "\n" not in str(error)
         else:
@@ -184,7 +184,7 @@ def test_damaged_archives_are_read_or_refused(zipped, tmp_path_factory, data):
     damaged.write_bytes(bytes(content))
 
     try:
-        archive.unpacked(damaged)
+        archive.unpack(damaged)
     except HyrfDataError as error:
         assert "\n" not in str(error)
 
@@ -200,7 +200,7 @@ def test_names_of_a_mac_are_the_ones_it_wrote(tmp_path):
         content.writestr(AsMacOSWrites("Straße/Müller.txt"), b"1")
     assert zipfile.ZipFile(tmp_path / "set.zip").namelist() != ["Straße/Müller.txt"]
 
-    assert (archive.unpacked(tmp_path / "set.zip") / "Müller.txt").read_bytes() == b"1"
+    assert (archive.unpack(tmp_path / "set.zip") / "Müller.txt").read_bytes() == b"1"
 
 
 def test_another_process_that_was_faster_is_no_trouble(zipped, monkeypatch):
@@ -213,6 +213,6 @@ def test_another_process_that_was_faster_is_no_trouble(zipped, monkeypatch):
 
     monkeypatch.setattr(os, "replace", after_another)
 
-    folder = archive.unpacked(zipped)
+    folder = archive.unpack(zipped)
 
     assert (folder / "images" / "000.png").is_file() and [*folder.parent.iterdir()] == [folder]

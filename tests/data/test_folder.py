@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from hyrfpack.data.folder import list_photos, list_pictures, photo_facts
+from hyrfpack.data.folder import list_photos, list_pictures, read_photo_facts
 from hyrfpack.errors import HyrfDataError
 
 
@@ -66,13 +66,13 @@ def test_no_folder_is_one_sentence(tmp_path):
     "orientation, size", [(1, (40, 30)), (3, (40, 30)), (6, (30, 40)), (8, (30, 40)), (9, (40, 30))]
 )
 def test_the_size_is_that_of_the_upright_picture(orientation, size, tmp_path):
-    facts = photo_facts(photo(tmp_path / "1.jpg", base={0x0112: orientation}))
+    facts = read_photo_facts(photo(tmp_path / "1.jpg", base={0x0112: orientation}))
     assert facts.size == size
     assert facts.orientation == (orientation if orientation <= 8 else 1)
 
 
 def test_the_focal_length_follows_from_the_35_mm_equivalent(tmp_path):
-    facts = photo_facts(photo(tmp_path / "1.jpg", (4000, 3000), exif={0xA405: 26}))
+    facts = read_photo_facts(photo(tmp_path / "1.jpg", (4000, 3000), exif={0xA405: 26}))
     # A full frame of 36 x 24 mm has a diagonal of 43.27 mm; 4000 x 3000 has one of 5000 pixels.
     assert facts.focal == pytest.approx(26 / math.sqrt(36**2 + 24**2) * 5000)
 
@@ -80,39 +80,39 @@ def test_the_focal_length_follows_from_the_35_mm_equivalent(tmp_path):
 def test_the_focal_length_follows_from_the_sensor_also_in_a_shrunk_copy(tmp_path):
     # 8 mm on a sensor with 200 pixels a mm are 1,600 pixels of 4,000, and 400 of 1,000.
     exif = {0x920A: IFDRational(8), 0xA20E: IFDRational(2000), 0xA210: 3, 0xA002: 4000, 0xA003: 3000}
-    assert photo_facts(photo(tmp_path / "1.jpg", (4000, 3000), exif=exif)).focal == pytest.approx(1600)
-    assert photo_facts(photo(tmp_path / "2.jpg", (1000, 750), exif=exif)).focal == pytest.approx(400)
+    assert read_photo_facts(photo(tmp_path / "1.jpg", (4000, 3000), exif=exif)).focal == pytest.approx(1600)
+    assert read_photo_facts(photo(tmp_path / "2.jpg", (1000, 750), exif=exif)).focal == pytest.approx(400)
 
 
 @pytest.mark.parametrize(
     "exif", [{}, {0xA405: 0}, {0x920A: IFDRational(1, 0), 0xA20E: IFDRational(72)}, {0x920A: IFDRational(8)}]
 )
 def test_where_exif_does_not_tell_there_is_no_focal_length(exif, tmp_path):
-    assert photo_facts(photo(tmp_path / "1.jpg", exif=exif)).focal is None
+    assert read_photo_facts(photo(tmp_path / "1.jpg", exif=exif)).focal is None
 
 
 def test_device_and_time(tmp_path):
     first = photo(tmp_path / "1.jpg", base={0x010F: "Apple", 0x0110: "iPhone 12"}, exif={0x9003: "2024:05:01 12:00:00"})
     exif = {0x9003: "2024:05:01 12:00:02", 0x9291: "5"}
     second = photo(tmp_path / "2.jpg", base={0x010F: "Canon", 0x0110: "Canon EOS R5"}, exif=exif)
-    assert photo_facts(first).device == "Apple iPhone 12"
-    assert photo_facts(second).device == "Canon EOS R5"
-    assert photo_facts(second).taken - photo_facts(first).taken == pytest.approx(2.5)
-    bare = photo_facts(photo(tmp_path / "3.png"))
+    assert read_photo_facts(first).device == "Apple iPhone 12"
+    assert read_photo_facts(second).device == "Canon EOS R5"
+    assert read_photo_facts(second).taken - read_photo_facts(first).taken == pytest.approx(2.5)
+    bare = read_photo_facts(photo(tmp_path / "3.png"))
     assert (bare.device, bare.taken) == ("", None)
 
 
 def test_no_picture_is_one_sentence(tmp_path):
     (tmp_path / "1.jpg").write_bytes(b"no picture at all")
     with pytest.raises(HyrfDataError, match="not a picture that can be read"):
-        photo_facts(tmp_path / "1.jpg")
+        read_photo_facts(tmp_path / "1.jpg")
 
 
 @pytest.mark.parametrize("ending", ["jpg", "tif"])
 @pytest.mark.parametrize("orientation", [1, 3, 6, 7])
 def test_pillow_turning_tiff_files_by_itself_changes_nothing(orientation, ending, tmp_path):
     exif = {0xA405: 26}
-    facts = photo_facts(photo(tmp_path / f"1.{ending}", (4000, 3000), base={0x0112: orientation}, exif=exif))
+    facts = read_photo_facts(photo(tmp_path / f"1.{ending}", (4000, 3000), base={0x0112: orientation}, exif=exif))
     assert facts.orientation == orientation
     assert facts.size == ((3000, 4000) if orientation >= 5 else (4000, 3000))
     assert facts.focal == pytest.approx(26 / math.sqrt(36**2 + 24**2) * 5000)

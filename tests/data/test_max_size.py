@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from hyrfpack.data import load_scene
-from hyrfpack.data.pictures import read_mask, read_pixels, shrunk_size
+from hyrfpack.data.pictures import fit_size, read_mask, read_pixels
 from hyrfpack.errors import HyrfDataError
 
 NOISE = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
@@ -30,7 +30,7 @@ def ramp(width: int, height: int) -> np.ndarray:
     ],
 )
 def test_the_longer_side_is_what_is_limited(stored, limit, shrunk):
-    assert shrunk_size(*stored, limit) == shrunk
+    assert fit_size(*stored, limit) == shrunk
 
 
 def test_cameras_follow_the_photos_exactly(tmp_path, colmap_folder):
@@ -71,7 +71,7 @@ def test_photos_within_the_limit_come_as_they_are_stored(tmp_path, colmap_folder
 @pytest.mark.parametrize("longer", [100, 37, 700])
 def test_shrinking_moves_nothing(tmp_path, size, longer):
     Image.fromarray(ramp(*size).round().astype(np.uint8)).save(tmp_path / "a.png")
-    small = shrunk_size(*size, longer)
+    small = fit_size(*size, longer)
 
     rgb, _ = read_pixels(tmp_path / "a.png", small)
 
@@ -143,7 +143,7 @@ def test_a_pixel_of_a_shrunk_photo_counts_if_all_that_it_covers_does(tmp_path, s
     ignored = generator.random((24, 32)) < 0.01
     Image.fromarray(np.where(ignored, 0, 255).astype(np.uint8)).save(tmp_path / "m.png")
 
-    mask = read_mask(tmp_path / "m.png", size[1], size[0], whole=True)
+    mask = read_mask(tmp_path / "m.png", size[1], size[0], require_all=True)
 
     expected = np.ones((size[1], size[0]), bool)
     for y, x in np.argwhere(ignored):  # by hand: which small pixels overlap the square of this one

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hyrfpack.data.names import PictureIndex, nearest, parts_of
+from hyrfpack.data.names import PictureIndex, find_similar_name, path_parts
 
 
 def folder_of(root: Path, *names: str) -> Path:
@@ -90,7 +90,7 @@ def test_a_file_is_given_to_no_second_name(tmp_path):
     matches = PictureIndex(tmp_path).match(["a.jpg", "A.png", "left/b.jpg", "right/b.jpg"])
 
     assert matches.found == {"a.jpg": tmp_path / "a.jpg"}
-    assert matches.unclear == ["left/b.jpg", "right/b.jpg"]
+    assert matches.ambiguous == ["left/b.jpg", "right/b.jpg"]
     assert "2 photos fit more than one file" in matches.notes[0] and "left/b.jpg first" in matches.notes[0]
 
 
@@ -108,13 +108,13 @@ def test_notes_say_how_many_are_called_otherwise_with_an_example(tmp_path):
 def test_the_nearest_by_name_is_named():
     files = [Path("photos/IMG_0412.jpg"), Path("photos/DSC_0001.jpg")]
 
-    assert nearest("images/IMG_412.jpeg", files) == files[0]
-    assert nearest("IMG_412.jpeg", []) is None
+    assert find_similar_name("images/IMG_412.jpeg", files) == files[0]
+    assert find_similar_name("IMG_412.jpeg", []) is None
 
 
 @given(name=st.text())
 def test_parts_never_lead_out_of_a_folder(name):
-    assert all(part not in ("", ".", "..") and "/" not in part and "\\" not in part for part in parts_of(name))
+    assert all(part not in ("", ".", "..") and "/" not in part and "\\" not in part for part in path_parts(name))
 
 
 part = st.text(alphabet="aAbéÉß.1 ", min_size=1, max_size=3).filter(lambda text: text.strip(". ") == text)
@@ -146,11 +146,11 @@ def test_matching_is_one_to_one_and_between_like_names(tmp_path_factory, names, 
 
     by_file: dict[Path, set[tuple[str, ...]]] = {}
     for name, file in matches.found.items():
-        by_file.setdefault(file.resolve(), set()).add(parts_of(name))
+        by_file.setdefault(file.resolve(), set()).add(path_parts(name))
         assert file.is_file()
-        assert stem(file.name) in (stem(parts_of(name)[-1]), plain(parts_of(name)[-1]))
+        assert stem(file.name) in (stem(path_parts(name)[-1]), plain(path_parts(name)[-1]))
     assert all(len(spellings) == 1 for spellings in by_file.values())
-    assert not set(matches.unclear) & set(matches.found)
+    assert not set(matches.ambiguous) & set(matches.found)
 
 
 def plain(text: str) -> str:
@@ -174,5 +174,5 @@ def test_two_files_that_fit_alike_are_never_chosen_between(tmp_path_factory, dat
     listed = data.draw(st.sampled_from(["", "/x/", "images/"])) + f"{name}.jpg"
 
     matches = PictureIndex(root).match([listed])
-    assert matches.found == {} and matches.unclear == [listed]
+    assert matches.found == {} and matches.ambiguous == [listed]
     assert PurePosixPath(listed).name.startswith(name)

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from hyrfpack.data.archive import unpacked
-from hyrfpack.data.pictures import PhotoFile, read_header, read_mask, read_orientation, read_pixels, same_aspect
+from hyrfpack.data.archive import unpack
+from hyrfpack.data.pictures import PhotoFile, has_same_aspect, read_header, read_mask, read_orientation, read_pixels
 from hyrfpack.data.undistort import Lens
 from hyrfpack.errors import HyrfDataError
 
@@ -149,7 +149,7 @@ def test_a_photo_out_of_an_archive_is_named_by_its_place_in_the_archive(tmp_path
     with zipfile.ZipFile(tmp_path / "set.zip", "w") as archive:
         archive.writestr("set/images/cut.png", whole[: len(whole) - 30])
         archive.writestr("set/notes.txt", "")
-    folder = unpacked(tmp_path / "set.zip")
+    folder = unpack(tmp_path / "set.zip")
 
     with pytest.raises(HyrfDataError) as error:
         read_pixels(folder / "images" / "cut.png")
@@ -166,7 +166,7 @@ def test_mask_is_resized_by_nearest_neighbour(tmp_path):
 
 @pytest.mark.parametrize(("width", "height", "same"), [(100, 67, True), (99, 66, True), (67, 100, False)])
 def test_aspect_tolerates_rounding_only(width, height, same):
-    assert same_aspect(width, height, 800, 533) is same
+    assert has_same_aspect(width, height, 800, 533) is same
 
 
 @settings(max_examples=60, deadline=None)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hyrfpack.data.points import read_ply
+from hyrfpack.data.points import read_ply_points
 from hyrfpack.errors import HyrfDataError
 
 POINTS = [[1.0, -2.5, 3.0], [0.0, 1e3, -4.0]]
@@ -40,7 +40,7 @@ def ply_file(path: Path, kind: str, full: float, order: str = "<", faces: bool =
     ("kind", "full", "half"), [("uchar", 255, 127 / 255), ("ushort", 65535, 32767 / 65535), ("float", 1.0, 0.5)]
 )
 def test_points_and_colours_are_those_written(tmp_path, kind, full, half, order, faces):
-    points, colors = read_ply(ply_file(tmp_path / "a.ply", kind, full, order, faces))
+    points, colors = read_ply_points(ply_file(tmp_path / "a.ply", kind, full, order, faces))
 
     np.testing.assert_array_equal(points, POINTS)
     np.testing.assert_allclose(colors, [[1, half, 0], [0, 0, 0]], rtol=0, atol=1e-7)
@@ -49,16 +49,16 @@ def test_points_and_colours_are_those_written(tmp_path, kind, full, half, order,
 
 def test_trimesh_is_not_needed(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
-    assert len(read_ply(ply_file(tmp_path / "a.ply", "uchar", 255))[0]) == 2
+    assert len(read_ply_points(ply_file(tmp_path / "a.ply", "uchar", 255))[0]) == 2
 
 
 @pytest.mark.parametrize("properties", ["", "property float x\nproperty float y\n"])
 def test_a_file_without_points_is_refused_by_name(tmp_path, properties):
     (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 0\n{properties}end_header\n")
     with pytest.raises(HyrfDataError, match="a.ply: it has no points"):
-        read_ply(tmp_path / "a.ply")
+        read_ply_points(tmp_path / "a.ply")
 
 
 def test_what_cannot_be_opened_is_refused_by_name(tmp_path):
     with pytest.raises(HyrfDataError, match="a.ply: the points cannot be read"):
-        read_ply(tmp_path / "a.ply")
+        read_ply_points(tmp_path / "a.ply")

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from hyrfpack.data.quality import TOO_SOFT, exposure, is_blurred, read_gray, sharpness
+from hyrfpack.data.quality import MIN_SHARPNESS, is_blurred, measure_exposure, measure_sharpness, read_gray
 
 
 def blocks(seed: int = 0, side: int = 128) -> np.ndarray:
@@ -30,7 +30,7 @@ def moved(picture: np.ndarray, length: int, axis: int) -> np.ndarray:
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_longer_motion_is_less_sharp_along_either_axis(axis):
-    values = [sharpness(blocks())] + [sharpness(moved(blocks(), length, axis)) for length in (3, 5, 9)]
+    values = [measure_sharpness(blocks())] + [measure_sharpness(moved(blocks(), length, axis)) for length in (3, 5, 9)]
     assert values == sorted(values, reverse=True)
     assert values[0] > 0.8 and values[-1] < 0.4
 
@@ -38,35 +38,35 @@ def test_longer_motion_is_less_sharp_along_either_axis(axis):
 def test_edges_and_waves_have_the_sharpness_of_the_closed_form():
     edge = np.zeros((64, 64), np.float32)
     edge[:32, 32:] = edge[32:, :32] = 1  # D(r) grows as r
-    assert sharpness(edge) == pytest.approx(1, rel=0.1)
+    assert measure_sharpness(edge) == pytest.approx(1, rel=0.1)
     wave = 2 * np.pi * np.arange(120) / 40  # D(r) of a wave of 40 pixels is 1 - cos(2 pi r / 40)
     expected = 4 * (1 - np.cos(np.pi / 20)) / (1 - np.cos(4 * np.pi / 20))
-    assert sharpness(0.5 + 0.2 * np.add.outer(np.sin(wave), np.sin(wave))) == pytest.approx(expected, rel=0.03)
+    assert measure_sharpness(0.5 + 0.2 * np.add.outer(np.sin(wave), np.sin(wave))) == pytest.approx(expected, rel=0.03)
 
 
 @pytest.mark.parametrize("contrast", [0.1, 0.5])
 def test_contrast_and_brightness_do_not_count(contrast):
-    assert sharpness(contrast * blocks() + 0.2) == pytest.approx(sharpness(blocks()), rel=0.05)
+    assert measure_sharpness(contrast * blocks() + 0.2) == pytest.approx(measure_sharpness(blocks()), rel=0.05)
 
 
 @pytest.mark.parametrize("deviation", [0.02, 0.05])
 def test_noise_does_not_pass_for_sharpness(deviation):
     noise = np.random.default_rng(3).normal(0, deviation, (128, 128))
     blurred = ndimage.gaussian_filter(blocks(), 2)
-    assert sharpness(blurred + noise) < 0.6 * sharpness(blocks())
-    assert sharpness(blocks() + noise) == pytest.approx(sharpness(blocks()), rel=0.15)
+    assert measure_sharpness(blurred + noise) < 0.6 * measure_sharpness(blocks())
+    assert measure_sharpness(blocks() + noise) == pytest.approx(measure_sharpness(blocks()), rel=0.15)
 
 
 def test_pictures_with_nothing_in_them_are_not_sharp():
-    assert sharpness(np.full((40, 40), 0.3)) == 0
-    assert sharpness(np.ones((4, 100))) == 0
+    assert measure_sharpness(np.full((40, 40), 0.3)) == 0
+    assert measure_sharpness(np.ones((4, 100))) == 0
 
 
 def test_what_is_no_picture_is_refused():
     with pytest.raises(ValueError, match="shape"):
-        sharpness(np.zeros((4, 4, 3)))
+        measure_sharpness(np.zeros((4, 4, 3)))
     with pytest.raises(ValueError, match="finite"):
-        sharpness(np.full((20, 20), np.nan))
+        measure_sharpness(np.full((20, 20), np.nan))
     with pytest.raises(ValueError, match="finite"):
         is_blurred([1.0, np.inf])
 
@@ -78,7 +78,7 @@ def test_a_photo_is_blurred_beside_its_neighbours_the_set_or_in_itself():
     assert np.flatnonzero(is_blurred(run)).tolist() == list(range(20, 29))
     slow_change = np.linspace(1.2, 0.8, 40)
     assert not is_blurred(slow_change).any()
-    assert is_blurred([TOO_SOFT / 2] * 5).all()
+    assert is_blurred([MIN_SHARPNESS / 2] * 5).all()
     assert is_blurred([]).shape == (0,) and not is_blurred([0.9]).any()
 
 
@@ -86,7 +86,7 @@ def test_exposure_is_linear_and_counts_what_is_clipped():
     picture = np.full((10, 10), 0.5)
     picture[:2] = 0
     picture[2:5] = 1
-    found = exposure(picture)
+    found = measure_exposure(picture)
     middle = ((0.5 + 0.055) / 1.055) ** 2.4
     assert found.luminance == pytest.approx(0.3 + 0.5 * middle, rel=1e-4)
     assert (found.dark, found.bright) == pytest.approx((0.2, 0.3))
@@ -104,7 +104,7 @@ def test_photos_are_measured_at_a_bounded_size(tmp_path):
 @pytest.mark.parametrize("name", ["mipnerf360_bonsai", "gerrard_hall", "specular_gold_cape", "indoor_room"])
 def test_blurred_copies_of_real_photos_are_told_from_sharp_ones(shared_data, name):
     photos = [read_gray(path) for path in sorted((shared_data / name / "images").iterdir())[::6]]
-    sharp = np.array([sharpness(gray) for gray in photos])
-    blurred = np.array([sharpness(ndimage.gaussian_filter(gray, 1.5)) for gray in photos])
+    sharp = np.array([measure_sharpness(gray) for gray in photos])
+    blurred = np.array([measure_sharpness(ndimage.gaussian_filter(gray, 1.5)) for gray in photos])
     assert np.median(sharp) > 1.5 * np.median(blurred)
     assert (sharp[:, None] > blurred).mean() > 0.99

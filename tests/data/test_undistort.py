@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 
 from hyrfpack.data.colmap import lens_from_colmap
-from hyrfpack.data.undistort import Lens, brown, distort, fold_radius, undistort
+from hyrfpack.data.undistort import Lens, brown_coefficients, distort, fold_radius, undistort
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Picture
 
@@ -78,7 +78,7 @@ def test_a_point_lands_where_the_pinhole_camera_projects_it(model):
 
 
 def test_pixels_outside_the_photo_are_masked():
-    pincushion = Lens(64, 64, 60.0, 60.0, 32.0, 32.0, "brown", brown(0.5))
+    pincushion = Lens(64, 64, 60.0, 60.0, 32.0, 32.0, "brown", brown_coefficients(0.5))
 
     picture = undistort(Picture(np.full((64, 64, 3), 200, np.uint8)), pincushion)
 
@@ -89,7 +89,7 @@ def test_pixels_outside_the_photo_are_masked():
 
 def test_rays_past_the_fold_of_the_polynomial_are_masked():
     # r (1 - 0.5 r^2) turns back at r = sqrt(2/3): beyond it the photo would appear a second time.
-    folding = Lens(200, 200, 60.0, 60.0, 100.0, 100.0, "brown", brown(-0.5))
+    folding = Lens(200, 200, 60.0, 60.0, 100.0, 100.0, "brown", brown_coefficients(-0.5))
     assert fold_radius(folding, 2.0) == pytest.approx(np.sqrt(2 / 3), abs=1e-3)
 
     picture = undistort(Picture(np.full((200, 200, 3), 9, np.uint8)), folding)
@@ -100,7 +100,7 @@ def test_rays_past_the_fold_of_the_polynomial_are_masked():
 
 
 def test_a_masked_pixel_never_leaks_into_a_used_one():
-    lens = Lens(40, 40, 40.0, 40.0, 20.0, 20.0, "brown", brown(0.05))
+    lens = Lens(40, 40, 40.0, 40.0, 20.0, 20.0, "brown", brown_coefficients(0.05))
     rgb = np.full((40, 40, 3), 50, np.uint8)
     mask = np.ones((40, 40), bool)
     rgb[10:20, 5:15], mask[10:20, 5:15] = 255, False
@@ -112,7 +112,7 @@ def test_a_masked_pixel_never_leaks_into_a_used_one():
 
 
 def test_colour_under_zero_alpha_never_leaks():
-    lens = Lens(40, 40, 40.0, 40.0, 20.0, 20.0, "brown", brown(0.05))
+    lens = Lens(40, 40, 40.0, 40.0, 20.0, 20.0, "brown", brown_coefficients(0.05))
     rgb = np.full((40, 40, 3), 50, np.uint8)
     alpha = np.full((40, 40), 255, np.uint8)
     rgb[10:20, 5:15], alpha[10:20, 5:15] = 255, 0

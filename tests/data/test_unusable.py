@@ -15,7 +15,7 @@ from PIL import Image
 
 import hyrfpack
 from hyrfpack.data import unusable
-from hyrfpack.data.unusable import name_files, raw_photos_note, unreadable_sentences
+from hyrfpack.data.unusable import format_file_names, raw_photos_notes, unreadable_sentences
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.make.source import Reading, Source
 
@@ -134,7 +134,7 @@ def test_make_takes_a_folder_whose_first_photo_cannot_be_read(tmp_path, monkeypa
     (folder / "0-first.heic").write_bytes(HEIC_HEADER)
     source = Source.of(folder, Reading())
     assert source.kind == "photos" and len(source.files()) == 4
-    assert hyrfpack.data.folder.first_readable(source.files()).size == (64, 48)
+    assert hyrfpack.data.folder.first_readable_photo(source.files()).size == (64, 48)
 
 
 def test_photos_that_cannot_be_read_for_several_reasons_are_counted_together():
@@ -147,9 +147,9 @@ def test_photos_that_cannot_be_read_for_several_reasons_are_counted_together():
 
 
 def test_a_list_of_names_is_complete_or_counted():
-    assert name_files(["a", "b", "c"]) == "a, b, c"
-    assert name_files(["a", "b", "c", "d"]) == "a, b, c and 1 more"
-    assert raw_photos_note([]) == []
+    assert format_file_names(["a", "b", "c"]) == "a, b, c"
+    assert format_file_names(["a", "b", "c", "d"]) == "a, b, c and 1 more"
+    assert raw_photos_notes([]) == []
 
 
 def test_the_examples_run():

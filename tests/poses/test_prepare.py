@@ -12,7 +12,7 @@ from made_up_photos import SIZE, write_photos
 from PIL import Image
 
 import hyrfpack
-from hyrfpack.data.folder import list_photos, photo_facts
+from hyrfpack.data.folder import list_photos, read_photo_facts
 from hyrfpack.data.pictures import read_pixels
 from hyrfpack.poses.copying import copy_file
 from hyrfpack.poses.job import Device, Job
@@ -250,4 +250,4 @@ def test_a_set_of_two_cameras_some_on_their_side_becomes_one_scene(tmp_path):
     scene = hyrfpack.load_scene(tmp_path / "scene")
     assert {(view.camera.width, view.camera.height) for view in scene.views} == {SIZE, (4 * SIZE[0] // 5, SIZE[1])}
     assert len(json.loads((tmp_path / "scene" / "poses.json").read_text())["made"]) == len(known)
-    assert photo_facts(tmp_path / "scene" / "images" / "photo01.jpg").size == SIZE
+    assert read_photo_facts(tmp_path / "scene" / "images" / "photo01.jpg").size == SIZE

@@ -146,7 +146,7 @@ def _of_photo(view: View, shows: dict[int, Path]) -> View:
         width, height = frame.stored
         rgb = np.asarray(Image.open(photo).convert("RGB"))[:height, :width]
         picture = Picture(np.ascontiguousarray(rgb))
-        return undistort(picture, frame.lens) if frame.lens.distorted else picture
+        return undistort(picture, frame.lens) if frame.lens.is_distorted else picture
 
     return dataclasses.replace(view, load=load)
 

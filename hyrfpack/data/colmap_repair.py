@@ -1,0 +1,104 @@
+"""Repair copies of COLMAP models that other programs wrote or people edited, so that pycolmap can read them.
+
+pycolmap's reader of text tables cuts a photo's name at the first space and fails on a byte-order mark. It also rejects
+a model without points.
+"""
+
+from __future__ import annotations
+
+import codecs
+import struct
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from hyrfpack.errors import HyrfDataError
+
+_U64_STRUCT = struct.Struct("<Q")
+_EMPTY_POINT_TABLES = {".bin": _U64_STRUCT.pack(0), ".txt": b"# Number of points: 0\n"}
+_IMAGE_RECORD_HEADER_BYTES = 64  # id, pose and camera, before the name in images.bin
+
+
+@contextmanager
+def readable_model(model: Path, kind: str) -> Iterator[Path]:
+    """Yield a folder that pycolmap can read: the model's own, or a temporary one with a repaired copy.
+
+    Args:
+        model: folder of the model, whose binary tables have been checked.
+        kind: ".bin" or ".txt".
+    """
+    tables = {name: model / f"{name}{kind}" for name in ("cameras", "images", "points3D", "rigs", "frames")}
+    lacks_points = not tables["points3D"].is_file()
+    has_mark = kind == ".txt" and any(_has_byte_order_mark(file) for file in tables.values())
+    if not (lacks_points or has_mark):
+        yield model
+        return
+    with tempfile.TemporaryDirectory(prefix="hyrfpack-") as folder:
+        for name, file in tables.items():
+            if file.is_file():
+                content = file.read_bytes().removeprefix(codecs.BOM_UTF8 if kind == ".txt" else b"")
+                if lacks_points and name == "images":
+                    remove = _remove_binary_observations if kind == ".bin" else _remove_text_observations
+                    content = remove(content)
+                Path(folder, file.name).write_bytes(content)
+        if lacks_points:
+            Path(folder, tables["points3D"].name).write_bytes(_EMPTY_POINT_TABLES[kind])
+        yield Path(folder)
+
+
+def read_image_names(file: Path) -> dict[int, str]:
+    """Read the names of images.txt by image id. A name is all text after the ninth field, including spaces."""
+    names = {}
+    for line in _image_lines(_read_text(file)):
+        fields = line.split(maxsplit=9)
+        if len(fields) == 10 and fields[0].isdecimal():
+            names[int(fields[0])] = fields[9].strip()
+    return names
+
+
+def _read_text(file: Path) -> str:
+    """Read a text table as UTF-8, or as cp1252 if it is not valid UTF-8."""
+    try:
+        content = file.read_bytes().removeprefix(codecs.BOM_UTF8)
+    except OSError as error:
+        raise HyrfDataError(f"{file}: cannot be read ({error.strerror}); check its permissions") from error
+    try:
+        return content.decode()
+    except UnicodeDecodeError:
+        return content.decode("cp1252", errors="replace")  # the encoding of older Windows programs
+
+
+def _image_lines(text: str) -> Iterator[str]:
+    """Yield the first of the two lines of each photo; the second line, of its 2D points, may be empty."""
+    lines = iter(text.split("\n"))
+    for line in lines:
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield line
+            next(lines, None)
+
+
+def _remove_text_observations(content: bytes) -> bytes:
+    """Return images.txt with the same photos and no 2D points, because 2D points refer to 3D points."""
+    lines = [line.rstrip() for line in _image_lines(content.decode(errors="replace"))]
+    return "".join(f"{line}\n\n" for line in lines).encode()
+
+
+def _remove_binary_observations(content: bytes) -> bytes:
+    """Return images.bin with the same photos and no 2D points, because 2D points refer to 3D points."""
+    (count,) = _U64_STRUCT.unpack_from(content)
+    offset, kept = 8, [content[:8]]
+    for _ in range(count):
+        end = content.index(b"\0", offset + _IMAGE_RECORD_HEADER_BYTES) + 1
+        (observations,) = _U64_STRUCT.unpack_from(content, end)
+        kept += [content[offset:end], _U64_STRUCT.pack(0)]
+        offset = end + 8 + 24 * observations
+    return b"".join(kept)
+
+
+def _has_byte_order_mark(file: Path) -> bool:
+    """Whether a file exists and starts with the byte-order mark of UTF-8."""
+    if not file.is_file():
+        return False
+    with file.open("rb") as stream:
+        return stream.read(3) == codecs.BOM_UTF8
