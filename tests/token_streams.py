@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hyrfpack.quant.integers import LEAST_VALUE
+from hyrfpack.quant.integers import MIN_VALUE_BY_TOKEN
 
 
 def laplace_tokens(count: int, scales: list[float] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -13,7 +13,7 @@ def laplace_tokens(count: int, scales: list[float] | np.ndarray) -> tuple[np.nda
     contexts = rng.integers(0, len(scales), count).astype(np.uint8)
     values = np.rint(rng.laplace(scale=np.asarray(scales, float)[contexts])).astype(np.int64)
     folded = np.where(values < 0, -2 * values - 1, 2 * values)
-    return (np.searchsorted(LEAST_VALUE, folded, side="right") - 1).astype(np.uint8), contexts
+    return (np.searchsorted(MIN_VALUE_BY_TOKEN, folded, side="right") - 1).astype(np.uint8), contexts
 
 
 def decode_by_the_book(data: bytes, contexts: list[int]) -> tuple[list[int], int]:

@@ -16,7 +16,7 @@ from hyrfpack.compress.rate_distortion import (
 )
 from hyrfpack.format.compact.channels import MAX_ABS_CHANNEL_VALUE, Channel
 from hyrfpack.quant.lifting import lift
-from hyrfpack.quant.steps import ONE, step_of
+from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
 
 # Candidate weights of the prediction.
 PREDICTION_WEIGHTS_SIXTEENTHS = (0, 6, 9, 12)
@@ -54,10 +54,10 @@ def quantize_channel(
     members = np.bincount(classes, minlength=kinds)
     mean_sensitivity = np.bincount(classes, sensitivity, kinds) / np.maximum(members, 1)
     codes = np.maximum(choose_step_codes(np.where(members > 0, mean_sensitivity, 1), distortion), MIN_STEP_CODE)
-    steps = step_of(codes)[classes]
+    steps = decode_step(codes)[classes]
     values = np.clip(values, -MAX_ABS_CHANNEL_VALUE, MAX_ABS_CHANNEL_VALUE)
     mean = np.float32(np.average(values, weights=1 / steps)) if len(values) else np.float32(0)
-    target = np.rint((values - float(mean)) * ONE).astype(np.int64)
+    target = np.rint((values - float(mean)) * FIXED_POINT_ONE).astype(np.int64)
     weight = _choose_weight(target, steps) if weight is None else weight
 
     nearest = _nearest_chooser(target, steps)
@@ -74,19 +74,19 @@ def quantize_channel(
             step = steps[places]
 
             def cost(symbols: np.ndarray) -> np.ndarray:
-                return added_error(places, (prediction + symbols * step) / ONE + float(mean))
+                return added_error(places, (prediction + symbols * step) / FIXED_POINT_ONE + float(mean))
 
             return choose_symbols(nearest(places, prediction), cost, classes[places], bits, distortion, reach)
 
         def total(symbols: np.ndarray, numbers: np.ndarray) -> float:
-            errors = added_error(np.arange(len(numbers)), numbers / ONE + float(mean))
+            errors = added_error(np.arange(len(numbers)), numbers / FIXED_POINT_ONE + float(mean))
             return float(errors.sum() + LAMBDA_PER_DISTORTION * distortion * look_up_bits(symbols, classes, bits).sum())
 
         # A choice also changes the predictions of later numbers. With coarse steps that can cost more than it saves.
         chosen = lift(len(target), weight, steps, choose)
         if total(*chosen) < total(residuals, decoded):
             residuals, decoded = chosen
-    return Channel(mean, weight, codes, residuals, decoded / ONE + float(mean))
+    return Channel(mean, weight, codes, residuals, decoded / FIXED_POINT_ONE + float(mean))
 
 
 def _choose_weight(target: np.ndarray, steps: np.ndarray) -> int:

@@ -27,7 +27,7 @@ from hyrfpack.model.exposure import expose
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
-from hyrfpack.quant.steps import ONE, step_of
+from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
 from hyrfpack.render import render
 from hyrfpack.scene import Picture, View
 from hyrfpack.train.config import LearningRates
@@ -219,5 +219,5 @@ def _rate_gradient(symbols: np.ndarray, index: np.ndarray, count: int, codes: np
     """Return d rate / d number = sign(q) / (b ln 2 step) in bits, (n,) float64."""
     members = np.maximum(np.bincount(index, minlength=count), 1)
     spread = np.bincount(index, np.abs(symbols), count) / members + 0.1
-    slope = 1 / (spread * np.log(2) * (step_of(codes) / ONE))
+    slope = 1 / (spread * np.log(2) * (decode_step(codes) / FIXED_POINT_ONE))
     return np.sign(symbols) * slope[index]

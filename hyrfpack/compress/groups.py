@@ -6,7 +6,7 @@ import numpy as np
 
 from hyrfpack.compress.rate_distortion import choose_step_codes, choose_symbols, estimate_code_bits
 from hyrfpack.format.compact.groups import ENTROPY_MODEL_COUNT, MAX_ABS_SYMBOL, GroupSymbols, StepGroups, iter_blocks
-from hyrfpack.quant.steps import NOT_CODED, ONE, step_of
+from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, decode_step
 
 # Lower bound of a number's sensitivity, as a share of the mean of its group.
 _MIN_RELATIVE_SENSITIVITY = 0.01
@@ -28,8 +28,10 @@ def quantize_groups(
     index, count = groups.index, groups.count
     members = np.maximum(np.bincount(index, minlength=count), 1)
     mean = np.bincount(index, sensitivity, count) / members
-    codes = np.where(mean > 0, choose_step_codes(np.where(mean > 0, mean, 1), distortion), NOT_CODED).astype(np.uint8)
-    steps, unread = step_of(codes) / ONE, codes == NOT_CODED
+    codes = np.where(mean > 0, choose_step_codes(np.where(mean > 0, mean, 1), distortion), ALL_ZERO_CODE).astype(
+        np.uint8
+    )
+    steps, unread = decode_step(codes) / FIXED_POINT_ONE, codes == ALL_ZERO_CODE
     symbols = np.empty(len(values), np.int64)
     for part in iter_blocks(len(values)):
         nearest = np.rint(values[part] / steps[index[part]])
@@ -47,7 +49,7 @@ def quantize_groups(
 
             chosen = choose_symbols(symbols[part], error, contexts[part], bits, distortion, reach)
             symbols[part] = np.where(unread[index[part]], 0, np.clip(chosen, -MAX_ABS_SYMBOL, MAX_ABS_SYMBOL))
-    codes[np.bincount(index, np.abs(symbols), count) == 0] = NOT_CODED
+    codes[np.bincount(index, np.abs(symbols), count) == 0] = ALL_ZERO_CODE
     return GroupSymbols(codes, models, symbols, (symbols * groups.gather(steps)).astype(np.float32))
 
 

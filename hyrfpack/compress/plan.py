@@ -14,8 +14,8 @@ from hyrfpack.format.compact.channels import MAX_ABS_CHANNEL_VALUE
 from hyrfpack.format.compact.plan import Layer, Plan, build_step_groups
 from hyrfpack.format.sections import COLORS, DECODER_SECTIONS, TABLE_SECTIONS
 from hyrfpack.model import HybridModel
-from hyrfpack.quant.morton import MAX_BITS
-from hyrfpack.quant.points import Points, encode_points
+from hyrfpack.quant.morton import MAX_BITS_PER_AXIS
+from hyrfpack.quant.points import LatticePoints, encode_points
 
 IMPORTANCE_CLASS_COUNT = 6
 # Each class spans this much log2 of sensitivity; much narrower or wider classes give larger files.
@@ -121,10 +121,10 @@ def _encode_layer(cube: np.ndarray, classes: np.ndarray, bits: np.ndarray) -> tu
         bits = points.bits
 
 
-def snap_to_lattice(cube: np.ndarray, classes: np.ndarray, bits: np.ndarray) -> Points:
+def snap_to_lattice(cube: np.ndarray, classes: np.ndarray, bits: np.ndarray) -> LatticePoints:
     """Return the lattice points of the cells that contain the points (n, 3) of the cube."""
     side = (1 << bits)[classes][:, None]
-    return Points(np.clip(np.floor(cube * side), 0, side - 1).astype(np.int64), classes, bits)
+    return LatticePoints(np.clip(np.floor(cube * side), 0, side - 1).astype(np.int64), classes, bits)
 
 
 def _group_classes_into_layers(members: np.ndarray) -> list[list[int]]:
@@ -162,7 +162,7 @@ def position_bits(sensitivity: np.ndarray, classes: np.ndarray, distortion: floa
     bits = np.ones(IMPORTANCE_CLASS_COUNT, np.int64)
     for kind in np.unique(classes):
         step = np.sqrt(12 * distortion / max(float(sensitivity[classes == kind].mean()), 1e-300))
-        bits[kind] = np.clip(np.round(-np.log2(max(step, 2.0**-MAX_BITS))), 1, MAX_BITS)
+        bits[kind] = np.clip(np.round(-np.log2(max(step, 2.0**-MAX_BITS_PER_AXIS))), 1, MAX_BITS_PER_AXIS)
     return bits
 
 

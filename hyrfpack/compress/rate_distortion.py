@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hyrfpack.quant.steps import step_code
+from hyrfpack.quant.steps import encode_step
 
 LAMBDA_PER_DISTORTION = 2 * np.log(2)
 # A table of code lengths has at most this many symbols. Those beyond its ends are rare and share the last entry.
@@ -19,7 +19,7 @@ _MAX_TABLE_SYMBOLS = 4096
 
 def choose_step_codes(sensitivity: np.ndarray, distortion: float) -> np.ndarray:
     """Choose step codes (n,) uint8 for mean sensitivities (n,) > 0, so that rounding adds the error D per number."""
-    return step_code(np.sqrt(12 * distortion / np.maximum(sensitivity, 1e-300)))
+    return encode_step(np.sqrt(12 * distortion / np.maximum(sensitivity, 1e-300)))
 
 
 def estimate_code_bits(symbols: np.ndarray, classes: np.ndarray, count: int, reach: int) -> tuple[np.ndarray, int]:

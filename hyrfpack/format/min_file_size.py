@@ -14,8 +14,8 @@ from hyrfpack.format.compact.quantized import LOGIT_COLUMNS, QuantizedModel
 from hyrfpack.format.sections import DECODER_SECTIONS, TABLE_SECTIONS
 from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.quant.points import Points, encode_points
-from hyrfpack.quant.steps import NOT_CODED
+from hyrfpack.quant.points import LatticePoints, encode_points
+from hyrfpack.quant.steps import ALL_ZERO_CODE
 
 # A table of zeros takes the same bytes at any size, so that the smallest size, which is encoded fastest, is used.
 MIN_LOG2_TABLE_SIZE = 4
@@ -43,7 +43,8 @@ def min_file_bytes(provenance: dict | None = None, exposure: ExposureMap | None 
     triple, single = torch.zeros(0, 3), torch.zeros(0, 1)
     model = HybridModel(config, Gaussians(triple, triple, single, single), torch.Generator().manual_seed(0))
     model.exposure = exposure
-    data, _, points = encode_points(Points(np.zeros((0, 3), np.int64), np.zeros(0, np.uint8), np.ones(1, np.int64)))
+    no_points = LatticePoints(np.zeros((0, 3), np.int64), np.zeros(0, np.uint8), np.ones(1, np.int64))
+    data, _, points = encode_points(no_points)
     groups = {group: build_step_groups(group, config, points) for group in (*TABLE_SECTIONS, *DECODER_SECTIONS)}
     plan = Plan(np.zeros(0, np.int64), (Layer(points, data),), np.eye(3, dtype=np.float32), groups, 0.0)
     empty = Channel(np.float32(0), 0, np.zeros(1, np.uint8), np.zeros(0, np.int64), np.zeros(0))
@@ -79,5 +80,6 @@ def check_target_bytes(target_bytes: int, provenance: dict | None = None, exposu
 def _zero_symbols(groups: StepGroups) -> GroupSymbols:
     """Return the symbols of groups in which all numbers are zero."""
     count = len(groups.index)
-    codes, models = np.full(groups.count, NOT_CODED, np.uint8), np.full(groups.count, ENTROPY_MODEL_COUNT - 1, np.uint8)
+    codes = np.full(groups.count, ALL_ZERO_CODE, np.uint8)
+    models = np.full(groups.count, ENTROPY_MODEL_COUNT - 1, np.uint8)
     return GroupSymbols(codes, models, np.zeros(count, np.int64), np.zeros(count, np.float32))

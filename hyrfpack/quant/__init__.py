@@ -1,4 +1,4 @@
-"""Numbers -> few symbols -> few bytes. Knows arrays, never models."""
+"""Quantisers and entropy coders: numbers to symbols to bytes, and back. They know arrays, never models."""
 
 from hyrfpack.quant.bits import pack_bits, unpack_bits
 from hyrfpack.quant.errors import DamagedDataError

@@ -1,4 +1,7 @@
-"""Bits of varying number, packed one after another: the lowest bit of a value first, into the lowest free bit."""
+"""Packing of values of varying bit length one after another.
+
+The lowest bit of a value comes first and goes into the lowest free bit.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +9,17 @@ import numpy as np
 
 from hyrfpack.quant.errors import DamagedDataError
 
-MAX_BITS = 56
-"""Most bits of a value."""
+MAX_BITS_PER_VALUE = 56
 
-_BLOCK = 1 << 16  # values at once: few enough that temporaries stay in the caches
+_VALUES_PER_BLOCK = 1 << 16  # small enough that temporary arrays stay in the caches
 
 
 def pack_bits(values: np.ndarray, lengths: np.ndarray) -> bytes:
-    """Pack the lowest bits of each value.
+    """Pack the lowest bits of each value into bytes.
 
     Args:
         values: (M,) unsigned integers; bits above a value's length are ignored.
-        lengths: (M,) uint8, 0 to `MAX_BITS`.
+        lengths: (M,) uint8 number of bits of each value, 0 to `MAX_BITS_PER_VALUE`.
 
     Returns:
         ceil(sum of lengths / 8) bytes; free bits at the end are zero.
@@ -29,12 +31,12 @@ def pack_bits(values: np.ndarray, lengths: np.ndarray) -> bytes:
         >>> pack_bits(np.array([1, 2], np.uint64), np.array([1, 7], np.uint8)).hex()
         '05'
     """
-    _check(values.shape, lengths)
+    _check_lengths(values.shape, lengths)
     bits = int(lengths.sum(dtype=np.int64))
     words = np.zeros(bits // 64 + 3, np.uint64)
     position = 0
-    for first in range(0, len(values), _BLOCK):
-        part = slice(first, first + _BLOCK)
+    for first in range(0, len(values), _VALUES_PER_BLOCK):
+        part = slice(first, first + _VALUES_PER_BLOCK)
         length = lengths[part].astype(np.uint64)
         entries = values[part].astype(np.uint64) & ((np.uint64(1) << length) - np.uint64(1))
         starts = np.cumsum(length)
@@ -42,19 +44,19 @@ def pack_bits(values: np.ndarray, lengths: np.ndarray) -> bytes:
         position = int(starts[-1])
         starts -= length
         offsets, places = starts & np.uint64(63), starts >> np.uint64(6)
-        # Values do not overlap, so adding them is joining them. Of those that start in a word only the last can reach
-        # into the next, and as none is longer than a word, every word has a start.
+        # Values do not overlap, so that adding them joins them. Only the last value that starts in a word can reach
+        # into the next word; since no value is longer than a word, a value starts in every word.
         heads = np.append(0, np.flatnonzero(places[1:] != places[:-1]) + 1)
         tails = np.append(heads[1:], len(entries)) - 1
         np.add.at(words, places[heads].astype(np.int64), np.add.reduceat(entries << offsets, heads))
-        # Two shifts, as one by all 64 bits would be undefined.
+        # Two shifts are used, because one shift by all 64 bits would be undefined.
         reach = entries[tails] >> np.uint64(1) >> (np.uint64(63) - offsets[tails])
         np.add.at(words, places[tails].astype(np.int64) + 1, reach)
     return words.astype("<u8").tobytes()[: (bits + 7) // 8]
 
 
 def unpack_bits(data: bytes | memoryview, lengths: np.ndarray) -> np.ndarray:
-    """Read back what `pack_bits` packed.
+    """Unpack the values that `pack_bits` packed.
 
     Args:
         data: the packed bytes, no more and no fewer.
@@ -71,24 +73,24 @@ def unpack_bits(data: bytes | memoryview, lengths: np.ndarray) -> np.ndarray:
         >>> unpack_bits(bytes([0x05]), np.array([1, 7], np.uint8)).tolist()
         [1, 2]
     """
-    _check(lengths.shape, lengths)
+    _check_lengths(lengths.shape, lengths)
     reader = BitReader(data, int(lengths.sum(dtype=np.int64)))
     values = np.empty(len(lengths), np.uint64)
-    for first in range(0, len(lengths), _BLOCK):
-        part = slice(first, first + _BLOCK)
+    for first in range(0, len(lengths), _VALUES_PER_BLOCK):
+        part = slice(first, first + _VALUES_PER_BLOCK)
         values[part] = reader.read(lengths[part])
     return values
 
 
 class BitReader:
-    """Reads packed values a block at a time.
+    """Reader of packed values that returns one block at a time.
 
     Args:
         data: the packed bytes, no more and no fewer.
-        bits: how many bits all values together have.
+        bits: total number of bits of all values.
 
     Raises:
-        DamagedDataError: that many bits take more or fewer bytes, or the bits left over are not zero.
+        DamagedDataError: this number of bits takes more or fewer bytes, or the bits left over are not zero.
     """
 
     def __init__(self, data: bytes | memoryview, bits: int) -> None:
@@ -99,7 +101,7 @@ class BitReader:
         self._data, self._position = memoryview(data), 0
 
     def read(self, lengths: np.ndarray) -> np.ndarray:
-        """Read the next values, uint64, of these lengths; together with those before no more than `bits`."""
+        """Read the next values, uint64, of the given bit lengths; all calls together read at most `bits` bits."""
         length = lengths.astype(np.uint64)
         starts = np.cumsum(length)
         bits = int(starts[-1]) if len(starts) else 0
@@ -108,12 +110,12 @@ class BitReader:
         words = self._words(self._position // 64, (self._position + bits) // 64 + 2)
         self._position += bits
         offsets, places = starts & np.uint64(63), (starts >> np.uint64(6)).view(np.int64)
-        # Two shifts, as one by all 64 bits would be undefined.
+        # Two shifts are used, because one shift by all 64 bits would be undefined.
         values = words[places] >> offsets | words[places + 1] << np.uint64(1) << (np.uint64(63) - offsets)
         return values & ((np.uint64(1) << length) - np.uint64(1))
 
     def words(self) -> np.ndarray:
-        """All bits as uint64 words, lowest bits first; after the last bit come 64 or more zeros."""
+        """Return all bits as uint64 words, lowest bits first; at least 64 zero bits follow the last bit."""
         return self._words(0, len(self._data) // 8 + 2)
 
     def _words(self, start: int, stop: int) -> np.ndarray:
@@ -121,8 +123,8 @@ class BitReader:
         return np.frombuffer(data.ljust(8 * (stop - start), b"\0"), "<u8").astype(np.uint64, copy=False)
 
 
-def _check(shape: tuple[int, ...], lengths: np.ndarray) -> None:
+def _check_lengths(shape: tuple[int, ...], lengths: np.ndarray) -> None:
     if len(shape) != 1 or lengths.shape != shape or lengths.dtype != np.uint8:
         raise ValueError(f"lengths must be uint8, one for each of (M,) values, got {lengths.shape} {lengths.dtype}")
-    if lengths.max(initial=0) > MAX_BITS:
-        raise ValueError(f"a value has at most {MAX_BITS} bits, got {lengths.max()}")
+    if lengths.max(initial=0) > MAX_BITS_PER_VALUE:
+        raise ValueError(f"a value has at most {MAX_BITS_PER_VALUE} bits, got {lengths.max()}")

@@ -1,5 +1,8 @@
-"""What decoders of this package raise: quant knows nothing of files, so who reads one says which."""
+"""The error that the decoders of this package raise.
+
+They do not know which file the data comes from; the reader of the file adds its name to the message.
+"""
 
 
 class DamagedDataError(ValueError):
-    """Coded data contradicts itself: it is truncated, damaged or forged."""
+    """Coded data is truncated, damaged or inconsistent."""

@@ -1,26 +1,26 @@
-"""Huffman coding of whole arrays: codes built by dahuffman, bits packed and unpacked with numpy.
+"""Huffman coding of whole arrays: dahuffman builds the codes, numpy packs and unpacks the bits.
 
-The packed bytes are exactly what `dahuffman.HuffmanCodec.from_frequencies(histogram).encode(symbols)` writes: codes
+The packed bytes are exactly those of `dahuffman.HuffmanCodec.from_frequencies(histogram).encode(symbols)`: codes
 follow one another, most significant bit first; the last byte, if not full, is filled with the first bits of the code
-of the end mark and then with zeros. dahuffman keeps no symbol count, so a decoder of such bytes alone may read extra
-symbols out of the last byte; the count is kept here.
+of the end mark and then with zeros. dahuffman stores no symbol count, so that a decoder of these bytes alone may read
+extra symbols out of the last byte. This module stores the count.
 
 **The code.** Leaves of the Huffman tree are listed from left to right, that is by rising code, each with its symbol
 and its length in bits; one leaf is the end mark. The codes follow from the lengths: the first is all zeros, and as
 binary fractions each is the one before plus 2^-length of that one. The fractions 2^-length add up to exactly 1.
 
-**Chunks.** A prefix code can only be read from one end to the other, one symbol after another. So that an array
-processor can read many symbols at a time, the bits taken by every `chunk_length(count)` consecutive symbols are kept
-beside the stream; the stream itself is not interrupted.
+**Chunks.** A prefix code can only be read from one end to the other, one symbol after another. To decode many symbols
+at a time, the number of bits of every `chunk_length(count)` consecutive symbols is stored beside the stream; the stream
+itself is not interrupted.
 
 **Bytes of a stream** (`HuffmanStream.to_bytes`), little-endian, nothing between or after:
 
     u64  count of symbols
     u64  P, bytes of packed codes
     u32  n, leaves of the code, the end mark among them; 0 only when count is 0
-    u32  place of the end mark among the leaves, 0 to n - 1; 0 when n is 0
-    u8   bytes of a symbol, 1 or 2
-    u8   bytes of a chunk size, 2 or 4
+    u32  index of the end mark among the leaves, 0 to n - 1; 0 when n is 0
+    u8   bytes per symbol, 1 or 2
+    u8   bytes per chunk size, 2 or 4
     n x u8              length of each leaf, 1 to 57 bits
     (n - 1) x u8|u16    symbol of each leaf but the end mark
     C x u16|u32         bits in each chunk; C = ceil(count / chunk_length(count))
@@ -37,21 +37,25 @@ import numpy as np
 
 from hyrfpack.quant.errors import DamagedDataError
 
-END = -1
-"""Stands for the end mark among the symbols of a code."""
+END_MARK = -1
+"""Symbol of the end mark among the symbols of a code."""
 
-MAX_LENGTH = 57
-"""Longest code in bits: a code of this length that starts anywhere in a byte ends within 64 bits. No array of fewer
-than 10^12 symbols can need more (a Huffman code that long needs a histogram that grows like the Fibonacci numbers)."""
+MAX_CODE_BITS = 57
+"""Length in bits of the longest code: a code of this length that starts anywhere in a byte ends within 64 bits. No
+array of fewer than 10^12 symbols needs more: a Huffman code that long needs a histogram that grows like the Fibonacci
+numbers."""
 
-_HEADER = struct.Struct("<QQIIBB")
-_PEEK = 16  # bits looked up at once in decoding
-_BLOCK = 1 << 16  # codes packed at once: few enough that temporaries stay in the caches
-_ROWS = 64  # decoding steps between two transpositions of what was decoded
+_HEADER_STRUCT = struct.Struct("<QQIIBB")
+_MAX_PEEK_BITS = 16  # bounds the lookup table of the decoder at 2^16 entries
+_CODES_PER_BLOCK = 1 << 16  # small enough that temporary arrays stay in the caches
+_STEPS_PER_BLOCK = 64  # decoding steps between two transpositions of the decoded symbols
 
 
 def chunk_length(count: int) -> int:
-    """Symbols in a chunk (the last may have fewer): 1024, or more so that there are at most 1024 chunks; even."""
+    """Return the even number of symbols per chunk: 1024, or more where `count` would need more than 1024 chunks.
+
+    The last chunk may have fewer symbols.
+    """
     return max(1024, 2 * -(-count // 2048))
 
 
@@ -60,8 +64,8 @@ class HuffmanCode:
     """A complete prefix code.
 
     Attributes:
-        symbols: (n,) int32 symbols by rising code, 0 to 65535, and `END` once.
-        lengths: (n,) uint8 bits of each code, 1 to `MAX_LENGTH`.
+        symbols: (n,) int32 symbols by rising code, 0 to 65535, and `END_MARK` once.
+        lengths: (n,) uint8 bits of each code, 1 to `MAX_CODE_BITS`.
     """
 
     symbols: np.ndarray
@@ -72,11 +76,11 @@ class HuffmanCode:
         """Build dahuffman's code for a histogram.
 
         Args:
-            counts: (K,) how often each symbol 0 to K - 1 occurs, K at most 65536. Symbols that do not occur get no
-                code. All zero gives the empty code, which codes the empty array only.
+            counts: (K,) number of occurrences of each symbol 0 to K - 1, K at most 65536. Symbols that do not occur
+                get no code. If all counts are zero, the result is the empty code, which codes the empty array only.
 
         Raises:
-            ValueError: a count is negative, K is too large, or a code would be longer than `MAX_LENGTH`.
+            ValueError: a count is negative, K is too large, or a code would be longer than `MAX_CODE_BITS`.
         """
         counts = np.asarray(counts)
         if counts.ndim != 1 or len(counts) > 65536 or (counts < 0).any():
@@ -87,22 +91,22 @@ class HuffmanCode:
         from dahuffman import HuffmanCodec
 
         frequencies = {int(symbol): int(counts[symbol]) for symbol in occurring}
-        table = HuffmanCodec.from_frequencies(frequencies, eof=END).get_code_table()
-        if max(length for length, _ in table.values()) > MAX_LENGTH:
-            raise ValueError(f"the histogram is so skewed that a code is longer than {MAX_LENGTH} bits")
-        leaves = sorted((code << (MAX_LENGTH - length), symbol, length) for symbol, (length, code) in table.items())
+        table = HuffmanCodec.from_frequencies(frequencies, eof=END_MARK).get_code_table()
+        if max(length for length, _ in table.values()) > MAX_CODE_BITS:
+            raise ValueError(f"the histogram is so skewed that a code is longer than {MAX_CODE_BITS} bits")
+        leaves = sorted((code << (MAX_CODE_BITS - length), symbol, length) for symbol, (length, code) in table.items())
         return cls(np.array([leaf[1] for leaf in leaves], np.int32), np.array([leaf[2] for leaf in leaves], np.uint8))
 
     @cached_property
-    def left_codes(self) -> np.ndarray:
-        """(n,) uint64 codes, each shifted so that its first bit is bit 63."""
+    def left_aligned_codes(self) -> np.ndarray:
+        """Return the (n,) uint64 codes, each shifted so that its first bit is bit 63."""
         shares = np.uint64(1) << (np.uint64(64) - self.lengths.astype(np.uint64))
-        return np.cumsum(shares, dtype=np.uint64) - shares  # only the sum of all, 2^64, wraps around
+        return np.cumsum(shares, dtype=np.uint64) - shares  # no overflow: only the sum of all shares is 2^64
 
     @property
     def codes(self) -> np.ndarray:
-        """(n,) uint64 codes as numbers of `lengths` bits, as dahuffman's code table has them."""
-        return self.left_codes >> (np.uint64(64) - self.lengths.astype(np.uint64))
+        """Return the (n,) uint64 codes as numbers of `lengths` bits, as in dahuffman's code table."""
+        return self.left_aligned_codes >> (np.uint64(64) - self.lengths.astype(np.uint64))
 
     def check(self) -> None:
         """Raise DamagedDataError unless this is a complete prefix code with each symbol once (or the empty code)."""
@@ -110,34 +114,34 @@ class HuffmanCode:
             return
         if len(np.unique(self.symbols)) != len(self.symbols):
             raise DamagedDataError("Huffman code table: a symbol has two codes; the data is damaged")
-        if len(self.symbols) < 2 or self.lengths.min() < 1 or self.lengths.max() > MAX_LENGTH:
+        if len(self.symbols) < 2 or self.lengths.min() < 1 or self.lengths.max() > MAX_CODE_BITS:
             raise DamagedDataError(
-                f"Huffman code table: a length is not in 1 to {MAX_LENGTH} bits; the data is damaged"
+                f"Huffman code table: a length is not in 1 to {MAX_CODE_BITS} bits; the data is damaged"
             )
         histogram = np.bincount(self.lengths).tolist()
-        if sum(leaves << (MAX_LENGTH - length) for length, leaves in enumerate(histogram)) != 1 << MAX_LENGTH:
+        if sum(leaves << (MAX_CODE_BITS - length) for length, leaves in enumerate(histogram)) != 1 << MAX_CODE_BITS:
             raise DamagedDataError("Huffman code table: the lengths make no complete code; the data is damaged")
-        if (self.left_codes << self.lengths.astype(np.uint64)).any():
+        if (self.left_aligned_codes << self.lengths.astype(np.uint64)).any():
             raise DamagedDataError("Huffman code table: the leaves are not in the order of their codes; it is damaged")
 
-    def by_symbol(self, size: int) -> tuple[np.ndarray, np.ndarray]:
-        """Left codes (uint64) and lengths (uint64, 0 = no code) of the symbols 0 to size - 1."""
+    def codes_by_symbol(self, size: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return left-aligned codes (uint64) and lengths (uint64, 0 = no code) of the symbols 0 to size - 1."""
         codes, lengths = np.zeros((2, size), np.uint64)
-        real = self.symbols != END
-        codes[self.symbols[real]] = self.left_codes[real]
+        real = self.symbols != END_MARK
+        codes[self.symbols[real]] = self.left_aligned_codes[real]
         lengths[self.symbols[real]] = self.lengths[real]
         return codes, lengths
 
 
 @dataclass(frozen=True, eq=False)
 class HuffmanStream:
-    """Coded symbols with all that is needed to decode them.
+    """Coded symbols and everything that is needed to decode them.
 
     Attributes:
         code: the prefix code.
-        count: symbols in the stream.
-        dtype: uint8 or uint16, of the symbols.
-        chunk_bits: (C,) int64 bits taken by every `chunk_length(count)` symbols.
+        count: number of symbols in the stream.
+        dtype: dtype of the symbols, uint8 or uint16.
+        chunk_bits: (C,) int64 number of bits of every `chunk_length(count)` symbols.
         payload: the packed codes, byte-identical to dahuffman's.
     """
 
@@ -148,15 +152,15 @@ class HuffmanStream:
     payload: bytes
 
     def to_bytes(self) -> bytes:
-        """Serialise; the layout is in the head of this module."""
+        """Serialise the stream; the docstring of this module describes the layout."""
         symbols, width = self.code.symbols, self.dtype.itemsize
         wide = 4 if self.chunk_bits.max(initial=0) > 0xFFFF else 2
-        end = int(np.argmax(symbols == END)) if len(symbols) else 0
+        end = int(np.argmax(symbols == END_MARK)) if len(symbols) else 0
         return b"".join(
             (
-                _HEADER.pack(self.count, len(self.payload), len(symbols), end, width, wide),
+                _HEADER_STRUCT.pack(self.count, len(self.payload), len(symbols), end, width, wide),
                 self.code.lengths.tobytes(),
-                symbols[symbols != END].astype(f"<u{width}").tobytes(),
+                symbols[symbols != END_MARK].astype(f"<u{width}").tobytes(),
                 self.chunk_bits.astype(f"<u{wide}").tobytes(),
                 self.payload,
             )
@@ -164,14 +168,14 @@ class HuffmanStream:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> HuffmanStream:
-        """Read what `to_bytes` wrote. Nothing is allocated that the length of `data` does not bear out.
+        """Read a stream that `to_bytes` wrote. Allocations are bounded by the length of `data`.
 
         Raises:
-            DamagedDataError: the bytes are truncated, too many, or contradict themselves.
+            DamagedDataError: the bytes are truncated, too many, or inconsistent.
         """
-        if len(data) < _HEADER.size:
+        if len(data) < _HEADER_STRUCT.size:
             raise DamagedDataError(f"Huffman stream: {len(data)} bytes are fewer than its header; it is truncated")
-        count, payload_size, leaves, end, width, wide = _HEADER.unpack_from(data)
+        count, payload_size, leaves, end, width, wide = _HEADER_STRUCT.unpack_from(data)
         if width not in (1, 2) or wide not in (2, 4) or leaves > 256**width + 1 or end > max(leaves - 1, 0):
             raise DamagedDataError("Huffman stream: its header says what cannot be; the data is damaged")
         if count > 8 * payload_size or (count > 0) != (payload_size > 0) or (leaves == 0 and count > 0):
@@ -180,31 +184,31 @@ class HuffmanStream:
             )
         chunks = -(-count // chunk_length(count))
         sizes = (leaves, max(leaves - 1, 0) * width, chunks * wide, payload_size)
-        if len(data) != _HEADER.size + sum(sizes):
+        if len(data) != _HEADER_STRUCT.size + sum(sizes):
             raise DamagedDataError(
-                f"Huffman stream: {len(data)} bytes where {_HEADER.size + sum(sizes)} are announced; it is truncated "
-                "or damaged"
+                f"Huffman stream: {len(data)} bytes where {_HEADER_STRUCT.size + sum(sizes)} are announced; it is "
+                "truncated or damaged"
             )
-        edges = np.cumsum((_HEADER.size, *sizes)).tolist()
+        edges = np.cumsum((_HEADER_STRUCT.size, *sizes)).tolist()
         lengths, symbols, chunk_bits, payload = (
             data[start:stop] for start, stop in zip(edges, edges[1:], strict=False)
         )
         alphabet = np.frombuffer(symbols, f"<u{width}").astype(np.int32)
-        code = HuffmanCode(np.insert(alphabet, end, END) if leaves else alphabet, np.frombuffer(lengths, np.uint8))
+        code = HuffmanCode(np.insert(alphabet, end, END_MARK) if leaves else alphabet, np.frombuffer(lengths, np.uint8))
         code.check()
         bits = np.frombuffer(chunk_bits, f"<u{wide}").astype(np.int64)
         return cls(code, count, np.dtype(f"u{width}"), bits, bytes(payload))
 
 
 def huffman_encode(symbols: np.ndarray, code: HuffmanCode | None = None) -> HuffmanStream:
-    """Code an array of symbols.
+    """Encode an array of symbols.
 
     Args:
         symbols: (N,) uint8 or uint16, N >= 0.
         code: the code to use; by default the best one for these symbols, built by dahuffman.
 
     Raises:
-        ValueError: another dtype or shape, or a symbol for which `code` has no code.
+        ValueError: the dtype or shape is wrong, or `code` has no code for a symbol.
 
     Example:
         >>> symbols = np.array([7, 7, 7, 9], np.uint8)
@@ -216,14 +220,14 @@ def huffman_encode(symbols: np.ndarray, code: HuffmanCode | None = None) -> Huff
     symbols = np.ascontiguousarray(symbols)
     counts = _histogram(symbols)
     code = code or HuffmanCode.from_frequencies(counts)
-    codes, lengths = code.by_symbol(len(counts))
+    codes, lengths = code.codes_by_symbol(len(counts))
     if (missing := np.flatnonzero((lengths == 0) & (counts > 0))).size:
         raise ValueError(f"the code has no code for symbol {missing[0]}")
     count, bits = len(symbols), int(counts @ lengths.astype(np.int64))
 
-    # One key looks up one packed entry: a code at the top and its length in the 6 lowest bits.
-    if symbols.dtype == np.uint8 and 2 * int(code.lengths.max(initial=0)) <= MAX_LENGTH:
-        # Two symbols at once. A last single one is doubled; what that adds is cut off below.
+    # The table holds a packed entry for each key: the code in the top bits and its length in the 6 lowest bits.
+    if symbols.dtype == np.uint8 and 2 * int(code.lengths.max(initial=0)) <= MAX_CODE_BITS:
+        # Symbols are coded in pairs. The last symbol of an odd number is repeated; its extra bits are cut off below.
         keys = (np.append(symbols, symbols[-1:]) if count % 2 else symbols).view("<u2")
         table = (codes | codes[:, None] >> lengths | lengths + lengths[:, None]).ravel()
         words, chunk_starts = _pack(keys, table, bits, chunk_length(count) // 2)
@@ -231,16 +235,16 @@ def huffman_encode(symbols: np.ndarray, code: HuffmanCode | None = None) -> Huff
         words, chunk_starts = _pack(symbols, codes | lengths, bits, chunk_length(count))
     packed = bytearray(words.astype(">u8").tobytes()[: (bits + 7) // 8])
     if free := -bits % 8:
-        end_code = int(code.left_codes[code.symbols == END][0])
+        end_code = int(code.left_aligned_codes[code.symbols == END_MARK][0])
         packed[-1] = packed[-1] >> free << free | end_code >> (64 - free)
     return HuffmanStream(code, count, symbols.dtype, np.diff(chunk_starts, append=bits), bytes(packed))
 
 
 def _histogram(symbols: np.ndarray) -> np.ndarray:
-    """How often each symbol occurs: (256,) int64 for uint8, (65536,) for uint16."""
+    """Count the occurrences of each symbol: (256,) int64 for uint8, (65536,) for uint16."""
     if symbols.dtype == np.uint16:
         return np.bincount(symbols, minlength=65536)
-    # Pairs are counted in half the time.
+    # Counting pairs takes half the time.
     even = len(symbols) // 2 * 2
     pairs = np.bincount(symbols[:even].view(np.uint16), minlength=65536).reshape(256, 256)
     return pairs.sum(axis=0) + pairs.sum(axis=1) + np.bincount(symbols[even:], minlength=256)
@@ -249,17 +253,17 @@ def _histogram(symbols: np.ndarray) -> np.ndarray:
 def _pack(keys: np.ndarray, table: np.ndarray, bits: int, interval: int) -> tuple[np.ndarray, np.ndarray]:
     """Pack the entries table[keys] one after another.
 
-    Codes are cut at word ends: of all codes that start in a word only the last reaches into the next. They do not
-    overlap, so adding them is joining them. Every word has a start, as no code is longer than 57 bits.
+    Codes are cut at word ends: only the last code that starts in a word reaches into the next word. Codes do not
+    overlap, so that adding them joins them. A code starts in every word, because no code is longer than 57 bits.
 
     Returns:
-        Words of 64 bits, first bit highest; and the int64 bit at which every interval-th entry starts.
+        Words of 64 bits, first bit highest; and the int64 bit position of every interval-th entry.
     """
     words = np.zeros(bits // 64 + 3, np.uint64)
     sampled = [np.zeros(0, np.uint64)]
     position = 0
-    for first in range(0, len(keys), _BLOCK):
-        entries = table[keys[first : first + _BLOCK]]
+    for first in range(0, len(keys), _CODES_PER_BLOCK):
+        entries = table[keys[first : first + _CODES_PER_BLOCK]]
         lengths = entries & np.uint64(63)
         entries ^= lengths
         starts = np.cumsum(lengths)
@@ -273,7 +277,7 @@ def _pack(keys: np.ndarray, table: np.ndarray, bits: int, interval: int) -> tupl
         tails = np.append(heads[1:], len(entries)) - 1
         word, stop = int(places[0]), int(places[0]) + len(heads)
         words[word:stop] |= np.add.reduceat(entries >> offsets, heads)
-        # Two shifts, as one by all 64 bits would be undefined.
+        # Two shifts are used, because one shift by all 64 bits would be undefined.
         words[word + 1 : stop + 1] |= entries[tails] << np.uint64(1) << (np.uint64(63) - offsets[tails])
     return words, np.concatenate(sampled).astype(np.int64)
 
@@ -281,11 +285,11 @@ def _pack(keys: np.ndarray, table: np.ndarray, bits: int, interval: int) -> tupl
 def huffman_decode(stream: HuffmanStream) -> np.ndarray:
     """Decode a stream into its (count,) symbols.
 
-    All chunks are read side by side, one symbol of each a step. Damage may yield wrong symbols, but never reads
-    outside the stream, and any damage that changes where a chunk ends is found.
+    All chunks are decoded in parallel, one symbol of each per step. Damaged data may give wrong symbols, but never
+    reads outside the stream; damage that changes the end of a chunk is detected.
 
     Raises:
-        DamagedDataError: a chunk does not end where the next starts, or the end mark comes early.
+        DamagedDataError: a chunk does not end where the next one starts, or the end mark comes too early.
     """
     count, interval = stream.count, chunk_length(stream.count)
     if count == 0:
@@ -304,18 +308,18 @@ def huffman_decode(stream: HuffmanStream) -> np.ndarray:
 
     position = (ends - stream.chunk_bits).astype(np.uint64)
     index, offset, window, advance = np.empty((4, lanes), np.uint64)
-    entries = np.empty((_ROWS, lanes), np.uint64)
+    entries = np.empty((_STEPS_PER_BLOCK, lanes), np.uint64)
     decoded = np.empty((lanes, steps), stream.dtype)
     last_end = None
-    for first in range(0, steps, _ROWS):
-        rows = min(_ROWS, steps - first)
+    for first in range(0, steps, _STEPS_PER_BLOCK):
+        rows = min(_STEPS_PER_BLOCK, steps - first)
         for row in range(rows):
             if first + row == left_over:
                 last_end = int(position[-1])
             entry = entries[row]
             np.right_shift(position, np.uint64(5), out=index)
             np.bitwise_and(position, np.uint64(31), out=offset)
-            # "clip" keeps a lane that runs away inside; where it ends up betrays it below.
+            # "clip" keeps a lane of damaged data inside the stream; the check of its end position below detects it.
             windows.take(index.view(np.int64), out=window, mode="clip")
             np.left_shift(window, offset, out=window)
             np.right_shift(window, peek_shift, out=index)
@@ -336,27 +340,28 @@ def huffman_decode(stream: HuffmanStream) -> np.ndarray:
 
 
 def _decoding_tables(code: HuffmanCode, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """What the next bits mean: entries with the symbol in the 16 lowest bits and the code's length above.
+    """Build the decoding tables: entries with the symbol in the 16 lowest bits and the code's length above.
 
     Returns:
-        (2^p,) entries by the next p bits, 0 where a code is longer: p is the longest code, but no more than 16 nor than
-        `count` symbols pay for; and (n,) the entries by leaf, empty if no code is longer.
+        (2^p,) entries by the next p bits, 0 where the code is longer. p is the length of the longest code, at most 16
+        and so small that building the table pays off for `count` symbols. And (n,) entries by leaf, empty if no code
+        is longer than p bits.
     """
     advance = code.lengths.astype(np.uint64)
-    advance[code.symbols == END] = 1 << 40  # out of the stream: no chunk can end there
+    advance[code.symbols == END_MARK] = 1 << 40  # leads out of the stream, so that the check of chunk ends fails
     leaf_entries = advance << np.uint64(16) | (code.symbols & 0xFFFF).astype(np.uint64)
     longest = int(code.lengths.max())
-    peek = min(longest, _PEEK, max(8, count.bit_length()))
-    # Leaves are in the order of their codes: the one that holds some bits is the last that starts at or before them.
+    peek = min(longest, _MAX_PEEK_BITS, max(8, count.bit_length()))
+    # Leaves are in the order of their codes, so that bits belong to the last leaf whose code is not above them.
     next_bits = np.arange(1 << peek, dtype=np.uint64) << np.uint64(64 - peek)
-    leaf = np.searchsorted(code.left_codes, next_bits, side="right") - 1
+    leaf = np.searchsorted(code.left_aligned_codes, next_bits, side="right") - 1
     table = np.where(code.lengths[leaf] <= peek, leaf_entries[leaf], np.uint64(0))
     return table, leaf_entries if longest > peek else leaf_entries[:0]
 
 
 def _long_entries(code: HuffmanCode, leaf_entries: np.ndarray, windows: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Entries of the codes at these bit positions, whatever their length."""
+    """Look up the entries of the codes at the given bit positions, of any length."""
     index = np.minimum(position >> np.uint64(5), np.uint64(len(windows) - 3)).astype(np.int64)
     offset = position & np.uint64(31)
     bits = windows[index] << offset | windows[index + 2] >> (np.uint64(63) - offset) >> np.uint64(1)
-    return leaf_entries[np.searchsorted(code.left_codes, bits, side="right") - 1]
+    return leaf_entries[np.searchsorted(code.left_aligned_codes, bits, side="right") - 1]

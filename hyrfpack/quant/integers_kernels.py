@@ -1,4 +1,4 @@
-"""Integers to tokens and extra bits and back, in Numba: the same results as the numpy loops of `integers`."""
+"""Numba kernels between integers and tokens with extra bits; their results equal the numpy loops of `integers`."""
 
 from __future__ import annotations
 
@@ -8,48 +8,61 @@ from hyrfpack.parallel.compiled import compiled
 
 njit = compiled(error_model="numpy")
 
-_1, _6, _OFFSET = np.uint64(1), np.uint64(6), np.uint64(63)
+_ONE = np.uint64(1)
+_WORD_SHIFT = np.uint64(6)  # a bit position shifted by it is the index of its 64-bit word
+_OFFSET_MASK = np.uint64(63)
 
 
 @njit
-def split(values, signed, token_of, extra_bits, tokens, words, place):
-    """Write the token of each value and add its extra bits to zeroed words, from bit `place` on; return where they end.
+def values_to_tokens(values, signed, token_of, extra_bits, tokens, words, place):
+    """Write the token of each value, and its extra bits into zeroed words from bit `place` on.
 
     Args:
         values: (M,) int64.
-        token_of: (2^k,) tokens of the values below 2^k, k at least 8: from 128 on, twice a value is 2 tokens higher.
-        tokens: (M,) uint8, written.
-        words: uint64, one more than the bits fill, written.
+        signed: whether values may be negative.
+        token_of: (2^k,) tokens of the values below 2^k, k at least 8. For values of 128 and more, the token of twice a
+            value is 2 higher.
+        extra_bits: number of extra bits of each token.
+        tokens: (M,) uint8 output.
+        words: uint64 output, one more word than the bits fill.
+        place: bit position of the first extra bit.
+
+    Returns:
+        The bit position after the last extra bit.
     """
     place = np.uint64(place)
     for i in range(len(values)):
         value = np.uint64(values[i] << 1 ^ values[i] >> 63) if signed else np.uint64(values[i])
         head, halvings = value, 0
         while head >= np.uint64(len(token_of)):
-            head >>= _1
+            head >>= _ONE
             halvings += 1
         token = token_of[head] + np.uint8(2 * halvings)
         tokens[i] = token
         length = np.uint64(extra_bits[np.uint64(token)])
         if length > 0:
-            extra, offset = value & ((_1 << length) - _1), place & _OFFSET
-            words[place >> _6] |= extra << offset
-            # Two shifts, as one by all 64 bits would be undefined.
-            words[(place >> _6) + _1] |= extra >> _1 >> (_OFFSET - offset)
+            extra, offset = value & ((_ONE << length) - _ONE), place & _OFFSET_MASK
+            words[place >> _WORD_SHIFT] |= extra << offset
+            # Two shifts are used, because one shift by all 64 bits would be undefined.
+            words[(place >> _WORD_SHIFT) + _ONE] |= extra >> _ONE >> (_OFFSET_MASK - offset)
             place += length
     return place
 
 
 @njit
-def join(tokens, words, signed, least_value, extra_bits, values):
-    """Write the values of tokens and of extra bits in uint64 words, one more than they fill; `values` are unsigned."""
+def tokens_to_values(tokens, words, signed, least_value, extra_bits, values):
+    """Write the values of tokens and their extra bits into `values`, uint32 or uint64.
+
+    `words` are uint64, one more word than the extra bits fill.
+    """
     place = np.uint64(0)
     for i in range(len(tokens)):
         token = np.uint64(tokens[i])
         value, length = least_value[token], np.uint64(extra_bits[token])
         if length > 0:
-            offset = place & _OFFSET
-            extra = words[place >> _6] >> offset | words[(place >> _6) + _1] << _1 << (_OFFSET - offset)
-            value += extra & ((_1 << length) - _1)
+            offset = place & _OFFSET_MASK
+            low, high = words[place >> _WORD_SHIFT], words[(place >> _WORD_SHIFT) + _ONE]
+            extra = low >> offset | high << _ONE << (_OFFSET_MASK - offset)
+            value += extra & ((_ONE << length) - _ONE)
             place += length
-        values[i] = value >> _1 ^ (~(value & _1) + _1) if signed else value
+        values[i] = value >> _ONE ^ (~(value & _ONE) + _ONE) if signed else value

@@ -1,11 +1,11 @@
-"""Numbers along a list, each predicted from neighbours that are decoded before it.
+"""Lifting: each number of a list is predicted from neighbours that are decoded before it.
 
-The list is halved again and again: first comes number 0, then those at odd multiples of the largest power of two, and
-so on down to the odd places. A number at an odd multiple of d is predicted by the mean of its neighbours d before and
-d after it (the last by the one before), times weight / 16. What is stored is the difference in steps, rounded.
+The list is coded in levels: first number 0, then the numbers at odd multiples of the largest power of two, and so on
+down to the odd indices. A number at an odd multiple of d is predicted by the mean of its neighbours d before and d
+after it (the last number by the one before), times weight / 16. The rounded difference is stored, in steps.
 
-All in integers (fixed point, `steps.ONE`), so that every decoder gets the same bits; a whole level is one array
-operation, as no number of it depends on another.
+All arithmetic is in integers (fixed point, `steps.FIXED_POINT_ONE`), so that every decoder gets the same bits. A whole
+level is one array operation, because no number depends on another of its level.
 """
 
 from __future__ import annotations
@@ -14,26 +14,32 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-_PART = 1 << 14
+_PLACES_PER_BLOCK = 1 << 14  # small enough that temporary arrays stay in the caches
 
 
-def levels(count: int) -> Iterator[tuple[np.ndarray, int]]:
-    """The places (n,) of each level after the first, and the distance d to their neighbours; coarse levels first.
+def iter_levels(count: int) -> Iterator[tuple[np.ndarray, int]]:
+    """Yield the indices (n,) of each level after the first and the distance d to their neighbours, coarse levels first.
 
-    Long levels come in parts, which temporaries in the caches are enough for.
+    Long levels come in several blocks, so that temporary arrays stay in the caches.
     """
     distance = 1 << max(count - 1, 0).bit_length()
     while distance > 1:
         distance //= 2
-        for first in range(distance, count, 2 * distance * _PART):
-            yield np.arange(first, min(first + 2 * distance * _PART, count), 2 * distance), distance
+        for first in range(distance, count, 2 * distance * _PLACES_PER_BLOCK):
+            yield np.arange(first, min(first + 2 * distance * _PLACES_PER_BLOCK, count), 2 * distance), distance
 
 
 def predict(values: np.ndarray, places: np.ndarray, distance: int, weight: int) -> np.ndarray:
-    """Predictions (n,) int64 for the numbers at `places`, from decoded `values` (N,) int64; weight 0 to 16.
+    """Predict the numbers at `places` from numbers that have been decoded.
 
     Args:
-        places: as from `levels`: 2 d apart.
+        values: (N,) int64 decoded numbers.
+        places: (n,) indices from `iter_levels`, 2 d apart.
+        distance: d.
+        weight: weight of the prediction in 16ths, 0 to 16.
+
+    Returns:
+        (n,) int64.
     """
     if weight == 0:
         return np.zeros(len(places), np.int64)
@@ -41,7 +47,7 @@ def predict(values: np.ndarray, places: np.ndarray, distance: int, weight: int) 
     prediction = neighbours[: len(places)].copy()
     after = neighbours[1:]
     prediction[: len(after)] += after
-    prediction[len(after) :] *= 2  # the last has none after it
+    prediction[len(after) :] *= 2  # the last number has no neighbour after it
     prediction *= weight
     prediction >>= 5
     return prediction
@@ -50,30 +56,30 @@ def predict(values: np.ndarray, places: np.ndarray, distance: int, weight: int) 
 def lift(
     count: int, weight: int, steps: np.ndarray, choose: Callable[[np.ndarray, np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Quantise a list. The encoder's side of `unlift`.
+    """Quantise a list of numbers: the encoder for `inverse_lift`.
 
     Args:
         count: N.
-        weight: of the prediction, 0 to 16.
-        steps: (N,) int64.
-        choose: called with places (n,) and predictions (n,); returns the differences (n,) int64, in steps.
+        weight: weight of the prediction in 16ths, 0 to 16.
+        steps: (N,) int64 quantisation steps.
+        choose: function of indices (n,) and predictions (n,) that returns the differences (n,) int64, in steps.
 
     Returns:
         The differences (N,) int64, and the numbers as they will be decoded (N,) int64.
     """
     residuals, values = np.zeros((2, count), np.int64)
     first = np.arange(min(count, 1))
-    for places, distance in [(first, 0), *levels(count)]:
+    for places, distance in [(first, 0), *iter_levels(count)]:
         prediction = predict(values, places, distance, weight) if distance else np.zeros(len(places), np.int64)
         residuals[places] = choose(places, prediction)
         values[places] = prediction + residuals[places] * steps[places]
     return residuals, values
 
 
-def unlift(residuals: np.ndarray, weight: int, steps: np.ndarray) -> np.ndarray:
-    """The numbers (N,) int64 from differences (N,) in steps (N,) int64."""
+def inverse_lift(residuals: np.ndarray, weight: int, steps: np.ndarray) -> np.ndarray:
+    """Return the numbers (N,) int64 from differences (N,), in units of steps (N,) int64."""
     values = np.multiply(residuals, steps, dtype=np.int64)
     if weight:
-        for places, distance in levels(len(values)):
+        for places, distance in iter_levels(len(values)):
             values[places[0] : places[-1] + 1 : 2 * distance] += predict(values, places, distance, weight)
     return values

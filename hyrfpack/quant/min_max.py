@@ -10,16 +10,16 @@ import numpy as np
 
 from hyrfpack.quant.errors import DamagedDataError
 
-_PARAMS = struct.Struct("<ffB")
+_PARAMS_STRUCT = struct.Struct("<ffB")
 
 
 @dataclass(frozen=True)
 class MinMaxParams:
-    """What `MinMaxQuantizer.decode` needs besides the codes.
+    """Parameters that `MinMaxQuantizer.decode` needs besides the codes.
 
     Attributes:
-        minimum, maximum: the range, each exactly a float32.
-        bits: bits of a code, 1 to 16.
+        minimum, maximum: range of the values; each is exactly a float32.
+        bits: bits per code, 1 to 16.
     """
 
     minimum: float
@@ -27,21 +27,22 @@ class MinMaxParams:
     bits: int
 
     def to_bytes(self) -> bytes:
-        """Nine bytes, little-endian: minimum float32, maximum float32, bits u8."""
-        return _PARAMS.pack(self.minimum, self.maximum, self.bits)
+        """Return nine bytes, little-endian: minimum float32, maximum float32, bits u8."""
+        return _PARAMS_STRUCT.pack(self.minimum, self.maximum, self.bits)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> MinMaxParams:
-        """Read what `to_bytes` wrote.
+        """Read parameters that `to_bytes` wrote.
 
         Raises:
-            DamagedDataError: not nine bytes, a range that is not finite or not ordered, or bits not in 1 to 16.
+            DamagedDataError: there are not nine bytes, the range is not finite or not ordered, or bits is not in 1 to
+                16.
         """
-        if len(data) != _PARAMS.size:
+        if len(data) != _PARAMS_STRUCT.size:
             raise DamagedDataError(
-                f"min-max parameters: {len(data)} bytes instead of {_PARAMS.size}; the data is damaged"
+                f"min-max parameters: {len(data)} bytes instead of {_PARAMS_STRUCT.size}; the data is damaged"
             )
-        params = cls(*_PARAMS.unpack(data))
+        params = cls(*_PARAMS_STRUCT.unpack(data))
         if not (-math.inf < params.minimum <= params.maximum < math.inf and 1 <= params.bits <= 16):
             raise DamagedDataError(f"min-max parameters: {params} is not a range; the data is damaged")
         return params
@@ -49,18 +50,18 @@ class MinMaxParams:
 
 @dataclass(frozen=True)
 class MinMaxQuantizer:
-    """Quantises an array to evenly spaced levels between its minimum and maximum, both of them levels.
+    """Uniform quantiser with levels from the minimum to the maximum of an array.
 
         L = 2^b - 1        q = round(L (v - min) / (max - min))        decoded: ((L - q) min + q max) / L
 
-    The arithmetic is float64, one correctly rounded operation at a time in the order written, halves rounded to the
-    even code, and decoded levels are rounded to float32 once: every platform gives the same codes and values.
+    The arithmetic is float64, one correctly rounded operation at a time in the order written, halves are rounded to
+    the even code, and decoded levels are rounded to float32 once. So every platform gives the same codes and values.
 
     Error of a decoded value: at most (max - min) / (2 L), half a step, plus rounding, at most
     2^-23 max(|min|, |max|). Arrays with min = max, and the minimum and the maximum of a float32 array, are exact.
 
     Attributes:
-        bits: b, bits of a code, 1 to 16.
+        bits: b, bits per code, 1 to 16.
     """
 
     bits: int = 8
@@ -70,7 +71,7 @@ class MinMaxQuantizer:
             raise ValueError(f"bits must be in 1 to 16, got {self.bits}")
 
     def encode(self, values: np.ndarray) -> tuple[np.ndarray, MinMaxParams]:
-        """Quantise.
+        """Quantise values.
 
         Args:
             values: floats of any shape, finite and within the range of float32; may be empty.
@@ -81,7 +82,7 @@ class MinMaxQuantizer:
         Raises:
             ValueError: a value is not finite as float32.
         """
-        work = np.array(values, np.float64)  # a copy, worked on in place
+        work = np.array(values, np.float64)  # copied, because it is changed in place
         with np.errstate(over="ignore"):
             minimum, maximum = (float(np.float32(f(work))) if work.size else 0.0 for f in (np.min, np.max))
         if not (math.isfinite(minimum) and math.isfinite(maximum)):
@@ -100,11 +101,11 @@ class MinMaxQuantizer:
 
     @staticmethod
     def decode(codes: np.ndarray, params: MinMaxParams) -> np.ndarray:
-        """Values for codes.
+        """Return the values of codes.
 
         Args:
             codes: unsigned integers of any shape.
-            params: as `encode` returned them; they alone say how many bits a code has.
+            params: parameters that `encode` returned; their `bits` is used instead of the quantiser's.
 
         Returns:
             float32 of the same shape.
@@ -116,5 +117,5 @@ class MinMaxQuantizer:
         if codes.max(initial=0) > last:
             raise DamagedDataError(f"min-max codes: {codes.max()} is more than {params.bits} bits; the data is damaged")
         levels = np.arange(last + 1)
-        # Both products are exact in float64, so the ends of the range are, however far apart.
+        # Both products are exact in float64, so that the ends of the range are exact, however far apart they are.
         return (((last - levels) * params.minimum + levels * params.maximum) / last).astype(np.float32)[codes]

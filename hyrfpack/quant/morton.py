@@ -1,43 +1,48 @@
-"""Morton (Z-order) codes: the bits of three coordinates interleaved; neighbours in the list are near in space."""
+"""Morton (Z-order) codes, which interleave the bits of three coordinates.
+
+Points that are neighbours in the order of their codes are close in space.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-MAX_BITS = 18  # of a coordinate: a code has 54 bits, and gaps between codes fit the integer coder
+MAX_BITS_PER_AXIS = 18  # a code then has 54 bits, so that gaps between codes fit the integer coder
 
-# Each step doubles the distance between groups of bits: 0x1FFFFF -> every third bit.
-_SPREAD = (
+# (shift, mask) of each step that moves groups of bits apart, from 21 consecutive bits to every third bit.
+_SPREAD_STEPS = (
     (32, 0x1F00000000FFFF),
     (16, 0x1F0000FF0000FF),
     (8, 0x100F00F00F00F00F),
     (4, 0x10C30C30C30C30C3),
     (2, 0x1249249249249249),
 )
-# And back.
-_GATHER = (
+# (shift, mask) of each step of the inverse, from every third bit to 21 consecutive bits.
+_GATHER_STEPS = (
     (2, 0x10C30C30C30C30C3),
     (4, 0x100F00F00F00F00F),
     (8, 0x1F0000FF0000FF),
     (16, 0x1F00000000FFFF),
     (32, 0x1FFFFF),
 )
-_BLOCK = 1 << 14  # points at once: few enough that temporaries stay in the caches
+_POINTS_PER_BLOCK = 1 << 14  # small enough that temporary arrays stay in the caches
 
 
 def morton_codes(cells: np.ndarray) -> np.ndarray:
-    """Cells (N, 3), each coordinate 0 to 2^21 - 1, to codes (N,) int64: bit 3 i + a is bit i of coordinate a.
+    """Return the codes (N,) int64 of cells (N, 3), each coordinate 0 to 2^21 - 1.
+
+    Bit 3 i + a of a code is bit i of coordinate a.
 
     Example:
         >>> morton_codes(np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]])).tolist()
         [1, 2, 4]
     """
     codes = np.zeros(len(cells), np.int64)
-    for first in range(0, len(cells), _BLOCK):
-        part = slice(first, first + _BLOCK)
+    for first in range(0, len(cells), _POINTS_PER_BLOCK):
+        part = slice(first, first + _POINTS_PER_BLOCK)
         for axis in range(3):
             bits = cells[part, axis].astype(np.int64)
-            for shift, mask in _SPREAD:
+            for shift, mask in _SPREAD_STEPS:
                 bits |= bits << shift
                 bits &= mask
             bits <<= axis
@@ -46,14 +51,14 @@ def morton_codes(cells: np.ndarray) -> np.ndarray:
 
 
 def morton_cells(codes: np.ndarray) -> np.ndarray:
-    """The inverse of `morton_codes`: codes (N,) int64, 0 or more, to cells (N, 3) int32."""
+    """Return the cells (N, 3) int32 of codes (N,) int64 >= 0: the inverse of `morton_codes`."""
     cells = np.empty((len(codes), 3), np.int32)
-    for first in range(0, len(codes), _BLOCK):
-        part = slice(first, first + _BLOCK)
+    for first in range(0, len(codes), _POINTS_PER_BLOCK):
+        part = slice(first, first + _POINTS_PER_BLOCK)
         for axis in range(3):
             bits = codes[part] >> axis
-            bits &= _SPREAD[-1][1]
-            for shift, mask in _GATHER:
+            bits &= _SPREAD_STEPS[-1][1]
+            for shift, mask in _GATHER_STEPS:
                 bits |= bits >> shift
                 bits &= mask
             cells[part, axis] = bits

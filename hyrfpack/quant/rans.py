@@ -1,19 +1,19 @@
-"""Interleaved rANS: arrays of small numbers (tokens) to bytes, close to their entropy.
+"""Interleaved rANS: entropy coding of arrays of small numbers (tokens), close to their entropy.
 
-A range asymmetric numeral system (Duda, arXiv:1311.2540) with 32-bit states, 16-bit words and frequencies in 4096ths.
-A coder works through the array on many lanes side by side, which numpy and a processor's pipelines both like.
+The coder is a range asymmetric numeral system (Duda, arXiv:1311.2540) with 32-bit states, 16-bit words and frequencies
+in 4096ths. It codes the array on many parallel lanes, which is fast in numpy and in pipelined processors.
 
-**Bytes of a stream**, little-endian; nothing at all for no tokens:
+**Bytes of a stream**, little-endian; an array without tokens takes no bytes:
 
-    u8   bits 0-3: log2 of the lanes asked for; bits 4-6: classes - 1; bit 7: models are static
+    u8   bits 0-3: log2 of the requested lanes; bits 4-6: classes - 1; bit 7: models are static
     u8   A, size of the alphabet, 1 to 126; 0 if each context has one token only
-    ...  A = 0: the token of each context, a byte each, and no more follows
+    ...  A = 0: the token of each context, a byte each, and nothing follows
     classes - 1 bytes    rising thresholds of the classes
     ...  static: the levels of the models, a stream of this kind
     u32 for each used lane    its state
     u16 ...                   words
 
-docs/format.md says what they mean.
+docs/format.md specifies the meaning of each field.
 """
 
 from __future__ import annotations
@@ -28,35 +28,35 @@ import numpy as np
 from hyrfpack.parallel import has_numba
 from hyrfpack.quant import rans_lanes
 from hyrfpack.quant.errors import DamagedDataError
-from hyrfpack.quant.rans_lanes import Lanes, Selector
+from hyrfpack.quant.rans_lanes import LaneLayout, ModelSelector
 from hyrfpack.quant.rans_models import (
-    COSTS,
+    COST_BY_FREQUENCY,
+    MAX_ALPHABET_SIZE,
     MAX_LEVEL,
-    MAX_TOKENS,
     adaptive_frequencies,
-    levels_of,
+    iter_update_ranges,
     static_frequencies,
-    update_steps,
+    static_levels,
 )
 
 MAX_LANES = 8192
-MAX_CLASSES = 8
-MAX_MODELS = 1024  # contexts times classes; bounds the decoder's table to 16 MiB
+MAX_TOKEN_CLASSES = 8
+MAX_MODELS = 1024  # (contexts times classes) bounds the table of the decoder at 16 MiB
 
-_HEADER = 2
-_MOST_STEPS = 1 << 16  # of a lane, as long as there are fewer than MAX_LANES
-_BYTES_PER_LANE = 1024  # a lane costs about 3
-_TOKENS_PER_MODEL = 64  # with fewer on average, classes are not worth trying
-_STATIC = 0x80
+_HEADER_BYTES = 2
+_MAX_STEPS_PER_LANE = 1 << 16  # a decoder requires it of streams with fewer than MAX_LANES lanes
+_TARGET_BYTES_PER_LANE = 1024  # keeps the overhead small: each lane takes about 3 extra bytes
+_MIN_TOKENS_PER_MODEL = 64  # with fewer tokens on average, token classes do not pay off
+_STATIC_FLAG = 0x80
 
 
 class DecodedTokens(NamedTuple):
-    """What a stream holds.
+    """Decoded tokens of a stream and the stream's properties.
 
     Attributes:
         tokens: (M,) uint8.
-        size: bytes that the stream took.
-        alphabet: tokens are below this number; the least such number, unless the stream is damaged.
+        size: length of the stream, bytes.
+        alphabet: size of the alphabet: the largest token plus 1, unless the stream is damaged.
     """
 
     tokens: np.ndarray
@@ -65,35 +65,35 @@ class DecodedTokens(NamedTuple):
 
 
 def encode_tokens(tokens: np.ndarray, contexts: np.ndarray | None = None, implementation: str = "auto") -> bytes:
-    """Code an array of tokens.
+    """Encode an array of tokens.
 
-    The smallest of these is kept: static or adaptive models, for the contexts alone or for each pair of a context and
-    a class of the token before.
+    The encoder chooses the variant with the smallest estimated size: static or adaptive models, one per context or one
+    per pair of a context and the class of the previous token.
 
     Args:
-        tokens: (M,) uint8 below `MAX_TOKENS`.
-        contexts: (M,) uint8 class of each token, which the decoder knows; None means one class.
+        tokens: (M,) uint8 below `MAX_ALPHABET_SIZE`.
+        contexts: (M,) uint8 class of each token, which the decoder must know; None means one class.
         implementation: "numpy", "cpu" (Numba) or "auto"; the bytes are the same.
 
     Raises:
-        ValueError: another shape or dtype, or a token that is too large.
+        ValueError: the shape or dtype is wrong, or a token is too large.
 
     Example:
         >>> tokens = np.array([0, 0, 1, 0, 2], np.uint8)
         >>> decode_tokens(encode_tokens(tokens), 5).tokens.tolist()
         [0, 0, 1, 0, 2]
     """
-    backend = _backend(implementation)
-    contexts, classes_of_context = _checked_contexts(contexts, len(tokens))
-    if tokens.ndim != 1 or tokens.dtype != np.uint8 or tokens.max(initial=0) >= MAX_TOKENS:
-        raise ValueError(f"tokens must be (M,) uint8 below {MAX_TOKENS}, got {tokens.shape} {tokens.dtype}")
+    backend = _select_backend(implementation)
+    contexts, classes_of_context = _check_contexts(contexts, len(tokens))
+    if tokens.ndim != 1 or tokens.dtype != np.uint8 or tokens.max(initial=0) >= MAX_ALPHABET_SIZE:
+        raise ValueError(f"tokens must be (M,) uint8 below {MAX_ALPHABET_SIZE}, got {tokens.shape} {tokens.dtype}")
     return _encode(np.ascontiguousarray(tokens), contexts, classes_of_context, backend, static=True)
 
 
 def decode_tokens(
     data: bytes | memoryview, count: int, contexts: np.ndarray | None = None, implementation: str = "auto"
 ) -> DecodedTokens:
-    """Decode what `encode_tokens` wrote.
+    """Decode tokens that `encode_tokens` encoded.
 
     Args:
         data: the stream; more may follow it.
@@ -102,27 +102,28 @@ def decode_tokens(
         implementation: "numpy", "cpu" (Numba) or "auto"; the tokens are the same.
 
     Raises:
-        DamagedDataError: the bytes are truncated, damaged or contradict themselves.
-        ValueError: a negative count, or contexts of another shape or dtype.
+        DamagedDataError: the bytes are truncated, damaged or inconsistent.
+        ValueError: the count is negative, or contexts have a wrong shape or dtype.
     """
     if count < 0:
         raise ValueError(f"count must be 0 or more, got {count}")
-    contexts, context_count = _checked_contexts(contexts, count)
-    return _decode(memoryview(data), count, contexts, context_count, _backend(implementation), static=True)
+    contexts, context_count = _check_contexts(contexts, count)
+    return _decode(memoryview(data), count, contexts, context_count, _select_backend(implementation), static=True)
 
 
 def uses_numba(implementation: str) -> bool:
-    """Whether this names the kernels in Numba.
+    """Return whether an implementation name selects the Numba kernels.
 
     Raises:
-        ValueError: it is none of "numpy", "cpu" and "auto".
+        ValueError: the name is not "numpy", "cpu" or "auto".
     """
     if implementation not in ("auto", "numpy", "cpu"):
         raise ValueError(f"no implementation '{implementation}'; there are auto, numpy, cpu")
     return implementation == "cpu" or (implementation == "auto" and has_numba())
 
 
-def _backend(implementation: str) -> ModuleType:
+def _select_backend(implementation: str) -> ModuleType:
+    """Return the module with the inner loops: `rans_lanes` (numpy) or `rans_kernels` (Numba)."""
     if not uses_numba(implementation):
         return rans_lanes
     from hyrfpack.quant import rans_kernels
@@ -130,8 +131,8 @@ def _backend(implementation: str) -> ModuleType:
     return rans_kernels
 
 
-def _checked_contexts(contexts: np.ndarray | None, count: int) -> tuple[np.ndarray | None, int]:
-    """The contexts, None if there is one only, and their number."""
+def _check_contexts(contexts: np.ndarray | None, count: int) -> tuple[np.ndarray | None, int]:
+    """Check the contexts; return them, or None if there is only one, and their number."""
     if contexts is None:
         return None, 1
     if contexts.shape != (count,) or contexts.dtype != np.uint8:
@@ -143,51 +144,54 @@ def _checked_contexts(contexts: np.ndarray | None, count: int) -> tuple[np.ndarr
 def _encode(
     tokens: np.ndarray, contexts: np.ndarray | None, context_count: int, backend: ModuleType, static: bool
 ) -> bytes:
-    """`encode_tokens`, already checked; only with adaptive models unless `static`."""
+    """Encode tokens that have been checked; static models are considered only if `static`."""
     if len(tokens) == 0:
         return b""
     alphabet = int(tokens.max()) + 1
-    most_classes = min(MAX_CLASSES, MAX_MODELS // context_count, len(tokens) // (context_count * _TOKENS_PER_MODEL))
+    most_classes = min(
+        MAX_TOKEN_CLASSES, MAX_MODELS // context_count, len(tokens) // (context_count * _MIN_TOKENS_PER_MODEL)
+    )
     if most_classes > 1:
         pairs = backend.count_pairs(tokens, contexts, context_count, alphabet)
     else:
-        one_lane, one_class = Lanes(len(tokens), 1), _selector(contexts, (), alphabet)
+        one_lane, one_class = LaneLayout(len(tokens), 1), _make_selector(contexts, (), alphabet)
         shape = (context_count, alphabet)
         pairs = backend.count_tokens(tokens, one_class, one_lane, 0, len(tokens), shape)[:, None]
     alone = pairs.sum(axis=1)
     if ((alone > 0).sum(axis=1) <= 1).all():
         return bytes((0, 0)) + alone.argmax(axis=1).astype(np.uint8).tobytes()
     plans = [
-        _plan(tokens, contexts, context_count, alphabet, thresholds, bits, backend, static)
-        for thresholds, bits in _thresholds_to_try(pairs, most_classes)
+        _make_plan(tokens, contexts, context_count, alphabet, thresholds, bits, backend, static)
+        for thresholds, bits in _candidate_thresholds(pairs, most_classes)
     ]
     return min(plans, key=lambda plan: plan.cost).encode(tokens, backend)
 
 
 @dataclass(frozen=True, eq=False)
-class _Plan:
-    """A way to code tokens.
+class _CodingPlan:
+    """A variant of coding tokens, with its estimated size.
 
     Attributes:
-        cost: 2^-16 bits that tokens and models take.
+        cost: size of tokens and models, in 2^-16 bits.
         head: bytes before the states.
-        selector: which model codes each token.
-        lanes: how the tokens are dealt.
-        segments: ranges of steps with their frequencies.
+        selector: selects the model of each token.
+        lanes: assignment of tokens to lanes.
+        segments: ranges (start, stop) of steps with their frequencies.
     """
 
     cost: int
     head: bytes
-    selector: Selector
-    lanes: Lanes
+    selector: ModelSelector
+    lanes: LaneLayout
     segments: list[tuple[int, int, np.ndarray]]
 
     def encode(self, tokens: np.ndarray, backend: ModuleType) -> bytes:
+        """Return the stream of the tokens."""
         states, words = backend.encode_lanes(tokens, self.selector, self.lanes, self.segments)
         return b"".join((self.head, states.astype("<u4").tobytes(), words.astype("<u2").tobytes()))
 
 
-def _plan(
+def _make_plan(
     tokens: np.ndarray,
     contexts: np.ndarray | None,
     context_count: int,
@@ -196,73 +200,79 @@ def _plan(
     bits: int,
     backend: ModuleType,
     static: bool,
-) -> _Plan:
-    """The better kind of models with these classes, for tokens that take about `bits`."""
-    lanes_log2 = _lanes_log2(len(tokens), bits)
-    lanes, selector = Lanes(len(tokens), 1 << lanes_log2), _selector(contexts, thresholds, alphabet)
+) -> _CodingPlan:
+    """Choose static or adaptive models for the classes of `thresholds`; `bits` is the estimated size of the tokens."""
+    lanes_log2 = _choose_lanes_log2(len(tokens), bits)
+    lanes, selector = LaneLayout(len(tokens), 1 << lanes_log2), _make_selector(contexts, thresholds, alphabet)
     shape = (context_count * selector.classes, alphabet)
     first = lanes_log2 | len(thresholds) << 4
 
     segments, cost, counts = [], 0, np.zeros(shape, np.int64)
-    for start, stop in update_steps(lanes.steps):
+    for start, stop in iter_update_ranges(lanes.steps):
         frequencies = adaptive_frequencies(counts)
         new = backend.count_tokens(tokens, selector, lanes, start, stop, shape)
-        cost += int((new * COSTS[frequencies]).sum())
+        cost += int((new * COST_BY_FREQUENCY[frequencies]).sum())
         segments.append((start, stop, frequencies))
         counts += new
-    adaptive = _Plan(cost, bytes((first, alphabet, *thresholds)), selector, lanes, segments)
+    adaptive = _CodingPlan(cost, bytes((first, alphabet, *thresholds)), selector, lanes, segments)
     if not static:
         return adaptive
 
-    levels = levels_of(counts)
+    levels = static_levels(counts)
     table, frequencies = _encode_levels(levels, backend), static_frequencies(levels)
-    cost = int((counts * COSTS[frequencies]).sum()) + (8 * len(table) << 16)
+    cost = int((counts * COST_BY_FREQUENCY[frequencies]).sum()) + (8 * len(table) << 16)
     if cost >= adaptive.cost:
         return adaptive
-    head = bytes((first | _STATIC, alphabet, *thresholds)) + table
-    return _Plan(cost, head, selector, lanes, [(0, lanes.steps, frequencies)])
+    head = bytes((first | _STATIC_FLAG, alphabet, *thresholds)) + table
+    return _CodingPlan(cost, head, selector, lanes, [(0, lanes.steps, frequencies)])
 
 
-def _selector(contexts: np.ndarray | None, thresholds: Sequence[int], alphabet: int) -> Selector:
+def _make_selector(contexts: np.ndarray | None, thresholds: Sequence[int], alphabet: int) -> ModelSelector:
+    """Build the selector for token classes that begin at the given thresholds."""
     class_of = np.searchsorted(thresholds, np.arange(alphabet), side="right").astype(np.uint8)
-    return Selector(contexts, class_of, len(thresholds) + 1)
+    return ModelSelector(contexts, class_of, len(thresholds) + 1)
 
 
-def _thresholds_to_try(pairs: np.ndarray, most_classes: int) -> list[tuple[tuple[int, ...], int]]:
-    """Thresholds of one class, that is none, and of the classes that promise most; with about how many bits it takes.
+def _candidate_thresholds(pairs: np.ndarray, most_classes: int) -> list[tuple[tuple[int, ...], int]]:
+    """Return thresholds that are worth trying, with the estimated size in bits.
+
+    These are no thresholds, that is one class, and the thresholds with the smallest estimate.
 
     Args:
-        pairs: how often each token follows each other one, (contexts, token before, token).
-        most_classes: how many classes there may be.
+        pairs: (contexts, previous token, token) number of occurrences of each pair.
+        most_classes: largest allowed number of classes.
     """
-    choices: dict[tuple[int, ...], int] = {(): _promise(pairs.sum(axis=1))}
+    choices: dict[tuple[int, ...], int] = {(): _estimate_bits(pairs.sum(axis=1))}
     pooled = np.cumsum(pairs.sum(axis=(0, 1)))
     for classes in range(2, most_classes + 1):
-        # As many tokens in each class, as far as whole tokens allow.
+        # Each class gets about the same number of tokens.
         edges = np.searchsorted(pooled, pooled[-1] * np.arange(1, classes) // classes, side="right")
         thresholds = tuple(np.unique(np.clip(edges, 1, len(pooled) - 1)).tolist())
         if len(pooled) > 1 and thresholds not in choices:
             counts = np.add.reduceat(pairs, [0, *thresholds], axis=1)
-            choices[thresholds] = _promise(counts.reshape(-1, len(pooled)))
+            choices[thresholds] = _estimate_bits(counts.reshape(-1, len(pooled)))
     best = min(choices, key=choices.__getitem__)
     return [(thresholds, choices[thresholds]) for thresholds in dict.fromkeys([(), best])]
 
 
-def _promise(counts: np.ndarray) -> int:
-    """About how many bits tokens with these counts (K, A) take: their entropy, and what it takes to learn it."""
+def _estimate_bits(counts: np.ndarray) -> int:
+    """Estimate the bits of tokens with counts (K, A): their entropy plus the cost of learning the frequencies."""
     totals = counts.sum(axis=1, keepdims=True)
     bits = counts * np.log2(np.maximum(totals, 1) / np.maximum(counts, 1)) + (counts > 0) * np.log2(totals + 1) / 2
     return round(float(bits.sum()))
 
 
-def _lanes_log2(count: int, bits: float) -> int:
-    """As many lanes as cost little, and enough that no lane is long."""
-    wanted = max(int(bits) // (8 * _BYTES_PER_LANE), count // (_MOST_STEPS // 2), 1)
+def _choose_lanes_log2(count: int, bits: float) -> int:
+    """Choose the number of lanes, so that they take few bytes and none is too long; return its log2."""
+    wanted = max(int(bits) // (8 * _TARGET_BYTES_PER_LANE), count // (_MAX_STEPS_PER_LANE // 2), 1)
     return min(wanted, MAX_LANES).bit_length() - 1
 
 
 def _encode_levels(levels: np.ndarray, backend: ModuleType) -> bytes:
-    """Levels (K, A) as a stream: of the first model the differences along the alphabet, then from model to model."""
+    """Encode levels (K, A) as a stream of differences.
+
+    They are differences along the alphabet in the first model, and from model to model in the others.
+    """
     differences = np.diff(levels, axis=0, prepend=0)
     differences[0] = np.diff(levels[0], prepend=0)
     zigzag = np.where(differences < 0, -2 * differences - 1, 2 * differences)
@@ -270,6 +280,7 @@ def _encode_levels(levels: np.ndarray, backend: ModuleType) -> bytes:
 
 
 def _decode_levels(data: memoryview, models: int, alphabet: int, backend: ModuleType) -> tuple[np.ndarray, int]:
+    """Decode the levels (models, alphabet) of static models; return them and the length of their stream in bytes."""
     decoded = _decode(data, models * alphabet, None, 1, backend, static=False)
     zigzag = decoded.tokens.astype(np.int64).reshape(models, alphabet)
     levels = np.where(zigzag & 1, -(zigzag + 1 >> 1), zigzag >> 1)
@@ -283,43 +294,43 @@ def _decode_levels(data: memoryview, models: int, alphabet: int, backend: Module
 def _decode(
     data: memoryview, count: int, contexts: np.ndarray | None, context_count: int, backend: ModuleType, static: bool
 ) -> DecodedTokens:
-    """`decode_tokens`, arguments already checked; refuses static models unless `static`."""
+    """Decode tokens, arguments have been checked; static models are rejected unless `static`."""
     if count == 0:
         return DecodedTokens(np.zeros(0, np.uint8), 0, 0)
-    if len(data) < _HEADER:
+    if len(data) < _HEADER_BYTES:
         raise DamagedDataError(f"rANS stream: {len(data)} bytes are fewer than its header; it is truncated")
     lanes_log2, classes, alphabet = data[0] & 15, (data[0] >> 4 & 7) + 1, data[1]
-    is_static = data[0] >= _STATIC
+    is_static = data[0] >= _STATIC_FLAG
     if alphabet == 0:
         return _decode_constants(data, count, contexts, context_count)
     models = context_count * classes
-    if alphabet > MAX_TOKENS or models > MAX_MODELS or 1 << lanes_log2 > MAX_LANES or (is_static and not static):
+    if alphabet > MAX_ALPHABET_SIZE or models > MAX_MODELS or 1 << lanes_log2 > MAX_LANES or (is_static and not static):
         raise DamagedDataError("rANS stream: its header says what cannot be; the data is damaged")
-    if count > _MOST_STEPS << lanes_log2 and 1 << lanes_log2 < MAX_LANES:
+    if count > _MAX_STEPS_PER_LANE << lanes_log2 and 1 << lanes_log2 < MAX_LANES:
         raise DamagedDataError(f"rANS stream: too few lanes for {count} symbols; the data is damaged")
-    place = _HEADER + classes - 1
-    thresholds = list(data[_HEADER:place])
+    place = _HEADER_BYTES + classes - 1
+    thresholds = list(data[_HEADER_BYTES:place])
     if any(low >= high for low, high in zip([0, *thresholds], [*thresholds, alphabet], strict=True)):
         raise DamagedDataError("rANS stream: the thresholds of its classes do not rise; the data is damaged")
 
-    lanes = Lanes(count, 1 << lanes_log2)
+    lanes = LaneLayout(count, 1 << lanes_log2)
     if is_static:
         levels, size = _decode_levels(data[place:], models, alphabet, backend)
         place += size
-    if len(data) < place + 4 * lanes.used:
+    if len(data) < place + 4 * lanes.used_lanes:
         raise DamagedDataError(f"rANS stream: {len(data)} bytes are fewer than its lanes need; it is truncated")
-    states = np.frombuffer(data, "<u4", lanes.used, place).astype(np.uint32)
-    place += 4 * lanes.used
+    states = np.frombuffer(data, "<u4", lanes.used_lanes, place).astype(np.uint32)
+    place += 4 * lanes.used_lanes
     words = np.frombuffer(data, "<u2", (len(data) - place) // 2, place).astype(np.uint16)
 
-    selector = _selector(contexts, thresholds, alphabet)
+    selector = _make_selector(contexts, thresholds, alphabet)
     decoder = backend.LaneDecoder(selector, lanes, states, words)
     if is_static:
         decoder.run(0, lanes.steps, static_frequencies(levels))
     else:
         shape = (models, alphabet)
         counts = np.zeros(shape, np.int64)
-        for start, stop in update_steps(lanes.steps):
+        for start, stop in iter_update_ranges(lanes.steps):
             decoder.run(start, stop, adaptive_frequencies(counts))
             if stop < lanes.steps:
                 counts += backend.count_tokens(decoder.tokens, selector, lanes, start, stop, shape)
@@ -327,10 +338,10 @@ def _decode(
 
 
 def _decode_constants(data: memoryview, count: int, contexts: np.ndarray | None, context_count: int) -> DecodedTokens:
-    """Tokens that follow from their contexts."""
-    stop = _HEADER + context_count
-    token_of = np.frombuffer(data[_HEADER:stop], np.uint8)
-    if data[0] != 0 or len(token_of) < context_count or token_of.max() >= MAX_TOKENS:
+    """Decode a stream in which each context has only one token."""
+    stop = _HEADER_BYTES + context_count
+    token_of = np.frombuffer(data[_HEADER_BYTES:stop], np.uint8)
+    if data[0] != 0 or len(token_of) < context_count or token_of.max() >= MAX_ALPHABET_SIZE:
         raise DamagedDataError("rANS stream: the tokens of its contexts are missing or damaged")
     tokens = np.full(count, token_of[0]) if contexts is None else token_of.take(contexts)
     return DecodedTokens(tokens, stop, int(token_of.max()) + 1)

@@ -1,4 +1,4 @@
-"""Residual vector quantisation: each row is the sum of one codeword out of every stage's codebook."""
+"""Residual vector quantisation: each row is approximated by the sum of one codeword of each stage's codebook."""
 
 from __future__ import annotations
 
@@ -8,34 +8,36 @@ import numpy as np
 
 from hyrfpack.quant.errors import DamagedDataError
 
-_TRAINING_ROWS = 100_000  # rows that k-means looks at
-_SEEDING_ROWS = 16_384  # of these, rows that first centres are drawn from
-_CHUNK_PRODUCTS = 1 << 18  # of one matrix product: small enough that BLAS leaves it to one thread (see _nearest)
-_LARGEST = {"float32": 1e30, "float16": 65504.0}  # room left for differences
+_MAX_TRAINING_ROWS = 100_000
+_MAX_SEEDING_ROWS = 16_384
+_MAX_PRODUCTS_PER_CHUNK = 1 << 18  # so small that BLAS computes a matrix product in one thread, see `_nearest_centers`
+_MAX_ABS_VALUE = {"float32": 1e30, "float16": 65504.0}  # by dtype of the codebooks; differences of values stay finite
 
 
 @dataclass(frozen=True)
 class ResidualVectorQuantizer:
-    """Quantises rows of D numbers in stages, each stage coding what the ones before left over.
+    """Quantises rows of D numbers in stages; each stage codes the residual of the previous stages.
 
         r_0 = v      i_s = argmin_k |(r_s - c_s[k]) / sigma|      r_s+1 = r_s - c_s[i_s]      decoded: sum_s c_s[i_s]
 
-    sigma is the standard deviation of each column (no less than what `codebook_dtype` resolves), so that columns of
-    different scale weigh alike. Codebooks come from k-means on up to 100,000 rows, are then moved to the means over
-    all rows and rounded as they will be stored, and only then is every row assigned to what a decoder will have.
+    sigma is the standard deviation of each column (at least the resolution of `codebook_dtype`), so that columns of
+    different scale have the same weight. k-means on up to 100,000 rows gives the codebooks. Their codewords are then
+    replaced by the means over all rows and rounded as they will be stored. Finally every row is assigned to the
+    codewords that a decoder will have.
 
-    The mean over rows of |error / sigma|^2 never grows with a stage (up to float32 rounding): the mean of a cluster,
-    even rounded to the nearest storable number, leaves no more than coding nothing, and assigning anew only lowers it.
+    A stage never increases the mean over rows of |error / sigma|^2 (up to float32 rounding): the mean of a cluster,
+    even rounded to the nearest storable number, leaves no larger error than no codeword at all, and the final
+    assignment only lowers it.
 
     The same values and settings give the same result on the same machine.
 
     Attributes:
-        stages: S, codewords added up for a row, 1 or more.
-        codebook_size: K, codewords of a stage, 1 to 65536.
-        codebook_dtype: how codebooks are stored, "float32" or "float16". Codebooks are always handed over as float32;
-            under "float16" they hold only numbers that float16 can.
-        iterations: rounds of k-means, fewer if it settles earlier.
-        seed: of the random choice of rows to train on and to start from.
+        stages: S, number of codewords that are added up for a row, 1 or more.
+        codebook_size: K, codewords per stage, 1 to 65536.
+        codebook_dtype: precision of stored codebooks, "float32" or "float16". Codebooks are always returned as
+            float32; with "float16" they hold only numbers that float16 can represent.
+        iterations: largest number of k-means iterations; it stops earlier when the assignment no longer changes.
+        seed: random seed for the choice of training rows and initial centres.
     """
 
     stages: int = 6
@@ -51,21 +53,21 @@ class ResidualVectorQuantizer:
             raise ValueError(f"codebook_dtype must be 'float32' or 'float16', got '{self.codebook_dtype}'")
 
     def encode(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Find codebooks for these rows and code the rows with them.
+        """Compute codebooks for the rows, and encode the rows.
 
         Args:
             values: (N, D) finite floats, N >= 0, D >= 1.
 
         Returns:
-            (N, S) indices, uint8 for up to 256 codewords, else uint16; and (S, K, D) float32 codebooks, in which
-            codewords that are not needed repeat another or are zero.
+            (N, S) indices, uint8 for up to 256 codewords, else uint16; and (S, K, D) float32 codebooks. Codewords that
+            are not needed equal another codeword or are zero.
 
         Raises:
             ValueError: a value is NaN, infinite, or larger than 1e30 (float32) or 65504 (float16).
         """
         if values.ndim != 2 or values.shape[1] == 0:
             raise ValueError(f"values must be (N, D) with D >= 1, got {values.shape}")
-        largest = _LARGEST[self.codebook_dtype]
+        largest = _MAX_ABS_VALUE[self.codebook_dtype]
         if not (np.abs(values) <= largest).all():
             raise ValueError(
                 f"residual VQ: a value is NaN or beyond +-{largest:g}, the range of {self.codebook_dtype} codebooks; "
@@ -90,7 +92,7 @@ class ResidualVectorQuantizer:
 
     @staticmethod
     def decode(indices: np.ndarray, codebooks: np.ndarray) -> np.ndarray:
-        """Add up the codewords, stage after stage, in float32.
+        """Decode rows: add up their codewords in float32, stage after stage.
 
         Args:
             indices: (N, S) unsigned integers.
@@ -100,7 +102,7 @@ class ResidualVectorQuantizer:
             (N, D) float32.
 
         Raises:
-            DamagedDataError: the stages disagree, or an index is K or more.
+            DamagedDataError: the numbers of stages differ, or an index is K or more.
         """
         if indices.ndim != 2 or codebooks.ndim != 3 or indices.shape[1] != codebooks.shape[0]:
             raise DamagedDataError(
@@ -118,8 +120,8 @@ class ResidualVectorQuantizer:
     def _encode_stage(
         self, residual: np.ndarray, weights: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Indices (N,) and codebook (K, D) for what is left over."""
-        # Centred before scaling: far from zero, float32 scores would have no digits left for differences.
+        """Compute indices (N,) and codebook (K, D) of one stage for the residual (N, D)."""
+        # Rows are centred before scaling, because float32 scores far from zero would not resolve differences.
         center = residual.mean(axis=0, dtype=np.float64)
 
         def scaled(points: np.ndarray) -> np.ndarray:
@@ -127,25 +129,28 @@ class ResidualVectorQuantizer:
 
         points = scaled(residual)
         sample = points
-        if len(points) > _TRAINING_ROWS:
-            sample = points[np.sort(rng.permutation(len(points))[:_TRAINING_ROWS])]
+        if len(points) > _MAX_TRAINING_ROWS:
+            sample = points[np.sort(rng.permutation(len(points))[:_MAX_TRAINING_ROWS])]
         centers = _kmeans(sample, self.codebook_size, self.iterations, rng)
-        codebook = _means(residual, _nearest(points, centers), self.codebook_size)
-        largest = _LARGEST[self.codebook_dtype]
+        codebook = _cluster_means(residual, _nearest_centers(points, centers), self.codebook_size)
+        largest = _MAX_ABS_VALUE[self.codebook_dtype]
         codebook = np.clip(codebook, -largest, largest).astype(self.codebook_dtype).astype(np.float32)
-        return _nearest(points, scaled(codebook)), codebook
+        return _nearest_centers(points, scaled(codebook)), codebook
 
 
 def _kmeans(points: np.ndarray, clusters: int, iterations: int, rng: np.random.Generator) -> np.ndarray:
-    """Centres (K, D) float32 of Lloyd's iteration from a k-means++ start; empty clusters move to the worst rows."""
-    seeds = points if len(points) <= _SEEDING_ROWS else points[rng.permutation(len(points))[:_SEEDING_ROWS]]
-    centers = _plus_plus(seeds, clusters, rng)
+    """Return the centres (K, D) float32 of Lloyd's iteration from a k-means++ start.
+
+    Empty clusters move to the rows with the largest error.
+    """
+    seeds = points if len(points) <= _MAX_SEEDING_ROWS else points[rng.permutation(len(points))[:_MAX_SEEDING_ROWS]]
+    centers = _choose_initial_centers(seeds, clusters, rng)
     labels = None
     for _ in range(iterations):
-        before, labels = labels, _nearest(points, centers)
+        before, labels = labels, _nearest_centers(points, centers)
         if before is not None and np.array_equal(before, labels):
             break
-        centers = _means(points, labels, clusters).astype(np.float32)
+        centers = _cluster_means(points, labels, clusters).astype(np.float32)
         empty = np.flatnonzero(np.bincount(labels, minlength=clusters) == 0)
         if len(empty):
             error = ((points - centers[labels]) ** 2).sum(axis=1)
@@ -154,8 +159,11 @@ def _kmeans(points: np.ndarray, clusters: int, iterations: int, rng: np.random.G
     return centers
 
 
-def _plus_plus(points: np.ndarray, clusters: int, rng: np.random.Generator) -> np.ndarray:
-    """k-means++: each further centre is a row drawn with odds proportional to its squared distance from the nearest."""
+def _choose_initial_centers(points: np.ndarray, clusters: int, rng: np.random.Generator) -> np.ndarray:
+    """Choose initial centres by k-means++.
+
+    Each further centre is a row, drawn with probability proportional to its squared distance from the nearest centre.
+    """
     columns = np.ascontiguousarray(points.T)
     centers = np.repeat(points[:1], clusters, axis=0)
     centers[0] = points[int(rng.random() * len(points))]
@@ -171,14 +179,15 @@ def _plus_plus(points: np.ndarray, clusters: int, rng: np.random.Generator) -> n
     return centers
 
 
-def _nearest(points: np.ndarray, centers: np.ndarray) -> np.ndarray:
-    """(N,) intp: the centre nearest to each row, the first of equals."""
+def _nearest_centers(points: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    """Return the index (N,) intp of the centre nearest to each row; the first one if several are equally near."""
     # |p - c|^2 is smallest where p . c - |c|^2 / 2 is largest.
     transposed = np.ascontiguousarray(centers.T)
     half_squares = 0.5 * (centers * centers).sum(axis=1)
     labels = np.empty(len(points), np.intp)
-    # One thread: waking others costs more than it saves on busy machines, and results cannot depend on their number.
-    chunk = max(1, _CHUNK_PRODUCTS // centers.size)
+    # Products use one thread: waking others costs more than it saves on busy machines, and the results must not depend
+    # on the number of threads.
+    chunk = max(1, _MAX_PRODUCTS_PER_CHUNK // centers.size)
     for first in range(0, len(points), chunk):
         scores = points[first : first + chunk] @ transposed
         scores -= half_squares
@@ -186,8 +195,8 @@ def _nearest(points: np.ndarray, centers: np.ndarray) -> np.ndarray:
     return labels
 
 
-def _means(points: np.ndarray, labels: np.ndarray, clusters: int) -> np.ndarray:
-    """(K, D) float64: the mean of the rows with each label, zero for none."""
+def _cluster_means(points: np.ndarray, labels: np.ndarray, clusters: int) -> np.ndarray:
+    """Return the mean (K, D) float64 of the rows of each label; zero for labels without rows."""
     counts = np.maximum(np.bincount(labels, minlength=clusters), 1)
     sums = [np.bincount(labels, weights=column, minlength=clusters) for column in points.T]
     return np.stack(sums, axis=1) / counts[:, None]

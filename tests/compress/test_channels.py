@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hyrfpack.compress import channels
 from hyrfpack.compress.channels import quantize_channel
 from hyrfpack.format.compact.channels import MAX_ABS_CHANNEL_VALUE, Channel, decode_channel, encode_channel
-from hyrfpack.quant.steps import step_of
+from hyrfpack.quant.steps import decode_step
 
 FIXED_POINT = 2**-24
 
@@ -82,7 +82,7 @@ def test_any_channel_round_trips_within_its_bound(data: st.DataObject) -> None:
     channel = quantize_channel(values, classes, sensitivity, distortion, reach=reach)
 
     check_round_trip(channel, classes)
-    steps = step_of(channel.codes)[classes] * FIXED_POINT
+    steps = decode_step(channel.codes)[classes] * FIXED_POINT
     assert (np.abs(channel.values - values) <= (0.5 + reach) * steps + FIXED_POINT).all()
 
 
@@ -109,7 +109,7 @@ def test_without_reach_the_error_is_half_a_step_at_most(values: np.ndarray, erro
 
     channel = quantize_channel(values, classes, sensitivity, step_for(error), reach=0)
 
-    steps = step_of(channel.codes)[classes] * FIXED_POINT
+    steps = decode_step(channel.codes)[classes] * FIXED_POINT
     assert (np.abs(channel.values - values) <= steps / 2 + FIXED_POINT / 2 + 1e-12).all()
 
 

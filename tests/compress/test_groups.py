@@ -19,7 +19,7 @@ from hyrfpack.format.compact.groups import (
     decode_groups,
     encode_groups,
 )
-from hyrfpack.quant.steps import NOT_CODED, ONE, step_of
+from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, decode_step
 
 
 def random_groups(count: int, groups: int, seed: int = 0) -> StepGroups:
@@ -64,8 +64,8 @@ def test_any_groups_round_trip_within_their_bound(data: st.DataObject) -> None:
 
     check_round_trip(chosen, groups)
     off = np.abs(chosen.values - values)
-    steps = step_of(chosen.codes)[groups.index] / ONE
-    coded = chosen.codes[groups.index] != NOT_CODED
+    steps = decode_step(chosen.codes)[groups.index] / FIXED_POINT_ONE
+    coded = chosen.codes[groups.index] != ALL_ZERO_CODE
     assert (off <= (0.5 + reach) * steps + np.abs(values) * 2**-23)[coded].all()
     assert (chosen.values[~coded] == 0).all()
 
@@ -83,7 +83,7 @@ def test_without_reach_the_error_is_half_a_step_at_most(error: float) -> None:
 
     chosen = quantize_groups(values, groups, np.ones(5000), error**2, reach=0)
 
-    steps = step_of(choose_step_codes(np.ones(1), error**2)) / ONE
+    steps = decode_step(choose_step_codes(np.ones(1), error**2)) / FIXED_POINT_ONE
     assert (np.abs(chosen.values - values) <= steps / 2 + np.abs(values) * 2**-23).all()
 
 
@@ -107,7 +107,7 @@ def test_groups_nobody_sees_become_zeros_and_take_no_symbols() -> None:
 
     chosen = quantize_groups(values, groups, seen, 1e-2)
 
-    assert chosen.codes[2] == NOT_CODED and (chosen.codes[[0, 1, 3]] != NOT_CODED).all()
+    assert chosen.codes[2] == ALL_ZERO_CODE and (chosen.codes[[0, 1, 3]] != ALL_ZERO_CODE).all()
     assert (chosen.values[~kept] == 0).all()
     assert check_round_trip(chosen, groups) == encode_groups(
         quantize_groups(values[kept], without, np.ones(kept.sum()), 1e-2), without
@@ -119,7 +119,7 @@ def test_groups_of_zeros_take_hardly_any_bytes() -> None:
 
     for values in (np.zeros(100_000), np.full(100_000, 1e-6)):
         chosen = quantize_groups(values, groups, np.ones(100_000), 1.0)
-        assert (chosen.codes == NOT_CODED).all()
+        assert (chosen.codes == ALL_ZERO_CODE).all()
         assert len(check_round_trip(chosen, groups)) < 16
 
 
@@ -228,7 +228,7 @@ def test_reach_never_costs_more_by_the_coders_own_measure(data: st.DataObject) -
     bits, least = estimate_code_bits(near.symbols, models, ENTROPY_MODEL_COUNT, 1)
 
     def cost(chosen: GroupSymbols) -> float:
-        steps = step_of(choose_step_codes(np.ones(1), distortion)) / ONE
+        steps = decode_step(choose_step_codes(np.ones(1), distortion)) / FIXED_POINT_ONE
         error = ((chosen.symbols * steps - values) ** 2).sum()
         return error + 2 * math.log(2) * distortion * bits[models, chosen.symbols - least].sum()
 

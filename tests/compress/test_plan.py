@@ -29,7 +29,7 @@ from hyrfpack.format.compact import encode
 from hyrfpack.format.compact.plan import Plan, lattice_to_local
 from hyrfpack.format.compact.quantized import QuantizedModel
 from hyrfpack.model import Frame, HybridModel, contract
-from hyrfpack.quant.steps import NOT_CODED, ONE, step_of
+from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, decode_step
 
 EXPLICIT = ("COLO", "SCAL", "OPAC")
 FIELDS = ("GTAB", "GMLP", "RTAB", "RMLP")
@@ -288,10 +288,10 @@ def test_without_reach_every_number_is_half_a_step_away_at_most() -> None:
     quantized = quantize(plan.apply(model), plan, a_sensitivity(model), reach=0)
 
     for group, chosen in quantized.groups.items():
-        steps = step_of(chosen.codes)[plan.groups[group].index] / ONE
+        steps = decode_step(chosen.codes)[plan.groups[group].index] / FIXED_POINT_ONE
         values = planned[group].ravel()
         off = np.abs(chosen.values - values)
-        coded = chosen.codes[plan.groups[group].index] != NOT_CODED
+        coded = chosen.codes[plan.groups[group].index] != ALL_ZERO_CODE
         assert (off <= steps / 2 + np.abs(values) * 2**-22)[coded].all() and coded.any()
     turned = planned["COLO"] @ plan.basis.astype(np.float64)
     for channel, values in zip(
@@ -299,7 +299,7 @@ def test_without_reach_every_number_is_half_a_step_away_at_most() -> None:
         [*turned.T, planned["SCAL"][:, 0]],
         strict=True,
     ):
-        steps = step_of(channel.codes)[plan.layers[0].points.classes] / ONE
+        steps = decode_step(channel.codes)[plan.layers[0].points.classes] / FIXED_POINT_ONE
         assert (np.abs(channel.values - values) <= steps / 2 + 1e-6).all()
 
 

@@ -16,8 +16,8 @@ from hyrfpack.format.compact.channels import MAX_ABS_CHANNEL_VALUE, decode_chann
 from hyrfpack.format.compact.quantized import decode_channels
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.integers import encode_integers
-from hyrfpack.quant.points import Points
-from hyrfpack.quant.steps import step_of
+from hyrfpack.quant.points import LatticePoints
+from hyrfpack.quant.steps import decode_step
 
 FIXED_POINT = 2**-24
 
@@ -97,7 +97,7 @@ def test_damage_is_refused_or_yields_as_many_finite_numbers(data: st.DataObject)
 @pytest.mark.parametrize("code", [0, 1, 255])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_the_largest_differences_allowed_do_not_overflow(code: int, sign: int) -> None:
-    step = int(step_of(code))
+    step = int(decode_step(code))
     largest = min(int(8 * MAX_ABS_CHANNEL_VALUE / FIXED_POINT) // step, 1 << 30)
 
     def decode(difference: int) -> np.ndarray:
@@ -145,7 +145,7 @@ def test_decoding_takes_little_memory_beside_the_numbers() -> None:
 
 # Sections of channels.
 
-POINTS = Points(np.zeros((80, 3), np.int64), SMALL_CLASSES, np.full(3, 5))
+POINTS = LatticePoints(np.zeros((80, 3), np.int64), SMALL_CLASSES, np.full(3, 5))
 TURN = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]], "<f4")
 
 

@@ -21,7 +21,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.ops.hash_encode.reference import cells as reference_cells
 from hyrfpack.ops.hash_encode.reference import corner_rows
 from hyrfpack.quant import DamagedDataError
-from hyrfpack.quant.points import Points
+from hyrfpack.quant.points import LatticePoints
 from tools.safety.plans import drawn
 
 
@@ -33,10 +33,10 @@ def a_model(count: int) -> HybridModel:
 # Groups.
 
 
-def a_lattice(count: int = 250, seed: int = 0) -> Points:
+def a_lattice(count: int = 250, seed: int = 0) -> LatticePoints:
     rng = np.random.default_rng(seed)
     bits, classes = np.array([12, 5, 3]), rng.integers(3, size=count).astype(np.uint8)
-    return Points(rng.integers(0, (1 << bits)[classes][:, None], (count, 3)), classes, bits)
+    return LatticePoints(rng.integers(0, (1 << bits)[classes][:, None], (count, 3)), classes, bits)
 
 
 @pytest.mark.parametrize("group", ["GTAB", "RTAB"])
@@ -60,7 +60,7 @@ def test_rows_share_a_step_by_level_and_how_often_they_are_read(group: str) -> N
 
 def test_of_many_gaussians_every_nth_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     config, points = a_model(1).config, a_lattice(250)
-    every_third = Points(points.cells[::3], points.classes[::3], points.bits)
+    every_third = LatticePoints(points.cells[::3], points.classes[::3], points.bits)
     expected = build_step_groups("GTAB", config, every_third)
 
     monkeypatch.setattr(layout, "MAX_COUNTED_GAUSSIANS", 100)
@@ -70,7 +70,7 @@ def test_of_many_gaussians_every_nth_is_counted(monkeypatch: pytest.MonkeyPatch)
 
 def test_no_gaussian_reads_no_row() -> None:
     config = a_model(1).config
-    points = Points(np.zeros((0, 3), np.int64), np.zeros(0, np.uint8), np.ones(6, np.int64))
+    points = LatticePoints(np.zeros((0, 3), np.int64), np.zeros(0, np.uint8), np.ones(6, np.int64))
 
     groups = build_step_groups("RTAB", config, points)
 

@@ -31,7 +31,7 @@ from hyrfpack.quant import (
     huffman_decode,
     huffman_encode,
 )
-from hyrfpack.quant.huffman import MAX_LENGTH
+from hyrfpack.quant.huffman import MAX_CODE_BITS
 from hyrfpack.render import render
 from tools.safety.plans import even
 
@@ -85,16 +85,16 @@ def test_the_largest_table_that_a_file_may_hold_needs_no_longer_codes_than_the_c
 
     longest = max(length for length in range(1, 90) if fibonacci(length + 2)[-1] - 1 <= grid.rows * FEATURES)
 
-    assert longest == 42 < MAX_LENGTH
-    assert fibonacci(MAX_LENGTH + 3)[-1] - 1 > 1000 * grid.rows * FEATURES  # what a bit past the codec's would take
+    assert longest == 42 < MAX_CODE_BITS
+    assert fibonacci(MAX_CODE_BITS + 3)[-1] - 1 > 1000 * grid.rows * FEATURES  # what a bit past the codec's would take
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_the_longest_codes_round_trip_at_every_bit_of_a_byte(dtype):
-    code = HuffmanCode.from_frequencies(fibonacci(MAX_LENGTH))
-    assert code.lengths.max() == MAX_LENGTH
-    rare = np.flatnonzero(code.by_symbol(256)[1] >= MAX_LENGTH - 1).astype(dtype)
-    fillers = [np.full(count, MAX_LENGTH - 1, dtype) for count in range(65)]  # of one bit each
+    code = HuffmanCode.from_frequencies(fibonacci(MAX_CODE_BITS))
+    assert code.lengths.max() == MAX_CODE_BITS
+    rare = np.flatnonzero(code.codes_by_symbol(256)[1] >= MAX_CODE_BITS - 1).astype(dtype)
+    fillers = [np.full(count, MAX_CODE_BITS - 1, dtype) for count in range(65)]  # of one bit each
     symbols = np.concatenate([part for filler in fillers for part in (filler, rare)])
 
     decoded, _ = through_bytes(symbols, code)
@@ -104,7 +104,7 @@ def test_the_longest_codes_round_trip_at_every_bit_of_a_byte(dtype):
 
 def test_a_histogram_one_bit_past_the_longest_code_is_refused():
     with pytest.raises(ValueError, match="so skewed that a code is longer than 57 bits"):
-        HuffmanCode.from_frequencies(fibonacci(MAX_LENGTH + 1))
+        HuffmanCode.from_frequencies(fibonacci(MAX_CODE_BITS + 1))
 
 
 @pytest.mark.parametrize("code", [None, HuffmanCode.from_frequencies(np.array([5, 3, 1]))])

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hyrfpack.quant.errors import DamagedDataError
-from hyrfpack.quant.huffman import END, HuffmanCode, HuffmanStream, chunk_length, huffman_decode, huffman_encode
+from hyrfpack.quant.huffman import END_MARK, HuffmanCode, HuffmanStream, chunk_length, huffman_decode, huffman_encode
 
 
 def fibonacci(n: int) -> np.ndarray:
@@ -102,7 +102,7 @@ def test_codes_are_dahuffmans() -> None:
     expected = {s: c for s, c in HuffmanCodec.from_frequencies(frequencies).get_code_table().items()}
     ours = zip(code.symbols.tolist(), code.lengths.tolist(), code.codes.tolist(), strict=True)
     ours = {symbol: (length, value) for symbol, length, value in ours}
-    assert ours.pop(END) in expected.values()
+    assert ours.pop(END_MARK) in expected.values()
     assert ours == {symbol: expected[symbol] for symbol in ours}
     assert len(expected) == len(ours) + 1
 
@@ -219,14 +219,14 @@ def forged(**changes: object) -> bytes:
 @pytest.mark.parametrize(
     ("lengths", "symbols", "claim"),
     [
-        ([1, 2, 3], [0, 1, END], "no complete code"),
-        ([1, 1, 1], [0, 1, END], "no complete code"),
-        ([2, 1, 2], [0, 1, END], "order of their codes"),
-        ([1, 2, 2], [0, 0, END], "two codes"),
-        ([0, 1, 1], [0, 1, END], "1 to 57"),
-        ([1, 1, 58], [0, 1, END], "1 to 57"),
-        ([1], [END], "1 to 57"),
-        ([8] * 255 + [1, 1], [*range(256), END], "no complete code"),
+        ([1, 2, 3], [0, 1, END_MARK], "no complete code"),
+        ([1, 1, 1], [0, 1, END_MARK], "no complete code"),
+        ([2, 1, 2], [0, 1, END_MARK], "order of their codes"),
+        ([1, 2, 2], [0, 0, END_MARK], "two codes"),
+        ([0, 1, 1], [0, 1, END_MARK], "1 to 57"),
+        ([1, 1, 58], [0, 1, END_MARK], "1 to 57"),
+        ([1], [END_MARK], "1 to 57"),
+        ([8] * 255 + [1, 1], [*range(256), END_MARK], "no complete code"),
     ],
 )
 def test_invalid_code_tables_are_refused(lengths: list[int], symbols: list[int], claim: str) -> None:
@@ -239,7 +239,7 @@ def test_invalid_code_tables_are_refused(lengths: list[int], symbols: list[int],
 def test_code_table_whose_sum_wraps_around_is_refused() -> None:
     # 2^57 + 2^64 in units of the longest code: a 64-bit sum would take it for complete.
     lengths = [*[1] * 256, 1, 1]
-    code = HuffmanCode(np.array([*range(257), END], np.int32), np.array(lengths, np.uint8))
+    code = HuffmanCode(np.array([*range(257), END_MARK], np.int32), np.array(lengths, np.uint8))
 
     with pytest.raises(DamagedDataError, match="no complete code"):
         HuffmanStream.from_bytes(forged(code=code, dtype=np.dtype("u2")))
@@ -260,7 +260,7 @@ def test_count_that_does_not_fit_the_payload_is_refused_in_decoding() -> None:
 
 def test_early_end_mark_is_refused() -> None:
     code = HuffmanCode.from_frequencies(np.array([9]))
-    end_is_one = int(code.codes[code.symbols == END][0])
+    end_is_one = int(code.codes[code.symbols == END_MARK][0])
     stream = HuffmanStream(code, 8, np.dtype("u1"), np.array([8]), bytes([0b00000001 if end_is_one else 0b11111110]))
 
     with pytest.raises(DamagedDataError, match="does not end where it should"):

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hyrfpack.quant.lifting import levels, lift, unlift
+from hyrfpack.quant.lifting import inverse_lift, iter_levels, lift
 
 COUNTS = [0, 1, 2, 3, 4, 5, 7, 8, 9, 16, 17, 31, 100, 1000]
 WEIGHT = st.sampled_from([0, 1, 6, 9, 12, 15, 16])
@@ -42,7 +42,7 @@ def test_unlift_is_the_definition(data: st.DataObject) -> None:
     weight = data.draw(WEIGHT)
     residuals, steps = [residual for residual, _ in pairs], [step for _, step in pairs]
 
-    values = unlift(np.array(residuals, np.int64), weight, np.array(steps, np.int64))
+    values = inverse_lift(np.array(residuals, np.int64), weight, np.array(steps, np.int64))
 
     assert values.dtype == np.int64
     assert values.tolist() == unlift_by_the_book(residuals, weight, steps)
@@ -57,7 +57,7 @@ def test_unlift_gives_what_lift_said_it_would(count: int, weight: int) -> None:
 
     residuals, values = lift(count, weight, steps, nearest_to(target, steps))
 
-    np.testing.assert_array_equal(unlift(residuals, weight, steps), values)
+    np.testing.assert_array_equal(inverse_lift(residuals, weight, steps), values)
     assert values.tolist() == unlift_by_the_book(residuals.tolist(), weight, steps.tolist())
     assert (2 * np.abs(values - target) <= steps).all()
 
@@ -72,14 +72,14 @@ def test_any_choice_of_differences_comes_back(data: st.DataObject) -> None:
     residuals, values = lift(count, weight, steps, lambda places, predictions: chosen[places])
 
     np.testing.assert_array_equal(residuals, chosen)
-    np.testing.assert_array_equal(unlift(residuals, weight, steps), values)
+    np.testing.assert_array_equal(inverse_lift(residuals, weight, steps), values)
 
 
 @pytest.mark.parametrize("count", COUNTS)
 def test_every_place_comes_once_and_after_its_neighbours(count: int) -> None:
     seen = [0] if count else []
 
-    for places, distance in levels(count):
+    for places, distance in iter_levels(count):
         for place in places.tolist():
             assert place - distance in seen
             assert place + distance in seen or place + distance >= count
@@ -117,13 +117,13 @@ def test_a_straight_line_is_predicted_by_its_ends() -> None:
 def test_without_a_weight_nothing_is_predicted() -> None:
     residuals, steps = np.array([3, -1, 4, 1, -5]), np.array([9, 2, 6, 5, 3])
 
-    assert unlift(residuals, 0, steps).tolist() == [27, -2, 24, 5, -15]
+    assert inverse_lift(residuals, 0, steps).tolist() == [27, -2, 24, 5, -15]
 
 
 def test_unlift_leaves_its_arguments_alone_and_takes_narrow_integers() -> None:
     residuals, steps = np.full(9, 2**31 - 1, np.int32), np.full(9, 2**10)
 
-    values = unlift(residuals, 16, steps)
+    values = inverse_lift(residuals, 16, steps)
 
     assert (residuals == 2**31 - 1).all() and (steps == 2**10).all()
     assert values.tolist() == unlift_by_the_book(residuals.tolist(), 16, steps.tolist())

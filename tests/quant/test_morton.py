@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hyrfpack.quant.morton import MAX_BITS, morton_cells, morton_codes
+from hyrfpack.quant.morton import MAX_BITS_PER_AXIS, morton_cells, morton_codes
 
 COORDINATE = st.one_of(st.integers(0, 3), st.integers(0, 2**21 - 1), st.integers(0, 20).map(lambda bit: 1 << bit))
 
@@ -52,6 +52,6 @@ def test_cells_of_any_integer_dtype_are_taken(dtype: type) -> None:
 
 
 def test_the_largest_gap_between_codes_fits_the_integer_coder() -> None:
-    corner = morton_codes(np.full((1, 3), (1 << MAX_BITS) - 1))
+    corner = morton_codes(np.full((1, 3), (1 << MAX_BITS_PER_AXIS) - 1))
 
     assert 0 < int(corner[0]) < 2**56

@@ -11,19 +11,19 @@ from hypothesis import strategies as st
 
 from hyrfpack.quant.errors import DamagedDataError
 from hyrfpack.quant.integers import encode_integers
-from hyrfpack.quant.morton import MAX_BITS
-from hyrfpack.quant.points import MAX_CLASSES, Points, decode_points, encode_points
+from hyrfpack.quant.morton import MAX_BITS_PER_AXIS
+from hyrfpack.quant.points import MAX_POINT_CLASSES, LatticePoints, decode_points, encode_points
 
 
-def random_points(count: int, bits: list[int], seed: int = 0, spread: float = 1.0) -> Points:
+def random_points(count: int, bits: list[int], seed: int = 0, spread: float = 1.0) -> LatticePoints:
     """Points in the cube [0, spread)^3 of the unit cube, of classes drawn evenly."""
     rng = np.random.default_rng(seed)
     classes = rng.integers(len(bits), size=count).astype(np.uint8)
     sides = (1 << np.array(bits))[classes][:, None]
-    return Points(np.floor(rng.random((count, 3)) * spread * sides).astype(np.int64), classes, np.array(bits))
+    return LatticePoints(np.floor(rng.random((count, 3)) * spread * sides).astype(np.int64), classes, np.array(bits))
 
 
-def sorted_rows(points: Points) -> list[tuple[int, ...]]:
+def sorted_rows(points: LatticePoints) -> list[tuple[int, ...]]:
     return sorted(map(tuple, np.column_stack([points.classes, points.cells]).tolist()))
 
 
@@ -31,25 +31,29 @@ _rng = np.random.default_rng(1)
 CASES = {
     "none": random_points(0, [7]),
     "none, all classes": random_points(0, list(range(1, 17))),
-    "one": Points(np.array([[5, 0, 7]]), np.zeros(1, np.uint8), np.array([3])),
-    "one in the last corner": Points(np.full((1, 3), 2**18 - 1), np.zeros(1, np.uint8), np.array([MAX_BITS])),
-    "first and last corner": Points(
-        np.array([[2**18 - 1] * 3, [0] * 3]), np.array([0, 0], np.uint8), np.array([MAX_BITS])
+    "one": LatticePoints(np.array([[5, 0, 7]]), np.zeros(1, np.uint8), np.array([3])),
+    "one in the last corner": LatticePoints(
+        np.full((1, 3), 2**18 - 1), np.zeros(1, np.uint8), np.array([MAX_BITS_PER_AXIS])
     ),
-    "coincident": Points(np.tile([[100, 200, 300]], (2000, 1)), np.zeros(2000, np.uint8), np.array([16])),
-    "coincident in all classes": Points(
+    "first and last corner": LatticePoints(
+        np.array([[2**18 - 1] * 3, [0] * 3]), np.array([0, 0], np.uint8), np.array([MAX_BITS_PER_AXIS])
+    ),
+    "coincident": LatticePoints(np.tile([[100, 200, 300]], (2000, 1)), np.zeros(2000, np.uint8), np.array([16])),
+    "coincident in all classes": LatticePoints(
         np.zeros((1600, 3), np.int64), (np.arange(1600) % 16).astype(np.uint8), np.arange(3, 19)
     ),
-    "duplicates": Points(_rng.integers(0, 3, (3000, 3)), np.zeros(3000, np.uint8), np.array([12])),
+    "duplicates": LatticePoints(_rng.integers(0, 3, (3000, 3)), np.zeros(3000, np.uint8), np.array([12])),
     "uniform": random_points(3000, [14]),
     "one bit": random_points(500, [1]),
     "all classes": random_points(3000, [18, 17, 16, 15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 2, 1]),
     "equal classes": random_points(900, [10, 10, 10]),
-    "classes nobody is in": Points(_rng.integers(0, 512, (800, 3)), np.full(800, 2, np.uint8), np.array([18, 1, 9, 4])),
-    "outlier": Points(
+    "classes nobody is in": LatticePoints(
+        _rng.integers(0, 512, (800, 3)), np.full(800, 2, np.uint8), np.array([18, 1, 9, 4])
+    ),
+    "outlier": LatticePoints(
         np.concatenate([_rng.integers(0, 9, (999, 3)), [[2**18 - 1] * 3]]), np.zeros(1000, np.uint8), np.array([18])
     ),
-    "two far clumps": Points(
+    "two far clumps": LatticePoints(
         np.concatenate([_rng.integers(0, 50, (500, 3)), 2**17 - 1 - _rng.integers(0, 50, (500, 3))]),
         _rng.integers(0, 2, 1000).astype(np.uint8),
         np.array([18, 17]),
@@ -57,7 +61,7 @@ CASES = {
 }
 
 
-def check_round_trip(points: Points) -> None:
+def check_round_trip(points: LatticePoints) -> None:
     data, order, ordered = encode_points(points)
 
     decoded = decode_points(data, len(points.cells))
@@ -79,7 +83,7 @@ def test_points_round_trip(name: str) -> None:
 @given(st.data())
 @settings(max_examples=100, deadline=None)
 def test_any_points_round_trip(data: st.DataObject) -> None:
-    bits = data.draw(st.lists(st.integers(1, MAX_BITS), min_size=1, max_size=MAX_CLASSES))
+    bits = data.draw(st.lists(st.integers(1, MAX_BITS_PER_AXIS), min_size=1, max_size=MAX_POINT_CLASSES))
     count, seed = data.draw(st.integers(0, 200)), data.draw(st.integers(0, 1000))
     spread = data.draw(st.sampled_from([1e-6, 0.01, 0.3, 1.0]))
 
@@ -103,7 +107,7 @@ def test_the_bytes_do_not_depend_on_the_order_given(name: str) -> None:
 
     data, _, ordered = encode_points(points)
     again = encode_points(points)[0]
-    from_shuffled = encode_points(Points(points.cells[shuffled], points.classes[shuffled], points.bits))[0]
+    from_shuffled = encode_points(LatticePoints(points.cells[shuffled], points.classes[shuffled], points.bits))[0]
 
     assert data == again == from_shuffled
     assert sorted_rows(decode_points(from_shuffled, len(shuffled))) == sorted_rows(ordered)
@@ -159,7 +163,7 @@ def test_even_points_take_hardly_more_than_their_information(count: int, bits: i
 
 def test_classes_take_hardly_more_than_their_entropy() -> None:
     points = random_points(30_000, [14, 14])
-    one_class = Points(points.cells, np.zeros(30_000, np.uint8), np.array([14]))
+    one_class = LatticePoints(points.cells, np.zeros(30_000, np.uint8), np.array([14]))
 
     more = 8 * (len(encode_points(points)[0]) - len(encode_points(one_class)[0])) / 30_000
 
@@ -167,7 +171,7 @@ def test_classes_take_hardly_more_than_their_entropy() -> None:
 
 
 def test_coincident_points_take_no_bytes() -> None:
-    points = Points(np.tile([[77, 5, 9]], (100_000, 1)), np.zeros(100_000, np.uint8), np.array([18]))
+    points = LatticePoints(np.tile([[77, 5, 9]], (100_000, 1)), np.zeros(100_000, np.uint8), np.array([18]))
 
     assert len(encode_points(points)[0]) < 60
 
@@ -195,7 +199,7 @@ def check_refused_or_on_the_lattice(data: bytes, count: int) -> None:
     except DamagedDataError:
         return
     assert points.cells.shape == (count, 3) and points.classes.shape == (count,)
-    assert points.bits.min() >= 1 and points.bits.max() <= MAX_BITS
+    assert points.bits.min() >= 1 and points.bits.max() <= MAX_BITS_PER_AXIS
     assert points.cells.min(initial=0) >= 0
     assert (points.cells < (1 << points.bits)[points.classes][:, None]).all()
     assert points.centers().max(initial=0) < 2**19
@@ -267,7 +271,7 @@ def test_another_count_is_refused(count: int) -> None:
 
 
 def test_gaps_that_lead_out_of_the_lattice_are_refused() -> None:
-    data = encode_points(Points(np.array([[1, 1, 1], [3, 3, 3]]), np.zeros(2, np.uint8), np.array([2])))[0]
+    data = encode_points(LatticePoints(np.array([[1, 1, 1], [3, 3, 3]]), np.zeros(2, np.uint8), np.array([2])))[0]
     damaged = bytearray(data)
     damaged[0] = damaged[HEADER.size] = 1  # a lattice of 8 cells; the last point is in cell 63
 

@@ -11,7 +11,7 @@ from hyrfpack.parallel import has_numba
 from hyrfpack.quant import rans
 from hyrfpack.quant.errors import DamagedDataError
 from hyrfpack.quant.rans import MAX_LANES, decode_tokens, encode_tokens
-from hyrfpack.quant.rans_lanes import Lanes
+from hyrfpack.quant.rans_lanes import LaneLayout
 from hyrfpack.quant.rans_models import LEVEL_WEIGHTS, MAX_LEVEL, adaptive_frequencies, normalise
 
 IMPLEMENTATIONS = ["numpy", pytest.param("cpu", marks=pytest.mark.skipif(not has_numba(), reason="no numba"))]
@@ -102,7 +102,7 @@ def test_cases_cover_all_kinds_of_models() -> None:
 def test_any_number_of_lanes_decodes(lanes_log2: int, implementation: str, monkeypatch: pytest.MonkeyPatch) -> None:
     tokens = following(777)
     contexts = (np.arange(777) % 3).astype(np.uint8)
-    monkeypatch.setattr(rans, "_lanes_log2", lambda count, bits: lanes_log2)
+    monkeypatch.setattr(rans, "_choose_lanes_log2", lambda count, bits: lanes_log2)
 
     data = encode_tokens(tokens, contexts, implementation)
 
@@ -322,9 +322,9 @@ def test_wrong_arguments_are_named() -> None:
 
 @given(count=st.integers(1, 5000), asked=st.integers(0, 13).map(lambda log2: 1 << log2))
 def test_active_lanes_are_those_that_have_a_token(count: int, asked: int) -> None:
-    lanes = Lanes(count, asked)
+    lanes = LaneLayout(count, asked)
 
-    for step in {0, lanes.last - 1, lanes.last % lanes.steps, lanes.steps - 1}:
+    for step in {0, lanes.last_lane_steps - 1, lanes.last_lane_steps % lanes.steps, lanes.steps - 1}:
         active = [lane for lane in range(asked) if lane * lanes.steps + step < min(count, (lane + 1) * lanes.steps)]
-        assert list(range(lanes.active(step))) == active
-    assert lanes.used <= asked
+        assert list(range(lanes.active_lanes(step))) == active
+    assert lanes.used_lanes <= asked

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hyrfpack.quant.steps import NOT_CODED, ONE, step_code, step_of
+from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, decode_step, encode_step
 
 CODES = range(1, 256)
 
@@ -17,7 +17,7 @@ def step_by_the_book(code: int) -> int:
 
 
 def test_steps_are_the_formula_exactly_and_rise() -> None:
-    steps = step_of(np.arange(1, 256, dtype=np.uint8))
+    steps = decode_step(np.arange(1, 256, dtype=np.uint8))
 
     assert steps.dtype == np.int64
     assert steps.tolist() == [step_by_the_book(code) for code in CODES]
@@ -25,7 +25,7 @@ def test_steps_are_the_formula_exactly_and_rise() -> None:
 
 
 def test_steps_reach_as_far_and_lie_as_close_as_promised() -> None:
-    steps = step_of(np.arange(1, 256)) / ONE
+    steps = decode_step(np.arange(1, 256)) / FIXED_POINT_ONE
 
     assert steps[0] == pytest.approx(5.4e-7, rel=0.01)
     assert steps[-1] == 1920
@@ -34,8 +34,8 @@ def test_steps_reach_as_far_and_lie_as_close_as_promised() -> None:
 
 
 def test_every_code_comes_back_from_its_step() -> None:
-    assert step_code(step_of(np.arange(1, 256)) / ONE).tolist() == list(CODES)
-    assert [int(step_code(float(step_of(code)) / ONE)) for code in CODES] == list(CODES)
+    assert encode_step(decode_step(np.arange(1, 256)) / FIXED_POINT_ONE).tolist() == list(CODES)
+    assert [int(encode_step(float(decode_step(code)) / FIXED_POINT_ONE)) for code in CODES] == list(CODES)
 
 
 @given(st.floats(1e-300, 1e300) | st.floats(math.log(1e-8), math.log(1e5)).map(math.exp))
@@ -44,7 +44,7 @@ def test_the_code_is_that_of_the_nearest_step_in_ratio(step: float) -> None:
     def distance(code: int) -> float:
         return abs(math.log(step_by_the_book(code) / 2**24) - math.log(step))
 
-    code = step_code(step)
+    code = encode_step(step)
 
     assert code.dtype == np.uint8
     assert distance(int(code)) <= min(map(distance, CODES)) + 1e-9
@@ -52,13 +52,13 @@ def test_the_code_is_that_of_the_nearest_step_in_ratio(step: float) -> None:
 
 @pytest.mark.parametrize(("step", "code"), [(0.0, 1), (1e-300, 1), (1e300, 255), (np.inf, 255)])
 def test_steps_out_of_reach_get_the_last_code_on_their_side(step: float, code: int) -> None:
-    assert int(step_code(step)) == code
+    assert int(encode_step(step)) == code
 
 
 @given(st.lists(st.floats(0, 1e6), max_size=50))
 @settings(max_examples=50, deadline=None)
 def test_no_step_gets_the_code_for_nothing_stored(steps: list[float]) -> None:
-    codes = step_code(np.array(steps))
+    codes = encode_step(np.array(steps))
 
     assert codes.shape == (len(steps),)
-    assert (codes != NOT_CODED).all()
+    assert (codes != ALL_ZERO_CODE).all()

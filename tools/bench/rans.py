@@ -14,7 +14,7 @@ import numpy as np
 from hyrfpack.measure.timing import time_alternately
 from hyrfpack.parallel import has_numba
 from hyrfpack.quant import HuffmanStream, decode_integers, encode_integers, huffman_decode, huffman_encode
-from hyrfpack.quant.integers import EXTRA_BITS
+from hyrfpack.quant.integers import EXTRA_BITS_BY_TOKEN
 from hyrfpack.quant.rans import decode_tokens
 
 try:
@@ -75,7 +75,7 @@ def _bench_set(name: str, values: np.ndarray, contexts: np.ndarray | None) -> li
     groups = np.zeros(count, np.uint8) if contexts is None else contexts
     histograms = np.stack([np.bincount(tokens[groups == group], minlength=126) for group in range(groups.max() + 1)])
     shares = histograms / np.maximum(histograms.sum(axis=1, keepdims=True), 1)
-    extra = int(EXTRA_BITS[tokens].sum(dtype=np.int64))
+    extra = int(EXTRA_BITS_BY_TOKEN[tokens].sum(dtype=np.int64))
     entropy = (extra - (histograms * np.log2(np.where(shares > 0, shares, 1))).sum()) / count
 
     coders = {}

@@ -18,7 +18,7 @@ from hyrfpack.format import encode_model
 from hyrfpack.format.arrays import decoder_widths, grid_configs, to_arrays
 from hyrfpack.format.compact.quantized import QuantizedModel
 from hyrfpack.model import HybridModel
-from hyrfpack.quant.morton import MAX_BITS
+from hyrfpack.quant.morton import MAX_BITS_PER_AXIS
 
 DISTORTION = 1e-5
 # Sums over all numbers of a kind, as they are in trained models, about.
@@ -31,10 +31,10 @@ def drawn_sensitivity(model: HybridModel, seed: int = 0) -> Sensitivity:
     rng = np.random.default_rng(seed)
     shares = np.exp(SPREAD * rng.normal(size=len(model))) / max(len(model), 1)
     places = model.cube_coords(model.gaussians.positions.detach().double()).numpy()
-    points = 2 * np.minimum(places * (1 << MAX_BITS), (1 << MAX_BITS) - 1).astype(np.int64) + 1
+    points = 2 * np.minimum(places * (1 << MAX_BITS_PER_AXIS), (1 << MAX_BITS_PER_AXIS) - 1).astype(np.int64) + 1
     fields = {}
     for group, grid in grid_configs(model.config).items():
-        usage = grid.usage(points, MAX_BITS + 1)
+        usage = grid.usage(points, MAX_BITS_PER_AXIS + 1)
         fields[group] = (TABLE * usage / max(usage.sum(), 1)).repeat(2)
     for group, widths in decoder_widths(model.config).items():
         count = sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(widths))

@@ -18,7 +18,7 @@ from hyrfpack.format.compact.plan import build_step_groups, lattice_to_local
 from hyrfpack.format.compact.quantized import CODEC_CHANNELS, CODEC_GROUPS, CODEC_POINTS, decode_channels, encode
 from hyrfpack.format.sections import DECODER_SECTIONS, LOGIT_SECTIONS, POSITIONS, TABLE_SECTIONS
 from hyrfpack.model.config import ModelConfig
-from hyrfpack.quant.points import Points, decode_points
+from hyrfpack.quant.points import LatticePoints, decode_points
 
 __all__ = ["CODEC_POINTS", "decode_positions", "decode_section", "encode"]
 
@@ -30,7 +30,7 @@ SECTIONS_BY_CODEC = {
 }
 
 
-def decode_positions(data: memoryview, count: int, config: ModelConfig) -> tuple[np.ndarray, Points]:
+def decode_positions(data: memoryview, count: int, config: ModelConfig) -> tuple[np.ndarray, LatticePoints]:
     """Decode the positions of a layer.
 
     Args:
@@ -49,7 +49,7 @@ def decode_positions(data: memoryview, count: int, config: ModelConfig) -> tuple
 
 
 def decode_section(
-    group: str, codec: int, data: memoryview, shape: tuple[int, int], config: ModelConfig, points: Points | None
+    group: str, codec: int, data: memoryview, shape: tuple[int, int], config: ModelConfig, points: LatticePoints | None
 ) -> np.ndarray:
     """Decode a section of codec 7 or 8.
 

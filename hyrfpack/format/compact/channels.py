@@ -13,8 +13,8 @@ import numpy as np
 
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.integers import decode_integers, encode_integers
-from hyrfpack.quant.lifting import unlift
-from hyrfpack.quant.steps import ONE, step_of
+from hyrfpack.quant.lifting import inverse_lift
+from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
 
 MAX_ABS_CHANNEL_VALUE = 4096.0  # keeps sums in fixed point far within 64 bits
 _NUMBERS_PER_BLOCK = 1 << 16  # small enough that temporary arrays stay in the caches
@@ -71,10 +71,10 @@ def decode_channel(data: memoryview, classes: np.ndarray) -> tuple[np.ndarray, m
         or kinds <= int(classes.max(initial=0))
     ):
         raise DamagedDataError("a channel's header says what cannot be; it is damaged")
-    steps = step_of(np.frombuffer(data[_HEADER_STRUCT.size : start], np.uint8))
+    steps = decode_step(np.frombuffer(data[_HEADER_STRUCT.size : start], np.uint8))
     residuals = decode_integers(data[start : start + size], len(classes), classes, signed=True)
     # Encoders stay within 2 MAX_ABS_CHANNEL_VALUE; sums of far larger differences could overflow.
-    limits = np.minimum(int(8 * MAX_ABS_CHANNEL_VALUE * ONE) // steps, 1 << 30).astype(np.int32)
+    limits = np.minimum(int(8 * MAX_ABS_CHANNEL_VALUE * FIXED_POINT_ONE) // steps, 1 << 30).astype(np.int32)
     for first in range(0, len(classes), _NUMBERS_PER_BLOCK):
         part, largest = (
             residuals[first : first + _NUMBERS_PER_BLOCK],
@@ -82,8 +82,8 @@ def decode_channel(data: memoryview, classes: np.ndarray) -> tuple[np.ndarray, m
         )
         if ((part > largest) | (part < -largest)).any():
             raise DamagedDataError(f"a channel holds differences beyond {8 * MAX_ABS_CHANNEL_VALUE:.0f}; it is damaged")
-    numbers = unlift(residuals, weight, steps[classes])
+    numbers = inverse_lift(residuals, weight, steps[classes])
     del residuals
-    values = numbers / ONE
+    values = numbers / FIXED_POINT_ONE
     values += mean
     return values, data[start + size :]

@@ -15,7 +15,7 @@ import numpy as np
 
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.integers import decode_integers, encode_integers
-from hyrfpack.quant.steps import NOT_CODED, ONE, step_of
+from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, decode_step
 
 ENTROPY_MODEL_COUNT = 8
 MAX_ABS_SYMBOL = 1 << 24
@@ -53,7 +53,7 @@ class GroupSymbols:
     """Quantised numbers in groups.
 
     Attributes:
-        codes: (count,) uint8 step codes, NOT_CODED for groups of zeros.
+        codes: (count,) uint8 step codes, ALL_ZERO_CODE for groups of zeros.
         models: (count,) uint8 entropy model of each group, 0 to ENTROPY_MODEL_COUNT - 1.
         symbols: (n,) int64 numbers in steps, at most MAX_ABS_SYMBOL in magnitude.
         values: (n,) float32 numbers as they will be decoded.
@@ -67,9 +67,9 @@ class GroupSymbols:
 
 def encode_groups(chosen: GroupSymbols, groups: StepGroups) -> bytes:
     """Encode quantised numbers in groups as bytes."""
-    coded = groups.gather(chosen.codes != NOT_CODED)
+    coded = groups.gather(chosen.codes != ALL_ZERO_CODE)
     codes = encode_integers(chosen.codes)
-    models = encode_integers(chosen.models[chosen.codes != NOT_CODED])
+    models = encode_integers(chosen.models[chosen.codes != ALL_ZERO_CODE])
     symbols = encode_integers(chosen.symbols[coded], groups.gather(chosen.models)[coded], signed=True)
     return _HEADER_STRUCT.pack(len(codes), len(models)) + codes + models + symbols
 
@@ -94,7 +94,7 @@ def decode_groups(data: memoryview, groups: StepGroups) -> np.ndarray:
     codes = decode_integers(data[:first], groups.count)
     if codes.max(initial=0) > 255:
         raise DamagedDataError(f"the step code {codes.max()} is above 255; it is damaged")
-    used = codes != NOT_CODED
+    used = codes != ALL_ZERO_CODE
     chosen = decode_integers(data[first : first + second], int(np.count_nonzero(used)))
     if chosen.max(initial=0) >= ENTROPY_MODEL_COUNT:
         raise DamagedDataError(f"the model {chosen.max()} of {ENTROPY_MODEL_COUNT}; it is damaged")
@@ -107,7 +107,7 @@ def decode_groups(data: memoryview, groups: StepGroups) -> np.ndarray:
     if symbols.max(initial=0) > MAX_ABS_SYMBOL or symbols.min(initial=0) < -MAX_ABS_SYMBOL:
         raise DamagedDataError(f"a number is more than {MAX_ABS_SYMBOL} steps; it is damaged")
     values = np.zeros(len(groups.index), np.float32)
-    steps, place = step_of(codes) / ONE, 0
+    steps, place = decode_step(codes) / FIXED_POINT_ONE, 0
     for part in iter_blocks(len(values)):
         index = groups.index[part][coded[part]]
         values[part][coded[part]] = symbols[place : place + len(index)] * steps[index]

@@ -16,8 +16,8 @@ from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.frame import Frame
 from hyrfpack.model.hash_grid import FEATURES
 from hyrfpack.model.hybrid import HybridModel
-from hyrfpack.quant.morton import MAX_BITS
-from hyrfpack.quant.points import Points
+from hyrfpack.quant.morton import MAX_BITS_PER_AXIS
+from hyrfpack.quant.points import LatticePoints
 
 USAGE_CLASS_COUNT = 16
 MAX_COUNTED_GAUSSIANS = 1 << 16  # of larger models only every n-th Gaussian is counted, which saves time
@@ -33,7 +33,7 @@ class Layer:
         positions: encoded bytes of `points`.
     """
 
-    points: Points
+    points: LatticePoints
     positions: bytes
 
 
@@ -70,17 +70,17 @@ class Plan:
         return stored
 
 
-def lattice_to_local(points: Points, frame: Frame) -> np.ndarray:
+def lattice_to_local(points: LatticePoints, frame: Frame) -> np.ndarray:
     """Return local positions (N, 3) float32 of the centres of the points' cells."""
     local = np.empty(points.cells.shape, np.float32)
     for first in range(0, len(local), GAUSSIANS_PER_BLOCK):
         part = slice(first, first + GAUSSIANS_PER_BLOCK)
-        cube = torch.from_numpy(points[part].centers() / float(2 << MAX_BITS))
+        cube = torch.from_numpy(points[part].centers() / float(2 << MAX_BITS_PER_AXIS))
         local[part] = (expand(cube) * cube.new_tensor(frame.half_extent)).float().numpy()
     return local
 
 
-def build_step_groups(group: str, config: ModelConfig, points: Points | None = None) -> StepGroups:
+def build_step_groups(group: str, config: ModelConfig, points: LatticePoints | None = None) -> StepGroups:
     """Group the numbers of a hash table or decoder that share a step.
 
     Rows of a table are grouped by level and usage class: 0 if no Gaussian reads the row, else 1 + floor(log4 n),
@@ -99,7 +99,7 @@ def build_step_groups(group: str, config: ModelConfig, points: Points | None = N
     assert points is not None
     grid = grid_configs(config)[group]
     every = max(1, -(-len(points.cells) // MAX_COUNTED_GAUSSIANS))
-    usage = grid.usage(points[::every].centers(), MAX_BITS + 1)
+    usage = grid.usage(points[::every].centers(), MAX_BITS_PER_AXIS + 1)
     index, count = np.empty((grid.rows, FEATURES), np.uint16), grid.levels * USAGE_CLASS_COUNT
     for level, (first, last) in enumerate(pairwise(grid.offsets)):
         length = np.frexp(usage[first:last].astype(np.float64))[1]  # number of binary digits, 0 for 0

@@ -24,7 +24,7 @@ from hyrfpack.format.sections import (
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.parallel.pool import run_jobs
 from hyrfpack.quant import DamagedDataError
-from hyrfpack.quant.points import Points
+from hyrfpack.quant.points import LatticePoints
 
 CODEC_POINTS = 6
 CODEC_CHANNELS = 7
@@ -90,7 +90,7 @@ def encode(model: HybridModel, quantized: QuantizedModel) -> tuple[list[Section]
     return [done[tag] for tag in (*DECODER_SECTIONS, *LAYERED_SECTIONS, *TABLE_SECTIONS, *further)], settings
 
 
-def decode_channels(data: memoryview, points: Points, columns: int) -> np.ndarray:
+def decode_channels(data: memoryview, points: LatticePoints, columns: int) -> np.ndarray:
     """Decode explicit logits; the basis of 3 columns is stored before them.
 
     Args:

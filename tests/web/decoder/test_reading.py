@@ -41,7 +41,7 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.quant import huffman_encode, rans_lanes
 from hyrfpack.quant.bits import pack_bits
 from hyrfpack.quant.integers import encode_integers
-from hyrfpack.quant.rans_models import adaptive_frequencies, update_steps
+from hyrfpack.quant.rans_models import adaptive_frequencies, iter_update_ranges
 from tools.safety.fuzz_browser import compare, disagreement, in_javascript, in_python
 from tools.safety.fuzz_mutate import KINDS, Part, assemble, disassemble, seeds
 from tools.safety.plans import encode
@@ -400,10 +400,14 @@ def test_deflated_metadata_is_unpacked_as_strictly():
 
 def tokens_in_lanes(tokens: np.ndarray, lanes_log2: int) -> bytes:
     """A stream of small integers in so many lanes, as rANS allows it and the format may not."""
-    lanes, alphabet = rans_lanes.Lanes(len(tokens), 1 << lanes_log2), int(tokens.max()) + 1
-    selector, counts, segments = rans_lanes.Selector(None, np.zeros(alphabet, np.uint8), 1), np.zeros((1, alphabet)), []
+    lanes, alphabet = rans_lanes.LaneLayout(len(tokens), 1 << lanes_log2), int(tokens.max()) + 1
+    selector, counts, segments = (
+        rans_lanes.ModelSelector(None, np.zeros(alphabet, np.uint8), 1),
+        np.zeros((1, alphabet)),
+        [],
+    )
     counts = counts.astype(np.int64)
-    for start, stop in update_steps(lanes.steps):
+    for start, stop in iter_update_ranges(lanes.steps):
         segments.append((start, stop, adaptive_frequencies(counts)))
         counts += rans_lanes.count_tokens(tokens, selector, lanes, start, stop, counts.shape)
     states, words = rans_lanes.encode_lanes(tokens, selector, lanes, segments)
