@@ -1,4 +1,4 @@
-"""Speed against error: what each operation and each setting costs in time, beside what it costs in accuracy."""
+"""Measure the run time of operations and settings together with the error that each of them causes."""
 
 from hyrfpack.bench.rows import Error, Row
 from hyrfpack.bench.suite import GROUPS, BenchReport, bench

@@ -1,4 +1,4 @@
-"""Profiles of the `.hyrf` file and their settings: time and bytes against what is lost."""
+"""Measure time, file size and loss of the `.hyrf` profiles and their settings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from hyrfpack.bench.rows import Row, in_words
+from hyrfpack.bench.rows import Row, format_value
 from hyrfpack.bench.subject import Subject
 from hyrfpack.compress.quantize import decide
 from hyrfpack.compress.sensitivity import measure_sensitivity
@@ -28,9 +28,9 @@ from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render
 
-# What is tried of each setting of a profile, one at a time; the profile's default joins them. A `seed` is no setting.
-# Of `distortion` these are multiples of the default, which the model's own quality decides.
-KNOBS: dict[str, dict[str, tuple]] = {
+# Values that are measured for each setting of a profile, one setting at a time, in addition to the profile's default.
+# A `seed` is not a setting. The values of `distortion` are multiples of the default, because that depends on the model.
+PROFILE_SETTING_VALUES: dict[str, dict[str, tuple]] = {
     "paper": {
         "color": ((1, 64), (1, 256), (2, 64), (2, 128), (2, 256), (3, 128), (4, 256)),
         "scale": ((1, 16), (1, 32), (1, 64), (1, 128), (1, 256), (2, 64), (2, 256)),
@@ -38,12 +38,19 @@ KNOBS: dict[str, dict[str, tuple]] = {
     },
     "compact": {"distortion": (0.1, 0.3, 3.0, 10.0), "prune": (False, True)},
 }
-REFERENCE = "raw"
+REFERENCE_PROFILE = "raw"
 
 
 @dataclass(frozen=True)
-class Case:
-    """A profile with its defaults (`setting` "profile"), or with one setting changed."""
+class EncodingCase:
+    """A profile with its defaults (`setting` is "profile"), or with one setting changed.
+
+    Attributes:
+        setting: name of the setting, as in `Row.setting`.
+        value: formatted value of the setting.
+        is_default: whether hyrfpack uses this value by default.
+        encode: encodes the model and returns the bytes of the file.
+    """
 
     setting: str
     value: str
@@ -53,30 +60,32 @@ class Case:
 
 @torch.no_grad()
 def codec_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
-    """Encode and decode with every profile, and with each setting of it away from its default.
+    """Measure encoding and decoding with every profile, and with each setting of it away from its default.
 
     Args:
-        note: called with the reason for each profile that cannot write this model.
+        subject: the model to encode.
+        repeats: measured runs of each case.
+        note: called with a sentence about each profile that cannot encode this model.
     """
-    if subject.profile != REFERENCE:
+    if subject.profile != REFERENCE_PROFILE:
         note(
             f"{subject.name} is of profile '{subject.profile}': its numbers are quantised already, so coding them "
             "again loses less than coding the trained model"
         )
-    cases: list[Case] = []
+    cases: list[EncodingCase] = []
     for profile in PROFILES:
         try:
-            cases += _cases(subject, profile, note)
+            cases += _encoding_cases(subject, profile, note)
         except HyrfError as error:
             note(f"profile '{profile}' is left out: {error}")
     names = {f"{case.setting} {case.value}": case for case in cases}
     encoding, files = time_alternately({name: case.encode for name, case in names.items()}, repeats)
     decoding, models = time_alternately({name: partial(decode_model, data) for name, data in files.items()}, repeats)
 
-    exact, first = _pictures(subject, subject.model), f"profile {REFERENCE}"
+    exact, first = _render_views(subject, subject.model), f"profile {REFERENCE_PROFILE}"
     best = subject.scores(exact, exact)
     for name, case in names.items():
-        pictures = _pictures(subject, models[name])
+        pictures = _render_views(subject, models[name])
         yield Row(
             group="codec",
             setting=case.setting,
@@ -94,14 +103,14 @@ def codec_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> I
 
 
 def parameter_errors(before: HybridModel, after: HybridModel) -> dict[str, Error]:
-    """Absolute errors of each group of parameters, by what it holds; positions in local units, the rest as stored.
+    """Compute the absolute errors of each group of parameters, by the group's description in SECTIONS.
 
-    Where a profile stores Gaussians in another order, each is compared with the one that took its place. Where it
-    stores another number of them, their parameters are left out.
+    Positions are compared in local units, other parameters as stored. If a profile changes the order of the Gaussians,
+    each is compared with the most similar one. If it changes their number, their parameters are left out.
     """
     old, new = to_arrays(before), to_arrays(after)
     if len(before) == len(after):
-        order = _order(old, new)
+        order = _match_gaussians(old, new)
         new |= {group: new[group][order] for group in LAYERED_SECTIONS}
     return {
         SECTION_CONTENTS[group]: measure_error(
@@ -112,45 +121,48 @@ def parameter_errors(before: HybridModel, after: HybridModel) -> dict[str, Error
     }
 
 
-def _order(old: dict[str, np.ndarray], new: dict[str, np.ndarray]) -> np.ndarray:
-    """(N,) which of the new Gaussians is each old one."""
+def _match_gaussians(old: dict[str, np.ndarray], new: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the (N,) index of the new Gaussian that corresponds to each old one."""
     count = len(old[POSITIONS])
     spread = np.linalg.norm(old[POSITIONS] - np.median(old[POSITIONS], axis=0), axis=1)
     moved = np.linalg.norm(new[POSITIONS] - old[POSITIONS], axis=1)
     if np.median(moved) <= 0.01 * np.median(spread):
         return np.arange(count)
-    # All their numbers together tell apart those at one place; each column counts by its spread.
+    # All parameters are compared, because Gaussians may share a position. Each column is scaled by its deviation.
     rows = [np.concatenate([arrays[group] for group in LAYERED_SECTIONS], axis=1) for arrays in (old, new)]
     size = rows[0].std(axis=0) + 1e-12
     return cKDTree(rows[1] / size).query(rows[0] / size)[1]
 
 
-def _cases(subject: Subject, profile: str, note: Callable[[str], None]) -> Iterator[Case]:
-    """The profile itself, then each of its knobs' values."""
-    encode, defaults = _compact(subject, note) if profile == "compact" else _plain(subject.model, profile)
-    itself = Case("profile", profile, profile == DEFAULT_PROFILE, encode)
+def _encoding_cases(subject: Subject, profile: str, note: Callable[[str], None]) -> Iterator[EncodingCase]:
+    """Yield the profile with its defaults, then each value of each of its settings."""
+    if profile == "compact":
+        encode, defaults = _compact_encoder(subject, note)
+    else:
+        encode, defaults = _encoder(subject.model, profile)
+    itself = EncodingCase("profile", profile, profile == DEFAULT_PROFILE, encode)
     yield itself
-    for knob, values in KNOBS.get(profile, {}).items():
-        default = defaults[knob]
-        if knob == "distortion":
+    for name, values in PROFILE_SETTING_VALUES.get(profile, {}).items():
+        default = defaults[name]
+        if name == "distortion":
             values = tuple(default * factor for factor in values)
         for value in sorted({*values, default}):
             if value == default:
-                yield replace(itself, setting=f"{profile}, {knob}", value=_in_words(value), is_default=True)
+                yield replace(itself, setting=f"{profile}, {name}", value=_format_value(value), is_default=True)
             else:
-                yield Case(f"{profile}, {knob}", _in_words(value), False, partial(encode, **{knob: value}))
+                yield EncodingCase(f"{profile}, {name}", _format_value(value), False, partial(encode, **{name: value}))
 
 
-def _plain(model: HybridModel, profile: str) -> tuple[Callable[..., bytes], dict]:
-    """What writes the model with settings of a profile, and their defaults."""
+def _encoder(model: HybridModel, profile: str) -> tuple[Callable[..., bytes], dict]:
+    """Return a function that encodes the model with settings of a profile, and the defaults of the settings."""
     encode = partial(encode_model, model, profile)
     defaults = read_metadata(read_container(encode(), SECTION_CONTENTS)).settings
-    # They came through JSON, which has no tuples.
+    # JSON has no tuples, so that they were read as lists.
     return encode, {name: tuple(value) if isinstance(value, list) else value for name, value in defaults.items()}
 
 
-def _compact(subject: Subject, note: Callable[[str], None]) -> tuple[Callable[..., bytes], dict]:
-    """The same of profile "compact". What each number does to pictures is measured here, once for all settings."""
+def _compact_encoder(subject: Subject, note: Callable[[str], None]) -> tuple[Callable[..., bytes], dict]:
+    """Return the same as `_encoder` for profile "compact"; the sensitivity is measured once for all settings."""
     start = perf_counter()
     with torch.enable_grad():
         sensitivity = measure_sensitivity(subject.model, subject.capture)
@@ -165,12 +177,14 @@ def _compact(subject: Subject, note: Callable[[str], None]) -> tuple[Callable[..
     return encode, {"distortion": subject.distortion, "prune": True}
 
 
-def _in_words(value: object) -> str:
+def _format_value(value: object) -> str:
+    """Format a value of a setting; numbers get two digits, because multiples of the default are not round."""
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:.2g}" if isinstance(value, float) else in_words(value)
+    return f"{value:.2g}" if isinstance(value, float) else format_value(value)
 
 
-def _pictures(subject: Subject, model: HybridModel) -> list[Tensor]:
+def _render_views(subject: Subject, model: HybridModel) -> list[Tensor]:
+    """Render a model from each camera of the subject."""
     decoded = model.decode()
     return [render(model, camera, decoded=decoded).rgb for camera in subject.cameras]

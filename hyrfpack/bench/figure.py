@@ -1,4 +1,4 @@
-"""Rows as a picture: time against error."""
+"""Plot measured rows: error against time."""
 
 from __future__ import annotations
 
@@ -16,69 +16,82 @@ from hyrfpack.evaluate.figures import blank_figure, save_figure
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FORMATS = ("png", "svg", "pdf")
-COLORS = ("#1a73e8", "#d93025", "#188038", "#e37400", "#8430ce", "#12858d", "#5f6368", "#b31412")
-COLUMNS = 3
-CURVES = ("render", "codec")  # groups whose settings are numbers on a scale
-LABEL_SIZE = 7  # points
-LABEL_PLACES = ((6, 4), (6, -9), (-6, 4), (-6, -9), (6, 13), (-6, 13), (6, -18), (-6, -18))  # points; < 0 is leftwards
+PLOT_FORMATS = ("png", "svg", "pdf")
+SETTING_COLORS = ("#1a73e8", "#d93025", "#188038", "#e37400", "#8430ce", "#12858d", "#5f6368", "#b31412")
+MAX_PANEL_COLUMNS = 3
+CURVE_GROUPS = ("render", "codec")  # groups whose points are joined, because their values lie on a scale
+LABEL_SIZE_POINTS = 7
+# Candidate offsets (right, up) of a label from its point; labels with a negative first offset are right-aligned.
+LABEL_OFFSETS_POINTS = ((6, 4), (6, -9), (-6, 4), (-6, -9), (6, 13), (-6, 13), (6, -18), (-6, -18))
 
 Box = tuple[float, float, float, float]  # left, bottom, right, top
 
 
 @dataclass(frozen=True)
 class Panel:
-    """Some rows, and what their horizontal axis is."""
+    """The rows of one panel of the plot.
+
+    Attributes:
+        title: title of the panel.
+        axis: label of the horizontal axis.
+        rows: rows that are drawn as points.
+        x_value: returns a row's value on the horizontal axis.
+    """
 
     title: str
     axis: str
     rows: list[Row]
-    across: Callable[[Row], float]
+    x_value: Callable[[Row], float]
 
 
 def plot(rows: Sequence[Row], path: str | os.PathLike[str], *, overwrite: bool = True) -> Path:
-    """Draw the rms error of each row against its time over the reference's, both axes logarithmic.
+    """Plot the rms error of each row against the ratio of its time to the reference's, both on logarithmic axes.
 
-    A panel for each group; in "render" one for each setting with a curve, in "codec" one for the profiles and one for
-    each profile's settings, and each again over bytes. References are stars, defaults are ringed. Results without any
-    error lie on the line marked 0.
+    There is one panel for each group. "render" has one for each setting with a curve. "codec" has one for the profiles
+    and one for each profile's settings, and each of these again with the file size. References are stars, defaults have
+    a ring. Results without any error lie on the line marked 0.
 
     Args:
-        path: the picture to write, in the format of its extension, one out of FORMATS.
-        overwrite: as of `hyrfpack.atomic.pending_file`.
+        rows: the measured rows.
+        path: the picture to write; its extension, one of PLOT_FORMATS, decides the format.
+        overwrite: as in `hyrfpack.atomic.pending_file`.
 
     Returns:
-        The path that was written.
+        The path of the written file.
 
     Raises:
-        HyrfError: the file cannot be written, or its extension names no such format.
+        HyrfError: the file cannot be written, or its extension is not one of PLOT_FORMATS.
     """
-    drawn = panels(rows)
-    across = min(COLUMNS, len(drawn))
-    down = -(-len(drawn) // across)
-    figure = blank_figure(5.2 * across, 4.2 * down)
-    places = list(figure.subplots(down, across, squeeze=False).flat)
-    marked = [_draw(axes, panel) for axes, panel in zip(places, drawn, strict=False)]
-    for axes in places[len(drawn) :]:
+    panels = build_panels(rows)
+    columns = min(MAX_PANEL_COLUMNS, len(panels))
+    lines = -(-len(panels) // columns)
+    figure = blank_figure(5.2 * columns, 4.2 * lines)
+    all_axes = list(figure.subplots(lines, columns, squeeze=False).flat)
+    labels_by_panel = [_draw_panel(axes, panel) for axes, panel in zip(all_axes, panels, strict=False)]
+    for axes in all_axes[len(panels) :]:
         axes.set_axis_off()
-    figure.draw_without_rendering()  # now it is known where each point lies
+    figure.draw_without_rendering()  # this lays out the axes, which the positions of the labels depend on
     figure.set_layout_engine("none")
-    for axes, labels in zip(places, marked, strict=False):
-        _label(axes, labels)
-    return save_figure(path, figure, overwrite=overwrite, format=picture_format(path))
+    for axes, labels in zip(all_axes, labels_by_panel, strict=False):
+        _draw_labels(axes, labels)
+    return save_figure(path, figure, overwrite=overwrite, format=plot_format(path))
 
 
-def picture_format(path: str | os.PathLike[str]) -> str:
-    """The format that a path's extension names. Raises HyrfError unless it is one of FORMATS."""
+def plot_format(path: str | os.PathLike[str]) -> str:
+    """Return the format that a path's extension names.
+
+    Raises:
+        HyrfError: the extension is not one of PLOT_FORMATS.
+    """
     suffix = Path(path).suffix.lower().removeprefix(".")
-    if suffix not in FORMATS:
-        raise HyrfError(f"{path}: a plot is written as {', '.join(FORMATS)}; give it one of these extensions")
+    if suffix not in PLOT_FORMATS:
+        raise HyrfError(f"{path}: a plot is written as {', '.join(PLOT_FORMATS)}; give it one of these extensions")
     return suffix
 
 
-def panels(rows: Sequence[Row]) -> list[Panel]:
-    """What is drawn where."""
-    parts: dict[str, list[Row]] = {}
+def build_panels(rows: Sequence[Row]) -> list[Panel]:
+    """Group rows into panels, see `plot`."""
+    rows_by_title: dict[str, list[Row]] = {}
     for row in rows:
         title = row.group
         if row.group == "render":
@@ -86,49 +99,50 @@ def panels(rows: Sequence[Row]) -> list[Panel]:
             title = f"render: {row.setting}" if values > 2 else "render: other settings"
         elif row.group == "codec":
             title = f"codec: {row.setting.partition(',')[0]}"
-        parts.setdefault(title, []).append(row)
-    made = []
-    for title, here in parts.items():
-        if here[0].group != "codec":
-            made.append(Panel(title, "time / reference", here, lambda row: row.ratio.wall))
+        rows_by_title.setdefault(title, []).append(row)
+    panels = []
+    for title, panel_rows in rows_by_title.items():
+        if panel_rows[0].group != "codec":
+            panels.append(Panel(title, "time / reference", panel_rows, lambda row: row.ratio.wall))
             continue
         (size,) = {row.bytes for row in rows if row.group == "codec" and row.is_reference}
-        made.append(Panel(f"{title}, encoding", "time / raw", here, lambda row: row.ratio.wall))
-        made.append(Panel(f"{title}, size", "bytes / raw", here, partial(_size_ratio, reference=size)))
-    return made
+        panels.append(Panel(f"{title}, encoding", "time / raw", panel_rows, lambda row: row.ratio.wall))
+        panels.append(Panel(f"{title}, size", "bytes / raw", panel_rows, partial(_size_ratio, reference=size)))
+    return panels
 
 
 def _size_ratio(row: Row, reference: int | None) -> float:
-    assert row.bytes is not None and reference is not None  # rows of the codec have bytes
+    """Divide a row's file size by that of the reference."""
+    assert row.bytes is not None and reference is not None  # every row of group "codec" has a size
     return row.bytes / reference
 
 
-def _draw(axes: Axes, panel: Panel) -> list[tuple[Row, float, float, str]]:
-    """Points and axes of a panel; returns what is to be labelled: row, place, colour."""
+def _draw_panel(axes: Axes, panel: Panel) -> list[tuple[Row, float, float, str]]:
+    """Draw the points and axes of a panel; return the row, x, y and colour of each point for the labels."""
     exact = min((row.error.rms for row in panel.rows if row.error.rms > 0), default=1e-8) / 10
     settings = list(dict.fromkeys(row.setting for row in panel.rows))
-    marked = []
+    labels = []
     for number, setting in enumerate(settings):
-        color = COLORS[number % len(COLORS)]
-        here = [row for row in panel.rows if row.setting == setting]
-        points = {id(row): (panel.across(row), row.error.rms or exact) for row in here}
-        if here[0].group in CURVES:
-            curve = [points[id(row)] for row in here if not row.is_reference]
+        color = SETTING_COLORS[number % len(SETTING_COLORS)]
+        setting_rows = [row for row in panel.rows if row.setting == setting]
+        points = {id(row): (panel.x_value(row), row.error.rms or exact) for row in setting_rows}
+        if setting_rows[0].group in CURVE_GROUPS:
+            curve = [points[id(row)] for row in setting_rows if not row.is_reference]
             axes.plot(*zip(*curve, strict=True), color=color, linewidth=0.8, alpha=0.5, zorder=1)
-        for row in here:
+        for row in setting_rows:
             x, y = points[id(row)]
             axes.scatter(x, y, s=90 if row.is_reference else 18, marker="*" if row.is_reference else "o", color=color)
             if row.is_default:
                 axes.scatter(x, y, s=110, facecolors="none", edgecolors=color, linewidths=1.5)
-            marked.append((row, x, y, color))
+            labels.append((row, x, y, color))
         axes.plot([], [], color=color, label=setting)
     axes.set(xscale="log", yscale="log", xlabel=panel.axis, ylabel="rms error")
     axes.set_title(panel.title, fontsize=10, loc="left")
     axes.margins(x=0.18, y=0.15)
     low, high = axes.get_xlim()
-    axes.xaxis.set_major_formatter(_plain)
-    axes.xaxis.set_minor_formatter(_plain if high < 10 * low else _nothing)
-    axes.tick_params(which="both", labelsize=LABEL_SIZE)
+    axes.xaxis.set_major_formatter(_format_tick)
+    axes.xaxis.set_minor_formatter(_format_tick if high < 10 * low else _hide_tick)
+    axes.tick_params(which="both", labelsize=LABEL_SIZE_POINTS)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     if any(row.error.rms == 0 for row in panel.rows):
@@ -139,24 +153,24 @@ def _draw(axes: Axes, panel: Panel) -> list[tuple[Row, float, float, str]]:
             xycoords=("axes fraction", "data"),
             xytext=(3, 2),
             textcoords="offset points",
-            fontsize=LABEL_SIZE,
+            fontsize=LABEL_SIZE_POINTS,
         )
     if len(settings) > 1:
-        axes.legend(fontsize=LABEL_SIZE, frameon=False)
-    return marked
+        axes.legend(fontsize=LABEL_SIZE_POINTS, frameon=False)
+    return labels
 
 
-def _label(axes: Axes, marked: Sequence[tuple[Row, float, float, str]]) -> None:
-    """Write values beside their points where there is room; references and defaults choose first."""
+def _draw_labels(axes: Axes, labels: Sequence[tuple[Row, float, float, str]]) -> None:
+    """Write values beside their points if there is room; references and defaults are placed first."""
     scale = axes.figure.dpi / 72
     edge = axes.bbox.x1 / scale
     taken: list[Box] = []
-    for row, x, y, color in sorted(marked, key=lambda item: not (item[0].is_reference or item[0].is_default)):
+    for row, x, y, color in sorted(labels, key=lambda item: not (item[0].is_reference or item[0].is_default)):
         left, bottom = axes.transData.transform((x, y)) / scale
-        width = 0.58 * LABEL_SIZE * len(row.value)
-        for right, up in LABEL_PLACES:
+        width = 0.58 * LABEL_SIZE_POINTS * len(row.value)
+        for right, up in LABEL_OFFSETS_POINTS:
             start = left + right - (width if right < 0 else 0)
-            box = (start, bottom + up, start + width, bottom + up + LABEL_SIZE)
+            box = (start, bottom + up, start + width, bottom + up + LABEL_SIZE_POINTS)
             if box[2] <= edge and not any(_overlap(box, other) for other in taken):
                 taken.append(box)
                 axes.annotate(
@@ -165,19 +179,22 @@ def _label(axes: Axes, marked: Sequence[tuple[Row, float, float, str]]) -> None:
                     xytext=(right, up),
                     textcoords="offset points",
                     ha="right" if right < 0 else "left",
-                    fontsize=LABEL_SIZE,
+                    fontsize=LABEL_SIZE_POINTS,
                     color=color,
                 )
                 break
 
 
 def _overlap(a: Box, b: Box) -> bool:
+    """Whether two boxes overlap."""
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def _plain(value: float, _position: float) -> str:
+def _format_tick(value: float, _position: float) -> str:
+    """Format a tick as a plain number, which matplotlib would write as a power of ten."""
     return f"{value:g}"
 
 
-def _nothing(_value: float, _position: float) -> str:
+def _hide_tick(_value: float, _position: float) -> str:
+    """Return no label for a tick."""
     return ""

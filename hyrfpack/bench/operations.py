@@ -1,4 +1,4 @@
-"""The hot operations on a model's own numbers: each implementation against the reference in float64."""
+"""Measure the hot operations on a model's own data: each implementation against the float64 reference."""
 
 from __future__ import annotations
 
@@ -27,13 +27,14 @@ from hyrfpack.scene import Camera
 
 
 @dataclass(frozen=True)
-class Way:
-    """A way to run an operation.
+class Variant:
+    """An implementation and the dtypes that an operation runs with.
 
     Attributes:
-        name: for people.
-        implementation: as the operation calls it.
-        dtype: of all tensors, but for those in `dtypes`.
+        name: name in tables and plots.
+        implementation: the operation's name of the implementation.
+        dtype: dtype of all tensors that are not in `dtypes`.
+        dtypes: dtypes of single tensors by name.
     """
 
     name: str
@@ -42,47 +43,50 @@ class Way:
     dtypes: Mapping[str, torch.dtype] = field(default_factory=dict)
 
 
-# The first is what the others are measured against.
-EXACT = Way("float64 reference", "reference", torch.float64)
-RASTERIZE_WAYS = (
-    EXACT,
-    Way("float32 reference", "reference", torch.float32),
-    Way("cpu", "cpu", torch.float32),
+# The first variant of each tuple is the reference of the others.
+FLOAT64_REFERENCE = Variant("float64 reference", "reference", torch.float64)
+RASTERIZE_VARIANTS = (
+    FLOAT64_REFERENCE,
+    Variant("float32 reference", "reference", torch.float32),
+    Variant("cpu", "cpu", torch.float32),
 )
-HASH_WAYS = (*RASTERIZE_WAYS, Way("cpu, bfloat16 table", "cpu", torch.float32, {"table": torch.bfloat16}))
-MLP_WAYS = (*RASTERIZE_WAYS, Way("bfloat16 reference", "reference", torch.bfloat16))
-DEFAULT_WAY = "cpu"
+HASH_ENCODE_VARIANTS = (
+    *RASTERIZE_VARIANTS,
+    Variant("cpu, bfloat16 table", "cpu", torch.float32, {"table": torch.bfloat16}),
+)
+MLP_VARIANTS = (*RASTERIZE_VARIANTS, Variant("bfloat16 reference", "reference", torch.bfloat16))
+DEFAULT_VARIANT = "cpu"
 
 
 def rasterize_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
-    """Draw the model's Gaussians as one view sees them; antialiased and not, forward and with all gradients."""
+    """Measure the rasterisation of one view, with and without antialiasing, forward and with all gradients."""
     model, camera, pose = _one_view(subject)
     inputs = splat_inputs(model, camera_center(pose))
     for antialiased in (False, True):
         call = rasterize_call(inputs, pose, camera.intrinsics, camera.width, camera.height, antialiased=antialiased)
         name = "antialiased, " if antialiased else ""
-        yield from _compare("rasterize", name, call, RASTERIZE_WAYS, measure_error, repeats)
+        yield from _compare("rasterize", name, call, RASTERIZE_VARIANTS, measure_error, repeats)
 
 
 def hash_encode_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
-    """Look up both fields' features at all Gaussians; gradients reach the table, as in training."""
+    """Measure the lookup of both fields' features at all Gaussians, with gradients of the table, as in training."""
     coords = subject.model.cube_coords(subject.model.gaussians.positions)
     for name, part in fields(subject.model):
         grid = part.grid.config
         call = hash_encode_call(coords, part.grid.table, grid.resolutions, grid.log2_table_size)
-        yield from _compare("hash_encode", f"{name}, ", call, HASH_WAYS, measure_relative_error, repeats)
+        yield from _compare("hash_encode", f"{name}, ", call, HASH_ENCODE_VARIANTS, measure_relative_error, repeats)
 
 
 def mlp_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
-    """Run both fields' decoders on the features of all Gaussians; the radiance field's as one view sees them."""
+    """Measure both fields' decoders on the features of all Gaussians, seen from one camera."""
     model, _, pose = _one_view(subject)
     for name, part, features in decoder_inputs(model, camera_center(pose)):
         call = mlp_call(features, list(part.weights), list(part.biases))
-        yield from _compare("mlp", f"{name}, ", call, MLP_WAYS, measure_relative_error, repeats)
+        yield from _compare("mlp", f"{name}, ", call, MLP_VARIANTS, measure_relative_error, repeats)
 
 
 def _one_view(subject: Subject) -> tuple[HybridModel, Camera, Tensor]:
-    """The model, a camera, and its pose (4, 4) camera_from_local, float64."""
+    """Return the model, the middle camera, and its (4, 4) float64 pose camera_from_local."""
     camera = subject.cameras[len(subject.cameras) // 2]
     return subject.model, camera, torch.as_tensor(subject.model.config.frame.local_pose(camera))
 
@@ -91,20 +95,20 @@ def _compare(
     group: str,
     prefix: str,
     call: Call,
-    ways: tuple[Way, ...],
+    variants: tuple[Variant, ...],
     compare: Callable[[Tensor, Tensor, str], Error],
     repeats: int,
 ) -> Iterator[Row]:
-    """Rows of one operation, forward alone and with gradients; all ways take turns."""
+    """Yield the rows of one operation, forward only and with gradients; all variants are timed in turns."""
     for setting, make in (("forward", call.forward), ("forward + backward", call.both)):
-        tasks = {way.name: make(way.implementation, way.dtype, way.dtypes) for way in ways}
-        for way in ways:
-            if way.implementation == "cpu":
-                tasks[way.name]()  # compiles kernels that are not cached: not to be taken for a slow first run
+        tasks = {one.name: make(one.implementation, one.dtype, one.dtypes) for one in variants}
+        for variant in variants:
+            if variant.implementation == "cpu":
+                tasks[variant.name]()  # compiles kernels that are not cached, which must not count as a slow first run
         times, results = time_alternately(tasks, repeats)
-        exact = results[ways[0].name]
-        for way in ways:
-            what, result = f"{group}, {prefix}{setting}, {way.name}", results[way.name]
+        exact = results[variants[0].name]
+        for variant in variants:
+            what, result = f"{group}, {prefix}{setting}, {variant.name}", results[variant.name]
             parts = {}
             if make == call.both:
                 pairs = zip(call.wanted, result[1], exact[1], strict=True)
@@ -112,11 +116,11 @@ def _compare(
             yield Row(
                 group=group,
                 setting=prefix + setting,
-                value=way.name,
-                is_reference=way is ways[0],
-                is_default=way.name == DEFAULT_WAY,
-                time=times[way.name],
-                ratio=times[way.name].ratio_to(times[ways[0].name]),
+                value=variant.name,
+                is_reference=variant is variants[0],
+                is_default=variant.name == DEFAULT_VARIANT,
+                time=times[variant.name],
+                ratio=times[variant.name].ratio_to(times[variants[0].name]),
                 error=largest_error(list(parts.values())) if parts else compare(result, exact, what),
                 parts=parts,
             )

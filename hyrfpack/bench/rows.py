@@ -1,4 +1,4 @@
-"""One measured setting."""
+"""The row that one measurement gives."""
 
 from __future__ import annotations
 
@@ -8,29 +8,30 @@ from dataclasses import dataclass, field
 from hyrfpack.measure.error import Error
 from hyrfpack.measure.timing import Ratio, Timing
 
-__all__ = ["Error", "Row", "in_words"]
+__all__ = ["Error", "Row", "format_value"]
 
 
 @dataclass(frozen=True)
 class Row:
-    """One setting of one thing: how long it takes, and how far off it is.
+    """Time and error of one value of one setting.
 
     Attributes:
-        group: what is measured, a name out of `hyrfpack.bench.GROUPS`.
-        setting: what is varied there, such as "background_threshold".
-        value: what it is set to, in words.
-        is_reference: other rows' errors and ratios are against this one.
-        is_default: what hyrfpack does when nothing else is said.
-        time: of one call; in "render" of one picture, in "codec" of encoding.
-        ratio: of this time to the reference's, which took turns with it.
-        error: of the result against the reference's. Pictures: in colour units, [0, 1]. Features and gradients: the
-            maximum as a fraction of the reference's largest number, the rms of its rms; of gradients the worst.
-        parts: the same for each part by itself: gradients by input (relative), parameters by group (absolute).
-        psnr, ssim: of the pictures against the photos, or without photos against the reference's pictures; means
-            over views of 8-bit pictures. None where there is no picture.
-        psnr_drop, ssim_drop: the reference's score minus this one's, in dB and SSIM. None without photos.
-        bytes: of the file ("codec").
-        decode, decode_ratio: as time and ratio, of decoding ("codec").
+        group: the group of measurements, one of `hyrfpack.bench.GROUPS`.
+        setting: the setting that is varied, such as "background_threshold".
+        value: the formatted value of the setting.
+        is_reference: whether errors and ratios of other rows refer to this row.
+        is_default: whether hyrfpack uses this value by default.
+        time: time of one call; in "render" of one picture, in "codec" of encoding.
+        ratio: ratio of this time to the reference's; both were measured in turns.
+        error: error of the result against the reference's. Pictures: in colour units, [0, 1]. Features and gradients:
+            the maximum relative to the reference's largest magnitude, the rms relative to its rms; the largest of all
+            gradients.
+        parts: the same for each part: relative errors of gradients by input, absolute errors of parameters by group.
+        psnr, ssim: scores of 8-bit pictures, means over views, against the photos, or without photos against the
+            reference's pictures. None if there is no picture.
+        psnr_drop, ssim_drop: the reference's score minus this row's, in dB and SSIM. None without photos.
+        bytes: size of the file in bytes ("codec").
+        decode, decode_ratio: as `time` and `ratio`, for decoding ("codec").
     """
 
     group: str
@@ -51,10 +52,10 @@ class Row:
     decode_ratio: Ratio | None = None
 
 
-def in_words(value: object) -> str:
-    """A setting's value for people: 0.3, 1/255, none (for no limit), 2 x 128."""
+def format_value(value: object) -> str:
+    """Format the value of a setting for tables: 0.3, 1/255, none (for infinity), 2 x 128."""
     if isinstance(value, (list, tuple)):
-        return " x ".join(in_words(part) for part in value)
+        return " x ".join(format_value(part) for part in value)
     if isinstance(value, float):
         if math.isinf(value):
             return "none"

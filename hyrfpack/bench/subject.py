@@ -1,4 +1,4 @@
-"""What is measured on: a model, viewpoints, and photos from there if there are any."""
+"""The subject of a measurement: a model, viewpoints, and photos from these viewpoints if there are any."""
 
 from __future__ import annotations
 
@@ -28,22 +28,25 @@ from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 from hyrfpack.train import TrainConfig, train
 
-VIEWS = 6
-BUILT_IN_STEPS, BUILT_IN_PHOTOS, BUILT_IN_SIDE = 1000, 48, 200
+MAX_VIEWS = 6
+# Training of the built-in model.
+BUILT_IN_STEPS = 1000
+BUILT_IN_PHOTOS = 48
+BUILT_IN_PHOTO_SIDE_PIXELS = 200
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A model and where it is looked at from.
+    """A model and the viewpoints at which it is measured.
 
     Attributes:
         name: the file, or "built-in".
-        profile: of the file that the model was read from.
-        model: what is measured; every loss is against it as it is here.
-        cameras: viewpoints.
-        photos: for each viewpoint (H, W, 3) in [0, 1] and a mask (H, W) or None; None when there are no photos.
-        capture: cameras that compression measures the model at: those of the photos it was trained on.
-        distortion: mean squared error in pictures that compression aims at by itself.
+        profile: profile of the file that the model was read from.
+        model: the model to measure; all losses are relative to it.
+        cameras: the viewpoints.
+        photos: (H, W, 3) photo in [0, 1] and (H, W) mask or None of each viewpoint; None if there are no photos.
+        capture: the cameras of the training photos, at which compression measures sensitivities.
+        distortion: mean squared error of pictures that compression aims at by default.
     """
 
     name: str
@@ -55,7 +58,7 @@ class Subject:
     distortion: float
 
     def scores(self, pictures: Sequence[Tensor], exact: Sequence[Tensor]) -> tuple[float, float]:
-        """PSNR and SSIM, means over views, against the photos, or against the `exact` pictures without photos."""
+        """Compute the mean PSNR and SSIM over views, against the photos, or without photos against `exact`."""
         against = self.photos or [(to_8bit(picture), None) for picture in exact]
         images = [to_8bit(picture) for picture in pictures]
         pairs = [(image, *photo) for image, photo in zip(images, against, strict=True)]
@@ -64,24 +67,24 @@ class Subject:
     def losses(
         self, pictures: Sequence[Tensor], exact: Sequence[Tensor], best: tuple[float, float], what: str
     ) -> dict[str, Any]:
-        """What a `Row` says of pictures: `error` and the scores, and their drops from `best` where there are photos.
+        """Compute the fields of a `Row` about pictures: the error, the scores and, with photos, their drops.
 
         Args:
-            pictures: (H, W, 3) of each camera.
-            exact: the reference's.
-            best: `scores` of those.
-            what: was measured, for the message.
+            pictures: (H, W, 3) picture of each camera.
+            exact: the reference's pictures.
+            best: `scores` of `exact`.
+            what: what is measured, for the error message.
 
         Raises:
             HyrfError: a picture holds NaN or infinity.
         """
         psnr, ssim = self.scores(pictures, exact)
-        found, right = (torch.cat([picture.flatten() for picture in many]) for many in (pictures, exact))
+        measured, expected = (torch.cat([picture.flatten() for picture in many]) for many in (pictures, exact))
         drops = {"psnr_drop": best[0] - psnr, "ssim_drop": best[1] - ssim} if self.photos else {}
-        return {"error": measure_error(found, right, what), "psnr": psnr, "ssim": ssim, **drops}
+        return {"error": measure_error(measured, expected, what), "psnr": psnr, "ssim": ssim, **drops}
 
-    def in_words(self) -> str:
-        """What is measured on, and what quality is measured against, in one sentence."""
+    def describe(self) -> str:
+        """Describe the model, and what quality is measured against, in one sentence."""
         camera = self.cameras[0]
         against = (
             f"quality against {len(self.photos)} held-out photos"
@@ -95,19 +98,19 @@ class Subject:
 
 
 def read_subject(path: str | os.PathLike[str], scene: Scene | None) -> Subject:
-    """A model file, with the held-out photos of a scene or seen from an orbit around what it was trained on.
+    """Read a model file; its viewpoints are a scene's held-out views, or an orbit around what it was trained on.
 
     Raises:
-        HyrfError: the file cannot be read, has no Gaussians or no usable viewpoint, or no photo is held out.
+        HyrfError: the file cannot be read, has no Gaussians or no usable viewpoint, or no held-out photo can be scored.
     """
     facts, model = describe(path), load(path)
     if len(model) == 0:
         raise HyrfError(f"{path}: the model has no Gaussians, so there is nothing to measure; name another")
     capture = Capture(facts, scene)
     if scene is None:
-        cameras, photos = orbit(capture.viewpoint, VIEWS), None
+        cameras, photos = orbit(capture.viewpoint, MAX_VIEWS), None
     else:
-        views, photos = _photos(scene, model)
+        views, photos = _load_held_out_photos(scene, model)
         cameras = [view.camera for view in views]
     return Subject(
         os.fspath(path),
@@ -121,26 +124,28 @@ def read_subject(path: str | os.PathLike[str], scene: Scene | None) -> Subject:
 
 
 def built_in_subject(say: Callable[[str], None]) -> Subject:
-    """The demo's scene, trained for a short while in a temporary folder: the same model every time.
+    """Train a small model on the demo's scene in a temporary folder; the result is the same every time.
 
     Args:
-        say: told what is going on.
+        say: called with a sentence before training starts.
     """
     say(f"training the built-in model: {BUILT_IN_STEPS:,} steps on a made-up scene, about a minute on two cores")
     with tempfile.TemporaryDirectory(prefix="hyrfpack-bench-") as folder:
-        scene = load_scene(write_demo_scene(Path(folder) / "scene", views=BUILT_IN_PHOTOS, size=BUILT_IN_SIDE))
+        scene = load_scene(
+            write_demo_scene(Path(folder) / "scene", views=BUILT_IN_PHOTOS, size=BUILT_IN_PHOTO_SIDE_PIXELS)
+        )
         trained = train(scene, Path(folder) / "run", TrainConfig(steps=BUILT_IN_STEPS), quiet=True)
-        if trained.model is None:  # Ctrl-C: training took it for a request to stop
+        if trained.model is None:  # training treats Ctrl-C as a request to stop
             raise KeyboardInterrupt
         subject = read_subject(trained.model, scene)
     return replace(subject, name="built-in")
 
 
-def _photos(scene: Scene, model: HybridModel) -> tuple[list[View], list[tuple[Tensor, Tensor | None]]]:
-    """Held-out views spread over all of them, and their photos; those whose mask leaves no pixel are left out."""
+def _load_held_out_photos(scene: Scene, model: HybridModel) -> tuple[list[View], list[tuple[Tensor, Tensor | None]]]:
+    """Select evenly spaced held-out views and load their photos, without views whose mask leaves no pixel."""
     solid = np.array(model.config.solid, np.float32)
     views, photos = [], []
-    for view in evenly_spaced(scene.test, VIEWS):
+    for view in evenly_spaced(scene.test, MAX_VIEWS):
         photo, mask = upload(view.load(), solid, model.gaussians.positions.device)
         if mask is None or mask.any():
             views.append(view)

@@ -1,4 +1,4 @@
-"""The whole measurement: groups of rows on one subject."""
+"""Run all groups of measurements on one subject."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from hyrfpack.measure.machine import describe_machine
 from hyrfpack.measure.timing import MAX_SECONDS_PER_TASK
 from hyrfpack.scene import Scene
 
-# What is measured, in order: functions of a subject, a number of repeats, and what to call with what was left out.
+# Groups in order of measurement. Each function takes a subject, the number of repeats, and a function that is called
+# with a sentence about everything that is left out.
 GROUPS: dict[str, Callable[[Subject, int, Callable[[str], None]], Iterator[Row]]] = {
     "rasterize": rasterize_rows,
     "hash_encode": hash_encode_rows,
@@ -29,13 +30,13 @@ GROUPS: dict[str, Callable[[Subject, int, Callable[[str], None]], Iterator[Row]]
 
 @dataclass(frozen=True)
 class BenchReport:
-    """What a measurement came to.
+    """Results of `bench`.
 
     Attributes:
-        machine: what the times belong to.
-        subject: what was measured on, and what quality is against, in one sentence.
-        notes: what was left out or cut short, one sentence each.
-        rows: in order of measurement.
+        machine: the machine that the times belong to, see `describe_machine`.
+        subject: one sentence about the model, and about what quality is measured against.
+        notes: sentences about what was left out or cut short.
+        rows: the measurements in order.
     """
 
     machine: dict[str, object]
@@ -44,7 +45,7 @@ class BenchReport:
     rows: list[Row]
 
     def to_dict(self) -> dict:
-        """Plain numbers, strings, lists and dictionaries, ready for JSON."""
+        """Convert the report to numbers, strings, lists and dictionaries, ready for JSON."""
         return asdict(self)
 
 
@@ -56,26 +57,26 @@ def bench(
     only: Sequence[str] | None = None,
     say: Callable[[str], None] = lambda sentence: None,
 ) -> BenchReport:
-    """Measure operations, renderer settings and file profiles of a model: time, beside error.
+    """Measure the time and the error of operations, renderer settings and file profiles on a model.
 
-    Contenders of one setting take turns, so that ratios hold on a busy machine. All may use all cores; torch's part
-    runs on as many threads as torch is set to. Set the environment variable OMP_WAIT_POLICY=PASSIVE before torch is
-    loaded, as the command line does: otherwise torch's threads go on spinning after a reference has run and take the
-    cores from the next contender.
+    The values of one setting are measured in turns, so that ratios are valid on a busy machine. All cores are used;
+    torch uses as many threads as it is set to. Set the environment variable OMP_WAIT_POLICY=PASSIVE before torch is
+    loaded, as the command line does. Otherwise torch's threads busy-wait after a reference has run, and take cores from
+    the next measurement.
 
     Args:
-        model: a `.hyrf` file, best the one that training wrote; None trains a built-in one for about a minute, and
-            brings its own photos.
-        scene: held-out photos to measure quality against; without it, it is measured against the model's own
-            pictures, from viewpoints that the file hints at.
-        repeats: turns of each contender, at least 1; those that take seconds get fewer.
-        only: groups to measure, names out of `GROUPS`; all when None.
-        say: told what is going on, a sentence before each part.
+        model: a `.hyrf` file, preferably the one that training wrote. None trains a built-in model for about a minute,
+            which has its own photos.
+        scene: held-out photos to measure quality against. Without it, quality is measured against the model's own
+            pictures, from an orbit around the viewpoint stored in the file.
+        repeats: measured runs of each value, at least 1; tasks that take seconds get fewer.
+        only: names of the groups to measure, out of `GROUPS`; None for all.
+        say: called with a sentence before each part.
 
     Raises:
         HyrfError: the model or the photos cannot be used, a result is not finite, or Numba is missing.
-        ValueError: there is no such group, no repeat, or a scene without a model.
-        TypeError: `scene` is no Scene.
+        ValueError: a group does not exist, `repeats` is less than 1, or there is a scene without a model.
+        TypeError: `scene` is not a Scene.
 
     Example:
         >>> import hyrfpack
@@ -93,7 +94,7 @@ def bench(
     if scene is not None:
         check_type("scene", scene, Scene)
     with needs_package("numba", "measuring the compiled kernels"):
-        import numba  # noqa: F401 - asked for here, before the work starts
+        import numba  # noqa: F401 - imported here, so that it fails before the work starts
     subject = built_in_subject(say) if model is None else read_subject(model, scene)
     notes: list[str] = []
     rows: list[Row] = []
@@ -103,4 +104,4 @@ def bench(
             rows += GROUPS[name](subject, repeats, notes.append)
     if any(row.time.repeats < repeats for row in rows):
         notes.append(f"a contender that has been measured for {MAX_SECONDS_PER_TASK:g} s gets no further turn")
-    return BenchReport(describe_machine(), subject.in_words(), notes, rows)
+    return BenchReport(describe_machine(), subject.describe(), notes, rows)

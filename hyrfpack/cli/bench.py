@@ -69,18 +69,18 @@ def bench(
     from hyrfpack.atomic import write_atomic
     from hyrfpack.bench import bench as measure
     from hyrfpack.bench import tables as words
-    from hyrfpack.bench.figure import picture_format, plot
+    from hyrfpack.bench.figure import plot, plot_format
     from hyrfpack.format import describe
     from hyrfpack.measure.machine import format_machine
 
     model = None if model is None else named_model(model)
-    picture_format(output)
+    plot_format(output)
     scene = None if data is None or model is None else read_scene(data, reading, describe(model))
     outputs = Outputs(model, scene=scene, overwrite=overwrite)
     outputs.file(output)
     page = _read_page(markdown)
     if page:  # does it have all places? Better asked now than after minutes
-        words.fill(page, dict.fromkeys(("machine", *(only or GROUPS)), ""), str(markdown))
+        words.fill_page(page, dict.fromkeys(("machine", *(only or GROUPS)), ""), str(markdown))
     if markdown is not None:  # a page with the places is not replaced, they are filled
         Outputs(model, scene=scene, overwrite=overwrite or bool(page)).file(markdown)
     result = measure(model, scene, repeats=repeats, only=only or None, say=note)
@@ -88,15 +88,15 @@ def bench(
         print_json(result.to_dict())
     else:
         click.echo(f"{format_machine(result.machine)}\n{result.subject}")
-        for part in words.tables(result.rows):
+        for part in words.build_tables(result.rows):
             click.echo(f"\n{part.title}\n{table(part.header, part.cells)}")
         for sentence in result.notes:
             click.echo(f"\nnote: {sentence}")
     note(f"{note_rename(output, plot(result.rows, output, overwrite=overwrite))}: time against error")
     if markdown is not None:
-        blocks = words.markdown(result)
+        blocks = words.format_markdown(result)
         page = page and _read_page(markdown)  # again: it may have been edited while this command measured
-        filled = words.fill(page or words.empty_page(blocks), blocks, str(markdown)).encode()
+        filled = words.fill_page(page or words.empty_page(blocks), blocks, str(markdown)).encode()
         note_rename(markdown, write_atomic(markdown, filled, overwrite=overwrite or bool(page)))
 
 

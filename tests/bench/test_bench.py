@@ -12,9 +12,9 @@ from scenes import ball_points, ball_scene, ring, small_model
 
 import hyrfpack
 from hyrfpack.bench import GROUPS, bench, rendering, subject
-from hyrfpack.bench.codec import KNOBS, codec_rows, parameter_errors
+from hyrfpack.bench.codec import PROFILE_SETTING_VALUES, codec_rows, parameter_errors
 from hyrfpack.bench.operations import hash_encode_rows, mlp_rows, rasterize_rows
-from hyrfpack.bench.rendering import EXACT, SWEEPS, render_rows
+from hyrfpack.bench.rendering import EXACT_SETTINGS, SWEEPS, render_rows
 from hyrfpack.bench.subject import Subject
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import encode_model, save
@@ -122,7 +122,10 @@ def test_half_precision_errors_of_the_fields_are_relative_to_float64():
 
 def test_every_accuracy_setting_of_rendering_is_swept_but_near():
     assert set(SWEEPS) == {field.name for field in dataclasses.fields(RenderSettings)} - {"near", "exposure"}
-    assert EXACT.background_stride == 1 and EXACT.background_threshold == EXACT.transmittance_min == 0
+    assert (
+        EXACT_SETTINGS.background_stride == 1
+        and EXACT_SETTINGS.background_threshold == EXACT_SETTINGS.transmittance_min == 0
+    )
 
 
 def test_the_default_is_among_what_is_tried_of_each_setting():
@@ -143,7 +146,9 @@ def test_the_error_of_a_render_setting_is_that_setting_s_own():
 def test_all_defaults_together_are_compared_with_everything_exact():
     model = model_of()
     row = by_setting(render_rows(subject_of(model), 1, ignore))["all"]["defaults"]
-    assert row.error.rms == pytest.approx(rms(pictures(model).double() - pictures(model, EXACT).double()), rel=1e-4)
+    assert row.error.rms == pytest.approx(
+        rms(pictures(model).double() - pictures(model, EXACT_SETTINGS).double()), rel=1e-4
+    )
 
 
 def test_without_a_background_sphere_its_settings_are_left_out_and_named():
@@ -196,9 +201,11 @@ def test_parameter_errors_of_the_paper_profile_follow_its_precision(coded):
 
 
 def test_every_knob_of_the_paper_profile_is_tried_with_its_default_marked(coded):
-    assert set(KNOBS["paper"]) == {field.name for field in dataclasses.fields(PaperSettings)} - {"seed"}
+    assert set(PROFILE_SETTING_VALUES["paper"]) == {field.name for field in dataclasses.fields(PaperSettings)} - {
+        "seed"
+    }
     model, rows = coded
-    for knob in KNOBS["paper"]:
+    for knob in PROFILE_SETTING_VALUES["paper"]:
         (default,) = [row for row in rows[f"paper, {knob}"].values() if row.is_default]
         assert default.bytes == rows["profile"]["paper"].bytes
     few = rows["paper, color"]["1 x 64"]
@@ -310,7 +317,7 @@ def test_a_file_is_measured_from_an_orbit_and_the_report_survives_json(tmp_path)
 def test_the_built_in_model_brings_its_own_photos(monkeypatch):
     monkeypatch.setattr(subject, "BUILT_IN_STEPS", 2)
     monkeypatch.setattr(subject, "BUILT_IN_PHOTOS", 9)
-    monkeypatch.setattr(subject, "BUILT_IN_SIDE", 32)
+    monkeypatch.setattr(subject, "BUILT_IN_PHOTO_SIDE_PIXELS", 32)
     said = []
     report = bench(only=["mlp"], repeats=1, say=said.append)
     assert "built-in" in report.subject and "2 held-out photos" in report.subject

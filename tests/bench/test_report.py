@@ -11,8 +11,8 @@ from PIL import Image
 from scenes import ball_points, small_model
 
 from hyrfpack.bench import GROUPS, BenchReport, Error, Row
-from hyrfpack.bench.figure import panels, plot
-from hyrfpack.bench.tables import fill, markdown, tables
+from hyrfpack.bench.figure import build_panels, plot
+from hyrfpack.bench.tables import build_tables, fill_page, format_markdown
 from hyrfpack.cli.bench import GROUPS as CHOICES
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import save
@@ -51,7 +51,7 @@ def model(tmp_path_factory):
 
 
 def test_every_row_is_in_a_table_beside_its_error_and_its_time():
-    render, codec, parts = tables(rows())
+    render, codec, parts = build_tables(rows())
     assert [table.title.partition(":")[0] for table in (render, codec, parts)] == ["render", "codec", "codec"]
     assert (len(render.cells), len(codec.cells), len(parts.cells)) == (5, 3, 1)
     stride = dict(zip(render.header, render.cells[2], strict=True))
@@ -70,23 +70,27 @@ def test_every_row_is_in_a_table_beside_its_error_and_its_time():
 def test_a_page_gets_its_tables_and_keeps_its_words():
     words = "# Title\nWords about `<!-- bench codec -->` and `<!-- end -->`.\n"
     places = "<!-- bench machine -->\nold\n<!-- end -->\nbetween\n<!-- bench codec -->\n<!-- end -->\nlast"
-    blocks = {name: block for name, block in markdown(report()).items() if name != "render"}
-    filled = fill(words + places, blocks)
+    blocks = {name: block for name, block in format_markdown(report()).items() if name != "render"}
+    filled = fill_page(words + places, blocks)
     assert filled.startswith(words) and "\nbetween\n" in filled and filled.endswith("last")
     assert "old" not in filled and "slide rule" in filled and "| profile | paper | default |" in filled
-    assert fill(filled, blocks) == filled
+    assert fill_page(filled, blocks) == filled
     assert "Error of each group of parameters, max / rms:\n\n| setting | value | positions |" in filled
 
 
 def test_a_page_without_a_place_is_refused():
     with pytest.raises(HyrfError, match="page.md: there is no place for render"):
-        fill("<!-- bench machine -->\n<!-- end -->\n<!-- bench codec -->\n<!-- end -->", markdown(report()), "page.md")
+        fill_page(
+            "<!-- bench machine -->\n<!-- end -->\n<!-- bench codec -->\n<!-- end -->",
+            format_markdown(report()),
+            "page.md",
+        )
     with pytest.raises(HyrfError, match="no place for machine"):
-        fill("<!-- bench machine --> and no end", markdown(report()))
+        fill_page("<!-- bench machine --> and no end", format_markdown(report()))
 
 
 def test_every_row_is_drawn_and_codec_sizes_too():
-    drawn = panels(rows())
+    drawn = build_panels(rows())
     titles = [panel.title for panel in drawn]
     assert titles == [
         "render: background_stride",
@@ -98,7 +102,7 @@ def test_every_row_is_drawn_and_codec_sizes_too():
     ]
     assert sum(len(panel.rows) for panel in drawn) == 5 + 2 * 3
     (size,) = [panel for panel in drawn if panel.title == "codec: paper, size"]
-    assert size.across(size.rows[0]) == 900 / 4000
+    assert size.x_value(size.rows[0]) == 900 / 4000
 
 
 def test_the_plot_is_a_picture_in_the_format_of_its_name(tmp_path):

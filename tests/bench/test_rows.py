@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from hyrfpack.bench.rows import in_words
+from hyrfpack.bench.rows import format_value
 
 
 @pytest.mark.parametrize(
@@ -24,4 +24,4 @@ from hyrfpack.bench.rows import in_words
     ],
 )
 def test_values_in_words(value, words):
-    assert in_words(value) == words
+    assert format_value(value) == words
