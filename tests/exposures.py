@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hyrfpack.model.exposure import DIRECTION_CODES, POSITION_CODES, WEIGHT_CODES, ExposureMap
+from hyrfpack.model.exposure import MAX_DIRECTION_CODE, MAX_POSITION_CODE, MAX_WEIGHT_CODE, ExposureMap
 from hyrfpack.model.frame import Frame
 from hyrfpack.scene import Camera
 
@@ -35,12 +35,12 @@ def map_through(cameras: Sequence[Camera], frame: Frame, gains: np.ndarray) -> E
     poses = [frame.local_pose(camera) for camera in cameras]
     places, directions = np.array([-p[:3, :3].T @ p[:3, 3] for p in poses]), np.array([p[2, :3] for p in poses])
     low, high = places.min(0), places.max(0)
-    codes = np.rint((places - low) / np.maximum(high - low, 1e-9) * POSITION_CODES)
-    turned = np.rint(directions * DIRECTION_CODES)
-    stored = low + codes / POSITION_CODES * (high - low), turned / DIRECTION_CODES
+    codes = np.rint((places - low) / np.maximum(high - low, 1e-9) * MAX_POSITION_CODE)
+    turned = np.rint(directions * MAX_DIRECTION_CODE)
+    stored = low + codes / MAX_POSITION_CODE * (high - low), turned / MAX_DIRECTION_CODE
     squares = [np.square(part[:, None] - part[None]).sum(-1) for part in stored]
     weights = np.linalg.solve(1 / (1 + squares[0] + squares[1] / 0.25**2), logs)
-    steps = np.maximum(np.abs(weights).max(0), 1e-6) / WEIGHT_CODES
+    steps = np.maximum(np.abs(weights).max(0), 1e-6) / MAX_WEIGHT_CODE
     return ExposureMap(
         box=np.array((low, high), np.float32),
         lengths=np.array((1.0, 0.25), np.float32),

@@ -13,12 +13,12 @@ from hyrfpack.bench.subject import Subject
 from hyrfpack.measure.error import Error, largest_error, measure_error, measure_relative_error
 from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import HybridModel
-from hyrfpack.model.calls import (
-    Call,
+from hyrfpack.model.operation_calls import (
+    OperationCall,
     decoder_inputs,
-    fields,
     hash_encode_call,
     mlp_call,
+    named_fields,
     rasterize_call,
     splat_inputs,
 )
@@ -71,7 +71,7 @@ def rasterize_rows(subject: Subject, repeats: int, note: Callable[[str], None]) 
 def hash_encode_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
     """Measure the lookup of both fields' features at all Gaussians, with gradients of the table, as in training."""
     coords = subject.model.cube_coords(subject.model.gaussians.positions)
-    for name, part in fields(subject.model):
+    for name, part in named_fields(subject.model):
         grid = part.grid.config
         call = hash_encode_call(coords, part.grid.table, grid.resolutions, grid.log2_table_size)
         yield from _compare("hash_encode", f"{name}, ", call, HASH_ENCODE_VARIANTS, measure_relative_error, repeats)
@@ -94,13 +94,13 @@ def _one_view(subject: Subject) -> tuple[HybridModel, Camera, Tensor]:
 def _compare(
     group: str,
     prefix: str,
-    call: Call,
+    call: OperationCall,
     variants: tuple[Variant, ...],
     compare: Callable[[Tensor, Tensor, str], Error],
     repeats: int,
 ) -> Iterator[Row]:
     """Yield the rows of one operation, forward only and with gradients; all variants are timed in turns."""
-    for setting, make in (("forward", call.forward), ("forward + backward", call.both)):
+    for setting, make in (("forward", call.forward_task), ("forward + backward", call.forward_backward_task)):
         tasks = {one.name: make(one.implementation, one.dtype, one.dtypes) for one in variants}
         for variant in variants:
             if variant.implementation == "cpu":
@@ -110,8 +110,8 @@ def _compare(
         for variant in variants:
             what, result = f"{group}, {prefix}{setting}, {variant.name}", results[variant.name]
             parts = {}
-            if make == call.both:
-                pairs = zip(call.wanted, result[1], exact[1], strict=True)
+            if make == call.forward_backward_task:
+                pairs = zip(call.gradient_inputs, result[1], exact[1], strict=True)
                 parts = {name: measure_relative_error(found, right, what) for name, found, right in pairs}
             yield Row(
                 group=group,

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from hyrfpack.evaluate import Evaluation, ViewScore
     from hyrfpack.model import HybridModel
     from hyrfpack.parallel.ranks import Ranks
-    from hyrfpack.render.files import Drawn
+    from hyrfpack.render.files import ColorAndDepth
     from hyrfpack.scene import Camera, Scene, View
     from hyrfpack.splats.draw import Drawable
 
@@ -104,7 +104,7 @@ def render(
     from hyrfpack.cli.subject import Subject
     from hyrfpack.lock import exclusive_folder
     from hyrfpack.render import RenderSettings
-    from hyrfpack.render.files import drawing_function, rendered_names, write_pictures
+    from hyrfpack.render.files import make_renderer, render_file_names, write_pictures
     from hyrfpack.render.video import has_ffmpeg, write_video
     from hyrfpack.splats.draw import Drawable, draw
 
@@ -120,7 +120,7 @@ def render(
         cameras_around = orbit_around(subject.viewpoint, orbit or DEFAULT_ORBIT)
         named = [(f"{number:04d}", camera) for number, camera in enumerate(cameras_around)]
     film = output / "video.mp4" if video and has_ffmpeg() else None
-    names = rendered_names([name for name, _ in named], depth)
+    names = render_file_names([name for name, _ in named], depth)
     names += [film.name] if film else []
 
     def check(replace: bool) -> None:
@@ -131,9 +131,9 @@ def render(
     def write() -> list[Path]:
         shown = subject.load()
         if isinstance(shown, Drawable):
-            picture_of: Callable[[Camera], Drawn] = partial(draw, shown, settings=settings, depth=depth)
+            picture_of: Callable[[Camera], ColorAndDepth] = partial(draw, shown, settings=settings, depth=depth)
         else:
-            picture_of = drawing_function(shown, depth=depth, settings=settings)
+            picture_of = make_renderer(shown, depth=depth, settings=settings)
         pictures = write_pictures(picture_of, named, output, overwrite=overwrite, ranks=ranks)
         return list(counted(pictures, len(ranks.share(named)), "rendering"))
 
@@ -147,7 +147,7 @@ def render(
         written = [parts[place % ranks.size][place // ranks.size] for place in range(len(named))]
         if film:
             film = note_rename(film, write_video(written, film, overwrite=overwrite))
-    for name, path in zip(rendered_names([name for name, _ in named]), written, strict=True):
+    for name, path in zip(render_file_names([name for name, _ in named]), written, strict=True):
         note_rename(output / name, path)
     if video and not film:
         note("there is no ffmpeg program, so no video was made; the pictures are in place")

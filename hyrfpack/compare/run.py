@@ -13,7 +13,7 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.format import describe
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.outputs import StrPath
-from hyrfpack.render.files import file_names
+from hyrfpack.render.files import unique_stems
 from hyrfpack.train.run import VIEWS
 
 LARGEST = 1e15  # no step, count, size or time in the metrics of a run that ever was is larger
@@ -200,7 +200,7 @@ def _files(folder: Path) -> dict[str, int]:
 
 def _pictures(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """The files of `evaluate`'s pictures that are there, by the name of their photo."""
-    files = {name: folder / VIEWS / f"{file}.png" for name, file in zip(names, file_names(names), strict=True)}
+    files = {name: folder / VIEWS / f"{file}.png" for name, file in zip(names, unique_stems(names), strict=True)}
     return {name: path for name, path in files.items() if path.is_file()}
 
 

@@ -23,7 +23,7 @@ from hyrfpack.format.compact.plan import Plan, lattice_to_local
 from hyrfpack.format.compact.quantized import QuantizedModel
 from hyrfpack.format.sections import COLORS, POSITIONS
 from hyrfpack.model import HybridModel
-from hyrfpack.model.exposure import expose
+from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
@@ -145,7 +145,7 @@ def _backpropagate_view(
     target, mask = photos.get(view.name, picture, solid)
     image = render(model, view.camera).rgb
     if gains is not None:
-        image = expose(image, gains[view.name])
+        image = apply_exposure_gains(image, gains[view.name])
     loss = photometric_loss(image, target, mask)
     loss.backward()
     return loss.detach()
@@ -155,11 +155,12 @@ def _backpropagate_view(
 def fit_residual_gains(
     model: HybridModel, views: Sequence[View], cache: PictureCache | None = None
 ) -> dict[str, Tensor]:
-    """Fit the residual gains of each photo: the gains of `expose` that match the render as photographed to the photo.
+    """Fit the residual gains of each photo, which match the render as photographed to the photo.
 
-    With the gains g_map of the model's exposure map and the residual gains g of a photo,
+    E(image, gains) is `apply_exposure_gains`. With the gains g_map of the model's exposure map and the residual gains g
+    of a photo,
 
-        photo = expose(expose(consistent, g_map), g) + e = expose(consistent, g_map g) + e
+        photo = E(E(consistent, g_map), g) + e = E(consistent, g_map g) + e
 
     A model that is fitted to photos with these gains keeps its consistent exposure and its map, because g absorbs what
     the map does not explain of a photo's exposure. Without a map, g holds the whole exposure. The gains of a photo that

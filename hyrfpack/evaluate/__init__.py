@@ -26,7 +26,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Report, no_report
 from hyrfpack.render import RenderSettings, apply_exposure_map, render
-from hyrfpack.render.files import file_names, save_picture
+from hyrfpack.render.files import save_picture, unique_stems
 from hyrfpack.scene import Camera, View, evenly_spaced
 from hyrfpack.splats.draw import Drawable, draw
 
@@ -233,7 +233,7 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 def picture_names(views: Sequence[View], count: int = PICTURES) -> dict[int, str]:
     """What `evaluate` writes into its folder of pictures: the views' places in the list, and names of files."""
-    names = file_names([view.name for view in views])
+    names = unique_stems([view.name for view in views])
     return {place: f"{names[place]}.png" for place in evenly_spaced(range(len(views)), count)}
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.evaluate.metrics import to_8bit
-from hyrfpack.model.exposure import expose
+from hyrfpack.model.exposure import apply_exposure_gains
 
 USABLE = 4 / 255, 251 / 255  # what every channel of a photo and of its render lies between where gains are fitted
 LEAST = 16  # pixels; fewer tell nothing, and the gains are one
@@ -18,12 +18,13 @@ CAUCHY = 2.385  # standard deviations at which a pixel counts half
 
 
 def fitted_gains(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> np.ndarray:
-    """The gains of `expose` that bring a render to the exposure and white balance of a photo.
+    """The gains of `apply_exposure_gains` that bring a render to the exposure and white balance of a photo.
 
-        photo = expose(image, g) + e        least squares over log g, weights 1 / (1 + (e / 2.385 s)^2), iterated
+        photo = apply_exposure_gains(image, g) + e
 
-    for each channel, with s the standard deviation of the rest by its median, so that what the render has wrong hardly
-    counts. Pixels that are nearly black or white in either are left out.
+    by iterated least squares over log g with the weights 1 / (1 + (e / 2.385 s)^2), for each channel. s is the standard
+    deviation of e, estimated from its median, so that errors of the render hardly count. Pixels that are nearly black
+    or white in either image are left out.
 
     Args:
         image, photo: (H, W, 3) in [0, 1].
@@ -37,7 +38,7 @@ def fitted_gains(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> np
 
     Example:
         >>> photo = torch.rand(32, 32, 3)
-        >>> fitted_gains(photo, expose(photo, torch.tensor([2.0, 1.0, 0.5]))).round(3)
+        >>> fitted_gains(photo, apply_exposure_gains(photo, torch.tensor([2.0, 1.0, 0.5]))).round(3)
         array([2. , 1. , 0.5])
     """
     rendered, wanted = _pixels(image, photo, mask)
@@ -51,11 +52,11 @@ def fitted_gains(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> np
     weights = torch.ones_like(rendered)
     gains = torch.ones_like(rendered[0])
     for _ in range(ROUNDS):  # of Gauss and Newton: the derivative by log g is y (1 - y)
-        exposed = expose(rendered, gains)
+        exposed = apply_exposure_gains(rendered, gains)
         slopes, errors = exposed * (1 - exposed), wanted - exposed
         steps = (weights * slopes * errors).sum(0) / (weights * slopes.square()).sum(0)
         gains = (gains * steps.clamp(-1, 1).exp()).clamp(1 / LARGEST, LARGEST)
-        errors = wanted - expose(rendered, gains)
+        errors = wanted - apply_exposure_gains(rendered, gains)
         spread = (1.4826 * errors.abs().median(0).values).clamp(min=1e-4)
         weights = 1 / (1 + (errors / (CAUCHY * spread)).square())
     return gains.cpu().numpy()

@@ -19,7 +19,7 @@ from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.export.bake import STRIDE, Sight, refuse_nonfinite, sights_of
 from hyrfpack.export.exposure import camera_log_gains, typical_log_gains
 from hyrfpack.model import BACKGROUND_RADIUS, Frame, HybridModel
-from hyrfpack.model.exposure import expose
+from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.ops.background import pixel_directions, sphere_points
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.shade import encode_directions
@@ -84,7 +84,7 @@ def background_splats(
     gains = BackgroundGains.of(model, cameras, sights)
     if gains is not None:
         towards = torch.from_numpy(directions).float()
-        colors = expose(torch.from_numpy(colors), gains.along(towards).double()).numpy()
+        colors = apply_exposure_gains(torch.from_numpy(colors), gains.along(towards).double()).numpy()
     radii = BACKGROUND_RADIUS * RECEDE ** (levels.max() - levels)
     count, frame = len(colors), model.config.frame
     shrink = min(1.0, largest_scale / (SPREAD * sides * radii * frame.scale).max())
@@ -153,7 +153,7 @@ def background_picture(
     if gains is not None:
         colors = torch.cat(
             [
-                expose(some, gains.along(there))
+                apply_exposure_gains(some, gains.along(there))
                 for some, there in zip(colors.split(GAINS_AT_ONCE), towards.split(GAINS_AT_ONCE), strict=True)
             ]
         )

@@ -14,7 +14,7 @@ from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.exposure import BakeGains
 from hyrfpack.model import Geometry, HybridModel
-from hyrfpack.model.exposure import expose
+from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.ops.least_squares import least_squares
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.poses import camera_center
@@ -234,7 +234,7 @@ def _colors(directions: Tensor, shading: Shading, index: Tensor | slice, gains: 
         first = shading.first_layer[index].addmm_(encoded, shading.direction_weight.T)
     rest = mlp(first.relu_(), shading.weights, shading.biases)
     colors = rest.add_(shading.color_logits[index]).sigmoid_()
-    return (colors if gains is None else expose(colors, gains)).sub_(0.5)
+    return (colors if gains is None else apply_exposure_gains(colors, gains)).sub_(0.5)
 
 
 def refuse_nonfinite(name: str, values: Tensor) -> None:

@@ -69,7 +69,7 @@ class BakeGains:
 
 def camera_log_gains(model: HybridModel, exposure: ExposureMap, cameras: Sequence[Camera]) -> np.ndarray:
     """Predict the log gains (V, 3) of cameras in world units."""
-    gains = [exposure.gains_of_pose(model.config.frame.local_pose(camera)) for camera in cameras]
+    gains = [exposure.predict_gains(model.config.frame.local_pose(camera)) for camera in cameras]
     return np.log(np.array(gains, np.float64).reshape(-1, 3))
 
 

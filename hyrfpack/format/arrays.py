@@ -13,7 +13,7 @@ from hyrfpack.format import sections
 from hyrfpack.model import BACKGROUND_RADIUS, DIRECTION_FEATURES
 from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.model.hash_grid import FEATURES, HashGridConfig
+from hyrfpack.model.hash_grid import FEATURES_PER_LEVEL, HashGridConfig
 from hyrfpack.model.hybrid import HybridModel
 
 # Equations that every model of this version uses and that no setting changes; `docs/format.md` defines each name.
@@ -73,9 +73,10 @@ def group_shapes(config: ModelConfig, gaussians: int) -> dict[str, tuple[int, in
     It allocates no arrays, so that a reader can check the sizes that a file declares before it decodes anything.
     """
     shapes = {
-        group: (gaussians, width) for group, width in zip(sections.LAYERED_SECTIONS, Gaussians.WIDTHS, strict=True)
+        group: (gaussians, width)
+        for group, width in zip(sections.LAYERED_SECTIONS, Gaussians.PARAMETER_WIDTHS, strict=True)
     }
-    shapes |= {group: (grid.rows, FEATURES) for group, grid in grid_configs(config).items()}
+    shapes |= {group: (grid.rows, FEATURES_PER_LEVEL) for group, grid in grid_configs(config).items()}
     for group, widths in decoder_widths(config).items():
         shapes[group] = (sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(widths)), 1)
     return {group: shapes[group] for group in SECTION_PARAMETERS}
@@ -90,8 +91,8 @@ def decoder_widths(config: ModelConfig) -> dict[str, tuple[int, int, int, int]]:
     """Return the layer widths (inputs, hidden, hidden, outputs) of each field's decoder, by its section."""
     hidden, direction = (config.hidden, config.hidden), DIRECTION_FEATURES[config.direction_encoding]
     return {
-        sections.GEOMETRY_DECODER: (config.geometry.levels * FEATURES, *hidden, 8),
-        sections.RADIANCE_DECODER: (config.radiance.levels * FEATURES + direction, *hidden, 3),
+        sections.GEOMETRY_DECODER: (config.geometry.levels * FEATURES_PER_LEVEL, *hidden, 8),
+        sections.RADIANCE_DECODER: (config.radiance.levels * FEATURES_PER_LEVEL + direction, *hidden, 3),
     }
 
 

@@ -1,4 +1,4 @@
-"""The representation: explicit Gaussians, two neural fields and a background, in one frame."""
+"""The scene representation: explicit Gaussians, two neural fields and a background, in one frame."""
 
 from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.exposure import ExposureMap

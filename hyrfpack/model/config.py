@@ -1,4 +1,4 @@
-"""What shape a model has: everything that is chosen before the first step and stored in the file."""
+"""Configuration of a model: everything that is chosen before training and stored in the file."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from hyrfpack.model.hash_grid import HashGridConfig
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """The shape of a HybridModel.
+    """The configuration of a HybridModel.
 
     Attributes:
-        frame: the scene's box.
-        geometry, radiance: the two hash grids.
+        frame: the box of the scene.
+        geometry, radiance: hash grids of the two fields.
         hidden: width of the decoders' two hidden layers.
-        background: whether a background sphere lies behind the Gaussians (coloured by the radiance field).
+        background: whether a background sphere, coloured by the radiance field, lies behind the Gaussians.
         solid: RGB in [0, 1] behind everything when there is no background sphere.
         scale_rule: "sum" S * sigmoid(s_n + s_e), or "product" S * sigmoid(s_n) * sigmoid(s_e).
         scale_grows: whether the largest scale S(p) grows with max(1, |u|) outside the box.
         direction_encoding: "frequency" (NeRF, 4 octaves) or "sh" (real spherical harmonics, bands 0 to 2).
         position_gradients: whether the fields pass gradients on to positions (training only).
-        antialiased: opacity is compensated for the rasteriser's low-pass filter.
+        antialiased: whether opacity is compensated for the rasteriser's low-pass filter.
     """
 
     frame: Frame
@@ -38,20 +38,24 @@ class ModelConfig:
     antialiased: bool = False
 
     def to_dict(self) -> dict:
-        """Plain numbers, strings, lists and dictionaries, ready for JSON."""
+        """Return the configuration as plain numbers, strings, lists and dictionaries, ready for JSON."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: dict) -> ModelConfig:
-        """The inverse of `to_dict`. Raises KeyError, TypeError or ValueError: a field is missing, unknown or wrong."""
+        """Build a configuration from a dictionary: the inverse of `to_dict`.
+
+        Raises:
+            KeyError, TypeError, ValueError: a field is missing, unknown or has a wrong value.
+        """
         parts = dict(values)
         frame = dict(parts["frame"])
-        for name, convert in (("center", _triple), ("scale", float), ("half_extent", _triple)):
+        for name, convert in (("center", _to_triple), ("scale", float), ("half_extent", _to_triple)):
             frame[name] = convert(frame[name])
         parts["frame"] = Frame(**frame)
         for name in ("geometry", "radiance"):
             parts[name] = HashGridConfig(**parts[name])
-        parts["solid"] = _triple(parts["solid"])
+        parts["solid"] = _to_triple(parts["solid"])
         return cls(**parts)
 
     def __post_init__(self) -> None:
@@ -65,6 +69,7 @@ class ModelConfig:
             raise ValueError("the frame's scale and half extents must be positive")
 
 
-def _triple(values: list[float]) -> tuple[float, float, float]:
+def _to_triple(values: list[float]) -> tuple[float, float, float]:
+    """Convert a list of three numbers to a tuple of floats."""
     x, y, z = map(float, values)
     return x, y, z

@@ -13,17 +13,19 @@ import numpy as np
 from torch import Tensor
 
 MAX_CENTERS = 64
-MAX_LOG_GAIN = 8.0  # no stored log gain is larger in magnitude
-POSITION_CODES, DIRECTION_CODES, WEIGHT_CODES = 255, 127, 32767  # the largest stored codes
+MAX_LOG_GAIN = 8.0
+MAX_POSITION_CODE = 255
+MAX_DIRECTION_CODE = 127
+MAX_WEIGHT_CODE = 32767
 
 
-def expose(image: Tensor, gains: Tensor) -> Tensor:
-    """Change the exposure of a picture, with the shoulder of a camera's tone curve: black and white stay what they are.
+def apply_exposure_gains(image: Tensor, gains: Tensor) -> Tensor:
+    """Change the exposure of an image by gains with the shoulder of a camera's tone curve.
 
         y' = g y / (1 + (g - 1) y)        that is, logit y' = logit y + log g
 
-    so that g is a gain in the shadows, and g followed by h is g h. Colours that photos show of a point follow this
-    more closely than a plain gain (`docs/training.md`).
+    Black and white do not change, g is the gain in the shadows, and gains g and h one after the other equal the gain
+    g h. The colours of a point in different photos follow this more closely than a linear gain (`docs/training.md`).
 
     Args:
         image: (..., 3) in [0, 1].
@@ -33,14 +35,14 @@ def expose(image: Tensor, gains: Tensor) -> Tensor:
         (..., 3) in [0, 1]. Differentiable in both.
 
     Example:
-        >>> expose(torch.tensor([0.0, 0.5, 1.0]), torch.tensor([3.0, 3.0, 3.0]))
+        >>> apply_exposure_gains(torch.tensor([0.0, 0.5, 1.0]), torch.tensor([3.0, 3.0, 3.0]))
         tensor([0.0000, 0.7500, 1.0000])
     """
     return gains * image / (1 + (gains - 1) * image)
 
 
-def kernel(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Inverse quadratic kernel 1 / (1 + |a - b|^2), (N, M), of features (N, D) and (M, D).
+def inverse_quadratic_kernel(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the inverse quadratic kernel 1 / (1 + |a - b|^2), (N, M), of features (N, D) and (M, D).
 
     Its slope is at most 3 sqrt(3) / 8 for each unit of distance.
     """
@@ -49,22 +51,22 @@ def kernel(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class ExposureMap:
-    """Log gains of any viewpoint, by kernel regression over the cameras of training photos.
+    """Kernel regression of log gains over the training cameras, which predicts the gains of any viewpoint.
 
         log g(x, f) = clip(mean + sum_m k((x', f), (x_m, f_m)) w_m, lowest, highest)
         k((x, f), (y, h)) = 1 / (1 + |x - y|^2 / l_x^2 + |f - h|^2 / l_f^2)
 
-    x is the viewpoint's position in local units, f its unit viewing direction, x' the point nearest to x in the box
-    that holds the training cameras: outside it the exposure is that of the nearest viewpoint inside. The function is
-    continuous, and Lipschitz by `slope_bounds`. It holds the very numbers that a file stores, so that writing and
-    reading it changes nothing.
+    x is the viewpoint's position in local units, f its unit viewing direction, and x' the point nearest to x in the box
+    of the training cameras: a viewpoint outside the box has the exposure of the nearest one inside. The function is
+    continuous, and Lipschitz with the constants `slope_bounds`. The fields are the numbers that a file stores, so that
+    writing and reading a map changes nothing.
 
     Attributes:
-        box: (2, 3) float32, the least and the largest position of the training cameras, local units.
+        box: (2, 3) float32, least and largest position of the training cameras per axis, local units.
         lengths: (2,) float32 > 0, l_x in local units and l_f in units of the sphere of directions.
         mean: (3,) float32 log gains far from all centres.
-        limits: (2, 3) float32, lowest and highest log gain, in [-8, 8].
-        steps: (3,) float32, the unit of the weights of each channel.
+        limits: (2, 3) float32, lowest and highest log gain of each channel, in [-8, 8].
+        steps: (3,) float32, unit of the weights of each channel.
         positions: (M, 3) uint8, x_m = least + code / 255 (largest - least). M <= 64.
         directions: (M, 3) int8, f_m = code / 127.
         weights: (M, 3) int16, w_m = code * step.
@@ -80,7 +82,11 @@ class ExposureMap:
     weights: np.ndarray
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a number is not finite or out of range, or shapes do not fit."""
+        """Check the fields.
+
+        Raises:
+            ValueError: a number is not finite or out of range, or shapes do not fit.
+        """
         count = len(self.positions)
         shapes = ((2, 3), (2,), (3,), (2, 3), (3,), (count, 3), (count, 3), (count, 3))
         types = ("f4",) * 5 + ("u1", "i1", "i2")
@@ -101,11 +107,11 @@ class ExposureMap:
         if not (self.limits[0] <= self.limits[1]).all() or np.abs(self.limits).max() > MAX_LOG_GAIN:
             raise ValueError(f"log gains of an exposure map must lie in order within {MAX_LOG_GAIN:g} of 0")
 
-    def log_gains(self, position: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    def predict_log_gains(self, position: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Predict the log gains of viewpoints.
 
         Args:
-            position: (..., 3) local units.
+            position: (..., 3) positions in local units.
             direction: (..., 3) unit viewing directions.
 
         Returns:
@@ -116,27 +122,29 @@ class ExposureMap:
         return np.clip(logs, *self.limits.astype(np.float64)).reshape(np.shape(position))
 
     def kernel_at(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """The kernel (N, M) between viewpoints, positions and directions (N, 3) as in `log_gains`, and the centres."""
-        return kernel(self._features(np.clip(positions, *self.box.astype(np.float64)), directions), self._centers)
+        """Return the kernel (N, M) of viewpoints, positions and directions (N, 3), and the map's centres."""
+        return inverse_quadratic_kernel(
+            self._features(np.clip(positions, *self.box.astype(np.float64)), directions), self._centers
+        )
 
     def kernel_of_centers(self) -> np.ndarray:
-        """The kernel (M, M) among the centres."""
-        return kernel(self._centers, self._centers)
+        """Return the kernel (M, M) between all centres."""
+        return inverse_quadratic_kernel(self._centers, self._centers)
 
-    def gains_of_pose(self, camera_from_local: np.ndarray) -> np.ndarray:
-        """Predict the gains (3,) float64 of a camera by its pose (4, 4), camera_from_local."""
+    def predict_gains(self, camera_from_local: np.ndarray) -> np.ndarray:
+        """Predict the gains (3,) float64 of a camera from its pose camera_from_local (4, 4)."""
         pose = np.asarray(camera_from_local, np.float64)
-        return np.exp(self.log_gains(-pose[:3, :3].T @ pose[:3, 3], pose[2, :3]))
+        return np.exp(self.predict_log_gains(-pose[:3, :3].T @ pose[:3, 3], pose[2, :3]))
 
     @property
     def slope_bounds(self) -> tuple[float, float]:
-        """The largest change of a log gain for each local unit of position and each radian of viewing angle.
+        """Return bounds of the change of a log gain per local unit of position and per radian of viewing angle.
 
         For f = sum_m w_m k(., v_m) with the norm |f|^2 = w^T K w of its Hilbert space,
 
             |f(a) - f(b)| <= |f| sqrt(2 - 2 k(a, b)) <= sqrt(2) |f| |a - b|
 
-        where |a - b| is the distance of features: position over l_x, direction over l_f.
+        where |a - b| is the distance between features: position over l_x, direction over l_f.
         """
         gram = self.kernel_of_centers()
         norm = float(np.sqrt(np.maximum(np.einsum("mc,mn,nc->c", self._weights, gram, self._weights), 0).max()))
@@ -146,14 +154,14 @@ class ExposureMap:
     @cached_property
     def _centers(self) -> np.ndarray:
         least, largest = self.box.astype(np.float64)
-        positions = least + self.positions / POSITION_CODES * (largest - least)
-        return self._features(positions, self.directions / DIRECTION_CODES)
+        positions = least + self.positions / MAX_POSITION_CODE * (largest - least)
+        return self._features(positions, self.directions / MAX_DIRECTION_CODE)
 
     @cached_property
     def _weights(self) -> np.ndarray:
         return self.weights * self.steps.astype(np.float64)
 
     def _features(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(N, 6) what the kernel compares."""
+        """Return the features (N, 6) that the kernel compares: scaled positions and directions."""
         length, chord = self.lengths.astype(np.float64)
         return np.concatenate((positions / length, directions / chord), 1)

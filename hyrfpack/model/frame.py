@@ -1,11 +1,12 @@
-"""World <-> frame <-> contracted cube.
+"""The frame of a scene and its coordinate systems.
 
-Three systems of coordinates, one after the other:
+Points are mapped through three coordinate systems:
 
 - **world**: the input's own axes, origin and unit (float64);
-- **local**: `local = (world - center) / scale`, axes kept; the box that matters is about [-1, 1]^3. All learnt
-  numbers live here, so nothing depends on the unit or the origin of a reconstruction, and float32 is enough;
-- **cube**: `contract(local / half_extent)` in (0, 1)^3, where the hash grids live.
+- **local**: `local = (world - center) / scale`, with the same axes; the scene's box lies within [-1, 1]^3. All learnt
+  positions and sizes are local, so that nothing depends on the unit or the origin of a reconstruction, and float32 is
+  precise enough;
+- **cube**: `contract(local / half_extent)` in (0, 1)^3, the domain of the hash grids.
 """
 
 from __future__ import annotations
@@ -19,18 +20,18 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.scene import Camera
 
-# No axis of the box is thinner than this fraction of the longest: a row of cameras still sees a volume.
-THINNEST_AXIS = 0.25
+# Flat boxes are widened to this fraction of the longest half-axis, because even a row of cameras sees a volume.
+MIN_HALF_EXTENT = 0.25
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The box B0 of a scene.
+    """The box B0 of a scene, which defines its local coordinates.
 
     Attributes:
-        center: (x, y, z) of the box in world units.
-        scale: world units per local unit: the longest half-axis of the box. Positive.
-        half_extent: half-axes of the box in local units, each in [THINNEST_AXIS, 1].
+        center: centre (x, y, z) of the box in world units.
+        scale: world units per local unit, which is the longest half-axis of the box; positive.
+        half_extent: half-axes of the box in local units, each in [MIN_HALF_EXTENT, 1].
     """
 
     center: tuple[float, float, float]
@@ -39,10 +40,10 @@ class Frame:
 
     @classmethod
     def from_box(cls, low: np.ndarray, high: np.ndarray) -> Frame:
-        """The frame of the box between two corners (3,) in world units; flat axes are widened.
+        """Build the frame of the box between two corners (3,) in world units; flat axes are widened.
 
         Raises:
-            HyrfDataError: a corner is not finite, or the box has no size at all.
+            HyrfDataError: a corner is not finite, or the box has size 0.
         """
         low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
         half = (high - low) / 2
@@ -53,27 +54,27 @@ class Frame:
             raise HyrfDataError(
                 "cameras and points all lie at one place, so the scene has no size; give views from different places"
             )
-        half = np.maximum(half / scale, THINNEST_AXIS)
+        half = np.maximum(half / scale, MIN_HALF_EXTENT)
         (x, y, z), (a, b, c) = ((low + high) / 2).tolist(), half.tolist()
         return cls((x, y, z), scale, (a, b, c))
 
     def to_local(self, points: np.ndarray) -> np.ndarray:
-        """World positions (N, 3) to local ones, float64."""
+        """Convert world positions (N, 3) to local positions, float64."""
         return (np.asarray(points, np.float64) - np.array(self.center)) / self.scale
 
     def to_world(self, points: np.ndarray) -> np.ndarray:
-        """Local positions (N, 3) to world ones, float64."""
+        """Convert local positions (N, 3) to world positions, float64."""
         return np.asarray(points, np.float64) * self.scale + np.array(self.center)
 
     def local_pose(self, camera: Camera) -> np.ndarray:
-        """camera_from_local (4, 4) float64: the camera's pose with depths in local units.
+        """Return the camera's pose camera_from_local (4, 4) float64, with depths in local units.
 
-        Worked out in float64, so that a scene a million units from the origin loses nothing.
+        It is computed in float64, so that a scene a million units from the origin loses no precision.
         """
         pose = camera.camera_from_world.copy()
         pose[:3, 3] = (pose[:3, :3] @ np.array(self.center) + pose[:3, 3]) / self.scale
         return pose
 
     def normalize(self, local: Tensor) -> Tensor:
-        """Local positions (..., 3) to u = local / half_extent, where the box is [-1, 1]^3."""
+        """Convert local positions (..., 3) to u = local / half_extent, where the box is [-1, 1]^3."""
         return local / tensor_like(self.half_extent, local)

@@ -1,4 +1,4 @@
-"""The explicit part of a model: eight numbers for each Gaussian."""
+"""The explicit part of a model: eight numbers per Gaussian."""
 
 from __future__ import annotations
 
@@ -8,26 +8,28 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-LOGIT_LIMIT = 12.0  # sigmoid is within 7e-6 of its ends there; beyond, gradients die
+LOGIT_LIMIT = 12.0  # the sigmoid is within 7e-6 of 0 or 1 there, and its gradient vanishes beyond
 
 
 def logit(values: Tensor) -> Tensor:
-    """The inverse of the sigmoid, clamped to +-LOGIT_LIMIT so that 0 and 1 stay finite and trainable."""
+    """Return the inverse of the sigmoid, clamped to +-LOGIT_LIMIT so that 0 and 1 give finite, trainable logits."""
     edge = 1 / (1 + math.exp(LOGIT_LIMIT))
     values = values.double().clamp(edge, 1 - edge)
     return (values.log() - (-values).log1p()).float()
 
 
 class Gaussians(nn.Module):
-    """Positions and the explicit logits, one row for each Gaussian.
+    """Positions and explicit logits, one row per Gaussian.
 
     Attributes:
-        positions: (N, 3) local units.
-        color_logits: (N, 3). scale_logits: (N, 1). opacity_logits: (N, 1).
+        positions: (N, 3) in local units.
+        color_logits: (N, 3).
+        scale_logits: (N, 1).
+        opacity_logits: (N, 1).
     """
 
-    NAMES = ("positions", "color_logits", "scale_logits", "opacity_logits")
-    WIDTHS = (3, 3, 1, 1)
+    PARAMETER_NAMES = ("positions", "color_logits", "scale_logits", "opacity_logits")
+    PARAMETER_WIDTHS = (3, 3, 1, 1)
     positions: Tensor
     color_logits: Tensor
     scale_logits: Tensor
@@ -36,7 +38,10 @@ class Gaussians(nn.Module):
     def __init__(self, positions: Tensor, color_logits: Tensor, scale_logits: Tensor, opacity_logits: Tensor) -> None:
         super().__init__()
         for name, width, values in zip(
-            self.NAMES, self.WIDTHS, (positions, color_logits, scale_logits, opacity_logits), strict=True
+            self.PARAMETER_NAMES,
+            self.PARAMETER_WIDTHS,
+            (positions, color_logits, scale_logits, opacity_logits),
+            strict=True,
         ):
             if values.shape != (len(positions), width):
                 raise ValueError(f"{name} has shape {tuple(values.shape)}; ({len(positions)}, {width}) is needed")
@@ -47,9 +52,10 @@ class Gaussians(nn.Module):
 
 
 def take_rows(values: Tensor, index: Tensor) -> Tensor:
-    """values[index], (n, C), for (n,) int64 in which no row comes twice; differentiable.
+    """Return the rows values[index] (n, C), for index (n,) int64 without repeated rows; differentiable.
 
-    Rows that are taken once need no sum: a copy is enough to pull a gradient back, where torch sorts the indices.
+    The gradient of rows that are taken only once needs no summation: a copy is enough, while torch would sort the
+    indices.
     """
     return _TakeRows.apply(values, index)
 

@@ -1,4 +1,4 @@
-"""Multiresolution hash grids (Mueller et al. 2022): shape and storage; the lookup itself is ops.hash_encode."""
+"""Multiresolution hash grids (Mueller et al. 2022): configuration and table; `ops.hash_encode` looks features up."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from torch import Tensor, nn
 from hyrfpack.ops.hash_encode import hash_encode, level_offsets, level_resolutions
 from hyrfpack.ops.hash_encode.reference import PRIME_Y, PRIME_Z
 
-FEATURES = 2
+FEATURES_PER_LEVEL = 2
 
 
 @dataclass(frozen=True)
 class HashGridConfig:
-    """The shape of one hash grid.
+    """The configuration of one hash grid.
 
     Attributes:
-        log2_table_size: rows of a level are min(resolution^3, 2^log2_table_size).
-        levels: number of levels, resolutions in geometric progression.
+        log2_table_size: a level has min(resolution^3, 2^log2_table_size) rows.
+        levels: number of levels; their resolutions form a geometric progression.
         base, finest: vertices per axis of the first and the last level.
     """
 
@@ -40,25 +40,28 @@ class HashGridConfig:
 
     @cached_property
     def resolutions(self) -> tuple[int, ...]:
-        """Vertices per axis of each level."""
+        """Return the vertices per axis of each level."""
         return level_resolutions(self.levels, self.base, self.finest)
 
     @cached_property
     def offsets(self) -> tuple[int, ...]:
-        """(levels + 1,) first row of each level in the table, and the number of rows."""
+        """Return the first row of each level in the table, followed by the total number of rows: (levels + 1,)."""
         return level_offsets(self.resolutions, self.log2_table_size)
 
     @property
     def rows(self) -> int:
-        """Rows of the whole table."""
+        """Return the number of rows of the whole table."""
         return self.offsets[-1]
 
-    def usage(self, points: np.ndarray, bits: int) -> np.ndarray:
-        """How many corners of the cells that hold these points read each row of the table. Integers only.
+    def count_row_reads(self, points: np.ndarray, bits: int) -> np.ndarray:
+        """Count how often each row of the table is read when features are looked up at the given points.
+
+        Each point reads the rows of the 8 corners of its cell on every level. The arithmetic is in integers only, so
+        that every decoder gets the same counts.
 
         Args:
-            points: (N, 3) int64 in units of 2^-bits of the unit cube, 0 to 2^bits - 1; bits + the bits of the finest
-                resolution at most 62.
+            points: (N, 3) int64 in units of 2^-bits of the unit cube, 0 to 2^bits - 1.
+            bits: number of bits per coordinate; this and the bits of the finest resolution add up to at most 62.
 
         Returns:
             (rows,) int64.
@@ -69,7 +72,7 @@ class HashGridConfig:
             cells = (points * (resolution - 1) >> bits).astype(np.uint32)
             dense = resolution**3 <= 1 << self.log2_table_size
             factors = (1, resolution, resolution**2) if dense else (1, PRIME_Y, PRIME_Z)
-            # Products wrap around at 32 bits, as the hash has it.
+            # Products wrap around at 32 bits, as the hash function requires.
             sides = [
                 [(cells[:, axis] + np.uint32(side)) * np.uint32(factor) for side in (0, 1)]
                 for axis, factor in enumerate(factors)
@@ -81,28 +84,28 @@ class HashGridConfig:
         return counts
 
 
-def uniform(rows: int, columns: int, *, bound: float, generator: torch.Generator | None = None) -> Tensor:
-    """(rows, columns) numbers drawn from -bound to bound.
+def draw_uniform(rows: int, columns: int, *, bound: float, generator: torch.Generator | None = None) -> Tensor:
+    """Draw (rows, columns) numbers uniformly from -bound to bound.
 
-    In place: out of place, without storage (on the device "meta", as a file's model is laid out), torch would load its
-    compiler first, which takes longer than reading the file.
+    The operations are in place, because on the device "meta", on which the model of a file is built, out-of-place ones
+    would make torch import its compiler, which takes longer than reading the file.
     """
     return torch.rand(rows, columns, generator=generator).mul_(2).sub_(1).mul_(bound)
 
 
 class HashGrid(nn.Module):
-    """A trainable table (rows, 2), all levels one after another."""
+    """A hash grid with a trainable table (rows, 2) that holds all levels one after another."""
 
     def __init__(self, config: HashGridConfig, generator: torch.Generator | None = None) -> None:
         super().__init__()
         self.config = config
-        self.table = nn.Parameter(uniform(config.rows, FEATURES, bound=1e-4, generator=generator))
+        self.table = nn.Parameter(draw_uniform(config.rows, FEATURES_PER_LEVEL, bound=1e-4, generator=generator))
 
     @property
-    def features(self) -> int:
-        """Numbers per point that `forward` returns."""
-        return self.config.levels * FEATURES
+    def feature_count(self) -> int:
+        """Return the number of features per point."""
+        return self.config.levels * FEATURES_PER_LEVEL
 
     def forward(self, coords: Tensor) -> Tensor:
-        """Features (N, levels * 2) of points (N, 3) in the unit cube."""
+        """Return the features (N, levels * 2) of points (N, 3) in the unit cube."""
         return hash_encode(coords, self.table, self.config.resolutions, self.config.log2_table_size)

@@ -1,4 +1,4 @@
-"""HybridModel: explicit Gaussians, a geometry field, a radiance field and the background, put together."""
+"""HybridModel: explicit Gaussians, a geometry field, a radiance field and a background in one module."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from hyrfpack.ops.contraction import contract
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_views
 
-SHADED_AT_ONCE = 1 << 20  # Gaussians whose hash features are in memory together in `shading`
+GAUSSIANS_PER_SHADING_BLOCK = 1 << 20  # bounds the memory of hash features in `HybridModel.shading`
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """The view-independent part of decoded Gaussians, activated.
+    """Activated view-independent properties of decoded Gaussians.
 
     Attributes:
         scales: (N, 3) standard deviations in local units.
-        quats: (N, 4) wxyz, not normalised (the rasteriser normalises).
+        quats: (N, 4) wxyz, not normalised, because the rasteriser normalises them.
         opacities: (N,) in (0, 1).
     """
 
@@ -41,12 +41,12 @@ class Geometry:
 
 @dataclass(frozen=True)
 class Decoded:
-    """What of a model does not depend on the view, to be kept from view to view.
+    """The view-independent part of a model's evaluation, which can be reused for many views.
 
     Attributes:
-        geometry: of all Gaussians.
-        shading: the colour decoder's first layer as far as places decide it, and what comes after it; None where
-            nothing is gained by it.
+        geometry: geometry of all Gaussians.
+        shading: the position-dependent part of the colour decoder's first layer for all Gaussians, and the remaining
+            layers; None where it would save no time.
     """
 
     geometry: Geometry
@@ -57,7 +57,7 @@ class Decoded:
 
 
 def scale_bounds(positions: Tensor, config: ModelConfig) -> Tensor:
-    """S(p), (N, 1): the largest scale, in local units, that a Gaussian may have at local positions (N, 3).
+    """Return S(p), (N, 1): the largest scale, in local units, of a Gaussian at local positions (N, 3).
 
     S(p) = max(1, |u|) with u = p / half_extent, or 1 everywhere when `config.scale_grows` is off.
     """
@@ -67,7 +67,7 @@ def scale_bounds(positions: Tensor, config: ModelConfig) -> Tensor:
 class HybridModel(nn.Module):
     """A hybrid radiance field (HyRF, NeurIPS 2025).
 
-    Each Gaussian's properties are the sum of what it stores (e) and what the fields say at its place (n):
+    The properties of a Gaussian combine its explicit logits (e) with the neural fields at its position (n):
 
         opacity = sigmoid(a_n + a_e)      colour = sigmoid(c_n(direction) + c_e)
         scale = S(p) sigmoid(s_n + s_e)   rotation = normalize(r_n + (1, 0, 0, 0))
@@ -75,9 +75,9 @@ class HybridModel(nn.Module):
     with S(p) = max(1, |u|) local units. All positions are local to `config.frame`.
 
     Attributes:
-        precision: how GPU kernels multiply in the decoders, not stored in files: "mixed" rounds factors to bfloat16
-            and adds up in float32, "float32" rounds nothing. The CPU always works in float32.
-        exposure: the exposure map, None for a model of one exposure. `hyrfpack.render` and `hyrfpack.export` apply it.
+        precision: precision of the decoders' products in GPU kernels, not stored in files: "mixed" rounds factors to
+            bfloat16 and adds up in float32, "float32" rounds nothing. The CPU always computes in float32.
+        exposure: the exposure map; None for a model of one exposure. `hyrfpack.render` and `hyrfpack.export` apply it.
     """
 
     def __init__(self, config: ModelConfig, gaussians: Gaussians, generator: torch.Generator | None = None) -> None:
@@ -96,19 +96,19 @@ class HybridModel(nn.Module):
         )
 
     def part(self, index: Tensor) -> HybridModel:
-        """A model of the Gaussians at `index` (n,) int64, copied. The fields are this model's own."""
-        explicit = (getattr(self.gaussians, name).detach()[index] for name in Gaussians.NAMES)
+        """Return a model with copies of the Gaussians at `index` (n,) int64; it shares the fields with this model."""
+        explicit = (getattr(self.gaussians, name).detach()[index] for name in Gaussians.PARAMETER_NAMES)
         part = HybridModel(self.config, Gaussians(*explicit))
         part.geometry, part.radiance = self.geometry, self.radiance
         part.precision, part.exposure = self.precision, self.exposure
         return part
 
     def cube_coords(self, positions: Tensor) -> Tensor:
-        """Local positions (N, 3) to the hash grids' unit cube."""
+        """Convert local positions (N, 3) to coordinates (N, 3) in the hash grids' unit cube."""
         return contract(positions, self.config.frame.half_extent)
 
     def scale_bounds(self, positions: Tensor) -> Tensor:
-        """S(p), (N, 1), at local positions (N, 3); see `scale_bounds`."""
+        """Return the largest scales S(p), (N, 1), at local positions (N, 3); see `scale_bounds`."""
         return scale_bounds(positions, self.config)
 
     @property
@@ -120,24 +120,24 @@ class HybridModel(nn.Module):
 
     @torch.no_grad()
     def decode(self) -> Decoded:
-        """What does not depend on the view, of all Gaussians: for many views of a model that does not change.
+        """Evaluate the view-independent part for all Gaussians, to render many views of a model that does not change.
 
-        Takes 4 (hidden + 8) bytes a Gaussian; on a GPU, where precision is mixed, 2 hidden + 32.
+        The result takes 4 (hidden + 8) bytes per Gaussian; with mixed precision on a GPU, 2 hidden + 32.
         """
-        gains = self.gaussians.positions.device.type in ("cpu", "cuda") and not self.radiance.silent
-        return Decoded(self.decode_geometry(), self.shading() if gains else None)
+        is_faster = self.gaussians.positions.device.type in ("cpu", "cuda") and not self.radiance.is_constant_zero
+        return Decoded(self.decode_geometry(), self.shading() if is_faster else None)
 
     @torch.no_grad()
     def shading(self) -> Shading:
-        """The colour decoder with what of its first layer does not depend on the view worked out for all Gaussians."""
+        """Evaluate the view-independent part of the colour decoder's first layer for all Gaussians."""
         field, explicit = self.radiance, self.gaussians
-        places = field.grid.features
+        places = field.grid.feature_count
         (weight, w2, w3), (bias, b2, b3) = self._color_layers()
         rows = [
             mlp(field.grid(self.cube_coords(some)), [weight[:, :places]], [bias], mixed=self._mixed)
-            for some in explicit.positions.split(SHADED_AT_ONCE)
+            for some in explicit.positions.split(GAUSSIANS_PER_SHADING_BLOCK)
         ]
-        first = rows[0] if len(rows) == 1 else torch.cat(rows)  # which would copy
+        first = rows[0] if len(rows) == 1 else torch.cat(rows)  # one block needs no copy
         return Shading(
             first.bfloat16() if self._mixed else first,
             weight[:, places:].contiguous(),
@@ -149,7 +149,7 @@ class HybridModel(nn.Module):
         )
 
     def decode_geometry(self, index: Tensor | None = None) -> Geometry:
-        """Scales, rotations and opacities of the Gaussians at `index` (n,) int64, or of all."""
+        """Return scales, rotations and opacities of the Gaussians at `index` (n,) int64, or of all."""
         explicit = self.gaussians
         pick = (lambda values: values) if index is None else (lambda values: take_rows(values, index))
         positions = self._field_positions(pick(explicit.positions))
@@ -157,7 +157,7 @@ class HybridModel(nn.Module):
         return self.activate(raw, positions, pick(explicit.scale_logits), pick(explicit.opacity_logits))
 
     def activate(self, raw: Tensor, positions: Tensor, scale_logits: Tensor, opacity_logits: Tensor) -> Geometry:
-        """What the geometry field says (n, 8) and what is stored, put together; see `activate_geometry`."""
+        """Combine raw outputs (n, 8) of the geometry field with the explicit logits; see `activate_geometry`."""
         half_extent = self.config.frame.half_extent if self.config.scale_grows else None
         rule = self.config.scale_rule
         parts = activate.activate_geometry(
@@ -166,23 +166,25 @@ class HybridModel(nn.Module):
         return Geometry(*parts)
 
     def decode_colors(self, viewpoint: Tensor, index: Tensor | None = None) -> Tensor:
-        """Colours (n, 3) in (0, 1) of the Gaussians at `index`, seen from `viewpoint` (3,) local units."""
+        """Return colours (n, 3) in (0, 1) of the Gaussians at `index`, seen from `viewpoint` (3,) in local units."""
         explicit = self.gaussians
         positions, logits = explicit.positions, explicit.color_logits
         if index is not None:
             positions, logits = take_rows(positions, index), take_rows(logits, index)
-        if self.radiance.silent:
+        if self.radiance.is_constant_zero:
             return torch.sigmoid(logits)
         positions = self._field_positions(positions)
         return torch.sigmoid(self._radiance(positions, viewpoint) + logits)
 
     def decode_background(self, points: Tensor, intrinsics: tuple[float, float, float, float], pose: Tensor) -> Tensor:
-        """Background colours (n, 3) in (0, 1) at points (n, 2) of the picture, in pixels.
+        """Return background colours (n, 3) in (0, 1) at points of the image.
 
         Args:
+            points: (n, 2) in pixels.
+            intrinsics: fx, fy, cx, cy in pixels.
             pose: (4, 4) camera_from_local.
         """
-        return background_colors(points, **self._sphere(intrinsics, pose))
+        return background_colors(points, **self._background_arguments(intrinsics, pose))
 
     def background_grid(
         self,
@@ -193,11 +195,13 @@ class HybridModel(nn.Module):
         threshold: float,
         stride: int,
     ) -> Tensor:
-        """Background colours (rows, columns, 3) of every stride-th pixel; see `ops.background.background_grid`."""
-        return background_grid(transmittance, threshold=threshold, stride=stride, **self._sphere(intrinsics, pose))
+        """Return background colours (rows, columns, 3) of every stride-th pixel, see `ops.background`."""
+        return background_grid(
+            transmittance, threshold=threshold, stride=stride, **self._background_arguments(intrinsics, pose)
+        )
 
-    def _sphere(self, intrinsics: tuple[float, float, float, float], pose: Tensor) -> dict[str, Any]:
-        """What the colours of the background depend on."""
+    def _background_arguments(self, intrinsics: tuple[float, float, float, float], pose: Tensor) -> dict[str, Any]:
+        """Return the arguments that both background operations share."""
         weights, biases = self._color_layers()
         return {
             "pose": pose,
@@ -213,7 +217,7 @@ class HybridModel(nn.Module):
         }
 
     def _color_layers(self) -> tuple[list[Tensor], list[Tensor]]:
-        """Weights and biases of the decoder of colours."""
+        """Return weights and biases of the colour decoder."""
         return list(self.radiance.weights), list(self.radiance.biases)
 
     def _radiance(self, positions: Tensor, viewpoint: Tensor) -> Tensor:

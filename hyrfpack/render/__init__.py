@@ -1,4 +1,4 @@
-"""Model + camera -> picture."""
+"""Rendering of a model from a camera."""
 
 from hyrfpack.render.renderer import Rendering, RenderSettings, apply_exposure_map, render
 

@@ -1,4 +1,4 @@
-"""Rendered views as picture files."""
+"""Rendering of views to image files."""
 
 from __future__ import annotations
 
@@ -32,31 +32,31 @@ def render_files(
     overwrite: bool = True,
     ranks: Ranks = SINGLE_PROCESS,
 ) -> Iterator[Path]:
-    """Render named cameras to `folder/<name>.png`, sub-folders kept; yields each path once it is written.
+    """Render named cameras to `folder/<name>.png`, keeping sub-folders; yield each path once it is written.
 
-    The folder is locked until the last picture is written or the iterator is closed.
+    The folder is locked until the last image is written or the iterator is closed.
 
     Args:
-        model: what to render.
-        cameras: names (of photos, or any) and cameras.
-        folder: made if missing.
-        depth: also write `<name>.depth.tiff`: one float32 channel, depth along the view axis in world units, 0 where
-            no Gaussian is hit.
-        settings: how to render.
-        overwrite: replace files that are there; without it, a picture gets a free name beside one that is there, and
-            depth that is there is an error.
-        ranks: processes that share the cameras; each yields what it has written.
+        model: the model to render.
+        cameras: pairs of a name (of a photo, or any other) and a camera.
+        folder: output folder; it is created if missing.
+        depth: whether to write also `<name>.depth.tiff`: one float32 channel, depth along the view axis in world units,
+            0 where no Gaussian is hit.
+        settings: render settings.
+        overwrite: replace existing files. Without it, an image whose file exists gets a free file name in the same
+            folder, and an existing depth file is an error.
+        ranks: processes that share the cameras; each yields the paths that it has written.
 
     Raises:
-        HyrfError: a picture cannot be written, or another call is at work in the folder.
+        HyrfError: an image cannot be written, or another call is writing into the folder.
     """
     with exclusive_folder(folder, ranks=ranks):
-        draw = drawing_function(model, depth=depth, settings=settings)
+        draw = make_renderer(model, depth=depth, settings=settings)
         yield from write_pictures(draw, cameras, folder, overwrite=overwrite, ranks=ranks)
 
 
-class Drawn(Protocol):
-    """A picture of colours (H, W, 3) and, where it was asked for, of depth (H, W) in world units."""
+class ColorAndDepth(Protocol):
+    """A rendered image of colours (H, W, 3) and, if requested, of depth (H, W) in world units."""
 
     @property
     def rgb(self) -> Tensor: ...
@@ -65,28 +65,28 @@ class Drawn(Protocol):
     def depth(self) -> Tensor | None: ...
 
 
-def drawing_function(
+def make_renderer(
     model: HybridModel,
     *,
     depth: bool = False,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
-) -> Callable[[Camera], Drawn]:
-    """Return a function that renders a model, decoded once, from a camera. Arguments as of `render_files`."""
+) -> Callable[[Camera], ColorAndDepth]:
+    """Decode a model once, and return a function that renders it from a camera. Arguments as in `render_files`."""
     with torch.no_grad():
         decoded = model.decode()
     return partial(render, model, settings=settings, decoded=decoded, depth=depth)
 
 
 def write_pictures(
-    draw: Callable[[Camera], Drawn],
+    draw: Callable[[Camera], ColorAndDepth],
     cameras: Sequence[tuple[str, Camera]],
     folder: str | os.PathLike[str],
     *,
     overwrite: bool = True,
     ranks: Ranks = SINGLE_PROCESS,
 ) -> Iterator[Path]:
-    """Write what `draw` shows of named cameras into a folder that the caller has locked; see `render_files`."""
-    named = list(zip(file_names([name for name, _ in cameras]), cameras, strict=True))
+    """Write the renders of named cameras by `draw` into a folder that the caller has locked; see `render_files`."""
+    named = list(zip(unique_stems([name for name, _ in cameras]), cameras, strict=True))
     for name, (_, camera) in ranks.share(named):
         with torch.no_grad():
             rendering = draw(camera)
@@ -98,23 +98,23 @@ def write_pictures(
         yield written
 
 
-def rendered_names(names: Sequence[str], depth: bool = False) -> list[str]:
-    """What `render_files` writes for cameras of these names, relative to its folder."""
+def render_file_names(names: Sequence[str], depth: bool = False) -> list[str]:
+    """Return the names of the files that `render_files` writes for cameras of these names, relative to its folder."""
     kinds = (".png", ".depth.tiff") if depth else (".png",)
-    return [f"{name}{kind}" for name in file_names(names) for kind in kinds]
+    return [f"{name}{kind}" for name in unique_stems(names) for kind in kinds]
 
 
 def to_image(rgb: Tensor) -> Image.Image:
-    """(H, W, 3) colours, clamped to [0, 1] and rounded to 8 bits."""
+    """Convert colours (H, W, 3) to an image: clamp them to [0, 1] and round them to 8 bits."""
     return Image.fromarray((rgb.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
 
 
-def file_names(names: Sequence[str]) -> list[str]:
-    """Names of photos to paths for renders, without an extension: relative, inside the folder, no two alike.
+def unique_stems(names: Sequence[str]) -> list[str]:
+    """Convert names of photos to distinct relative paths for renders, inside the folder and without an extension.
 
-    "left/0001.JPG" becomes "left/0001"; where two photos differ in their extension only, all keep it.
+    "left/0001.JPG" becomes "left/0001". If two photos differ only in their extensions, all names keep theirs.
     """
-    full = [_safe(name) for name in names]
+    full = [_safe_relative_path(name) for name in names]
     bare = [
         str(PurePosixPath(name).with_suffix("")) if PurePosixPath(name).suffix.lower() in PICTURE_SUFFIXES else name
         for name in full
@@ -125,7 +125,8 @@ def file_names(names: Sequence[str]) -> list[str]:
     return chosen
 
 
-def _safe(name: str) -> str:
+def _safe_relative_path(name: str) -> str:
+    """Return a name without characters and path parts that could lead out of a folder or that a system forbids."""
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in {"/", ".", ".."}]
     kept = "/".join(parts)
     return "".join(c if c.isprintable() and c not in ':*?"<>|' else "_" for c in kept) or "view"
@@ -134,9 +135,9 @@ def _safe(name: str) -> str:
 def save_picture(
     path: str | os.PathLike[str], image: Image.Image, *, overwrite: bool = True, rename: bool = True
 ) -> Path:
-    """Write a picture in one step, in the format of its extension, making its folder; returns the path written.
+    """Write an image, whole or not at all, in the format of its extension; return the path that was written.
 
-    `overwrite` and `rename` are those of `hyrfpack.atomic.pending_file`.
+    The folder is created if missing. `overwrite` and `rename` are those of `hyrfpack.atomic.pending_file`.
 
     Raises:
         HyrfError: the folder or the file cannot be written.

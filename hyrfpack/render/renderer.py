@@ -1,4 +1,4 @@
-"""The renderer: cull -> decode the visible -> project, bin, blend -> background."""
+"""The renderer: cull Gaussians, decode the visible ones, project, sort into tiles, blend, and add the background."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hyrfpack.checks import check_choice, check_float, check_int, check_type
 from hyrfpack.choices import AS_PHOTOGRAPHED, RENDER_EXPOSURES
 from hyrfpack.errors import HyrfError
 from hyrfpack.model import Decoded, HybridModel
-from hyrfpack.model.exposure import expose
+from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.model.gaussians import take_rows
 from hyrfpack.ops.composite import composite
 from hyrfpack.ops.finite import all_finite
@@ -33,18 +33,18 @@ from hyrfpack.scene import Camera
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """How exactly to render. What each default costs and saves is in `docs/speed-and-accuracy.md`.
+    """Settings of accuracy against speed. `docs/speed-and-accuracy.md` lists error and time of each default.
 
     Attributes:
-        near: Gaussians nearer than this are dropped, local units (the frame's longest half-axis is 1).
-        cull_tolerance: how far outside the picture a centre may project, as a fraction of half its size; infinite for
-            anywhere in front of it.
-        background_threshold: pixels with no more transmittance than this get no background (the paper's tau).
+        near: Gaussians nearer than this are culled, in local units (the frame's longest half-axis is 1).
+        cull_tolerance: how far outside the image a centre may project, as a fraction of half the image size; infinite
+            keeps every Gaussian in front of the camera.
+        background_threshold: pixels with at most this transmittance get no background (tau in the paper).
         background_stride: the background is evaluated at every background_stride-th pixel of each axis and
-            interpolated between; 1 is exact.
-        transmittance_min: a pixel is finished once no more light than this passes; 0 blends every Gaussian.
+            interpolated between them; 1 is exact.
+        transmittance_min: blending of a pixel stops when its transmittance is at most this; 0 blends every Gaussian.
         exposure: "as-photographed" applies the model's exposure map, so that a view looks like the photos taken near
-            it; "consistent" shows all views at the model's own exposure. The same for a model without such a map.
+            it; "consistent" renders all views at the model's own exposure. A model without a map renders the same.
     """
 
     near: float = 0.01
@@ -72,12 +72,13 @@ class Rendering:
     Attributes:
         rgb: (H, W, 3) display-referred colour, background included; within [0, 1] up to rounding.
         alpha: (H, W) coverage by Gaussians, 1 - transmittance.
-        depth: (H, W) expected depth along the view axis in world units, 0 where nothing is hit; None unless asked.
-        indices: (n,) of the Gaussians that were decoded.
-        visible: (n,) bool, which of these touched the picture.
-        absgrad: (n, 2) sums over pixels of |dL/d mean2d| in pixels; zero until backward has run; None unless asked.
-        pairs: Gaussian-tile pairs blended.
-        seconds: wall time per stage.
+        depth: (H, W) expected depth along the view axis in world units, 0 where no Gaussian is hit; None unless
+            requested.
+        indices: (n,) indices of the Gaussians that were decoded.
+        visible: (n,) bool, whether each of these touches the image.
+        absgrad: (n, 2) sums over pixels of |dL/d mean2d| in pixels; zero until backward has run; None unless requested.
+        pairs: number of blended tile-Gaussian pairs.
+        seconds: wall time of each stage in seconds.
     """
 
     rgb: Tensor
@@ -105,20 +106,20 @@ def render(
     """Render one view; differentiable in the model's parameters.
 
     Args:
-        model: what to render.
-        camera: from where, in world units.
+        model: the model to render.
+        camera: the camera, in world units.
         settings: accuracy against speed.
-        decoded: `model.decode()`, when the caller keeps it between views: it does not depend on them, so inference
-            makes it once. Nothing is differentiable then.
-        depth: also return depth.
-        absgrad: also collect absolute gradients of the projected centres during backward.
+        decoded: result of `model.decode()`. It does not depend on the view, so that callers who render many views of
+            an unchanged model compute it once. The result is not differentiable then.
+        depth: whether to return depth.
+        absgrad: whether to collect absolute gradients of the projected centres during backward.
         solid: (3,) colour behind everything instead of the model's own; for models without a background sphere.
-        background: False leaves the background sphere out.
+        background: whether to render the background sphere.
 
     Raises:
-        HyrfError: a number that the view needs is NaN or infinite. On a GPU, while gradients are recorded, a
-            background that is not finite passes: see that the loss is finite before you step.
-        TypeError: the model, the camera or the settings are something else.
+        HyrfError: a number that the view needs is NaN or infinite. On a GPU, while gradients are recorded, the
+            background is not checked: check that the loss is finite before an optimiser step.
+        TypeError: the model, the camera or the settings have a wrong type.
 
     Example:
         >>> import hyrfpack
@@ -134,9 +135,9 @@ def render(
     positions = model.gaussians.positions
     pose_here = torch.as_tensor(model.config.frame.local_pose(camera), dtype=positions.dtype)
     on_cpu = positions.device.type == "cpu"
-    _refuse_nonfinite(pose=pose_here)
+    _check_finite(pose=pose_here)
     view = pose_here, camera.intrinsics, camera.width, camera.height
-    how: dict[str, Any] = {
+    options: dict[str, Any] = {
         "near": settings.near,
         "antialiased": model.config.antialiased,
         "transmittance_min": settings.transmittance_min,
@@ -148,14 +149,14 @@ def render(
         geometry = decoded.geometry
         explicit = positions, geometry.quats, geometry.scales, geometry.opacities
         index = torch.arange(len(model), device=positions.device)
-        raster = rasterize_shaded(*explicit, shading, *view, cull_tolerance=settings.cull_tolerance, **how)
+        raster = rasterize_shaded(*explicit, shading, *view, cull_tolerance=settings.cull_tolerance, **options)
     else:
-        with _timed(seconds, "cull"), torch.no_grad():
+        with _record_seconds(seconds, "cull"), torch.no_grad():
             try:
                 index = frustum_cull(positions, *view, settings.near, settings.cull_tolerance)
             except FloatingPointError:
-                raise _nonfinite("positions") from None
-        with _timed(seconds, "decode"):
+                raise _nonfinite_error("positions") from None
+        with _record_seconds(seconds, "decode"):
             geometry = model.decode_geometry(index) if decoded is None else decoded.geometry[index]
             viewpoint = camera_center(pose_here).to(positions.device, non_blocking=positions.is_cuda)
             if shading is None:
@@ -164,11 +165,11 @@ def render(
                 colors = shade(positions, viewpoint, shading, index)
         gradients = positions.new_zeros(len(index), 2) if absgrad else None
         explicit = take_rows(positions, index), geometry.quats, geometry.scales, geometry.opacities
-        raster = rasterize(*explicit, colors, *view, absgrad=gradients, **how)
+        raster = rasterize(*explicit, colors, *view, absgrad=gradients, **options)
     if raster.nonfinite:
-        raise _nonfinite(raster.nonfinite[0])
+        raise _nonfinite_error(raster.nonfinite[0])
     seconds.update(raster.seconds)
-    with _timed(seconds, "background"):
+    with _record_seconds(seconds, "background"):
         if model.config.background and background:
             stride, light = settings.background_stride, raster.transmittance
             behind = model.background_grid(
@@ -178,10 +179,10 @@ def render(
         else:
             behind = tensor_like(model.config.solid, positions) if solid is None else solid
             rgb = raster.rgb + raster.transmittance[..., None] * behind
-        # On a GPU each question waits for the device. There the picture is asked, and where it will be learnt from,
-        # its loss tells as much.
+        # On a GPU each check waits for the device. So only the image is checked there, and in training not even that,
+        # because its loss shows the same.
         if on_cpu or not rgb.requires_grad:
-            _refuse_nonfinite(background=behind if on_cpu else rgb)
+            _check_finite(background=behind if on_cpu else rgb)
     if settings.exposure == AS_PHOTOGRAPHED:
         rgb = apply_exposure_map(model, camera, rgb)
     return Rendering(
@@ -197,7 +198,7 @@ def render(
 
 
 def apply_exposure_map(model: HybridModel, camera: Camera, rgb: Tensor) -> Tensor:
-    """Expose a render of the consistent exposure as `render` does for "as-photographed".
+    """Apply the model's exposure map to a render of the consistent exposure, as `render` does for "as-photographed".
 
     Args:
         model: the model that was rendered.
@@ -205,22 +206,26 @@ def apply_exposure_map(model: HybridModel, camera: Camera, rgb: Tensor) -> Tenso
         rgb: (H, W, 3) in [0, 1], rendered with `RenderSettings(exposure="consistent")`.
 
     Returns:
-        (H, W, 3) in [0, 1]; `rgb` itself where the model has no exposure map. Differentiable in `rgb`.
+        (H, W, 3) in [0, 1]; `rgb` itself if the model has no exposure map. Differentiable in `rgb`.
     """
     if model.exposure is None:
         return rgb
-    gains = model.exposure.gains_of_pose(model.config.frame.local_pose(camera))
-    return expose(rgb, tensor_like(gains.tolist(), rgb))
+    gains = model.exposure.predict_gains(model.config.frame.local_pose(camera))
+    return apply_exposure_gains(rgb, tensor_like(gains.tolist(), rgb))
 
 
-def _refuse_nonfinite(**values: Tensor) -> None:
-    """Raise HyrfError for NaN and infinity: further on they fail every comparison and are left out without a word."""
+def _check_finite(**values: Tensor) -> None:
+    """Raise HyrfError for NaN and infinity.
+
+    Later stages would silently drop such values, because they fail every comparison.
+    """
     for name, tensor in values.items():
         if not all_finite(tensor):
-            raise _nonfinite(name)
+            raise _nonfinite_error(name)
 
 
-def _nonfinite(name: str) -> HyrfError:
+def _nonfinite_error(name: str) -> HyrfError:
+    """Return the error for numbers of a view that are not finite."""
     return HyrfError(
         f"the view's {name} hold NaN or infinity, from a broken model or a pose beyond float32; "
         "train the model again or correct the pose"
@@ -228,7 +233,8 @@ def _nonfinite(name: str) -> HyrfError:
 
 
 @contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+def _record_seconds(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    """Record the wall time of the enclosed block as `seconds[stage]`."""
     start = time.perf_counter()
     yield
     seconds[stage] = time.perf_counter() - start

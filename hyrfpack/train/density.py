@@ -129,9 +129,11 @@ class DensityControl:
         alive[split] = False
         keep = torch.nonzero(alive).squeeze(-1)
         explicit.opacity_logits[cloned] = _dimmed(explicit, geometry, cloned)
-        clones = {name: getattr(explicit, name)[cloned] for name in Gaussians.NAMES}
+        clones = {name: getattr(explicit, name)[cloned] for name in Gaussians.PARAMETER_NAMES}
         children = self._split(step, model, geometry, bounds, split)
-        optimizer.replace_gaussians(keep, {name: torch.cat((clones[name], children[name])) for name in Gaussians.NAMES})
+        optimizer.replace_gaussians(
+            keep, {name: torch.cat((clones[name], children[name])) for name in Gaussians.PARAMETER_NAMES}
+        )
         # What two share is each one's half.
         self.squares[cloned] /= 2
         self.squares = FADING * torch.cat((self.squares[keep], self.squares[cloned], self.squares[split.repeat(2)] / 2))

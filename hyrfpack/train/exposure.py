@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
-from hyrfpack.model.exposure import expose
+from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.model.frame import Frame
 from hyrfpack.ops.adam import adam_step
 from hyrfpack.scene import Camera, Picture, Scene, View
@@ -166,7 +166,7 @@ class Exposures:
 
     def exposed(self, rgb: Tensor, view: View) -> Tensor:
         """A render (H, W, 3) as the view's photo was exposed; differentiable."""
-        return expose(rgb, self.values[self._row[view.name]].exp())
+        return apply_exposure_gains(rgb, self.values[self._row[view.name]].exp())
 
     def fit_map(self, frame: Frame, views: Sequence[View]) -> ExposureFit:
         """Fit the exposure map of the views' gains; `views` as at the start, `frame` that of the model."""

@@ -9,13 +9,13 @@ from itertools import product
 import numpy as np
 
 from hyrfpack.model.exposure import (
-    DIRECTION_CODES,
     MAX_CENTERS,
+    MAX_DIRECTION_CODE,
     MAX_LOG_GAIN,
-    POSITION_CODES,
-    WEIGHT_CODES,
+    MAX_POSITION_CODE,
+    MAX_WEIGHT_CODE,
     ExposureMap,
-    kernel,
+    inverse_quadratic_kernel,
 )
 
 # The kernel's lengths and the ridge that are tried: position in root mean square distances of the cameras from their
@@ -93,8 +93,8 @@ def _without_weights(
         mean=gains.mean(0).astype(np.float32),
         limits=np.stack((gains.min(0), gains.max(0))).astype(np.float32),
         steps=np.ones(3, np.float32),
-        positions=np.rint((positions[centers] - box[0]) / size * POSITION_CODES).clip(0, 255).astype(np.uint8),
-        directions=np.rint(directions[centers] * DIRECTION_CODES).astype(np.int8),
+        positions=np.rint((positions[centers] - box[0]) / size * MAX_POSITION_CODE).clip(0, 255).astype(np.uint8),
+        directions=np.rint(directions[centers] * MAX_DIRECTION_CODE).astype(np.int8),
         weights=np.zeros((len(centers), 3), np.int16),
     )
 
@@ -103,7 +103,7 @@ def choose_centers(features: np.ndarray) -> tuple[list[int], np.ndarray, np.ndar
     """Choose centres by pivoted Cholesky factorisation of the kernel matrix.
 
     Args:
-        features: (N, D) of the cameras, see `hyrfpack.model.exposure.kernel`.
+        features: (N, D) of the cameras, see `hyrfpack.model.exposure.inverse_quadratic_kernel`.
 
     Returns:
         Rows of the centres in the order chosen, M <= 64; F (N, M) with F F^T close to the kernel matrix; and (M,) the
@@ -117,7 +117,9 @@ def choose_centers(features: np.ndarray) -> tuple[list[int], np.ndarray, np.ndar
         row = int(residual.argmax())
         if residual[row] < MIN_CENTER_VARIANCE_RIDGES * RIDGES[0]:
             break
-        column = (kernel(features, features[row : row + 1])[:, 0] - factor @ factor[row]) / np.sqrt(residual[row])
+        column = (inverse_quadratic_kernel(features, features[row : row + 1])[:, 0] - factor @ factor[row]) / np.sqrt(
+            residual[row]
+        )
         factor = np.column_stack((factor, column))
         centers.append(row)
         variances.append(residual[row])
@@ -154,6 +156,6 @@ def _solve(
     mean, weights = solution[0], solution[1:]
     steps = np.full(3, 1.0, np.float32)
     if count:
-        steps = np.maximum(np.abs(weights).max(0) / WEIGHT_CODES, 1e-12).astype(np.float32)
-    codes = np.rint(weights / steps).clip(-WEIGHT_CODES, WEIGHT_CODES).astype(np.int16)
+        steps = np.maximum(np.abs(weights).max(0) / MAX_WEIGHT_CODE, 1e-12).astype(np.float32)
+    codes = np.rint(weights / steps).clip(-MAX_WEIGHT_CODE, MAX_WEIGHT_CODE).astype(np.int16)
     return replace(exposure, mean=mean.astype(np.float32), steps=steps, weights=codes)

@@ -44,7 +44,7 @@ class Optimizer:
         first, second = (beta if views == 1 else max(0.0, 1 - views * (1 - beta)) for beta in BETAS)
         self.betas = first, second
         self.groups: dict[str, list[nn.Parameter]] = {
-            name: [getattr(model.gaussians, name)] for name in Gaussians.NAMES
+            name: [getattr(model.gaussians, name)] for name in Gaussians.PARAMETER_NAMES
         }
         self.groups["fields"] = [*model.geometry.parameters(), *model.radiance.parameters()]
         self._states: dict[nn.Parameter, _State] = {}
@@ -94,7 +94,7 @@ class Optimizer:
                 lambda moment: torch.cat((moment[keep], torch.zeros_like(rows))),
             )
 
-        for name in Gaussians.NAMES:
+        for name in Gaussians.PARAMETER_NAMES:
             edit(name, new[name])
 
     def reset(self, name: str, values: Tensor) -> None:

@@ -32,7 +32,7 @@ class Strategy(Protocol):
         ...     def act(self, step, model, optimizer):
         ...         if step % 100 == 0:
         ...             keep = (model.decode_geometry().opacities >= 0.01).nonzero().squeeze(1)
-        ...             nothing = {name: getattr(model.gaussians, name)[:0] for name in model.gaussians.NAMES}
+        ...             nothing = {name: getattr(model.gaussians, name)[:0] for name in model.gaussians.PARAMETER_NAMES}
         ...             optimizer.replace_gaussians(keep, nothing)
         ...     def state_dict(self):
         ...         return {}

@@ -331,7 +331,7 @@ class Trainer:
 
     def _restore(self, tensors: dict[str, Tensor]) -> None:
         """The inverse of `_tensors`."""
-        explicit = [tensors[f"model.gaussians.{name}"] for name in Gaussians.NAMES]
+        explicit = [tensors[f"model.gaussians.{name}"] for name in Gaussians.PARAMETER_NAMES]
         model = HybridModel(self.model.config, Gaussians(*explicit))
         model.load_state_dict(_under("model.", tensors))
         model.exposure = self.model.exposure

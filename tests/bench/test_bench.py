@@ -22,7 +22,7 @@ from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.paper import PaperSettings
 from hyrfpack.measure import timing
-from hyrfpack.model import HybridModel, calls
+from hyrfpack.model import HybridModel, operation_calls
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.rasterize import rasterize
@@ -237,7 +237,7 @@ def test_a_new_profile_appears_by_itself_and_may_reorder_gaussians(monkeypatch):
         order = torch.from_numpy(np.random.default_rng(0).permutation(len(model)))
         other = model_of()
         other.load_state_dict(model.state_dict())
-        for name in other.gaussians.NAMES:
+        for name in other.gaussians.PARAMETER_NAMES:
             getattr(other.gaussians, name).data = getattr(model.gaussians, name)[order]
         return PROFILES["raw"](other)
 
@@ -279,7 +279,7 @@ def test_a_result_that_is_not_finite_stops_the_measurement():
 
 @pytest.mark.parametrize(
     ("measure", "module", "operation"),
-    [(hash_encode_rows, calls, "hash_encode"), (render_rows, rendering, "render")],
+    [(hash_encode_rows, operation_calls, "hash_encode"), (render_rows, rendering, "render")],
 )
 def test_time_to_compile_kernels_is_nobodys_time(monkeypatch, measure, module, operation):
     now, compiled, run = [0.0], [], getattr(module, operation)

@@ -82,7 +82,7 @@ def test_one_thread_and_two_write_the_same_bytes_again_and_again(layered, monkey
 def test_gaussians_in_another_order_give_the_same_file():
     model, other = a_model(), a_model()
     order = np.random.default_rng(1).permutation(COUNT)
-    for name in other.gaussians.NAMES:
+    for name in other.gaussians.PARAMETER_NAMES:
         getattr(other.gaussians, name).data = getattr(model.gaussians, name).data[order]
     quantized = drawn(model, prune=False)
     moved = dataclasses.replace(quantized.plan, kept=np.argsort(order)[quantized.plan.kept])

@@ -14,7 +14,7 @@ from hyrfpack.evaluate import evaluate
 from hyrfpack.evaluate.exposure import corrected, fitted_gains
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR, psnr, ssim, to_8bit
 from hyrfpack.model import HybridModel
-from hyrfpack.model.exposure import expose
+from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Picture, View
 
@@ -27,7 +27,7 @@ def a_picture(height: int = 40, width: int = 30, seed: int = 0) -> torch.Tensor:
 
 def test_gains_are_found_beside_things_the_render_has_wrong_and_pixels_that_are_clipped():
     image = a_picture()
-    photo = expose(image, torch.from_numpy(GAINS).float())
+    photo = apply_exposure_gains(image, torch.from_numpy(GAINS).float())
     photo[:8] = a_picture(8, 30, seed=1)  # a fifth of the picture shows something else
     photo[8:12] *= 9
 
@@ -37,7 +37,7 @@ def test_gains_are_found_beside_things_the_render_has_wrong_and_pixels_that_are_
 def test_masked_pixels_have_no_part_in_gains_and_corrections():
     image, mask = a_picture(), torch.zeros(40, 30, dtype=torch.bool)
     mask[10:30] = True
-    photo = torch.where(mask[..., None], expose(image, torch.full((3,), 0.6)), 1.0 - image)
+    photo = torch.where(mask[..., None], apply_exposure_gains(image, torch.full((3,), 0.6)), 1.0 - image)
 
     np.testing.assert_allclose(fitted_gains(image, photo, mask), 0.6, rtol=1e-4)
     assert psnr(corrected(image, photo, mask), to_8bit(photo), mask) > 35
@@ -106,7 +106,7 @@ def test_psnr_is_of_renders_as_photographed_and_psnr_consistent_of_those_at_one_
     for view, score in zip(views, scores.views, strict=True):
         photo = view.load().rgb / 255
         image = render(plain, view.camera).rgb.detach()
-        gains = mapped.exposure.gains_of_pose(plain.config.frame.local_pose(view.camera))
+        gains = mapped.exposure.predict_gains(plain.config.frame.local_pose(view.camera))
         assert np.abs(np.log(gains)).max() > 0.1
         for told, drawn in ((score.psnr, gains), (score.psnr_consistent, np.ones(3))):
             expected = -10 * np.log10(np.mean((exposed_by_formula(image, drawn) - photo) ** 2))
@@ -135,7 +135,7 @@ def test_a_map_of_the_photos_gains_scores_what_the_model_without_it_scores_on_un
     unexposed, exposed = [], []
     for number, camera in enumerate(cameras):
         image = render(plain, camera).rgb.detach()
-        gains = mapped.exposure.gains_of_pose(plain.config.frame.local_pose(camera))
+        gains = mapped.exposure.predict_gains(plain.config.frame.local_pose(camera))
         for views, by in ((unexposed, np.ones(3)), (exposed, gains)):
             pixels = (255 * exposed_by_formula(image, by)).round().astype(np.uint8)
             views.append(View(str(number), camera, lambda pixels=pixels: Picture(pixels)))

@@ -50,7 +50,7 @@ def map_over(places, log_gains, spread=0.05) -> ExposureMap:
 
 
 def gains_at(model, camera) -> np.ndarray:
-    return model.exposure.gains_of_pose(model.config.frame.local_pose(camera))
+    return model.exposure.predict_gains(model.config.frame.local_pose(camera))
 
 
 def half_bright(positions=None, **options):

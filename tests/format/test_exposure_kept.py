@@ -73,7 +73,7 @@ def damaged(data: bytes) -> bytes:
 
 def test_a_copy_of_a_model_has_a_map_of_its_own():
     model = exposed_model()
-    model.exposure.log_gains(np.zeros(3), np.array([0.0, 0.0, 1.0]))  # which it keeps something of
+    model.exposure.predict_log_gains(np.zeros(3), np.array([0.0, 0.0, 1.0]))  # which it keeps something of
     copied = copy.deepcopy(model)
 
     assert same_map(copied.exposure, EXPOSURE) and copied.exposure is not model.exposure

@@ -65,7 +65,7 @@ def assert_same_gains(read: minimal_reader.Exposure, exposure: ExposureMap) -> N
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     gains = [minimal_reader.log_gains(read, *view) for view in zip(positions, directions, strict=True)]
 
-    np.testing.assert_allclose(exposure.log_gains(positions, directions), gains, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(exposure.predict_log_gains(positions, directions), gains, rtol=1e-12, atol=1e-12)
 
 
 def test_minimal_reader_is_independent():

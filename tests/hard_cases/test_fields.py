@@ -244,7 +244,7 @@ def test_decoded_numbers_and_gradients_of_hard_places_and_logits_keep_to_float64
         values = [geometry.scales / bound, geometry.quats, geometry.opacities,
                   model.decode_colors(torch.tensor([0.0, 0.0, 0.0], dtype=dtype))]  # fmt: skip
         sum(value.sum() for value in values).backward()
-        return values, [getattr(model.gaussians, name).grad for name in model.gaussians.NAMES]
+        return values, [getattr(model.gaussians, name).grad for name in model.gaussians.PARAMETER_NAMES]
 
     expected, expected_gradients = run(torch.float64)
     values, gradients = run(torch.float32)

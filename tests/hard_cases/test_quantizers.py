@@ -21,7 +21,7 @@ from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.compact.groups import MAX_ABS_SYMBOL as LARGEST_SYMBOL
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.model import HashGridConfig, HybridModel
-from hyrfpack.model.hash_grid import FEATURES
+from hyrfpack.model.hash_grid import FEATURES_PER_LEVEL
 from hyrfpack.quant import (
     HuffmanCode,
     HuffmanStream,
@@ -83,10 +83,12 @@ def test_the_largest_table_that_a_file_may_hold_needs_no_longer_codes_than_the_c
         with pytest.raises(ValueError, match="must lie in"):
             dataclasses.replace(grid, **past)
 
-    longest = max(length for length in range(1, 90) if fibonacci(length + 2)[-1] - 1 <= grid.rows * FEATURES)
+    longest = max(length for length in range(1, 90) if fibonacci(length + 2)[-1] - 1 <= grid.rows * FEATURES_PER_LEVEL)
 
     assert longest == 42 < MAX_CODE_BITS
-    assert fibonacci(MAX_CODE_BITS + 3)[-1] - 1 > 1000 * grid.rows * FEATURES  # what a bit past the codec's would take
+    assert (
+        fibonacci(MAX_CODE_BITS + 3)[-1] - 1 > 1000 * grid.rows * FEATURES_PER_LEVEL
+    )  # what a bit past the codec's would take
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])

@@ -81,7 +81,7 @@ def _render(model: HybridModel, camera: Camera) -> tuple[Rendering, dict[str, Te
     rendering = render(model, camera, EXACT, depth=True)
     weights = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
     (rendering.rgb * weights.to(rendering.rgb.dtype)).sum().backward()
-    parts = {name: [getattr(model.gaussians, name)] for name in Gaussians.NAMES}
+    parts = {name: [getattr(model.gaussians, name)] for name in Gaussians.PARAMETER_NAMES}
     parts |= {"geometry": list(model.geometry.parameters()), "radiance": list(model.radiance.parameters())}
     grads = {name: torch.cat([p.grad.double().flatten() for p in ps]) for name, ps in parts.items()}
     return rendering, grads

@@ -31,7 +31,7 @@ def test_by_default_grids_rise_from_8_to_512_vertices_and_directions_have_24_inp
     assert len(grid.resolutions) == 16 and (grid.resolutions[0], grid.resolutions[-1]) == (8, 512)
     assert np.abs(ratios - 64 ** (1 / 15)).max() < 1 / 8  # geometric, up to whole vertices
     config = ModelConfig(CONFIG.frame, geometry=grid, radiance=grid)
-    nothing = Gaussians(*(torch.zeros(0, width) for width in Gaussians.WIDTHS))
+    nothing = Gaussians(*(torch.zeros(0, width) for width in Gaussians.PARAMETER_WIDTHS))
     model = HybridModel(config, nothing)
     assert model.radiance.weights[0].shape == (64, 16 * 2 + 24)
 

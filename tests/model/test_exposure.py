@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scenes import ball_points, ball_scene, small_model
 
 from hyrfpack.choices import CONSISTENT_EXPOSURE
-from hyrfpack.model.exposure import MAX_CENTERS, ExposureMap, expose
+from hyrfpack.model.exposure import MAX_CENTERS, ExposureMap, apply_exposure_gains
 from hyrfpack.render import RenderSettings, render
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -39,7 +39,7 @@ def test_gains_follow_the_documented_sum(seed):
             apart += np.sum((direction - f / 127) ** 2) / float(exposure.lengths[1]) ** 2
             expected = expected + w * exposure.steps.astype(float) / (1 + apart)
         expected = np.minimum(np.maximum(expected, exposure.limits[0]), exposure.limits[1])
-        np.testing.assert_allclose(exposure.log_gains(position, direction), expected, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(exposure.predict_log_gains(position, direction), expected, rtol=1e-5, atol=1e-6)
 
 
 @given(SEEDS)
@@ -50,11 +50,11 @@ def test_exposure_changes_no_faster_than_its_bound(seed):
     rng = np.random.default_rng(seed)
     moved = positions + rng.normal(size=positions.shape) * 10.0 ** rng.uniform(-5, 1, (len(positions), 1))
     turned = unit(directions + rng.normal(size=positions.shape) * 10.0 ** rng.uniform(-5, 0, (len(positions), 1)))
-    here = exposure.log_gains(positions, directions)
+    here = exposure.predict_log_gains(positions, directions)
 
-    change = np.abs(exposure.log_gains(moved, directions) - here).max(1)
+    change = np.abs(exposure.predict_log_gains(moved, directions) - here).max(1)
     assert (change <= per_unit * np.linalg.norm(moved - positions, axis=1) + 1e-9).all()
-    change = np.abs(exposure.log_gains(positions, turned) - here).max(1)
+    change = np.abs(exposure.predict_log_gains(positions, turned) - here).max(1)
     angle = 2 * np.arcsin(np.minimum(np.linalg.norm(turned - directions, axis=1) / 2, 1))
     assert (change <= per_radian * angle + 1e-9).all()
 
@@ -65,7 +65,9 @@ def test_far_from_the_cameras_the_exposure_is_that_of_the_nearest_viewpoint_amon
     positions, directions = viewpoints(seed)
     nearest = np.clip(positions * 1e6, *exposure.box.astype(float))
     np.testing.assert_allclose(
-        exposure.log_gains(positions * 1e6, directions), exposure.log_gains(nearest, directions), atol=1e-9
+        exposure.predict_log_gains(positions * 1e6, directions),
+        exposure.predict_log_gains(nearest, directions),
+        atol=1e-9,
     )
 
 
@@ -105,7 +107,7 @@ def test_render_applies_the_map_unless_one_exposure_is_asked_for():
     model.exposure = constant_map([0.5, 0.0, -0.25])
 
     gains = torch.tensor([0.5, 0.0, -0.25]).exp()
-    torch.testing.assert_close(render(model, camera).rgb, expose(plain, gains))
+    torch.testing.assert_close(render(model, camera).rgb, apply_exposure_gains(plain, gains))
     torch.testing.assert_close(
         render(model, camera, RenderSettings(exposure=CONSISTENT_EXPOSURE)).rgb, plain, rtol=0, atol=0
     )

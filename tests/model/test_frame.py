@@ -7,7 +7,7 @@ from scenes import camera_at, look_at
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.model import Frame
-from hyrfpack.model.frame import THINNEST_AXIS
+from hyrfpack.model.frame import MIN_HALF_EXTENT
 from hyrfpack.scene import Camera
 
 
@@ -90,7 +90,7 @@ def test_from_box_puts_the_corners_at_the_half_extent():
 
 def test_from_box_widens_flat_axes():
     frame = Frame.from_box(np.array([0.0, 5, -8]), np.array([0.0, 5, 8]))  # a row of cameras
-    assert frame.scale == 8 and frame.half_extent == (THINNEST_AXIS, THINNEST_AXIS, 1.0)
+    assert frame.scale == 8 and frame.half_extent == (MIN_HALF_EXTENT, MIN_HALF_EXTENT, 1.0)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

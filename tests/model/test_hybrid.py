@@ -271,4 +271,6 @@ def test_position_gradients_attach_the_fields(scale_rule):
 def test_gaussian_rows_are_the_models_length():
     model = random_model()
     assert len(model) == len(model.gaussians) == 40
-    assert [getattr(model.gaussians, name).shape[1] for name in Gaussians.NAMES] == list(Gaussians.WIDTHS)
+    assert [getattr(model.gaussians, name).shape[1] for name in Gaussians.PARAMETER_NAMES] == list(
+        Gaussians.PARAMETER_WIDTHS
+    )

@@ -12,7 +12,7 @@ from scenes import ball_points, ring, small_model
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.render import render
-from hyrfpack.render.files import file_names, render_files, save_picture
+from hyrfpack.render.files import render_files, save_picture, unique_stems
 from hyrfpack.render.video import write_video
 
 
@@ -29,7 +29,7 @@ from hyrfpack.render.video import write_video
     ],
 )
 def test_pictures_are_named_after_photos_and_stay_in_the_folder(names, files):
-    assert file_names(names) == files
+    assert unique_stems(names) == files
 
 
 def test_rendered_files_hold_the_rounded_render_and_exact_depth(tmp_path):

@@ -376,7 +376,7 @@ def test_gradients_reach_every_parameter(background):
 
 
 @pytest.mark.parametrize("stride", [1, 2, 3])
-@pytest.mark.parametrize("part", [*Gaussians.NAMES, "geometry", "radiance"])
+@pytest.mark.parametrize("part", [*Gaussians.PARAMETER_NAMES, "geometry", "radiance"])
 def test_gradients_match_finite_differences_through_the_whole_chain(part, stride):
     """In float64, fields attached to positions, along one random direction of each parameter group."""
     model = ball_model(12, background=True, position_gradients=True, scale_logits=-1.8).double()

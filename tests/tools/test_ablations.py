@@ -21,13 +21,13 @@ from tools.studies import ablation_models, ablations
 DENSITY = DensityConfig(start=0.05, stop=0.7, rounds=5, gradient=1e-6)
 SHORT = TrainConfig(steps=24, seed=3, max_gaussians=160, density=DENSITY)
 VARIANTS = {variant.name: variant for variant in ablation_models.TRAINED}
-EVERYTHING = {*Gaussians.NAMES, "geometry", "radiance"}
+EVERYTHING = {*Gaussians.PARAMETER_NAMES, "geometry", "radiance"}
 KEEPS = {
     "full": EVERYTHING,
     "single field": EVERYTHING - {"geometry"},  # the radiance field, doubled, is the one
     "no explicit properties": {"positions", "geometry", "radiance"},
-    "no neural fields": set(Gaussians.NAMES),
-    "no neural Gaussians, sphere kept": {*Gaussians.NAMES, "radiance"},
+    "no neural fields": set(Gaussians.PARAMETER_NAMES),
+    "no neural Gaussians, sphere kept": {*Gaussians.PARAMETER_NAMES, "radiance"},
     "no background sphere": EVERYTHING,
     "no explicit colour": EVERYTHING - {"color_logits"},
     "no explicit scale": EVERYTHING - {"scale_logits"},

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from hyrfpack.errors import HyrfError, needs_package
-from hyrfpack.model.calls import Call
+from hyrfpack.model.operation_calls import OperationCall
 from hyrfpack.ops.dispatch import has_triton
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.rasterize.reference import project
@@ -200,15 +200,15 @@ def test_errors_beyond_their_bounds_fail_a_row() -> None:
     def double(implementation: str, x: torch.Tensor) -> torch.Tensor:
         return x * (2.0 if implementation == "reference" else 2.001)
 
-    call = Call(double, {"x": torch.linspace(1, 2, 5)}, ("x",), (1e-2, 1e-4))
+    call = OperationCall(double, {"x": torch.linspace(1, 2, 5)}, ("x",), (1e-2, 1e-4))
     row = checked(call, "gpu")
     assert row["value error"] == pytest.approx(5e-4, rel=1e-2)
     assert row["status"] == "failed" and "beyond 1e-04" in row["note"]
 
 
 def test_numbers_that_are_not_finite_fail_a_row() -> None:
-    call = Call(lambda implementation, x: x if implementation == "reference" else x * float("nan"), {}, ())
-    call = Call(call.run, {"x": torch.ones(3)}, ("x",))
+    call = OperationCall(lambda implementation, x: x if implementation == "reference" else x * float("nan"), {}, ())
+    call = OperationCall(call.run, {"x": torch.ones(3)}, ("x",))
     assert checked(call, "gpu")["status"] == "failed"
 
 

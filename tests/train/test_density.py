@@ -34,7 +34,7 @@ def set_up(count: int = 20, *, budget: int = 1000, config=CONFIG, seed: int = 0,
 
 
 def copied(model) -> dict[str, torch.Tensor]:
-    return {name: getattr(model.gaussians, name).detach().clone() for name in Gaussians.NAMES}
+    return {name: getattr(model.gaussians, name).detach().clone() for name in Gaussians.PARAMETER_NAMES}
 
 
 def halved(logits: torch.Tensor | float) -> torch.Tensor:

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import camera_at, ring
 
-from hyrfpack.model.exposure import MAX_CENTERS, kernel
+from hyrfpack.model.exposure import MAX_CENTERS, inverse_quadratic_kernel
 from hyrfpack.train.exposure_map import (
     MAX_SLOPE_PER_DEGREE,
     MAX_SLOPE_PER_RADIUS,
@@ -21,7 +21,7 @@ def poses_of(cameras) -> list[np.ndarray]:
 
 
 def gains_at(cameras, fit) -> np.ndarray:
-    return np.array([np.log(fit.map.gains_of_pose(camera.camera_from_world)) for camera in cameras])
+    return np.array([np.log(fit.map.predict_gains(camera.camera_from_world)) for camera in cameras])
 
 
 def sunny_side(cameras) -> np.ndarray:
@@ -88,14 +88,14 @@ def test_a_map_never_changes_faster_than_allowed_nor_leaves_the_range_of_the_pho
     assert per_unit * radius <= MAX_SLOPE_PER_RADIUS * 1.001
     assert np.radians(per_radian) <= MAX_SLOPE_PER_DEGREE * 1.001
     assert len(exposure.positions) <= MAX_CENTERS
-    predicted = exposure.log_gains(rng.normal(size=(100, 3)) * 10, rng.normal(size=(100, 3)))
+    predicted = exposure.predict_log_gains(rng.normal(size=(100, 3)) * 10, rng.normal(size=(100, 3)))
     assert (predicted >= gains.min(0) - 1e-5).all() and (predicted <= gains.max(0) + 1e-5).all()
 
 
 def test_the_leave_one_out_error_is_that_of_fits_without_each_photo():
     rng = np.random.default_rng(5)
     features, gains, ridge = rng.normal(size=(15, 6)), rng.normal(size=(15, 3)), 0.1
-    factor = np.linalg.cholesky(kernel(features, features) + 1e-12 * np.eye(15))
+    factor = np.linalg.cholesky(inverse_quadratic_kernel(features, features) + 1e-12 * np.eye(15))
 
     errors = []
     for left in range(15):
@@ -109,7 +109,7 @@ def test_the_leave_one_out_error_is_that_of_fits_without_each_photo():
 
 def test_centres_reproduce_the_kernel_matrix():
     features = np.random.default_rng(1).normal(size=(50, 3))
-    gram = kernel(features, features)
+    gram = inverse_quadratic_kernel(features, features)
     centers, factor, variances = choose_centers(features)
     assert (np.diff(variances) <= 1e-12).all()
     assert len(set(centers)) == len(centers) <= 50

@@ -39,7 +39,7 @@ PACES = [(20, 30**0.5), (1000, 30**0.5), (7500, 2.0), (30_000, 1.0), (100_000, 1
 
 
 @pytest.mark.parametrize(("steps", "pace"), PACES)
-@pytest.mark.parametrize("name", [*Gaussians.NAMES, "fields"])
+@pytest.mark.parametrize("name", [*Gaussians.PARAMETER_NAMES, "fields"])
 def test_rates_fall_evenly_in_their_logarithm_and_are_higher_in_short_runs(name, steps, pace):
     first, last = getattr(RATES, name)
     assert RATES.at(name, 0, steps) == pytest.approx(pace * first, rel=1e-12)
@@ -50,7 +50,7 @@ def test_rates_fall_evenly_in_their_logarithm_and_are_higher_in_short_runs(name,
 @pytest.mark.parametrize("views", [2, 4, 16])
 @pytest.mark.parametrize("seen", [200, 3000, 30_000])
 def test_steps_of_several_views_are_as_much_larger_as_the_root_of_their_number(views, seen):
-    for name in (*Gaussians.NAMES, "fields"):
+    for name in (*Gaussians.PARAMETER_NAMES, "fields"):
         for share in (0, 0.25, 1):
             alone, together = (
                 RATES.at(name, share * seen, seen),
@@ -70,7 +70,7 @@ def test_running_means_cover_as_many_views_whatever_a_step_has_of_them(views, be
     for step in range(3):
         for group, name in zip(adam.param_groups, plain, strict=True):
             kind = name.removeprefix("gaussians.")
-            group["lr"] = RATES.at(kind if kind in Gaussians.NAMES else "fields", step, 20, views)
+            group["lr"] = RATES.at(kind if kind in Gaussians.PARAMETER_NAMES else "fields", step, 20, views)
         set_gradients(model, step)
         for name, parameter in model.named_parameters():
             plain[name].grad = parameter.grad.clone()
@@ -82,7 +82,7 @@ def test_running_means_cover_as_many_views_whatever_a_step_has_of_them(views, be
 
 def test_rates_fall_tenfold_or_more_by_default():
     rates = LearningRates()
-    for name in (*Gaussians.NAMES, "fields"):
+    for name in (*Gaussians.PARAMETER_NAMES, "fields"):
         assert rates.at(name, 0, 30_000) >= 9.99 * rates.at(name, 30_000, 30_000) > 0
 
 
@@ -123,15 +123,18 @@ def test_replacing_keeps_rows_and_moments_and_starts_new_ones_at_zero():
     model = a_model()
     optimizer = Optimizer(model, RATES)
     taken(model, optimizer, range(3))
-    values = {name: getattr(model.gaussians, name).detach().clone() for name in Gaussians.NAMES}
+    values = {name: getattr(model.gaussians, name).detach().clone() for name in Gaussians.PARAMETER_NAMES}
     moments = {key: value.clone() for key, value in optimizer.state_dict().items()}
     keep = torch.tensor([4, 0, 2])
-    new = {name: torch.full((2, width), 7.0) for name, width in zip(Gaussians.NAMES, Gaussians.WIDTHS, strict=True)}
+    new = {
+        name: torch.full((2, width), 7.0)
+        for name, width in zip(Gaussians.PARAMETER_NAMES, Gaussians.PARAMETER_WIDTHS, strict=True)
+    }
 
     optimizer.replace_gaussians(keep, new)
 
     after = optimizer.state_dict()
-    for name in Gaussians.NAMES:
+    for name in Gaussians.PARAMETER_NAMES:
         assert torch.equal(getattr(model.gaussians, name), torch.cat([values[name][keep], new[name]]))
         for moment in ("exp_avg", "exp_avg_sq"):
             kept = moments[f"{name}.0.{moment}"][keep]
@@ -147,7 +150,10 @@ def test_kept_rows_go_on_as_if_nothing_happened():
     for model, optimizer in zip((edited, alone), optimizers, strict=True):
         taken(model, optimizer, range(3))
     keep = torch.tensor([1, 5])
-    nothing = {name: torch.zeros(0, width) for name, width in zip(Gaussians.NAMES, Gaussians.WIDTHS, strict=True)}
+    nothing = {
+        name: torch.zeros(0, width)
+        for name, width in zip(Gaussians.PARAMETER_NAMES, Gaussians.PARAMETER_WIDTHS, strict=True)
+    }
 
     optimizers[0].replace_gaussians(keep, nothing)
     set_gradients(alone, 99)
@@ -163,7 +169,10 @@ def test_kept_rows_go_on_as_if_nothing_happened():
 def test_replacing_before_the_first_step_works():
     model = a_model()
     optimizer = Optimizer(model, RATES)
-    new = {name: torch.zeros(3, width) for name, width in zip(Gaussians.NAMES, Gaussians.WIDTHS, strict=True)}
+    new = {
+        name: torch.zeros(3, width)
+        for name, width in zip(Gaussians.PARAMETER_NAMES, Gaussians.PARAMETER_WIDTHS, strict=True)
+    }
     optimizer.replace_gaussians(torch.arange(6), new)
     taken(model, optimizer, range(2))
     assert len(model) == 9 and optimizer.state_dict()["positions.0.exp_avg"].shape == (9, 3)
@@ -214,7 +223,7 @@ def test_a_state_of_no_steps_goes_on_too():
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-@pytest.mark.parametrize("group", [*Gaussians.NAMES, "fields"])
+@pytest.mark.parametrize("group", [*Gaussians.PARAMETER_NAMES, "fields"])
 def test_the_group_with_a_broken_gradient_is_named(bad, group):
     model = a_model()
     set_gradients(model, 0)

@@ -15,7 +15,7 @@ from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.evaluate import Evaluation, ViewScore
 from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
-from hyrfpack.model.exposure import expose
+from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.scene import Scene, View
 from hyrfpack.train import TrainConfig, budget_pilots, decisions, exposure_pilots, pilots, train
 from hyrfpack.train.budget_pilots import FACTORS, measure_budget
@@ -246,7 +246,7 @@ def relit(scene: Scene, stops: list[float]) -> Scene:
 
     def exposed(view: View, gain: float) -> View:
         picture = view.load()
-        rgb = expose(torch.from_numpy(picture.rgb).double() / 255, torch.full((3,), gain).double())
+        rgb = apply_exposure_gains(torch.from_numpy(picture.rgb).double() / 255, torch.full((3,), gain).double())
         lit = dataclasses.replace(picture, rgb=(rgb * 255).round().byte().numpy())
         return dataclasses.replace(view, load=lambda: lit)
 

@@ -43,7 +43,8 @@ class LeastSeen:
         if step % 4 == 0:
             keep = torch.arange(len(model)) != self.sums.argmin()
             optimizer.replace_gaussians(
-                keep.nonzero().squeeze(1), {name: getattr(model.gaussians, name)[:0] for name in Gaussians.NAMES}
+                keep.nonzero().squeeze(1),
+                {name: getattr(model.gaussians, name)[:0] for name in Gaussians.PARAMETER_NAMES},
             )
             self.sums = self.sums[keep]
 

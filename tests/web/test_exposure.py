@@ -123,7 +123,7 @@ def test_gains_are_those_of_the_viewpoint_of_the_window_and_follow_it(browser: B
         browser.drag((120, 90), end)
         pose = model.config.frame.local_pose(eye(browser))
         gains = browser.evaluate("hyrfpack.player.gains(hyrfpack.player.view())")
-        np.testing.assert_allclose(gains, model.exposure.gains_of_pose(pose), rtol=1e-9)
+        np.testing.assert_allclose(gains, model.exposure.predict_gains(pose), rtol=1e-9)
         seen.append(gains)
     assert np.ptp(seen, axis=0).max() > 0.05
 
@@ -178,7 +178,7 @@ def test_saved_pictures_and_the_window_have_the_chosen_exposure(browser: Browser
 def test_fitted_harmonics_of_weak_devices_are_exposed_too(browser: Browser, tmp_path: Path):
     model = mapped(400)
     with torch.no_grad():  # colours that degree 3 can hold
-        model.radiance.weights[0][:, model.radiance.grid.features :] *= 0.1
+        model.radiance.weights[0][:, model.radiance.grid.feature_count :] *= 0.1
     loaded(browser, tmp_path, page_of(model).replace(b'{"kind": "hyrf"', b'{"plain": true, "kind": "hyrf"'))
     assert browser.evaluate("Boolean(hyrfpack.player.renderer.content.harmonics)")
     for exposure in RENDER_EXPOSURES:
@@ -217,7 +217,7 @@ def test_the_first_layer_of_a_file_is_shown_with_its_map(browser: Browser, tmp_p
     (count, gains), *_ = browser.evaluate("seen")
     pose = model.config.frame.local_pose(eye(browser))
     assert count < 14000
-    np.testing.assert_allclose(gains, model.exposure.gains_of_pose(pose), rtol=1e-9)
+    np.testing.assert_allclose(gains, model.exposure.predict_gains(pose), rtol=1e-9)
 
 
 # ---- the control

@@ -55,7 +55,7 @@ def made_up(count: int = 2600, seed: int = 0, **config: object) -> HybridModel:
             for bias in field.biases:
                 bias.copy_(normal(*bias.shape) * 0.3)
         # The background is seen along directions from the middle; models that are not made up hardly tell them apart.
-        model.radiance.weights[0][:, model.radiance.grid.features :] *= 0.5
+        model.radiance.weights[0][:, model.radiance.grid.feature_count :] *= 0.5
     return model
 
 
@@ -286,7 +286,7 @@ def test_a_weak_device_draws_fitted_harmonics(browser: Browser, tmp_path: Path, 
     wide = {"radiance": replace(SIXTEEN, log2_table_size=15)} if script == NO_TEXELS else {}  # more than 128 rows
     model = made_up(400, **wide)
     with torch.no_grad():  # colours that degree 3 can hold
-        model.radiance.weights[0][:, model.radiance.grid.features :] *= 0.1
+        model.radiance.weights[0][:, model.radiance.grid.feature_count :] *= 0.1
     page_bytes = page_of(model)
     if not script:
         page_bytes = page_bytes.replace(b'{"kind": "hyrf"', b'{"plain": true, "kind": "hyrf"')

@@ -114,7 +114,9 @@ def test_a_snapshot_brings_the_exposure_map_and_its_control(browser: Browser):
         camera = eye(settled(browser))
         assert browser.evaluate(control)
         gains = browser.evaluate("hyrfpack.player.gains(hyrfpack.player.view())")
-        np.testing.assert_allclose(gains, np.exp(exposure.log_gains(camera.position, camera.forward)), rtol=1e-9)
+        np.testing.assert_allclose(
+            gains, np.exp(exposure.predict_log_gains(camera.position, camera.forward)), rtol=1e-9
+        )
         training.show(snapshot(40), 3)
         until(browser, f"{COUNT} === 40")
         assert not browser.evaluate(control)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from hyrfpack.measure.error import measure_relative_error
 from hyrfpack.measure.timing import time_alternately
-from hyrfpack.model.calls import Call, hash_encode_call, mlp_call
+from hyrfpack.model.operation_calls import OperationCall, hash_encode_call, mlp_call
 from hyrfpack.ops.hash_encode import level_offsets, level_resolutions
 
 REPEATS = 5
@@ -15,7 +15,7 @@ HASH_SIZES = ((50_000, 12), (50_000, 14), (50_000, 17), (200_000, 18))  # points
 MLP_SIZES = ((50_000, 0.0), (50_000, 0.3), (10_000, 0.3))  # rows, share of them without a gradient
 
 
-def hash_of(points: int, log2_table_size: int) -> tuple[Call, Tensor]:
+def hash_of(points: int, log2_table_size: int) -> tuple[OperationCall, Tensor]:
     """16 levels from 64 to 1024, and the gradient of their features, by columns as `mlp` hands it on."""
     random = torch.Generator().manual_seed(0)
     resolutions = level_resolutions(16, 64, 1024)
@@ -24,7 +24,7 @@ def hash_of(points: int, log2_table_size: int) -> tuple[Call, Tensor]:
     return hash_encode_call(coords, table, resolutions, log2_table_size), torch.randn(32, points, generator=random).T
 
 
-def mlp_of(rows: int, idle: float) -> tuple[Call, Tensor]:
+def mlp_of(rows: int, idle: float) -> tuple[OperationCall, Tensor]:
     """Layers 32-64-64-8, and the gradient of their outputs."""
     random = torch.Generator().manual_seed(0)
     widths = (32, 64, 64, 8)
@@ -35,10 +35,10 @@ def mlp_of(rows: int, idle: float) -> tuple[Call, Tensor]:
     return mlp_call(x, weights, list(map(torch.zeros, widths[1:]))), upstream
 
 
-def compare(call: Call, upstream: Tensor, items: int) -> list[dict]:
+def compare(call: OperationCall, upstream: Tensor, items: int) -> list[dict]:
     """One row for the forward pass and one for the backward; the error is against float64, over its largest value."""
-    ours, reference = (call.passes(who, upstream=upstream) for who in ("cpu", "reference"))
-    exact = call.passes("reference", torch.float64, upstream=upstream)
+    ours, reference = (call.separate_tasks(who, upstream=upstream) for who in ("cpu", "reference"))
+    exact = call.separate_tasks("reference", torch.float64, upstream=upstream)
     rows = []
     for way, task, slow, right in zip(("forward", "backward"), ours, reference, exact, strict=True):
         times, _ = time_alternately({"cpu": task, "reference": slow}, REPEATS)

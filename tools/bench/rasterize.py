@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.measure.error import largest_error, measure_error, measure_relative_error
-from hyrfpack.model.calls import cotangent, rasterize_call
+from hyrfpack.model.operation_calls import random_cotangent, rasterize_call
 from hyrfpack.ops.rasterize import SHAPES, rasterize
 from hyrfpack.parallel.pool import thread_count
 
@@ -48,7 +48,7 @@ def run(inputs: dict[str, Tensor], camera: tuple, implementation: str) -> dict[s
     leaves = [tensor.detach().clone().requires_grad_() for tensor in inputs.values()]
     absgrad = torch.zeros(len(leaves[0]), 2)
     width, height = camera[2:]
-    upstream = cotangent(torch.empty(height, width, 3)), cotangent(torch.empty(height, width))
+    upstream = random_cotangent(torch.empty(height, width, 3)), random_cotangent(torch.empty(height, width))
     started, work = perf_counter(), process_time()
     picture = rasterize(*leaves, *camera, absgrad=absgrad, implementation=implementation)
     between, work_between = perf_counter(), process_time()
@@ -94,8 +94,11 @@ def errors(inputs: dict[str, Tensor], camera: tuple) -> dict[str, float]:
     those beyond 1e-5 is told apart.
     """
     call = rasterize_call(inputs, *camera)
-    (values, gradients), (exact, slopes) = call.both("cpu")(), call.both("reference", torch.float64)()
-    pairs = zip(call.wanted, gradients, slopes, strict=True)
+    (values, gradients), (exact, slopes) = (
+        call.forward_backward_task("cpu")(),
+        call.forward_backward_task("reference", torch.float64)(),
+    )
+    pairs = zip(call.gradient_inputs, gradients, slopes, strict=True)
     return {
         "value_error": measure_error(values, exact, "picture").max,
         "share_beyond_1e-5": float(((values - exact).abs() > 1e-5).double().mean()),

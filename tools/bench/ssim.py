@@ -7,7 +7,7 @@ from torch import Tensor
 
 from hyrfpack.measure.error import measure_error, measure_relative_error
 from hyrfpack.measure.timing import time_alternately
-from hyrfpack.model.calls import loss_call
+from hyrfpack.model.operation_calls import loss_call
 
 REPEATS = 7
 SIZES = ((200, 200), (240, 320), (800, 800))  # height, width
@@ -25,8 +25,8 @@ def pictures(height: int, width: int) -> tuple[Tensor, Tensor]:
 def compare(image: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, float]:
     """Times of loss and gradient together, and errors against float64 (the gradient's over its largest value)."""
     call = loss_call(image, target, mask)
-    times, results = time_alternately({way: call.both(way) for way in ("cpu", "reference")}, REPEATS)
-    (value, gradients), (exact, slopes) = results["cpu"], call.both("reference", torch.float64)()
+    times, results = time_alternately({way: call.forward_backward_task(way) for way in ("cpu", "reference")}, REPEATS)
+    (value, gradients), (exact, slopes) = results["cpu"], call.forward_backward_task("reference", torch.float64)()
     return {
         "ms": times["cpu"].ms,
         "ns_a_pixel": 1e6 * times["cpu"].ms / image[..., 0].numel(),

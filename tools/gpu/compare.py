@@ -7,17 +7,17 @@ from torch import Tensor
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.measure.error import measure_relative_error
-from hyrfpack.model.calls import Call
+from hyrfpack.model.operation_calls import OperationCall
 
 
-def checked(call: Call, implementation: str) -> dict[str, object]:
+def checked(call: OperationCall, implementation: str) -> dict[str, object]:
     """The errors of a call's values and of its gradients, the worst of them, as cells of a row with its status."""
-    exact, exact_gradients = call.both("reference", torch.float64)()
-    found, gradients = call.both(implementation)()
+    exact, exact_gradients = call.forward_backward_task("reference", torch.float64)()
+    found, gradients = call.forward_backward_task(implementation)()
     values = relative_error(found, exact)
     worst = max((relative_error(a, b) for a, b in zip(gradients, exact_gradients, strict=True)), default=0.0)
     row: dict[str, object] = {"value error": values, "gradient error": worst}
-    return row | within(values, call.bounds[0]) | within(worst, call.bounds[1])
+    return row | within(values, call.error_bounds[0]) | within(worst, call.error_bounds[1])
 
 
 def within(error: float, bound: float) -> dict[str, object]:

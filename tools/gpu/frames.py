@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.model import HybridModel
-from hyrfpack.model.calls import Call
+from hyrfpack.model.operation_calls import OperationCall
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.render import render
 from hyrfpack.scene import Camera
@@ -136,9 +136,9 @@ def _rasterizer(room: str, splats: Splats, setup: Setup) -> Iterator[Row]:
         draws["gsplat"] = _gsplat(splats)
     except Exception as error:  # not there, or not for this torch: whatever it is, ours is measured
         yield {**row, "status": "left out", "note": f"gsplat's rasteriser cannot be compared: {str(error)[:200]}"}
-    calls = {name: Call(draw, splats.inputs, tuple(splats.inputs)) for name, draw in draws.items()}
-    tasks = {f"{name} forward": call.forward("auto") for name, call in calls.items()}
-    tasks |= {f"{name} forward and backward": call.both("auto") for name, call in calls.items()}
+    calls = {name: OperationCall(draw, splats.inputs, tuple(splats.inputs)) for name, draw in draws.items()}
+    tasks = {f"{name} forward": call.forward_task("auto") for name, call in calls.items()}
+    tasks |= {f"{name} forward and backward": call.forward_backward_task("auto") for name, call in calls.items()}
     times = median_ms(tasks, setup.repeats, setup.torch_device)
     for way in ("forward", "forward and backward"):
         ours, theirs = times[f"hyrfpack {way}"], times.get(f"gsplat {way}")

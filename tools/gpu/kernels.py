@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from hyrfpack.model import HybridModel
-from hyrfpack.model.calls import (
-    Call,
+from hyrfpack.model.operation_calls import (
+    OperationCall,
     decoder_inputs,
-    fields,
     hash_encode_call,
+    join_color_and_transmittance,
     loss_call,
     mlp_call,
-    picture,
+    named_fields,
     rasterize_call,
 )
 from hyrfpack.ops.adam import adam_step
@@ -80,7 +80,7 @@ def rasterize_rows(name: str, look: Look, setup: Setup) -> Iterator[Row]:
     }
     totals = (sum(works.values(), Work(0, 0)), sum(back.values(), Work(0, 0)))
     yield from _timed(name, size, call, totals, setup, crop)
-    forward, backward = call.passes(setup.implementation)
+    forward, backward = call.separate_tasks(setup.implementation)
     for way, task, parts in (("forward", forward, works), ("backward", backward, back)):
         measured = profiled(task, 5, setup.torch_device).times
         for stage, ms in group_kernels(measured, STAGES, "bin" if way == "forward" else "other").items():
@@ -102,7 +102,7 @@ def hash_encode_rows(setup: Setup) -> Iterator[Row]:
     """Both fields' features of all Gaussians; gradients reach the table, as in training."""
     model = _model(setup)
     coords = model.cube_coords(model.gaussians.positions).detach()
-    for name, field in fields(model):
+    for name, field in named_fields(model):
         grid = field.grid.config
         # The table as trained ones are: numbers about 0.1, not the 1e-4 that training starts from.
         numbers = 1e3 * field.grid.table.detach(), grid.resolutions, grid.log2_table_size
@@ -143,7 +143,7 @@ def decode_rows(setup: Setup) -> Iterator[Row]:
         "radiance": lambda: model.decode_colors(viewpoint),
     }
     times = median_ms(tasks, setup.repeats, setup.torch_device)
-    for (name, field), (values, reference) in zip(fields(model), (geometry, colors), strict=True):
+    for (name, field), (values, reference) in zip(named_fields(model), (geometry, colors), strict=True):
         widths = [field.weights[0].shape[1], *(weight.shape[0] for weight in field.weights)]
         mixed = model.precision == "mixed"
         work = roofline.decode(len(model), widths, field.grid.config.levels, field.grid.config.rows, mixed)
@@ -234,7 +234,7 @@ def rasterize_shaded_rows(setup: Setup) -> Iterator[Row]:
         whole += roofline.blend(pairs, pixels, reached, blended)
         view = cropped(splats, setup.crop).view
         wanted = rasterize_shaded(*exact, _cast(shading, torch.float64), *view, implementation="reference")
-        error = relative_error(picture(draw(view)), picture(wanted))
+        error = relative_error(join_color_and_transmittance(draw(view)), join_color_and_transmittance(wanted))
         size = f"{len(model):,} Gaussians, {seen:,} visible, {pairs:,} pairs, {setup.width} x {setup.height}"
         row = _row(f"rasterize shaded, {precision}", "forward", size, ms, whole, setup)
         yield row | {"value error": error} | within(error, 3e-3 if shading.mixed else 1e-3)
@@ -281,7 +281,9 @@ def ssim_rows(setup: Setup) -> Iterator[Row]:
     pictures = [tensor.contiguous().to(setup.device) for tensor in ((smooth + noise).clamp(0, 1), smooth)]
 
     call = loss_call(*pictures)
-    ms = median_ms({"both": call.both(setup.implementation)}, setup.repeats, setup.torch_device)["both"]
+    ms = median_ms({"both": call.forward_backward_task(setup.implementation)}, setup.repeats, setup.torch_device)[
+        "both"
+    ]
     words = f"{setup.width} x {setup.height}"
     work = roofline.photometric_loss(setup.width * setup.height)
     yield _row("SSIM and L1 loss", "both", words, ms, work, setup) | checked(call, setup.implementation)
@@ -307,9 +309,9 @@ def adam_rows(setup: Setup) -> Iterator[Row]:
     yield row | {"value error": error} | within(error, 1e-5)
 
 
-def _timed(name: str, size: str, call: Call, works: Works, setup: Setup, part: Call) -> Iterator[Row]:
+def _timed(name: str, size: str, call: OperationCall, works: Works, setup: Setup, part: OperationCall) -> Iterator[Row]:
     """Rows of both passes of a call; the error is that of `part`."""
-    tasks = dict(zip(("forward", "backward"), call.passes(setup.implementation), strict=True))
+    tasks = dict(zip(("forward", "backward"), call.separate_tasks(setup.implementation), strict=True))
     times = median_ms(tasks, setup.repeats, setup.torch_device)
     found = checked(part, setup.implementation)
     values, gradients = found.pop("value error"), found.pop("gradient error")

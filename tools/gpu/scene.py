@@ -17,8 +17,8 @@ from torch import Tensor
 
 from hyrfpack.cameras.paths import look_at
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
-from hyrfpack.model.calls import splat_inputs
 from hyrfpack.model.gaussians import Gaussians, logit
+from hyrfpack.model.operation_calls import splat_inputs
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize.reference import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, project
 from hyrfpack.render import render

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
-from hyrfpack.model.calls import Call, hash_encode_call, loss_call, mlp_call, rasterize_call
+from hyrfpack.model.operation_calls import OperationCall, hash_encode_call, loss_call, mlp_call, rasterize_call
 from hyrfpack.ops.hash_encode import level_offsets, level_resolutions
 from tools.gpu.compare import checked
 from tools.gpu.rows import Row
@@ -35,8 +35,10 @@ def _normal(seed: int, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def _rasterize(count: int, width: int, height: int, size: float, **options: object) -> Callable[[torch.device], Call]:
-    def make(device: torch.device) -> Call:
+def _rasterize(
+    count: int, width: int, height: int, size: float, **options: object
+) -> Callable[[torch.device], OperationCall]:
+    def make(device: torch.device) -> OperationCall:
         inputs = {
             "means": _normal(0, count, 3) * 0.8 + torch.tensor([0.0, 0.0, 4.0]),
             "quats": _normal(1, count, 4),
@@ -50,8 +52,8 @@ def _rasterize(count: int, width: int, height: int, size: float, **options: obje
     return make
 
 
-def _hash_encode(points: int, log2: int, wanted: tuple[str, ...]) -> Callable[[torch.device], Call]:
-    def make(device: torch.device) -> Call:
+def _hash_encode(points: int, log2: int, wanted: tuple[str, ...]) -> Callable[[torch.device], OperationCall]:
+    def make(device: torch.device) -> OperationCall:
         resolutions = level_resolutions(16, 8, 512)
         # Numbers of 16 bits: a point lies in the same cell, at the same place, in every precision.
         coords = torch.randint(0, 1 << 16, (points, 3), generator=torch.Generator().manual_seed(0)) / (1 << 16)
@@ -61,8 +63,8 @@ def _hash_encode(points: int, log2: int, wanted: tuple[str, ...]) -> Callable[[t
     return make
 
 
-def _mlp(rows: int, widths: tuple[int, ...], mixed: bool) -> Callable[[torch.device], Call]:
-    def make(device: torch.device) -> Call:
+def _mlp(rows: int, widths: tuple[int, ...], mixed: bool) -> Callable[[torch.device], OperationCall]:
+    def make(device: torch.device) -> OperationCall:
         x = _normal(0, rows, widths[0]).to(device)
         shapes = enumerate(zip(widths[1:], widths, strict=False))
         weights = [(_normal(layer + 1, o, i) / i**0.5).to(device) for layer, (o, i) in shapes]
@@ -72,8 +74,8 @@ def _mlp(rows: int, widths: tuple[int, ...], mixed: bool) -> Callable[[torch.dev
     return make
 
 
-def _loss(height: int, width: int, share: float | None) -> Callable[[torch.device], Call]:
-    def make(device: torch.device) -> Call:
+def _loss(height: int, width: int, share: float | None) -> Callable[[torch.device], OperationCall]:
+    def make(device: torch.device) -> OperationCall:
         target = torch.sigmoid(_normal(0, height, width, 3))
         image = (target + 0.1 * _normal(1, height, width, 3)).clamp(0, 1)
         mask = None if share is None else (_normal(2, height, width).sigmoid() < share).to(device)
@@ -82,7 +84,7 @@ def _loss(height: int, width: int, share: float | None) -> Callable[[torch.devic
     return make
 
 
-CASES: dict[str, Callable[[torch.device], Call]] = {
+CASES: dict[str, Callable[[torch.device], OperationCall]] = {
     "rasterize, 400 Gaussians, 45 x 37": _rasterize(400, 45, 37, 0.1),
     "rasterize, 3,000 small Gaussians, 64 x 48": _rasterize(3000, 64, 48, 0.02),
     "rasterize, antialiased": _rasterize(300, 48, 32, 0.03, antialiased=True),

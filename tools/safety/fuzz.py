@@ -134,7 +134,7 @@ def check_model(model: HybridModel) -> None:
     if again.exposure is None or encode_exposure(again.exposure) != encode_exposure(model.exposure):
         raise Failure("the exposure map does not survive")
     for position in (np.zeros(3), np.full(3, 1e30)):
-        gains = model.exposure.log_gains(position, np.array([0.0, 0.0, 1.0]))
+        gains = model.exposure.predict_log_gains(position, np.array([0.0, 0.0, 1.0]))
         if not (np.abs(gains) <= MAX_LOG_GAIN).all():
             raise Failure(f"the exposure map gives the log gains {gains}")
 

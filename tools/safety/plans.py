@@ -34,7 +34,7 @@ def drawn_sensitivity(model: HybridModel, seed: int = 0) -> Sensitivity:
     points = 2 * np.minimum(places * (1 << MAX_BITS_PER_AXIS), (1 << MAX_BITS_PER_AXIS) - 1).astype(np.int64) + 1
     fields = {}
     for group, grid in grid_configs(model.config).items():
-        usage = grid.usage(points, MAX_BITS_PER_AXIS + 1)
+        usage = grid.count_row_reads(points, MAX_BITS_PER_AXIS + 1)
         fields[group] = (TABLE * usage / max(usage.sum(), 1)).repeat(2)
     for group, widths in decoder_widths(model.config).items():
         count = sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(widths))

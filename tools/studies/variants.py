@@ -6,7 +6,7 @@
     bonsai@25@contiguous       both
 
 Poses and points are the set's own, and held-out photos are the same ones. Photos are made lighter by a tone curve
-(`hyrfpack.model.exposure.expose`), held-out ones like their neighbours.
+(`hyrfpack.model.exposure.apply_exposure_gains`), held-out ones like their neighbours.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import torch
 
 import hyrfpack
 from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
-from hyrfpack.model.exposure import expose
+from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 
 SECOND_GROUP_STOPS = 2.0  # by which it is lighter than the first
@@ -75,7 +75,7 @@ def _lighter(view: View) -> View:
 
     def load() -> Picture:
         picture = view.load()
-        exposed = expose(torch.from_numpy(picture.rgb).double() / 255, gains)
+        exposed = apply_exposure_gains(torch.from_numpy(picture.rgb).double() / 255, gains)
         return replace(picture, rgb=(exposed * 255).round().byte().numpy())
 
     return replace(view, load=load)

@@ -14,7 +14,7 @@ from hyrfpack.format.sections import DECODER_SECTIONS, LOGIT_SECTIONS, POSITIONS
 from hyrfpack.model import expand
 from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.frame import Frame
-from hyrfpack.model.hash_grid import FEATURES
+from hyrfpack.model.hash_grid import FEATURES_PER_LEVEL
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.quant.morton import MAX_BITS_PER_AXIS
 from hyrfpack.quant.points import LatticePoints
@@ -99,8 +99,8 @@ def build_step_groups(group: str, config: ModelConfig, points: LatticePoints | N
     assert points is not None
     grid = grid_configs(config)[group]
     every = max(1, -(-len(points.cells) // MAX_COUNTED_GAUSSIANS))
-    usage = grid.usage(points[::every].centers(), MAX_BITS_PER_AXIS + 1)
-    index, count = np.empty((grid.rows, FEATURES), np.uint16), grid.levels * USAGE_CLASS_COUNT
+    usage = grid.count_row_reads(points[::every].centers(), MAX_BITS_PER_AXIS + 1)
+    index, count = np.empty((grid.rows, FEATURES_PER_LEVEL), np.uint16), grid.levels * USAGE_CLASS_COUNT
     for level, (first, last) in enumerate(pairwise(grid.offsets)):
         length = np.frexp(usage[first:last].astype(np.float64))[1]  # number of binary digits, 0 for 0
         usage_class = np.minimum((length + 1) // 2, USAGE_CLASS_COUNT - 1)

@@ -33,7 +33,7 @@ def test_usage_counts_the_rows_that_the_lookup_reads(name: str, bits: int) -> No
     points = np.random.default_rng(bits).integers(0, 2**bits, (400, 3))
     points[0], points[1], points[2] = 0, 2**bits - 1, 2 ** (bits - 1)  # corners and the middle
 
-    usage = grid.usage(points, bits)
+    usage = grid.count_row_reads(points, bits)
 
     assert usage.shape == (grid.rows,) and usage.dtype == np.int64
     np.testing.assert_array_equal(usage, usage_by_reference(grid, points, bits))
@@ -43,18 +43,18 @@ def test_every_point_reads_eight_corners_of_each_level() -> None:
     grid = GRIDS["both"]
     points = np.random.default_rng(0).integers(0, 2**19, (1000, 3))
 
-    usage = grid.usage(points, 19)
+    usage = grid.count_row_reads(points, 19)
 
     per_level = [usage[first:last].sum() for first, last in zip(grid.offsets, grid.offsets[1:], strict=False)]
     assert per_level == [8000] * grid.levels
 
 
 def test_no_point_reads_nothing() -> None:
-    assert not GRIDS["both"].usage(np.zeros((0, 3), np.int64), 19).any()
+    assert not GRIDS["both"].count_row_reads(np.zeros((0, 3), np.int64), 19).any()
 
 
 def test_coincident_points_are_all_counted() -> None:
-    usage = GRIDS["dense"].usage(np.full((70_000, 3), 12345), 19)
+    usage = GRIDS["dense"].count_row_reads(np.full((70_000, 3), 12345), 19)
 
     assert set(usage.tolist()) == {0, 70_000}
     assert np.count_nonzero(usage) == 8 * GRIDS["dense"].levels
@@ -70,7 +70,7 @@ def test_rows_with_usage_are_those_that_pass_gradients() -> None:
     module(torch.from_numpy(points / 2.0**19).float()).sum().backward()
 
     read = module.table.grad.abs().sum(dim=1).numpy() > 0
-    usage = grid.usage(points, 19)
+    usage = grid.count_row_reads(points, 19)
     assert (usage[read] > 0).all()
     assert np.count_nonzero(read) > 0.98 * np.count_nonzero(usage)  # a corner may have the weight 0
 
