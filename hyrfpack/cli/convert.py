@@ -52,10 +52,10 @@ def convert(
       hyrfpack convert scene.spz table.ply --crop -1,-1,-1,1,1,1
     """
     from hyrfpack.export.conversion import convert as run
-    from hyrfpack.export.conversion import format_of
+    from hyrfpack.export.conversion import find_target_format
     from hyrfpack.splats.names import sog_folder
 
-    format_of(source, target)
+    find_target_format(source, target)
     Outputs(source, folder=sog_folder(source), overwrite=overwrite).file(target)
     with shown_progress("convert") as progress:
         report = run(

@@ -149,16 +149,16 @@ def export(
     """
     from hyrfpack.export import export as write
     from hyrfpack.export.folder import check_folder, gallery, player
-    from hyrfpack.export.kinds import PLAYER, check_place, check_request, kind_of
+    from hyrfpack.export.kinds import PLAYER_FOLDER, check_place, check_request, find_file_kind
     from hyrfpack.format import describe, find_model
     from hyrfpack.splats.names import is_splats
 
-    kind = kind_of(output, colmap)
-    if len(models) != 1 and kind is not PLAYER:
+    kind = find_file_kind(output, colmap)
+    if len(models) != 1 and kind is not PLAYER_FOLDER:
         what = "there is no MODEL to write" if not models else "several models make a gallery, which is a folder"
         raise HyrfError(f"{output}: {what}; name one MODEL")
     splats = [model for model in models if is_splats(model)]
-    if splats and kind is not PLAYER:
+    if splats and kind is not PLAYER_FOLDER:
         raise HyrfError(_how_to_write_splats(splats[0], output, kind))
     files = [model if model in splats else find_model(model) for model in models]
     if splats and data:
@@ -167,8 +167,8 @@ def export(
         raise HyrfError(f"--data is given {len(data)} times, for {len(models)} models; give it once for each, or not")
     check_request(kind, output, degree, crop, min_opacity, background, baked, exposure)
     scenes = [read_scene(path, reading, describe(model)) for path, model in zip(data, files, strict=False)]
-    if kind is PLAYER:
-        check_folder(output, models, scenes, overwrite=overwrite, listed=len(models) > 1)
+    if kind is PLAYER_FOLDER:
+        check_folder(output, models, scenes, overwrite=overwrite, is_gallery=len(models) > 1)
     else:
         check_place(output, Outputs(*files, scene=scenes[0] if scenes else None, overwrite=overwrite), colmap)
     with shown_progress("export") as progress:

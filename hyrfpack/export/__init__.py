@@ -1,4 +1,4 @@
-"""Models for other programs: baked to explicit Gaussians, written in their formats, and shown in a browser."""
+"""Export of models to other programs: baking to explicit Gaussians, writing file formats, and pages for browsers."""
 
 from hyrfpack.export.conversion import ConversionReport, convert
 from hyrfpack.export.folder import gallery, player

@@ -1,4 +1,4 @@
-"""Bake: a hybrid model as explicit Gaussians with spherical harmonics, for programs that know no neural field."""
+"""Baking of a hybrid model to explicit Gaussians with spherical harmonics, for programs without neural fields."""
 
 from __future__ import annotations
 
@@ -30,16 +30,18 @@ from hyrfpack.splats.harmonics import fibonacci_sphere, harmonics_basis, num_sh_
 from hyrfpack.splats.splats import Splats, normalized_quats
 
 SPHERE_DIRECTIONS = 32
-SPHERE_WEIGHT = 3e-3  # of all these together, against 1 for all cameras
-# Of a model with an exposure map. What cameras see differs more by the direction there, and harmonics of it go astray
-# where no camera looks along: far from all cameras this gives 1.9 to 3.7 dB at degree 3 (indoor_room, gerrard_hall,
-# drone_caliterra), and -0.2 to 0.4 dB at cameras that are not fitted.
+SPHERE_WEIGHT = 3e-3  # total weight of all SPHERE_DIRECTIONS, where all cameras together weigh 1
+# Used instead for models with an exposure map. Their colours differ more between directions, so harmonics overshoot
+# along directions from which no camera looks. The larger weight gives 1.9 to 3.7 dB at degree 3 far from all cameras
+# (indoor_room, gerrard_hall, drone_caliterra), and -0.2 to 0.4 dB at cameras that are not fitted.
 EXPOSED_SPHERE_WEIGHT = 3e-2
-RIDGE = 1e-5
-STRIDE = 2
-# Gaussians that a thread fits together, 24 kB each with 128 cameras: of fewer at once Python itself takes longest, and
-# one thread at a time can run that. BLOCKS of them at least, where there are enough, so that all threads have some.
-LEAST_BLOCK, LARGEST_BLOCK, BLOCKS = 2048, 8192, 8
+RIDGE_WEIGHT = 1e-5
+TRANSMITTANCE_STRIDE_PIXELS = 2
+# A thread fits one block of Gaussians at a time; with 128 cameras each Gaussian takes 24 kB. In smaller blocks most of
+# the time goes to Python, which runs in one thread only.
+MIN_BLOCK_GAUSSIANS = 2048
+MAX_BLOCK_GAUSSIANS = 8192
+MIN_BLOCKS = 8  # where the model has enough Gaussians, so that all threads have work
 
 
 @torch_on_one_thread()
@@ -48,36 +50,38 @@ def bake(
     model: HybridModel,
     cameras: Sequence[Camera],
     degrees: Sequence[int] = (3,),
-    sights: Sequence[Sight] | None = None,
+    visibility: Sequence[CameraVisibility] | None = None,
     report: Report = no_report,
 ) -> dict[int, Splats]:
-    """A model as explicit Gaussians in world units, in the model's order, for each degree of spherical harmonics.
+    """Bake a model to explicit Gaussians in world units, in the model's order, for each degree of spherical harmonics.
 
-    Scales, rotations and opacities are the model's own. Colours minimise, for each Gaussian over the cameras v that it
-    sends light w_v to (the sum over pixels of T alpha; sum_v w_v = 1), seen along the directions d_v,
+    Scales, rotations and opacities are the model's own. Each Gaussian sends light w_v to the cameras v, the sum over
+    pixels of T alpha, scaled so that sum_v w_v = 1, along the directions d_v. Its harmonics h minimise
 
-        sum_v w_v |f(d_v) - color(d_v)|^2 + SPHERE_WEIGHT mean_s |f(d_s) - color(d_s)|^2 + RIDGE sum_{k > 0} |h_k|^2
+        sum_v w_v |f(d_v) - color(d_v)|^2
+            + SPHERE_WEIGHT mean_s |f(d_s) - color(d_s)|^2
+            + RIDGE_WEIGHT sum_{k > 0} |h_k|^2
 
-    with f(d) = 0.5 + sum_k h_k Y_k(d) and directions d_s that cover the sphere evenly: from where no camera stood the
-    colours follow the model, too, as far as that costs the cameras' views nothing.
+    with f(d) = 0.5 + sum_k h_k Y_k(d) and SPHERE_DIRECTIONS directions d_s that cover the sphere evenly. The second
+    term keeps the colours close to the model's along directions from which no camera looks, at hardly any cost for the
+    cameras.
 
-    Of a model with an exposure map, color(d_v) is exposed by the gains of camera v, and color(d_s) by the mean gains of
-    the cameras that see the Gaussian or its neighbours (`BakeGains`), with EXPOSED_SPHERE_WEIGHT. The splats then look
-    as photographed: their harmonics hold a part of the map.
+    If the model has an exposure map, color(d_v) is exposed by the gains of camera v. color(d_s) is exposed by the mean
+    gains of the cameras that see the Gaussian or its neighbours (`BakeGains`), and EXPOSED_SPHERE_WEIGHT replaces
+    SPHERE_WEIGHT. The splats then look as photographed, because their harmonics hold a part of the map.
 
-    One thing is corrected. The model is trained with Gaussians left out whose centres project far outside the picture
-    (`RenderSettings.cull_tolerance`). Many programs draw these, and large ones near a camera would cover its picture.
-    So opacities are multiplied by 1 - s^2, where s is the share of a Gaussian's light, were nothing left out, that
-    would go to cameras which the model draws without it; most have s = 0, and those that this makes invisible are
-    dropped.
+    One difference between renderers is corrected. Training culls Gaussians whose centres project far outside the
+    picture (`RenderSettings.cull_tolerance`). Many programs draw these, and large ones near a camera would cover its
+    picture. So opacities are multiplied by 1 - s^2, where s is the share of a Gaussian's light, without culling, that
+    goes to cameras for which the model culls it. Most Gaussians have s = 0. Those that become invisible are dropped.
 
     Args:
-        model: on the CPU.
-        cameras: from where it was photographed, world units; when there are none, colours are fitted on the sphere
-            alone, at the mean gains of the exposure map if there is one, and no opacity changes.
-        degrees: of the harmonics, each 0 to 3. More than one costs little more.
-        sights: what `sights_of` told of these cameras, where it is known already.
-        report: called with what is being done and the share of the work that is done, 0 to 1.
+        model: a model on the CPU.
+        cameras: cameras from which the model was photographed, world units. Without any, colours are fitted on the
+            sphere alone, at the mean gains of the exposure map if there is one, and opacities do not change.
+        degrees: degrees of the harmonics, each 0 to 3. Several degrees take little longer than one.
+        visibility: result of `compute_visibility` for these cameras, if it is known already.
+        report: called with the current activity and the share of the work that is done, 0 to 1.
 
     Raises:
         HyrfError: a number of the model, or a camera's pose, is NaN, infinite or beyond float32.
@@ -85,13 +89,13 @@ def bake(
     geometry, positions = model.decode_geometry(), model.gaussians.positions.detach()
     scales = geometry.scales * model.config.frame.scale
     for name, values in {**vars(geometry), "positions": positions, "scales": scales}.items():
-        refuse_nonfinite(name, values)
-    views = sights_of(model, cameras) if sights is None else sights
-    light, stray = torch.zeros(2, len(model), dtype=torch.float64)
-    for view in views:
+        check_finite(name, values)
+    visibility = compute_visibility(model, cameras) if visibility is None else visibility
+    light, culled_light = torch.zeros(2, len(model), dtype=torch.float64)
+    for view in visibility:
         light[view.index] += view.light
-        stray[view.left_out] += view.stray
-    share = stray / (light + stray).clamp_min(torch.finfo().tiny)
+        culled_light[view.culled_index] += view.culled_light
+    share = culled_light / (light + culled_light).clamp_min(torch.finfo().tiny)
     opacities = geometry.opacities * (1 - share.float().square())
     keep = ((share == 0) | (opacities >= ALPHA_MIN)).numpy()
 
@@ -101,87 +105,103 @@ def bake(
         normalized_quats(geometry.quats.numpy()),
         opacities.numpy(),
     )
-    fitted = _fit(model, views, light, BakeGains.of(model, cameras, views), degrees, report)
+    fitted = _fit_harmonics(model, visibility, light, BakeGains.predict(model, cameras, visibility), degrees, report)
     baked = {}
-    for degree in list(fitted):  # one at a time: all harmonics of many Gaussians are a lot
+    for degree in list(fitted):  # one at a time, because the harmonics of many Gaussians take much memory
         harmonics = fitted.pop(degree)
-        refuse_nonfinite("colors", harmonics)
+        check_finite("colors", harmonics)
         splats = Splats(*shared, harmonics.numpy(), model.config.antialiased)
         baked[degree] = splats if keep.all() else splats[keep]
     return baked
 
 
 @dataclass(frozen=True)
-class Sight:
-    """The light that Gaussians send to a picture: the sum over its pixels of T alpha.
+class CameraVisibility:
+    """The light that each Gaussian sends to one camera's picture: the sum over its pixels of T alpha.
 
     Attributes:
-        viewpoint: (3,) where the camera stands, local units.
-        index, light: (n,) int32 ascending and float32: of those that the model draws.
-        left_out, stray: (m,) the same of those that it leaves out, were all drawn.
-        passed: (H / STRIDE, W / STRIDE) the share of a pixel's light that passes those that it draws, of every
-            STRIDE-th pixel in both directions.
+        viewpoint: (3,) position of the camera, local units.
+        index: (n,) int32 ascending indices of the Gaussians that the model draws and that send light.
+        light: (n,) float32 light of these.
+        culled_index: (m,) int32 ascending indices of the Gaussians that the model culls for this camera.
+        culled_light: (m,) float32 light of these, if nothing were culled.
+        transmittance: (H / stride, W / stride) transmittance of the drawn Gaussians, at every
+            TRANSMITTANCE_STRIDE_PIXELS-th pixel in both directions.
     """
 
     viewpoint: Tensor
     index: Tensor
     light: Tensor
-    left_out: Tensor
-    stray: Tensor
-    passed: Tensor
+    culled_index: Tensor
+    culled_light: Tensor
+    transmittance: Tensor
 
 
 @torch_on_one_thread()
 @torch.no_grad()
-def sights_of(model: HybridModel, cameras: Sequence[Camera], report: Report = no_report) -> list[Sight]:
-    """What each camera sees of a model.
+def compute_visibility(
+    model: HybridModel, cameras: Sequence[Camera], report: Report = no_report
+) -> list[CameraVisibility]:
+    """Compute the light that the Gaussians of a model send to each camera.
 
     Args:
-        report: told of each camera, and the share of the work that is done.
+        model: a model on the CPU.
+        cameras: cameras in world units.
+        report: called after each camera with the share of the work that is done, 0 to 1.
 
     Raises:
         HyrfError: a camera's pose is NaN, infinite or beyond float32.
     """
-    # Much of one runs on one core only.
+    # Cameras run in parallel, because much of the work for one camera uses one core only.
     see = report_each_call(
-        partial(_sight, model, model.decode_geometry()), report, "looking from each camera", len(cameras)
+        partial(_compute_camera_visibility, model, model.decode_geometry()),
+        report,
+        "looking from each camera",
+        len(cameras),
     )
     return parallel_map(see, cameras)
 
 
-@torch.no_grad()  # of each thread
-def _sight(model: HybridModel, geometry: Geometry, camera: Camera) -> Sight:
+@torch.no_grad()  # because the setting is per thread
+def _compute_camera_visibility(model: HybridModel, geometry: Geometry, camera: Camera) -> CameraVisibility:
     settings, positions = RenderSettings(), model.gaussians.positions.detach()
     camera = shrink_camera(camera)
     pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=torch.float32)
-    refuse_nonfinite("camera poses", pose)
-    view = pose, camera.intrinsics, camera.width, camera.height
-    how: dict[str, Any] = {"near": settings.near, "antialiased": model.config.antialiased}
-    drawn = frustum_cull(positions, *view, settings.near, settings.cull_tolerance)
+    check_finite("camera poses", pose)
+    viewport = pose, camera.intrinsics, camera.width, camera.height
+    settings_of_light: dict[str, Any] = {"near": settings.near, "antialiased": model.config.antialiased}
+    drawn = frustum_cull(positions, *viewport, settings.near, settings.cull_tolerance)
 
-    def light(means: Tensor, some: Geometry) -> tuple[Tensor, Tensor]:
-        return sent_light(means, some.quats, some.scales, some.opacities, *view, **how)
+    def compute_light(means: Tensor, shapes: Geometry) -> tuple[Tensor, Tensor]:
+        return sent_light(means, shapes.quats, shapes.scales, shapes.opacities, *viewport, **settings_of_light)
 
-    stray, passed = light(positions, geometry)
-    received = stray[drawn]
-    stray[drawn] = 0
-    left_out = torch.nonzero(stray).squeeze(-1)
-    if len(left_out):  # they took light from others
-        received, passed = light(positions[drawn], geometry[drawn])
-    lit = received > 0
-    left_out_light, some = stray[left_out], passed[::STRIDE, ::STRIDE].clone()
-    return Sight(camera_center(pose), drawn[lit].int(), received[lit], left_out.int(), left_out_light, some)
+    culled_light, transmittance = compute_light(positions, geometry)
+    light = culled_light[drawn]
+    culled_light[drawn] = 0
+    culled_index = torch.nonzero(culled_light).squeeze(-1)
+    if len(culled_index):  # without them, the others send more light
+        light, transmittance = compute_light(positions[drawn], geometry[drawn])
+    lit = light > 0
+    stride = TRANSMITTANCE_STRIDE_PIXELS
+    return CameraVisibility(
+        camera_center(pose),
+        drawn[lit].int(),
+        light[lit],
+        culled_index.int(),
+        culled_light[culled_index],
+        transmittance[::stride, ::stride].clone(),
+    )
 
 
-def _fit(
+def _fit_harmonics(
     model: HybridModel,
-    views: Sequence[Sight],
+    visibility: Sequence[CameraVisibility],
     light: Tensor,
     gains: BakeGains | None,
     degrees: Iterable[int],
     report: Report,
 ) -> dict[int, Tensor]:
-    """Harmonics (N, K, 3) of all Gaussians by degree."""
+    """Fit the harmonics (N, K, 3) of all Gaussians for each degree."""
     shading, positions = model.shading(), model.gaussians.positions.detach()
     fitted = {degree: positions.new_empty(len(model), num_sh_bases(degree), 3) for degree in degrees}
     highest = max(fitted)
@@ -190,26 +210,28 @@ def _fit(
     net = harmonics_basis(sphere, highest)
     sphere_weight = SPHERE_WEIGHT if gains is None else EXPOSED_SPHERE_WEIGHT
     around = (sphere_weight / len(sphere) * net.T).contiguous()
-    ridge = torch.full((terms,), RIDGE, dtype=torch.float64)
+    ridge = torch.full((terms,), RIDGE_WEIGHT, dtype=torch.float64)
     ridge[0] = 0
     gram = around.double() @ net.double() + ridge.diag()
-    size = min(max(len(model) // BLOCKS, LEAST_BLOCK), LARGEST_BLOCK)
+    size = min(max(len(model) // MIN_BLOCKS, MIN_BLOCK_GAUSSIANS), MAX_BLOCK_GAUSSIANS)
     edges = torch.arange(0, len(model) + size, size, dtype=torch.int32)
-    ranges = [torch.searchsorted(view.index, edges) for view in views]
+    ranges = [torch.searchsorted(view.index, edges) for view in visibility]
 
     def fit_block(block: int) -> None:
         start, stop = block * size, min((block + 1) * size, len(model))
         here = slice(start, stop)
         mean_gains = None if gains is None else gains.gaussians[here]
-        far = torch.stack([_colors(direction[None], shading, here, mean_gains) for direction in sphere]).flatten(1)
+        far = torch.stack(
+            [_centered_colors(direction[None], shading, here, mean_gains) for direction in sphere]
+        ).flatten(1)
         right = (around @ far).reshape(terms, stop - start, 3).transpose(0, 1)
         rows = [(torch.empty(0, dtype=torch.int64), net[:0], net.new_empty(0, 3), net.new_empty(0))]
-        for number, (view, bounds) in enumerate(zip(views, ranges, strict=True)):
+        for number, (view, bounds) in enumerate(zip(visibility, ranges, strict=True)):
             seen = slice(int(bounds[block]), int(bounds[block + 1]))
             index = view.index[seen].long()
             directions = torch.nn.functional.normalize(positions[index] - view.viewpoint, dim=-1, eps=1e-12)
             camera_gains = None if gains is None else gains.cameras[number]
-            colors = _colors(directions, shading, index, camera_gains)
+            colors = _centered_colors(directions, shading, index, camera_gains)
             weights = (view.light[seen] / light[index]).float()
             rows.append((index - start, harmonics_basis(directions, highest), colors, weights))
         owners, basis, colors, weights = map(torch.cat, zip(*rows, strict=True))
@@ -222,10 +244,11 @@ def _fit(
     return fitted
 
 
-def _colors(directions: Tensor, shading: Shading, index: Tensor | slice, gains: Tensor | None) -> Tensor:
-    """Colours (n, 3) less 0.5 of the Gaussians at `index` along directions (n, 3), or of a slice along one (1, 3).
+def _centered_colors(directions: Tensor, shading: Shading, index: Tensor | slice, gains: Tensor | None) -> Tensor:
+    """Evaluate colours minus 0.5 (n, 3) of Gaussians along directions, exposed by `gains` (3,) or (n, 3) if given.
 
-    They are exposed by `gains`, (3,) or (n, 3), if there are any.
+    Args:
+        directions: (n, 3), one for each Gaussian at `index`; or (1, 3) if `index` is a slice.
     """
     encoded = encode_directions(directions, shading.encoding)
     if isinstance(index, slice):
@@ -237,8 +260,8 @@ def _colors(directions: Tensor, shading: Shading, index: Tensor | slice, gains: 
     return (colors if gains is None else apply_exposure_gains(colors, gains)).sub_(0.5)
 
 
-def refuse_nonfinite(name: str, values: Tensor) -> None:
-    """Raise HyrfError, naming what they are, unless all values are finite."""
+def check_finite(name: str, values: Tensor) -> None:
+    """Raise HyrfError, with the name of the values, unless all are finite."""
     if not values.isfinite().all():
         raise HyrfError(
             f"the bake's {name} hold NaN or infinity, from a broken model or numbers beyond float32; "

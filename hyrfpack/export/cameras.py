@@ -1,4 +1,4 @@
-"""The cameras of a scene in the layouts that other trainers read: a COLMAP model, and nerfstudio's transforms.json."""
+"""Export of a scene's cameras for other trainers: as a COLMAP model or as nerfstudio's transforms.json."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from hyrfpack.scene import Camera, evenly_spaced
 from hyrfpack.splats.splats import Splats
 
 COLMAP_FILES = tuple(f"sparse/0/{table}.bin" for table in ("cameras", "frames", "images", "points3D", "rigs"))
-MAX_POINTS = 100_000  # in a COLMAP model: as many as a large reconstruction has
-_MIN_OPACITY = 0.1  # of a Gaussian whose centre is a point: fainter ones lie anywhere
+MAX_COLMAP_POINTS = 100_000  # the size of a large reconstruction
+_MIN_POINT_OPACITY = 0.1  # because the centres of fainter Gaussians need not lie on a surface
 
 
 def write_colmap(
     cameras: Sequence[tuple[str, Camera]],
     folder: str | os.PathLike[str],
     points: Splats | None,
-    max_points: int = MAX_POINTS,
+    max_points: int = MAX_COLMAP_POINTS,
     *,
     overwrite: bool = True,
 ) -> None:
-    """Write `folder`/sparse/0, a binary COLMAP model. The photos belong into `folder`/images.
+    """Write a binary COLMAP model to `folder`/sparse/0. The photos belong into `folder`/images.
 
-    One PINHOLE camera for each distinct size and intrinsics, one image for each photo, without observations, all
-    numbered from 1 in order. Points are centres of Gaussians that are not faint, evenly picked, without tracks:
-    something for a trainer to start from. No table is replaced before all are written.
+    The model has one PINHOLE camera for each distinct size and intrinsics, and one image without observations for each
+    photo, all numbered from 1 in order. The points are evenly picked centres of Gaussians that are not faint, without
+    tracks, from which a trainer can start. No table is replaced before all are written.
 
     Args:
-        cameras: photo names, below the photo folder, and their cameras.
-        folder: where; made when it is missing.
-        points: whose centres become points, or None for no points.
-        max_points: at most so many points.
-        overwrite: replace tables that are there.
+        cameras: names of the photos, relative to the photo folder, with their cameras.
+        folder: output folder; created if it is missing.
+        points: splats whose centres become points, or None for no points.
+        max_points: maximum number of points.
+        overwrite: replace existing tables.
 
     Raises:
-        HyrfError: pycolmap is missing, or a file cannot be written, or not without `overwrite`.
+        HyrfError: pycolmap is missing, a file cannot be written, or a table exists and `overwrite` is False.
     """
     with needs_package("pycolmap", f"{folder}: writing a COLMAP model"):
         import pycolmap
@@ -61,10 +61,10 @@ def write_colmap(
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(camera.rotation), camera.camera_from_world[:3, 3])
         model.add_image_with_trivial_frame(pycolmap.Image(name=name, image_id=image_id, camera_id=numbers[lens]), pose)
     if points is not None:
-        solid = np.flatnonzero(points.opacities >= _MIN_OPACITY)
-        chosen = points[np.array(evenly_spaced(solid.tolist(), max_points), np.int64)]
-        colors = np.round(255 * chosen.base_colors).astype(np.uint8)
-        for position, color in zip(chosen.positions, colors, strict=True):
+        solid = np.flatnonzero(points.opacities >= _MIN_POINT_OPACITY)
+        select_splats = points[np.array(evenly_spaced(solid.tolist(), max_points), np.int64)]
+        colors = np.round(255 * select_splats.base_colors).astype(np.uint8)
+        for position, color in zip(select_splats.positions, colors, strict=True):
             model.add_point3D(position, pycolmap.Track(), color)
 
     target = Path(folder, "sparse", "0")
@@ -72,19 +72,19 @@ def write_colmap(
         model.write_binary(temporary)
         for table in sorted(Path(temporary).iterdir()):
             data = table.read_bytes()
-            # They take their names when the block ends.
+            # The files get their final names when the block ends.
             pending = pending_file(target / table.name, len(data), overwrite=overwrite, rename=False)
             tables.enter_context(pending).temporary.write_bytes(data)
 
 
 def encode_transforms(cameras: Sequence[tuple[str, Camera]]) -> bytes:
-    """Cameras as a transforms.json, which lies beside the photo folder "images".
+    """Encode cameras as a transforms.json, to be placed beside the photo folder "images".
 
-    Matrices are world_from_camera of OpenGL's cameras (x right, y up, z backward), in the input's axes and units.
-    Intrinsics stand once for all frames where they are the same, otherwise with each.
+    Matrices are world_from_camera for OpenGL cameras (x right, y up, z backward), in the input's axes and units.
+    Intrinsics are written once if all frames share them, otherwise for each frame.
 
     Args:
-        cameras: photo names, below the photo folder, and their cameras.
+        cameras: names of the photos, relative to the photo folder, with their cameras.
     """
     lenses = [
         {"w": c.width, "h": c.height, **dict(zip(("fl_x", "fl_y", "cx", "cy"), c.intrinsics, strict=True))}

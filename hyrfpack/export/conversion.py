@@ -1,4 +1,4 @@
-"""Converting splats between the formats of other programs, and measuring what was lost."""
+"""Conversion of splats between the formats of other programs, with a measurement of the loss."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.export.kinds import check_request, chosen
+from hyrfpack.export.kinds import check_request, select_splats
 from hyrfpack.export.measure import psnr_of_splats
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Report, no_report, report_part
@@ -25,22 +25,23 @@ from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS, SplatFormat
 from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 
-MEASURED_VIEWS, MEASURED_SIZE_PIXELS = 12, 400
+MEASURED_VIEWS = 12
+MEASURED_SIZE_PIXELS = 400
 
 
 @dataclass(frozen=True)
 class ConversionReport:
-    """What a conversion of splats came to.
+    """The result of a conversion of splats.
 
     Attributes:
-        file: what was written.
-        bytes_before, bytes_after: on disk, of the source and of the file.
-        gaussians_before, gaussians_after: in the source and in the file.
-        degree_before, degree_after: of their spherical harmonics.
-        views: viewpoints that the loss was measured at.
-        psnr: dB, mean over the views, of the file's pictures, as read back from its bytes, against the source's, both
-            over black. Of a cropped source, what lies in the box alone is compared.
-        psnr_worst: dB, of the view with the least.
+        file: path of the written file.
+        bytes_before, bytes_after: sizes on disk of the source and of the file.
+        gaussians_before, gaussians_after: numbers of Gaussians in the source and in the file.
+        degree_before, degree_after: degrees of their spherical harmonics.
+        views: number of viewpoints at which the loss was measured.
+        psnr: PSNR in dB, mean over the views, of the file's pictures against the source's, both over black. The file is
+            read back from its bytes. Of a cropped source, only the Gaussians in the box are compared.
+        psnr_worst: PSNR in dB of the worst view.
     """
 
     file: str
@@ -55,7 +56,7 @@ class ConversionReport:
     psnr_worst: float
 
     def to_dict(self) -> dict:
-        """Plain numbers and strings, ready for JSON."""
+        """Return the fields as plain numbers and strings that JSON can hold."""
         return asdict(self)
 
 
@@ -70,23 +71,23 @@ def convert(
     say: Callable[[str], None] = lambda sentence: None,
     report: Report = no_report,
 ) -> ConversionReport:
-    """Convert splats from one format of other programs to another, in their own axes and units, and measure the loss.
+    """Convert splats between the formats of other programs, in their own axes and units, and measure the loss.
 
     Args:
-        source: .ply (plain or compressed), .splat, .spz, .sog, or the folder of a SOG that is not bundled.
+        source: .ply (plain or compressed), .splat, .spz, .sog, or the folder of an unbundled SOG.
         target: the file to write; its ending names the format: .ply, .splat, .spz, .glb, .usda, .usdc, .usdz or .sog.
         degree: highest degree of the spherical harmonics to keep, 0 to 3; None keeps all that the format can hold.
         crop: (min x, min y, min z, max x, max y, max z) in world units; Gaussians whose centres lie outside are left
             out. Infinite numbers leave a side open.
-        min_opacity: fainter Gaussians are left out.
-        overwrite: replace a file at `target`. Without it, one that is there is an error, and one that appears in the
-            meantime is kept: the result gets a free name beside it, which the report names.
-        say: told what the format cannot hold.
-        report: called with what is being done and the share of the work that is done, 0 to 1.
+        min_opacity: Gaussians with a lower opacity are left out.
+        overwrite: replace a file at `target`. If False, an existing file is an error. A file that appears during the
+            conversion is kept, and the result gets a free name beside it, which the report contains.
+        say: called with a sentence for each property of the splats that the format cannot hold.
+        report: called with the current activity and the share of the work that is done, 0 to 1.
 
     Raises:
-        HyrfDataError: the source cannot be read, or shows nothing.
-        HyrfError: the target is no format of splats or cannot be written, or the options leave no Gaussian.
+        HyrfDataError: the source cannot be read, or nothing in it is visible.
+        HyrfError: the target is not a format of splats or cannot be written, or the options leave no Gaussian.
 
     Example:
         >>> import hyrfpack
@@ -94,24 +95,24 @@ def convert(
         >>> result.degree_after, result.bytes_after == 32 * result.gaussians_after, result.psnr > 20
         (0, True, True)
     """
-    form = format_of(source, target)
-    check_request(form, target, degree, crop, min_opacity)
+    kind = find_target_format(source, target)
+    check_request(kind, target, degree, crop, min_opacity)
     Outputs(source, folder=sog_folder(source), overwrite=overwrite).file(target)
     report(f"reading {Path(source).name}", 0.0)
     splats = read_splats(source)
     if not len(splats):
         raise HyrfDataError(f"{source}: there is no Gaussian in it, so there is nothing to convert; name another file")
-    whole = splats if crop is None else chosen(splats, crop)
-    kept = chosen(whole, None, min_opacity)
-    kept = kept.with_degree(min(kept.degree, form.max_degree, kept.degree if degree is None else degree))
-    _tell_of_limits(form, splats, kept, say)
+    whole = splats if crop is None else select_splats(splats, crop)
+    kept = select_splats(whole, None, min_opacity)
+    kept = kept.with_degree(min(kept.degree, kind.max_degree, kept.degree if degree is None else degree))
+    _check_limits(kind, splats, kept, say)
     weighted = WeightedSplats.from_splats(whole, str(source))
     hints = Hints(camera=Viewpoint.from_frame(weighted.frame.center, weighted.frame.scale).camera)
-    report(f"writing {len(kept):,} Gaussians as {form.ending}", 0.2)
-    data = form.encode(kept, hints)
+    report(f"writing {len(kept):,} Gaussians as {kind.ending}", 0.2)
+    data = kind.encode(kept, hints)
     report("reading them back", 0.5)
-    after = form.decode(data, str(target))
-    psnr = _measure(whole, after, weighted, report_part(report, 0.6, 1.0))
+    after = kind.decode(data, str(target))
+    psnr = _measure_psnr(whole, after, weighted, report_part(report, 0.6, 1.0))
     written = write_atomic(target, data, overwrite=overwrite)
     return ConversionReport(
         file=str(written),
@@ -127,11 +128,12 @@ def convert(
     )
 
 
-def format_of(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> SplatFormat:
-    """Return the format of splats that the ending of `target` names.
+def find_target_format(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> SplatFormat:
+    """Find the format of splats that the ending of `target` names.
 
     Raises:
-        HyrfError: it names none, or the source is no file of splats; another command may be the one for them.
+        HyrfError: the ending names no such format, or the source is not a file of splats. The message names the
+            command to use instead, if there is one.
     """
     if not is_splats(source):
         if Path(source).suffix.lower() == ".hyrf":
@@ -146,31 +148,31 @@ def format_of(source: str | os.PathLike[str], target: str | os.PathLike[str]) ->
         raise HyrfError(f"{target}: a model is learnt from splats; run 'hyrfpack import {source} -o {target}'")
     if name.endswith(".compressed.ply"):
         raise HyrfError(f"{target}: compressed PLY is read, not written; name a .sog or .spz file, which are smaller")
-    form = FORMATS.get(Path(name).suffix)
-    if form is None:
+    kind = FORMATS.get(Path(name).suffix)
+    if kind is None:
         raise HyrfError(f"{target}: the ending names the format; end it in one of {', '.join(FORMATS)}")
-    return form
+    return kind
 
 
-def _tell_of_limits(form: SplatFormat, splats: Splats, kept: Splats, say: Callable[[str], None]) -> None:
-    """Refuse positions that the format cannot hold, and say what else it cannot."""
+def _check_limits(kind: SplatFormat, splats: Splats, kept: Splats, say: Callable[[str], None]) -> None:
+    """Raise HyrfError for positions that the format cannot hold, and report the other losses with `say`."""
     reach = float(np.abs(kept.positions).max())
-    if reach > form.max_coordinate:
+    if reach > kind.max_coordinate:
         raise HyrfError(
-            f"the splats reach {reach:,.0f} units from the origin, and {form.ending} {form.max_coordinate:,}; "
+            f"the splats reach {reach:,.0f} units from the origin, and {kind.ending} {kind.max_coordinate:,}; "
             "name another format, or leave the far ones out with `crop`"
         )
-    if splats.degree > form.max_degree:
+    if splats.degree > kind.max_degree:
         say(
-            f"{form.ending} holds no harmonics above degree {form.max_degree}; those of degree {splats.degree} are lost"
+            f"{kind.ending} holds no harmonics above degree {kind.max_degree}; those of degree {splats.degree} are lost"
         )
-    if splats.antialiased and not form.stores_antialiased:
+    if splats.antialiased and not kind.stores_antialiased:
         able = " or ".join(row.ending for row in FORMATS.values() if row.stores_antialiased)
-        say(f"{form.ending} cannot tell that the splats are antialiased: set it where they are drawn, or choose {able}")
+        say(f"{kind.ending} cannot tell that the splats are antialiased: set it where they are drawn, or choose {able}")
 
 
-def _measure(before: Splats, after: Splats, weighted: WeightedSplats, report: Report) -> list[float]:
-    """PSNR of the pictures of `after` against those of `before`, by view."""
+def _measure_psnr(before: Splats, after: Splats, weighted: WeightedSplats, report: Report) -> list[float]:
+    """Measure the PSNR in dB of the pictures of `after` against those of `before`, for each view."""
     original, converted = (Drawable.from_splats(splats, weighted.frame) for splats in (before, after))
     report("choosing viewpoints to compare at", 0.0)
     cameras = sample_viewpoints(weighted, original, MEASURED_VIEWS, MEASURED_SIZE_PIXELS, seed=0)

@@ -1,4 +1,4 @@
-"""Which degree of spherical harmonics a scene wants: more can be worse where few cameras say what colours do."""
+"""Choice of the degree of spherical harmonics for a scene; with few cameras a higher degree can overfit."""
 
 from __future__ import annotations
 
@@ -7,58 +7,62 @@ from collections.abc import Sequence
 import torch
 
 from hyrfpack.cameras.view_sampling import shrink_camera
-from hyrfpack.export.bake import Sight, bake
-from hyrfpack.export.measure import likeness
-from hyrfpack.export.source import FEW, MEASURED
+from hyrfpack.export.bake import CameraVisibility, bake
+from hyrfpack.export.measure import measure_psnr
+from hyrfpack.export.source import MAX_MEASURED_VIEWS, MIN_CAMERAS_TO_HOLD_OUT
 from hyrfpack.model import HybridModel
 from hyrfpack.progress import Report, no_report, report_part
 from hyrfpack.scene import Camera, evenly_spaced
 
-# Every ninth of the cameras, from the fifth on, is not fitted but chosen by; of those that `Source` makes up,
-# which stand three above one another, it is a middle one.
-KEPT_BACK = slice(4, None, 9)
-MANY = 200_000  # Gaussians; of more, so many spread over them are chosen by, drawn by themselves
-TOLERANCE = 0.2  # dB that a lower degree, which takes fewer bytes, may score less than the best
+# Every ninth camera, from the fifth on, is a validation camera. The cameras that `Source` makes up stand three above
+# one another; this slice takes middle ones.
+VALIDATION_CAMERAS = slice(4, None, 9)
+MAX_GAUSSIANS = 200_000
+# A lower degree takes fewer bytes, so it may score this much less than the best one.
+SCORE_TOLERANCE_DB = 0.2
 
 
 def choose_degree(
     model: HybridModel,
     cameras: Sequence[Camera],
     highest: int,
-    sights: Sequence[Sight] | None = None,
+    visibility: Sequence[CameraVisibility] | None = None,
     report: Report = no_report,
 ) -> tuple[int, dict[int, float]]:
-    """The lowest degree of harmonics, 0 to `highest`, that looks as good as any, and the score of each, dB.
+    """Choose the lowest degree of harmonics, 0 to `highest`, whose score is within SCORE_TOLERANCE_DB of the best.
 
-    The model is baked at all degrees with every ninth of the cameras kept back, and its pictures (of at most 512
-    pixels, without the background) are compared with the model's from those. Where there are too few cameras to spare
-    one (fewer than FEW), all are fitted and compared: nothing then tells a degree that fits too well from a good one.
-    Where there are MANY Gaussians and more, some are enough.
+    The model is baked at all degrees without the validation cameras. A degree's score is the PSNR of its pictures (of
+    at most 512 pixels, without the background) against the model's at these cameras. With fewer than
+    MIN_CAMERAS_TO_HOLD_OUT cameras, all are fitted and all are compared, so that overfitting is not detected. Of models
+    with more than MAX_GAUSSIANS Gaussians, every n-th is used.
 
     Args:
-        model: on the CPU.
-        cameras: that colours shall be fitted at, world units; none of those that a result will be judged by.
-        highest: degree to think of, 0 to 3.
-        sights: what `sights_of` told of the cameras, where it is known already.
-        report: called with what is being done and the share of the work that is done, 0 to 1.
+        model: a model on the CPU.
+        cameras: cameras at which colours may be fitted, world units; none at which the result will be measured.
+        highest: highest degree to consider, 0 to 3.
+        visibility: result of `compute_visibility` for the cameras, if it is known already.
+        report: called with the current activity and the share of the work that is done, 0 to 1.
+
+    Returns:
+        The degree, and the score in dB of each degree.
     """
-    fitted, kept = list(cameras), list(cameras)
-    every = -(-len(model) // MANY)
-    if every > 1:
-        model, sights = model.part(torch.arange(0, len(model), every)), None
-    seen = None if sights is None else list(sights)
-    if len(cameras) >= FEW:
-        kept = fitted[KEPT_BACK]
-        for some in (fitted, seen or []):
-            del some[KEPT_BACK]
-    baked = bake(model, fitted, range(highest + 1), seen, report_part(report, 0.0, 0.6))
-    contenders = {str(degree): (splats, None) for degree, splats in baked.items()}
-    views = [(shrink_camera(camera), None) for camera in evenly_spaced(kept, MEASURED)]
-    found = likeness(model, contenders, views, sphere=False, report=report_part(report, 0.6, 1.0))
+    fit_cameras, validation = list(cameras), list(cameras)
+    stride = -(-len(model) // MAX_GAUSSIANS)
+    if stride > 1:
+        model, visibility = model.part(torch.arange(0, len(model), stride)), None
+    fit_visibility = None if visibility is None else list(visibility)
+    if len(cameras) >= MIN_CAMERAS_TO_HOLD_OUT:
+        validation = fit_cameras[VALIDATION_CAMERAS]
+        for some in (fit_cameras, fit_visibility or []):
+            del some[VALIDATION_CAMERAS]
+    baked = bake(model, fit_cameras, range(highest + 1), fit_visibility, report_part(report, 0.0, 0.6))
+    candidates = {str(degree): (splats, None) for degree, splats in baked.items()}
+    views = [(shrink_camera(camera), None) for camera in evenly_spaced(validation, MAX_MEASURED_VIEWS)]
+    found = measure_psnr(model, candidates, views, sphere=False, report=report_part(report, 0.6, 1.0))
     scores = {degree: found[str(degree)].model for degree in baked}
-    return lowest_as_good(scores), scores
+    return lowest_degree_within_tolerance(scores), scores
 
 
-def lowest_as_good(scores: dict[int, float]) -> int:
-    """The lowest degree whose score is within TOLERANCE of the best."""
-    return min(degree for degree, score in scores.items() if score >= max(scores.values()) - TOLERANCE)
+def lowest_degree_within_tolerance(scores: dict[int, float]) -> int:
+    """Return the lowest degree whose score in dB is within SCORE_TOLERANCE_DB of the best."""
+    return min(degree for degree, score in scores.items() if score >= max(scores.values()) - SCORE_TOLERANCE_DB)

@@ -1,6 +1,6 @@
-"""Local exposure of baked splats: the gains by which the colours that splats are fitted to are exposed.
+"""Local exposure of baked splats: the gains that expose the colours to which splats are fitted.
 
-Splats carry no exposure map, so their colours hold what the map says of the cameras that see them.
+Splats have no exposure map, so their colours include the gains that the map predicts for the cameras that see them.
 """
 
 from __future__ import annotations
@@ -20,37 +20,39 @@ from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.scene import Camera
 
 if TYPE_CHECKING:
-    from hyrfpack.export.bake import Sight
+    from hyrfpack.export.bake import CameraVisibility
 
-# Without smoothing, indoor_room loses 0.18 dB at training cameras that are not fitted; 64 neighbours gain 0.05 dB more
-# and take four times as long.
+# Without smoothing, indoor_room loses 0.18 dB at training cameras that are not fitted. 64 neighbours gain another
+# 0.05 dB but take four times as long.
 SMOOTHING_NEIGHBORS = 16
 GAUSSIANS_PER_TASK = 1 << 16
 
 
 @dataclass(frozen=True)
 class BakeGains:
-    """Gains of the colour samples that the harmonics of Gaussians are fitted to.
+    """Gains of the colour samples to which the harmonics of Gaussians are fitted.
 
     Attributes:
-        cameras: (V, 3) float32, of what each camera sees: its render as photographed has these.
-        gaussians: (N, 3) float32, of each Gaussian along directions from which no camera sees it.
+        cameras: (V, 3) float32 gains of what each camera sees, as in its render with local exposure.
+        gaussians: (N, 3) float32 gains of each Gaussian along directions from which no camera sees it.
     """
 
     cameras: Tensor
     gaussians: Tensor
 
     @classmethod
-    def of(cls, model: HybridModel, cameras: Sequence[Camera], sights: Sequence[Sight]) -> BakeGains | None:
-        """Predict the gains of a bake's samples by the exposure map; None without a map, or where it changes nothing.
+    def predict(
+        cls, model: HybridModel, cameras: Sequence[Camera], visibility: Sequence[CameraVisibility]
+    ) -> BakeGains | None:
+        """Predict the gains of a bake's samples by the exposure map; None without a map, or where all gains are 1.
 
-        A Gaussian's log gain is the mean over the cameras and over its nearest neighbours, see `smooth_log_gains`,
-        weighted by the light that they send and receive.
+        The log gain of a Gaussian is a mean over the cameras and over its nearest neighbours, weighted by the light
+        that each neighbour sends to each camera; see `smooth_log_gains`.
 
         Args:
-            model: on the CPU.
-            cameras: that the model is baked from, world units.
-            sights: what `sights_of` returns for these cameras.
+            model: a model on the CPU.
+            cameras: the cameras of the bake, world units.
+            visibility: result of `compute_visibility` for these cameras.
         """
         if model.exposure is None:
             return None
@@ -59,8 +61,8 @@ class BakeGains:
         if not (logs.any() or typical.any()):
             return None
         light, sums = np.zeros(len(model)), np.zeros((len(model), 3))
-        for sight, log in zip(sights, logs, strict=True):
-            index, received = sight.index.numpy(), sight.light.double().numpy()
+        for camera_visibility, log in zip(visibility, logs, strict=True):
+            index, received = camera_visibility.index.numpy(), camera_visibility.light.double().numpy()
             light[index] += received
             sums[index] += received[:, None] * log
         smooth = smooth_log_gains(model.gaussians.positions.detach().numpy(), light, sums, typical)
@@ -85,9 +87,9 @@ def smooth_log_gains(positions: np.ndarray, light: np.ndarray, sums: np.ndarray,
 
     Args:
         positions: (N, 3).
-        light: (N,) >= 0, that each sends to all cameras.
-        sums: (N, 3) sum over the cameras of light times log gain.
-        typical: (3,) log gains of all where no camera sees any.
+        light: (N,) >= 0, total light that each Gaussian sends to the cameras.
+        sums: (N, 3) sums over the cameras of light times log gain.
+        typical: (3,) log gains of all Gaussians if no camera sees any.
 
     Returns:
         (N, 3) float64, finite.

@@ -1,4 +1,4 @@
-"""Folders of static files that anyone can host: a player with a model, and a gallery of several."""
+"""Folders of static files for any web server: a player of one model, and a gallery of several."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import count as counted
+from itertools import count as count_up
 from pathlib import Path
 
 from PIL import Image
@@ -16,8 +16,8 @@ from hyrfpack.atomic import pending_file, write_atomic
 from hyrfpack.checks import check_type
 from hyrfpack.evaluate import evaluate
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
-from hyrfpack.export.pages import page_cameras, tell_of_size
-from hyrfpack.export.poster import encode_poster, model_poster, splats_poster
+from hyrfpack.export.pages import page_cameras, suggest_compression
+from hyrfpack.export.poster import encode_poster, render_model_poster, render_splats_poster
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
 from hyrfpack.format import describe
@@ -31,9 +31,15 @@ from hyrfpack.web.html import stage
 from hyrfpack.web.player import element_script, encode_player, encode_readme
 from hyrfpack.web.view import playable_file
 
-POSTER, POSTER_BYTES = 640, 30_000  # pixels of its longer side; bytes
-INDEX, LIST_PLAYER, README, ELEMENT = "index.html", "player.html", "README.txt", "hyrf-viewer.js"
-SCENE, HYRF, POSTER_NAME = "scene", ".hyrf", "poster.jpg"
+POSTER_LONGEST_SIDE_PIXELS = 640
+MAX_POSTER_BYTES = 30_000
+INDEX_NAME = "index.html"
+GALLERY_PLAYER_NAME = "player.html"
+README_NAME = "README.txt"
+ELEMENT_SCRIPT_NAME = "hyrf-viewer.js"
+DEFAULT_SCENE_STEM = "scene"
+HYRF_ENDING = ".hyrf"
+POSTER_NAME = "poster.jpg"
 
 StrPath = str | os.PathLike[str]
 Say = Callable[[str], None]
@@ -47,22 +53,23 @@ def player(
     overwrite: bool = True,
     say: Say = lambda sentence: None,
 ) -> ExportReport:
-    """Write a folder of static files that plays a scene on any web server: a page, the file itself and its picture.
+    """Write a folder of static files that plays a scene on any web server: a page, the file itself and a poster.
 
-    The page plays other files as well: those that its address names (`index.html?content=URL`) and those that are
-    dropped on it. `hyrf-viewer.js` beside it is for other people's pages: `<hyrf-viewer src="scene.hyrf">`.
+    The page plays other files as well: one that its address names (`index.html?content=URL`), or one that is dropped
+    on it. `hyrf-viewer.js` beside it embeds the player into other pages: `<hyrf-viewer src="scene.hyrf">`.
 
     Args:
-        source: a `.hyrf` file or the folder of a run, or a file of splats (.ply, .spz, .splat, .sog), copied as it is;
-            None for a player without a scene.
-        folder: where; made when it is missing. Files of other names stay.
-        data: photos of the scene, from where the picture is taken; else it is from where the file says.
-        overwrite: replace files that are there; without it, they are an error.
-        say: told what is going on.
+        source: a `.hyrf` file or the folder of a run, or a file of splats (.ply, .spz, .splat, .sog), which is copied
+            unchanged; None for a player without a scene.
+        folder: output folder; created if it is missing. Files with other names stay.
+        data: photos of the scene; the poster is rendered from the first camera. Without them it is rendered from a
+            camera that the file keeps or suggests.
+        overwrite: replace existing files; if False, an existing file is an error.
+        say: called with notes on the progress.
 
     Raises:
-        HyrfError: the file cannot be read, a file cannot be written, or another call is at work in the folder.
-        TypeError: `data` is no Scene.
+        HyrfError: the file cannot be read, a file cannot be written, or another call is writing into the folder.
+        TypeError: `data` is not a Scene.
 
     Example:
         >>> import hyrfpack
@@ -73,35 +80,37 @@ def player(
     if data is not None:
         check_type("data", data, Scene)
     sources = [] if source is None else [source]
-    check_folder(folder, sources, [data], overwrite=True, listed=False)
+    check_folder(folder, sources, [data], overwrite=True, is_gallery=False)
     with exclusive_folder(folder):
-        check_folder(folder, sources, [data], overwrite=overwrite, listed=False)
-        return _write_player(source, _Folder(Path(folder), overwrite), data, say)
+        check_folder(folder, sources, [data], overwrite=overwrite, is_gallery=False)
+        return _write_player(source, _OutputFolder(Path(folder), overwrite), data, say)
 
 
-def _write_player(source: StrPath | None, into: _Folder, data: Scene | None, say: Say) -> ExportReport:
-    """As `player`, into a folder that this call holds."""
-    title = _title(into.path)
+def _write_player(source: StrPath | None, output: _OutputFolder, data: Scene | None, say: Say) -> ExportReport:
+    """Write the files of `player` into a folder that this call has locked."""
+    title = _folder_title(output.path)
     content = poster = None
     stages = {}
     description, count = "A player of 3D scenes", 0
     if source is not None:
         title = Path(source).stem
         source = playable_file(source)
-        scene = _Content.read(source, data, say, scored=False)
+        scene = _PlayableContent.read(source, data, say, with_quality=False)
         count = scene.count
-        content, poster = _names([source], listed=False)[0]
-        into.copy(content, source)
+        content, poster = _choose_file_names([source], is_gallery=False)[0]
+        output.copy(content, source)
         stages = {content: scene.stage} if scene.stage else {}
         if scene.poster is None:
             poster = None
         else:
-            into.write(poster, encode_poster(scene.poster, "JPEG", POSTER_BYTES))
+            output.write(poster, encode_poster(scene.poster, "JPEG", MAX_POSTER_BYTES))
         description = f"{count:,} Gaussians, {scene.length:,} bytes"
-    into.write(ELEMENT, element_script())
-    into.write(README, encode_readme(title, INDEX, INDEX, element=content or "URL"))
-    into.write(INDEX, encode_player(title, content=content, poster=poster, description=description, stages=stages))
-    return ExportReport(str(into.path), into.bytes, count, native=source is not None)
+    output.write(ELEMENT_SCRIPT_NAME, element_script())
+    output.write(README_NAME, encode_readme(title, INDEX_NAME, INDEX_NAME, element=content or "URL"))
+    output.write(
+        INDEX_NAME, encode_player(title, content=content, poster=poster, description=description, stages=stages)
+    )
+    return ExportReport(str(output.path), output.bytes, count, native=source is not None)
 
 
 def gallery(
@@ -115,16 +124,16 @@ def gallery(
     """Write a folder of static files that shows several scenes: a page that lists them, a player, and the files.
 
     Args:
-        sources: as of `player`, at least one; the folder of a run gives its name to the scene.
-        folder: where; made when it is missing. Files of other names stay.
-        data: photos of each scene, or None; held-out ones score it, and the list tells so. Without them it tells how
-            well a model fits the photos it was trained on, where its file says.
-        overwrite: replace files that are there; without it, they are an error.
-        say: told what is going on.
+        sources: at least one source as in `player`; a scene from the folder of a run is named after the folder.
+        folder: output folder; created if it is missing. Files with other names stay.
+        data: photos of each scene, or None. Held-out photos score a model, and the list shows the score. Without them
+            the list shows how well the model fits its training photos, if the file states it.
+        overwrite: replace existing files; if False, an existing file is an error.
+        say: called with notes on the progress.
 
     Raises:
-        HyrfError: a file cannot be read or written, or another call is at work in the folder.
-        ValueError: there are not as many `data` as `sources`.
+        HyrfError: a file cannot be read or written, or another call is writing into the folder.
+        ValueError: the numbers of `data` and `sources` differ.
 
     Example:
         >>> import hyrfpack
@@ -138,63 +147,68 @@ def gallery(
     for scene in scenes:
         if scene is not None:
             check_type("data", scene, Scene)
-    check_folder(folder, sources, scenes, overwrite=True, listed=True)
+    check_folder(folder, sources, scenes, overwrite=True, is_gallery=True)
     with exclusive_folder(folder):
-        check_folder(folder, sources, scenes, overwrite=overwrite, listed=True)
-        return _write_gallery(sources, _Folder(Path(folder), overwrite), scenes, say)
+        check_folder(folder, sources, scenes, overwrite=overwrite, is_gallery=True)
+        return _write_gallery(sources, _OutputFolder(Path(folder), overwrite), scenes, say)
 
 
-def _write_gallery(sources: Sequence[StrPath], into: _Folder, scenes: Sequence[Scene | None], say: Say) -> ExportReport:
-    """As `gallery`, into a folder that this call holds."""
+def _write_gallery(
+    sources: Sequence[StrPath], output: _OutputFolder, scenes: Sequence[Scene | None], say: Say
+) -> ExportReport:
+    """Write the files of `gallery` into a folder that this call has locked."""
     contents = []
-    for source, scene in zip(sources, scenes, strict=True):  # all, before anything is written
+    for source, scene in zip(sources, scenes, strict=True):  # all are read before anything is written
         say(f"reading {source}")
-        contents.append(_Content.read(playable_file(source), scene, say, scored=True))
+        contents.append(_PlayableContent.read(playable_file(source), scene, say, with_quality=True))
     cards = []
-    for source, shown, (content, poster) in zip(sources, contents, _names(sources, listed=True), strict=True):
-        into.copy(content, playable_file(source))
+    for source, shown, (content, poster) in zip(
+        sources, contents, _choose_file_names(sources, is_gallery=True), strict=True
+    ):
+        output.copy(content, playable_file(source))
         if shown.poster is not None:
-            into.write(poster, encode_poster(shown.poster, "JPEG", POSTER_BYTES))
+            output.write(poster, encode_poster(shown.poster, "JPEG", MAX_POSTER_BYTES))
         picture = None if shown.poster is None else poster
         cards.append(Card(Path(source).stem, content, picture, shown.count, shown.length, shown.quality))
-    title = _title(into.path)
+    title = _folder_title(output.path)
     pairs = zip(cards, contents, strict=True)
     stages = {card.content: shown.stage for card, shown in pairs if shown.stage}
-    into.write(LIST_PLAYER, encode_player(title, stages=stages))
-    into.write(README, encode_readme(title, LIST_PLAYER, INDEX))
-    into.write(INDEX, encode_gallery(title, cards, LIST_PLAYER))
-    return ExportReport(str(into.path), into.bytes, sum(card.count for card in cards), native=True)
+    output.write(GALLERY_PLAYER_NAME, encode_player(title, stages=stages))
+    output.write(README_NAME, encode_readme(title, GALLERY_PLAYER_NAME, INDEX_NAME))
+    output.write(INDEX_NAME, encode_gallery(title, cards, GALLERY_PLAYER_NAME))
+    return ExportReport(str(output.path), output.bytes, sum(card.count for card in cards), native=True)
 
 
 def check_folder(
-    folder: StrPath, sources: Sequence[StrPath], scenes: Sequence[Scene | None], *, overwrite: bool, listed: bool
+    folder: StrPath, sources: Sequence[StrPath], scenes: Sequence[Scene | None], *, overwrite: bool, is_gallery: bool
 ) -> None:
-    """Refuse a folder that `player`, or if `listed` `gallery`, may not or cannot write into.
+    """Check that `player`, or `gallery` if `is_gallery`, may write into a folder.
 
     Args:
-        folder, sources, scenes: theirs.
-        overwrite: files that are there may be replaced, but for those that are read.
+        folder, sources, scenes: arguments of `player` or `gallery`.
+        overwrite: existing files may be replaced, except those that are read.
+        is_gallery: check for the files of `gallery`.
 
     Raises:
-        HyrfError: what it is.
+        HyrfError: a file may not or cannot be written.
     """
-    names = [name for pair in _names(sources, listed=listed) for name in pair]
-    names += [README, INDEX, LIST_PLAYER if listed else ELEMENT]
+    names = [name for pair in _choose_file_names(sources, is_gallery=is_gallery) for name in pair]
+    names += [README_NAME, INDEX_NAME, GALLERY_PLAYER_NAME if is_gallery else ELEMENT_SCRIPT_NAME]
     files = [playable_file(source) for source in sources]
     for scene in scenes or [None]:
         Outputs(*files, scene=scene, overwrite=overwrite).folder(folder, names)
 
 
 @dataclass(frozen=True)
-class _Content:
-    """A file to be played.
+class _PlayableContent:
+    """A file to be played, with what the page says about it.
 
     Attributes:
-        count: Gaussians in it.
-        length: its bytes.
-        poster: what it looks like; None where that cannot be told.
-        quality: how good it is, in words; empty where nothing is known.
-        stage: from where to look at it, see `hyrfpack.web.html.stage`; None of splats.
+        count: number of Gaussians.
+        length: size in bytes.
+        poster: a picture of the scene, or None if none can be made.
+        quality: quality of the model in words; empty if unknown.
+        stage: initial cameras for the page, see `hyrfpack.web.html.stage`; None for splats.
     """
 
     count: int
@@ -204,34 +218,34 @@ class _Content:
     stage: dict | None = None
 
     @classmethod
-    def read(cls, path: StrPath, data: Scene | None, say: Say, *, scored: bool) -> _Content:
-        """Read a file whole, so that none goes along that is damaged.
+    def read(cls, path: StrPath, data: Scene | None, say: Say, *, with_quality: bool) -> _PlayableContent:
+        """Read a whole file, so that no damaged file is published.
 
         Args:
-            path, data, say: as of `player`.
-            scored: whether to find out how good it is.
+            path, data, say: `source`, `data` and `say` of `player`.
+            with_quality: whether to determine the quality.
 
         Raises:
-            HyrfError: it cannot be read.
+            HyrfError: the file cannot be read.
         """
         length = os.path.getsize(path) if os.path.isfile(path) else 0
-        if _ending(path) != HYRF:
+        if _playable_ending(path) != HYRF_ENDING:
             splats = read_splats(path)
-            return cls(len(splats), length, splats_poster(splats, POSTER))
-        read = Source.read(path, data)
-        tell_of_size(path, length, say)
-        quality = _quality(path, read.model, data, say) if scored else ""
-        cameras = page_cameras(read)
-        poster = model_poster(read.model, cameras[0], POSTER)
-        return cls(len(read.model), length, poster, quality, stage(cameras, read.up, read.center))
+            return cls(len(splats), length, render_splats_poster(splats, POSTER_LONGEST_SIDE_PIXELS))
+        loaded = Source.read(path, data)
+        suggest_compression(path, length, say)
+        quality = _describe_quality(path, loaded.model, data, say) if with_quality else ""
+        cameras = page_cameras(loaded)
+        poster = render_model_poster(loaded.model, cameras[0], POSTER_LONGEST_SIDE_PIXELS)
+        return cls(len(loaded.model), length, poster, quality, stage(cameras, loaded.up, loaded.center))
 
 
-def _quality(path: StrPath, model: HybridModel, data: Scene | None, say: Say) -> str:
-    """How good a model is, in words: on held-out photos if there are some, or else by its file's own account."""
+def _describe_quality(path: StrPath, model: HybridModel, data: Scene | None, say: Say) -> str:
+    """Describe the quality of a model in words, on held-out photos if there are any, else as stated in its file."""
     if data is not None and data.test:
-        say(f"scoring on {_photos(len(data.test))}")
+        say(f"scoring on {_format_photo_count(len(data.test))}")
         scores = evaluate(model, data.test)
-        return f"{scores.psnr:.2f} dB on {_photos(len(scores.views))}"
+        return f"{scores.psnr:.2f} dB on {_format_photo_count(len(scores.views))}"
     provenance = describe(path)["provenance"]
     stated, choices = provenance.get("psnr"), provenance.get("choices")
     if not isinstance(stated, float) or not 0 < stated < IDENTICAL_PSNR:
@@ -240,10 +254,10 @@ def _quality(path: StrPath, model: HybridModel, data: Scene | None, say: Say) ->
     return f"{stated:.1f} dB " + ("against the splats it was made of" if imported else "on its training photos")
 
 
-class _Folder:
-    """A folder to write into, each file whole or not at all, and the bytes that have been.
+class _OutputFolder:
+    """An output folder that counts the bytes written; each file is written completely or not at all.
 
-    Its files name each other, so that none of them can take another name where its own is taken: that is an error.
+    The files refer to each other by name. So a file whose name is taken does not get another name, which is an error.
     """
 
     def __init__(self, path: Path, overwrite: bool) -> None:
@@ -260,28 +274,28 @@ class _Folder:
         self.bytes += os.path.getsize(self.path / name)
 
 
-def _names(sources: Sequence[StrPath], *, listed: bool) -> list[tuple[str, str]]:
-    """File names, for models and their pictures, that differ in whatever file system and need no quoting."""
-    if not listed:
-        return [(f"{SCENE}{_ending(source)}", POSTER_NAME) for source in sources]
+def _choose_file_names(sources: Sequence[StrPath], *, is_gallery: bool) -> list[tuple[str, str]]:
+    """Choose names for the files and their posters that differ on any file system and need no quoting."""
+    if not is_gallery:
+        return [(f"{DEFAULT_SCENE_STEM}{_playable_ending(source)}", POSTER_NAME) for source in sources]
     names: list[str] = []
     for source in sources:
-        stem = re.sub(r"[^\w.-]+", "-", Path(source).stem).strip("-.") or SCENE
+        stem = re.sub(r"[^\w.-]+", "-", Path(source).stem).strip("-.") or DEFAULT_SCENE_STEM
         taken = {name.casefold() for name in names}
-        numbered = (stem if number == 1 else f"{stem}-{number}" for number in counted(1))
+        numbered = (stem if number == 1 else f"{stem}-{number}" for number in count_up(1))
         names.append(next(name for name in numbered if name.casefold() not in taken))
-    return [(f"{name}{_ending(source)}", f"{name}.jpg") for name, source in zip(names, sources, strict=True)]
+    return [(f"{name}{_playable_ending(source)}", f"{name}.jpg") for name, source in zip(names, sources, strict=True)]
 
 
-def _ending(path: StrPath) -> str:
-    """Of a file to be played: those that are not of splats are taken for models."""
+def _playable_ending(path: StrPath) -> str:
+    """Return the ending of a file to be played; a file without an ending of splats is taken for a model."""
     ending = Path(path).suffix.lower()
-    return ending if ending in READABLE_ENDINGS else HYRF
+    return ending if ending in READABLE_ENDINGS else HYRF_ENDING
 
 
-def _photos(count: int) -> str:
+def _format_photo_count(count: int) -> str:
     return f"{count:,} held-out photo{'' if count == 1 else 's'}"
 
 
-def _title(folder: StrPath) -> str:
+def _folder_title(folder: StrPath) -> str:
     return Path(os.path.abspath(folder)).name or "hyrfpack"

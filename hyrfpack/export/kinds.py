@@ -1,4 +1,4 @@
-"""What is asked for: which kind of file and which Gaussians, and what can be refused before minutes of work."""
+"""The kinds of files that an export writes, the selection of Gaussians, and early checks of the request."""
 
 from __future__ import annotations
 
@@ -20,27 +20,31 @@ from hyrfpack.splats.harmonics import MAX_DEGREE
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS, FileKind
 
-# What is exported besides the formats of splats.
-PAGE, TRANSFORMS = FileKind(ending=".html", stores_antialiased=True), FileKind(ending=".json", max_degree=0)
-POINTS = (
+# The kinds of output besides the formats of splats.
+HTML_PAGE = FileKind(ending=".html", stores_antialiased=True)
+TRANSFORMS_JSON = FileKind(ending=".json", max_degree=0)
+POINT_FILES = (
     FileKind(ending=".points.ply", max_degree=0),
     FileKind(ending=".points.glb", max_degree=0, package=("trimesh", "trimesh")),
 )
-COLMAP = FileKind(ending="", max_degree=0, package=("pycolmap", "pycolmap"))  # a folder
-PLAYER = FileKind(ending="")  # the same
-_KINDS = {kind.ending: kind for kind in (*POINTS, *FORMATS.values(), PAGE, TRANSFORMS)}
-ENDINGS = tuple(_KINDS)
+COLMAP_FOLDER = FileKind(ending="", max_degree=0, package=("pycolmap", "pycolmap"))
+PLAYER_FOLDER = FileKind(ending="")
+_KINDS_BY_ENDING = {kind.ending: kind for kind in (*POINT_FILES, *FORMATS.values(), HTML_PAGE, TRANSFORMS_JSON)}
+ENDINGS = tuple(_KINDS_BY_ENDING)
 
 
-def kind_of(target: str | os.PathLike[str], colmap: bool = False, *, others: tuple[str, ...] = ()) -> FileKind:
-    """What the ending, one of ENDINGS, says is to be written; for a folder or a name without ending a player.
+def find_file_kind(
+    target: str | os.PathLike[str], colmap: bool = False, *, other_endings: tuple[str, ...] = ()
+) -> FileKind:
+    """Find the kind of file that the ending of `target` names; a folder or a name without ending is for a player.
 
     Args:
-        colmap: into a folder, a COLMAP model instead.
-        others: endings that the caller knows besides, for the sentence.
+        target: path of the output.
+        colmap: the output is a folder with a COLMAP model.
+        other_endings: further endings that the caller accepts, to be named in the error message.
 
     Raises:
-        HyrfError: it is none of them.
+        HyrfError: the ending is none of ENDINGS, or does not go with `colmap`.
     """
     name = Path(target).name.lower()
     if colmap:
@@ -48,19 +52,19 @@ def kind_of(target: str | os.PathLike[str], colmap: bool = False, *, others: tup
             raise HyrfError(
                 f"{target}: a COLMAP model is a folder of tables; name one without ending for `colmap=True`"
             )
-        return COLMAP
+        return COLMAP_FOLDER
     if name.endswith(".compressed.ply"):
         raise HyrfError(
             f"{target}: compressed PLY is read, not written; .sog and .spz are small, .ply is not compressed"
         )
-    for ending, kind in _KINDS.items():
+    for ending, kind in _KINDS_BY_ENDING.items():
         if name.endswith(ending):
             return kind
     if os.path.isdir(target) or not Path(name).suffix:
-        return PLAYER
+        return PLAYER_FOLDER
     raise HyrfError(
-        f"{target}: the ending names the format; end it in one of {', '.join((*others, *ENDINGS))}, or name a folder "
-        "for a player"
+        f"{target}: the ending names the format; end it in one of {', '.join((*other_endings, *ENDINGS))}, or name a "
+        "folder for a player"
     )
 
 
@@ -74,18 +78,18 @@ def check_request(
     baked: bool = False,
     exposure: str = LOCAL_EXPOSURE,
 ) -> None:
-    """Refuse what would fail later on: see `export`. Raises HyrfError."""
+    """Check the arguments of `export` before any work. Raises HyrfError if they do not go together."""
     if degree is not None and degree not in range(MAX_DEGREE + 1):
         raise HyrfError(f"spherical harmonics of degree {degree} are not known; name 0 to {MAX_DEGREE}")
     if crop is not None and (np.shape(crop) != (6,) or np.isnan(crop).any()):
         raise HyrfError(f"the crop {crop} is not a box; name the least x, y, z, then the greatest, in world units")
     if not 0 <= min_opacity <= 1:
         raise HyrfError(f"an opacity of {min_opacity} cannot be asked for; name 0 to 1")
-    if kind is TRANSFORMS and (crop is not None or min_opacity > 0):
+    if kind is TRANSFORMS_JSON and (crop is not None or min_opacity > 0):
         raise HyrfError(
             f"{target}: this holds cameras only, and `crop` and `min_opacity` choose Gaussians; leave them out"
         )
-    if baked and kind is PLAYER:
+    if baked and kind is PLAYER_FOLDER:
         raise HyrfError(f"{target}: a player's folder holds the model file itself; for `baked=True` name a file .html")
     asked = {
         "`degree`": degree is not None,
@@ -94,7 +98,7 @@ def check_request(
         "`background=False`": not background,
         f"`exposure={exposure!r}`": exposure != LOCAL_EXPOSURE,
     }
-    if any(asked.values()) and (kind is PLAYER or (kind is PAGE and not baked)):
+    if any(asked.values()) and (kind is PLAYER_FOLDER or (kind is HTML_PAGE and not baked)):
         names = " and ".join(name for name, given in asked.items() if given)
         raise HyrfError(
             f"{target}: the model goes along whole, and {names} would change it; leave it out, or write splats into a "
@@ -107,21 +111,30 @@ def check_request(
 
 
 def check_place(target: str | os.PathLike[str], outputs: Outputs, colmap: bool = False) -> None:
-    """Refuse a target, no player's folder, that may not or cannot be written. Raises HyrfError."""
-    if kind_of(target, colmap) is COLMAP:
+    """Check that a target other than a player's folder may be written. Raises HyrfError otherwise."""
+    if find_file_kind(target, colmap) is COLMAP_FOLDER:
         outputs.folder(target, COLMAP_FILES)
     else:
         outputs.file(target)
 
 
 @torch.no_grad()
-def check_model(read: Source, kind: FileKind, crop: Sequence[float] | None, min_opacity: float, sphere: bool) -> None:
-    """Refuse a choice that leaves nothing, and a scene, with its background if `sphere`, too far away for the kind of
-    file: before the bake. Raises HyrfError."""
-    model, frame = read.model, read.model.config.frame
+def check_model(loaded: Source, kind: FileKind, crop: Sequence[float] | None, min_opacity: float, sphere: bool) -> None:
+    """Check before the bake that Gaussians remain and that their positions fit into the kind of file.
+
+    Args:
+        loaded: the model.
+        kind: the kind of file.
+        crop, min_opacity: as in `export`.
+        sphere: whether the background sphere is exported, too.
+
+    Raises:
+        HyrfError: the options leave no Gaussian, or the scene is too far from the origin.
+    """
+    model, frame = loaded.model, loaded.model.config.frame
     positions = frame.to_world(model.gaussians.positions.numpy())
-    if crop is not None or min_opacity > 0:  # the bake makes no Gaussian less faint
-        positions = positions[kept_of(positions, model.decode_geometry().opacities.numpy(), crop, min_opacity)]
+    if crop is not None or min_opacity > 0:  # checked early, because the bake raises no opacity
+        positions = positions[selection_mask(positions, model.decode_geometry().opacities.numpy(), crop, min_opacity)]
     reach = max(float(np.abs(positions).max()), background_reach(frame) if sphere else 0.0)
     if reach > kind.max_coordinate:
         raise HyrfError(
@@ -130,20 +143,24 @@ def check_model(read: Source, kind: FileKind, crop: Sequence[float] | None, min_
         )
 
 
-def chosen(splats: Splats, crop: Sequence[float] | None = None, min_opacity: float = 0.0) -> Splats:
-    """Those with centres in the box `crop` and not fainter than `min_opacity`; see `export`.
+def select_splats(splats: Splats, crop: Sequence[float] | None = None, min_opacity: float = 0.0) -> Splats:
+    """Return the splats with centres in the box `crop` and opacities of at least `min_opacity`; see `export`.
 
     Raises:
-        HyrfError: none is left.
+        HyrfError: no splat is left.
     """
-    keep = kept_of(splats.positions, splats.opacities, crop, min_opacity)
+    keep = selection_mask(splats.positions, splats.opacities, crop, min_opacity)
     return splats if keep.all() else splats[keep]
 
 
-def kept_of(
+def selection_mask(
     positions: np.ndarray, opacities: np.ndarray, crop: Sequence[float] | None, min_opacity: float
 ) -> np.ndarray:
-    """(N,) bool: which Gaussians with positions (N, 3) and opacities (N,) `chosen` keeps. HyrfError when none."""
+    """Return a mask (N,) of the Gaussians that `select_splats` keeps, given positions (N, 3) and opacities (N,).
+
+    Raises:
+        HyrfError: no Gaussian is left.
+    """
     keep = opacities >= min_opacity
     if crop is not None:
         keep &= ((positions >= crop[:3]) & (positions <= crop[3:])).all(axis=1)

@@ -1,4 +1,4 @@
-"""What an export loses: pictures of splats beside those of the model they came from."""
+"""Measurement of the loss of an export: pictures of splats against those of the model they were baked from."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from hyrfpack.splats.splats import Splats
 
 
 @dataclass(frozen=True)
-class Likeness:
-    """PSNR in dB, means over views.
+class PsnrScores:
+    """PSNR of splats in dB, as means over views.
 
     Attributes:
-        model: of the splats' pictures against the model's.
-        photos: of the splats' pictures against the photos; None without photos.
-        views: how many.
+        model: PSNR of the splats' pictures against the model's.
+        photos: PSNR of the splats' pictures against the photos; None without photos.
+        views: number of views.
     """
 
     model: float
@@ -37,38 +37,41 @@ class Likeness:
 
 
 @torch.no_grad()
-def likeness(
+def measure_psnr(
     model: HybridModel,
-    contenders: Mapping[str, tuple[Splats, np.ndarray | None]],
+    candidates: Mapping[str, tuple[Splats, np.ndarray | None]],
     views: Sequence[tuple[Camera, View | None]],
     *,
     sphere: bool,
     report: Report = no_report,
-) -> dict[str, Likeness]:
-    """How like a model splats look.
+) -> dict[str, PsnrScores]:
+    """Measure the PSNR of pictures of splats against those of a model, and against photos.
 
     Args:
-        model: what they were made of; scored itself, too, as "model".
-        contenders: by name, splats and what lies behind them: an equirectangular picture (H, 2H, 3) as
+        model: the model from which the splats were baked. It is scored, too, under the name "model".
+        candidates: splats by name, each with its background: an equirectangular picture (H, 2H, 3) as
             `background_picture` makes it, or None for the model's solid colour.
-        views: where to look from; photos are scored where all views have them.
-        sphere: whether the model shows its background sphere.
-        report: told of each view, and the share of the work that is done.
+        views: cameras, with their photos or None. Photos are scored if all views have them.
+        sphere: whether the model is rendered with its background sphere.
+        report: called after each view with the share of the work that is done, 0 to 1.
+
+    Returns:
+        Scores by name, and of "model"; empty if the masks of the photos leave no pixel.
     """
     decoded, frame = model.decode(), model.config.frame
     solid = torch.tensor(model.config.solid)
-    drawables = {name: (Drawable.from_splats(splats, frame), behind) for name, (splats, behind) in contenders.items()}
+    drawables = {name: (Drawable.from_splats(splats, frame), behind) for name, (splats, behind) in candidates.items()}
 
-    @torch.no_grad()  # of each thread
-    def scores_at(place: tuple[Camera, View | None]) -> dict[str, tuple[float, float | None]]:
-        camera, view = place
+    @torch.no_grad()  # because the setting is per thread
+    def scores_at(viewpoint: tuple[Camera, View | None]) -> dict[str, tuple[float, float | None]]:
+        camera, view = viewpoint
         own = to_8bit(render(model, camera, decoded=decoded, background=sphere).rgb)
         pictures = {"model": own}
         for name, (drawable, behind) in drawables.items():
             raster = draw(drawable, camera)
             backdrop = solid if behind is None else _equirect_colors(torch.from_numpy(behind), camera)
             pictures[name] = to_8bit(raster.rgb + raster.transmittance[..., None] * backdrop)
-        photo, mask = (None, None) if view is None else _photo(view, model)
+        photo, mask = (None, None) if view is None else _load_photo(view, model)
         if mask is not None and not mask.any():
             return {}
         return {
@@ -78,17 +81,17 @@ def likeness(
 
     compare = report_each_call(scores_at, report, "comparing pictures with the model's", len(views))
     scores = [found for found in parallel_map(compare, views) if found]
-    return {name: _mean([found[name] for found in scores]) for name in ("model", *drawables)} if scores else {}
+    return {name: _mean_scores([found[name] for found in scores]) for name in ("model", *drawables)} if scores else {}
 
 
 def _equirect_colors(picture: Tensor, camera: Camera) -> Tensor:
-    """(H, W, 3) what a camera sees of an equirectangular picture infinitely far away; see `background_picture`."""
+    """Sample an equirectangular picture as a camera sees it at infinite distance; returns (H, W, 3)."""
     height, width, _ = picture.shape
     rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     points = torch.stack((columns, rows), -1).reshape(-1, 2) + 0.5
     directions = pixel_directions(points.double(), camera.intrinsics, torch.from_numpy(camera.camera_from_world))
     x, y, z = directions.float().unbind(-1)
-    # Half a pixel of the other side beyond each edge, so that interpolation goes around.
+    # The picture is extended by one column of the opposite side at each edge, so that interpolation wraps around.
     around = torch.cat((picture[:, -1:], picture, picture[:, :1]), dim=1).permute(2, 0, 1)[None]
     across = torch.atan2(x, z) / torch.pi * width / (width + 2)
     down = 2 * torch.atan2(y, torch.hypot(x, z)) / torch.pi
@@ -97,19 +100,19 @@ def _equirect_colors(picture: Tensor, camera: Camera) -> Tensor:
     return sampled[0, :, 0].T.reshape(camera.height, camera.width, 3)
 
 
-def _photo(view: View, model: HybridModel) -> tuple[Tensor, Tensor | None]:
+def _load_photo(view: View, model: HybridModel) -> tuple[Tensor, Tensor | None]:
     picture = view.load()
     photo = torch.from_numpy(picture.composite(np.array(model.config.solid, np.float32)))
     return photo, None if picture.mask is None else torch.from_numpy(picture.mask)
 
 
-def _mean(scores: Sequence[tuple[float, float | None]]) -> Likeness:
+def _mean_scores(scores: Sequence[tuple[float, float | None]]) -> PsnrScores:
     own, photos = zip(*scores, strict=True)
-    return Likeness(fmean(own), None if None in photos else fmean(photos), len(scores))
+    return PsnrScores(fmean(own), None if None in photos else fmean(photos), len(scores))
 
 
 @torch.no_grad()
 def psnr_of_splats(before: Drawable, after: Drawable, camera: Camera) -> float:
-    """Return the PSNR in dB of what a camera sees of `after` against what it sees of `before`, both over black."""
+    """Return the PSNR in dB of a camera's picture of `after` against that of `before`, both over black."""
     shown, reference = (to_8bit(draw(drawable, camera).rgb) for drawable in (after, before))
     return psnr(shown, reference)

@@ -1,4 +1,4 @@
-"""Pages of one file: with the model itself inside, or with the splats that it was baked to."""
+"""Pages of a single file that contain either the model itself or splats baked from it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hyrfpack.atomic import write_atomic
-from hyrfpack.export.poster import encode_poster, model_poster
+from hyrfpack.export.poster import encode_poster, render_model_poster
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
 from hyrfpack.format import describe
@@ -20,75 +20,80 @@ from hyrfpack.scene import Camera, evenly_spaced
 from hyrfpack.splats.splats import Splats
 from hyrfpack.web.html import encode_native, encode_page
 
-PAGE_CAMERAS = 12  # that a page can be stepped through
-POSTER, POSTER_BYTES = 480, 9_000  # pixels of its longer side; bytes, a third more in the page
-LARGE = 20_000_000  # bytes of a page that take a while on many a connection
+MAX_PAGE_CAMERAS = 12
+POSTER_LONGEST_SIDE_PIXELS = 480
+MAX_POSTER_BYTES = 9_000  # before base64, which adds a third
+LARGE_FILE_BYTES = 20_000_000  # larger files take long to load on many connections
 
 
-def page_cameras(read: Source) -> list[Camera]:
-    """Those that a page can be stepped through: up to PAGE_CAMERAS of the known ones, or made-up ones."""
-    cameras = [camera for _, camera in read.cameras] or [camera for camera, _ in read.measured]
-    return evenly_spaced(cameras, PAGE_CAMERAS)
+def page_cameras(loaded: Source) -> list[Camera]:
+    """Choose the cameras that a page steps through: up to MAX_PAGE_CAMERAS known ones, or made-up ones."""
+    cameras = [camera for _, camera in loaded.cameras] or [camera for camera, _ in loaded.measured_views]
+    return evenly_spaced(cameras, MAX_PAGE_CAMERAS)
 
 
-def baked_page(read: Source, splats: Splats, picture: np.ndarray | None, title: str) -> bytes:
-    """The page that shows splats of a model.
+def encode_baked_page(loaded: Source, splats: Splats, picture: np.ndarray | None, title: str) -> bytes:
+    """Encode a page that shows splats baked from a model.
 
     Args:
-        read: the model.
-        splats: what it was baked to.
-        picture: (H, 2H, 3) its background, see `background_picture`; None for its solid colour.
-        title: of the page.
+        loaded: the model with its cameras.
+        splats: the baked splats.
+        picture: (H, 2H, 3) background of the model, see `background_picture`; None for its solid colour.
+        title: title of the page.
     """
-    frame = read.model.config.frame
+    frame = loaded.model.config.frame
     near, sphere = RenderSettings().near * frame.scale, (frame.center, BACKGROUND_RADIUS * frame.scale)
-    return encode_page(splats, background=picture, near=near, sphere=sphere, **_stage(read, title))
+    return encode_page(splats, background=picture, near=near, sphere=sphere, **_page_settings(loaded, title))
 
 
-def native_page(read: Source, data: bytes, title: str) -> bytes:
-    """The page that holds a model itself.
+def encode_native_page(loaded: Source, data: bytes, title: str) -> bytes:
+    """Encode a page that contains a model file.
 
     Args:
-        read: the model.
-        data: its `.hyrf` file.
-        title: of the page.
+        loaded: the model with its cameras.
+        data: bytes of the `.hyrf` file.
+        title: title of the page.
     """
-    return encode_native(data, count=len(read.model), frame=read.model.config.frame, **_stage(read, title))
+    return encode_native(
+        data, count=len(loaded.model), frame=loaded.model.config.frame, **_page_settings(loaded, title)
+    )
 
 
 def write_native_page(
-    read: Source,
+    loaded: Source,
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
     say: Callable[[str], None],
     overwrite: bool = True,
 ) -> ExportReport:
-    """Write the page that holds a model file itself. `overwrite` as of `hyrfpack.atomic.pending_file`.
+    """Write a page that contains a model file; `overwrite` is that of `hyrfpack.atomic.pending_file`.
 
     Raises:
-        HyrfError: it cannot be written.
+        HyrfError: the page cannot be written.
     """
     data = Path(source).read_bytes()
-    tell_of_size(source, len(data), say)
-    page = native_page(read, data, Path(target).stem)
+    suggest_compression(source, len(data), say)
+    page = encode_native_page(loaded, data, Path(target).stem)
     written = write_atomic(target, page, overwrite=overwrite)
-    return ExportReport(str(written), len(page), len(read.model), native=True)
+    return ExportReport(str(written), len(page), len(loaded.model), native=True)
 
 
-def tell_of_size(source: str | os.PathLike[str], length: int, say: Callable[[str], None]) -> None:
-    """Say what can be done where a model file of so many bytes, to be sent to browsers, is larger than need be."""
-    if length > LARGE or describe(source)["profile"] == "raw":
+def suggest_compression(source: str | os.PathLike[str], length: int, say: Callable[[str], None]) -> None:
+    """Suggest `hyrfpack compress` with `say` if a model file of `length` bytes is large or uncompressed."""
+    if length > LARGE_FILE_BYTES or describe(source)["profile"] == "raw":
         say(f"{source} goes along as it is, {length:,} bytes; 'hyrfpack compress' makes it smaller")
 
 
-def _stage(read: Source, title: str) -> dict[str, Any]:
-    """What pages are told besides what they hold."""
-    cameras = page_cameras(read)
+def _page_settings(loaded: Source, title: str) -> dict[str, Any]:
+    """Collect the arguments that both kinds of page share: title, cameras, axes, background colour and poster."""
+    cameras = page_cameras(loaded)
     return {
         "title": title,
         "cameras": cameras,
-        "up": read.up,
-        "center": read.center,
-        "solid": read.model.config.solid,
-        "poster": encode_poster(model_poster(read.model, cameras[0], POSTER), "WEBP", POSTER_BYTES),
+        "up": loaded.up,
+        "center": loaded.center,
+        "solid": loaded.model.config.solid,
+        "poster": encode_poster(
+            render_model_poster(loaded.model, cameras[0], POSTER_LONGEST_SIDE_PIXELS), "WEBP", MAX_POSTER_BYTES
+        ),
     }

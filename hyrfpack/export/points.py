@@ -1,4 +1,4 @@
-"""The centres of splats as coloured points, with the cameras as frusta: a look at a scene in any 3D program."""
+"""Export of the centres of splats as coloured points, with the cameras as frusta, for any 3D program."""
 
 from __future__ import annotations
 
@@ -13,26 +13,27 @@ from hyrfpack.splats.formats.gltf import GLTF_UP, linear_colors
 from hyrfpack.splats.placement import local_origin, local_positions, upright_rotation
 from hyrfpack.splats.splats import Splats
 
-_CAMERA_COLOR = (255, 106, 0, 255)  # orange: rare in photos
-_DEPTH = 0.06  # of a frustum, in distances from camera to scene
-_DOTS = 16  # along each edge of a frustum, where there are no lines
-# Apex 0, corners 1 to 4 clockwise from the top left, and 5, a tip that shows which side is up: one stroke draws all.
-_STROKE = (4, 0, 1, 2, 3, 4, 1, 5, 2, 0, 3)
+_CAMERA_COLOR = (255, 106, 0, 255)  # orange, because it is rare in photos
+_FRUSTUM_DEPTH_RATIO = 0.06  # over the median distance from camera to scene
+_DOTS_PER_EDGE = 16
+# One stroke through these vertices draws a frustum: 0 is the apex, 1 to 4 are the corners clockwise from the top left,
+# and 5 is a tip that shows which side is up.
+_FRUSTUM_STROKE = (4, 0, 1, 2, 3, 4, 1, 5, 2, 0, 3)
 
 
 def encode_points(splats: Splats, cameras: Sequence[Camera], extension: Literal["glb", "ply"], up: np.ndarray) -> bytes:
-    """Splats and cameras as points and lines, in the input's axes and units.
+    """Encode splats and cameras as points and lines, in the input's axes and units.
 
-    A .glb holds two geometries, the points "gaussians" and the lines "cameras"; their nodes turn them upright, and
-    move them where the scene lies far from the origin compared to its size. A .ply holds vertices only, for few
-    programs draw its edges: the frusta are dotted lines, after the points, and positions are double where float would
-    be coarse. Colours are those of degree 0 with opacity as alpha. Same input, same bytes.
+    A .glb holds two geometries, the points "gaussians" and the lines "cameras". Their nodes turn them upright, and
+    translate them if the scene lies far from the origin compared to its size. A .ply holds vertices only, because few
+    programs draw its edges: dotted frusta follow the points, and positions are float64 where float32 would be too
+    coarse. Colours are those of degree 0, with the opacity as alpha. The same input gives the same bytes.
 
     Args:
-        splats: (N) whose centres are shown.
-        cameras: any number.
-        extension: which file.
-        up: (3,) unit vector in the world: which way is up in the scene.
+        splats: splats whose centres become points.
+        cameras: any number of cameras.
+        extension: format of the file.
+        up: (3,) unit vector in world axes that points up in the scene.
 
     Raises:
         HyrfError: trimesh is missing.
@@ -40,12 +41,12 @@ def encode_points(splats: Splats, cameras: Sequence[Camera], extension: Literal[
     """
     if not len(splats) and not cameras:
         raise HyrfDataError("there are neither points nor cameras to export; name a model that has some")
-    frusta = _frusta(cameras, splats.positions)
+    frusta = _make_frusta(cameras, splats.positions)
     origin = local_origin(np.concatenate((splats.positions, frusta.reshape(-1, 3))))
-    return _glb(splats, frusta, origin, up) if extension == "glb" else _ply(splats, frusta, origin)
+    return _encode_glb(splats, frusta, origin, up) if extension == "glb" else _encode_ply(splats, frusta, origin)
 
 
-def _glb(splats: Splats, frusta: np.ndarray, origin: np.ndarray, up: np.ndarray) -> bytes:
+def _encode_glb(splats: Splats, frusta: np.ndarray, origin: np.ndarray, up: np.ndarray) -> bytes:
     with needs_package("trimesh", "writing points as .glb"):
         import trimesh
         from trimesh.path.entities import Line
@@ -57,7 +58,7 @@ def _glb(splats: Splats, frusta: np.ndarray, origin: np.ndarray, up: np.ndarray)
         cloud = trimesh.PointCloud(local_positions(splats, origin), colors=linear_colors(splats))
         scene.add_geometry(cloud, node_name="gaussians", geom_name="gaussians", transform=place)
     if len(frusta):
-        strokes = np.arange(len(frusta))[:, None] * frusta.shape[1] + _STROKE
+        strokes = np.arange(len(frusta))[:, None] * frusta.shape[1] + _FRUSTUM_STROKE
         lines = trimesh.path.Path3D(
             entities=[Line(stroke) for stroke in strokes],
             vertices=(frusta - origin).reshape(-1, 3),
@@ -68,9 +69,9 @@ def _glb(splats: Splats, frusta: np.ndarray, origin: np.ndarray, up: np.ndarray)
     return scene.export(file_type="glb")
 
 
-def _ply(splats: Splats, frusta: np.ndarray, origin: np.ndarray) -> bytes:
-    ends = frusta[:, _STROKE, None]  # (cameras, corners along the stroke, 1, 3)
-    steps = np.arange(_DOTS)[:, None] / _DOTS
+def _encode_ply(splats: Splats, frusta: np.ndarray, origin: np.ndarray) -> bytes:
+    ends = frusta[:, _FRUSTUM_STROKE, None]  # (cameras, corners along the stroke, 1, 3)
+    steps = np.arange(_DOTS_PER_EDGE)[:, None] / _DOTS_PER_EDGE
     dots = (ends[:, :-1] * (1 - steps) + ends[:, 1:] * steps).reshape(-1, 3)
     number = "double" if origin.any() else "float"
     kind = [("position", "<f8" if origin.any() else "<f4", 3), ("color", "u1", 4)]
@@ -84,13 +85,13 @@ def _ply(splats: Splats, frusta: np.ndarray, origin: np.ndarray) -> bytes:
     return "\n".join((*header, "end_header", "")).encode() + vertices.tobytes()
 
 
-def _frusta(cameras: Sequence[Camera], positions: np.ndarray) -> np.ndarray:
-    """(cameras, 6, 3) world positions of apex, corners and tip; see _STROKE."""
+def _make_frusta(cameras: Sequence[Camera], positions: np.ndarray) -> np.ndarray:
+    """Return the world positions (cameras, 6, 3) of each frustum's apex, corners and tip; see _FRUSTUM_STROKE."""
     if not cameras:
         return np.zeros((0, 6, 3))
     centers = np.stack([camera.position for camera in cameras])
     middle = np.median(positions if len(positions) else centers, axis=0)
-    depth = _DEPTH * float(np.median(np.linalg.norm(centers - middle, axis=1))) or _DEPTH
+    depth = _FRUSTUM_DEPTH_RATIO * float(np.median(np.linalg.norm(centers - middle, axis=1))) or _FRUSTUM_DEPTH_RATIO
     frusta = np.empty((len(cameras), 6, 3))
     for frustum, camera in zip(frusta, cameras, strict=True):
         width, height = camera.width, camera.height

@@ -1,4 +1,4 @@
-"""A picture of a scene to be shown before the scene itself is there."""
+"""Posters: pictures of a scene that a page shows until the scene is loaded."""
 
 from __future__ import annotations
 
@@ -17,42 +17,43 @@ from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.splats import Splats
 
-QUALITIES = (80, 65, 50, 35, 20, 10)  # of WebP and JPEG, of 100
-MIDDLE = (1, 99)  # percentiles of splats' positions between which the scene is taken to lie
+ENCODER_QUALITIES = (80, 65, 50, 35, 20, 10)
+FRAME_PERCENTILES = (1, 99)
 
 
-def model_poster(model: HybridModel, camera: Camera, longest: int) -> Image.Image:
-    """What a camera sees of a model, in a picture of at most `longest` pixels a side."""
-    return to_image(render(model, shrink_camera(camera, longest)).rgb)
+def render_model_poster(model: HybridModel, camera: Camera, longest_side: int) -> Image.Image:
+    """Render a model from a camera, in a picture of at most `longest_side` pixels a side."""
+    return to_image(render(model, shrink_camera(camera, longest_side)).rgb)
 
 
-def splats_poster(splats: Splats, longest: int) -> Image.Image | None:
-    """What splats look like from a little above, over black; None where they lie at one place, or there are none.
+def render_splats_poster(splats: Splats, longest_side: int) -> Image.Image | None:
+    """Render splats from slightly above, over black; None if there are none or all lie at one place.
 
-    The scene is taken to be upright as most reconstructions are, with y downwards.
+    The scene is assumed to be upright with y downwards, as most reconstructions are.
     """
     if not len(splats):
         return None
     try:
-        frame = Frame.from_box(*np.percentile(splats.positions, MIDDLE, axis=0))
+        frame = Frame.from_box(*np.percentile(splats.positions, FRAME_PERCENTILES, axis=0))
     except HyrfDataError:
         return None
     camera = orbit(Viewpoint.from_frame(frame.center, frame.scale), 1)[0]
-    return to_image(draw(Drawable.from_splats(splats, frame), shrink_camera(camera, longest)).rgb)
+    return to_image(draw(Drawable.from_splats(splats, frame), shrink_camera(camera, longest_side)).rgb)
 
 
-def encode_poster(picture: Image.Image, form: str, most: int) -> bytes:
-    """A picture as the bytes of a file, as good as `most` bytes allow.
+def encode_poster(picture: Image.Image, image_format: str, max_bytes: int) -> bytes:
+    """Encode a picture at the highest quality that `max_bytes` allow.
 
     Args:
-        picture: RGB.
-        form: "WEBP" or "JPEG".
-        most: bytes, as nearly as possible: where the lowest quality takes more, the picture is made smaller.
+        picture: an RGB picture.
+        image_format: "WEBP" or "JPEG".
+        max_bytes: maximum size. If the lowest quality takes more bytes, the picture is shrunk. Only a picture of one
+            pixel can exceed it.
     """
     while True:
-        for quality in QUALITIES:
+        for quality in ENCODER_QUALITIES:
             file = io.BytesIO()
-            picture.save(file, form, quality=quality)
-            if file.tell() <= most or max(picture.size) == 1:
+            picture.save(file, image_format, quality=quality)
+            if file.tell() <= max_bytes or max(picture.size) == 1:
                 return file.getvalue()
         picture = picture.resize([max(1, side // 2) for side in picture.size], Image.Resampling.BOX)

@@ -1,4 +1,4 @@
-"""What an export came to."""
+"""The report of an export."""
 
 from __future__ import annotations
 
@@ -7,29 +7,28 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class ExportReport:
-    """What an export came to. PSNR in dB, means over views.
+    """The result of an export. PSNR is in dB, as a mean over views.
 
     Attributes:
-        file: what was written, a file or a folder.
-        bytes: on disk; of all files that were written into a folder.
-        gaussians: in the file, those of the background included; 0 where it is one of cameras.
-        native: whether it holds the model itself, so that nothing was lost and nothing is measured.
-        background: how many of the Gaussians make the background.
-        degree: of the spherical harmonics in the file.
-        chosen_by: PSNR of the baked model's pictures against the model's own, by degree, at cameras kept back for the
-            purpose: what the degree was chosen by; empty where it was given.
-        views: how many views the loss was measured at; 0 where it was not.
-        psnr_baked: PSNR of the baked model's pictures against the model's own, before anything is rounded to what the
-            file holds; None where it was not measured.
+        file: path of the written file or folder.
+        bytes: size on disk; of a folder, the total size of the written files.
+        gaussians: number of Gaussians in the file, including the background's; 0 for a file of cameras.
+        native: whether the file holds the model itself, so that nothing was lost and nothing is measured.
+        background: number of Gaussians that represent the background.
+        degree: degree of the spherical harmonics in the file.
+        chosen_by: scores by which the degree was chosen: for each degree, the PSNR of the baked model's pictures
+            against the model's own at validation cameras. Empty if the degree was given.
+        views: number of views at which the loss was measured; 0 if it was not measured.
+        psnr_baked: PSNR of the baked model's pictures against the model's own, before numbers are rounded to the file's
+            precision; None if it was not measured.
         psnr: PSNR of the file's pictures, as read back from its bytes, against the model's own.
         photos_model, photos_file: PSNR of the model's and of the file's pictures against held-out photos, if given.
-        exposure: of the splats in the file, "local" or "consistent": the model's pictures that `psnr_baked`, `psnr` and
-            `photos_model` are about have the same, as photographed or consistent. None of a model without an exposure
-            map.
-        psnr_by_exposure: PSNR of baked splats with local and with consistent exposure, before anything is rounded,
-            against the model's pictures as photographed; empty without an exposure map, or where it was not measured.
+        exposure: exposure of the splats in the file, "local" or "consistent"; None for a model without an exposure map.
+            The model's pictures behind `psnr_baked`, `psnr` and `photos_model` have the same exposure.
+        psnr_by_exposure: PSNR of baked splats with local and with consistent exposure, before rounding, against the
+            model's pictures as photographed. Empty without an exposure map, or if it was not measured.
         photos_by_exposure: the same against held-out photos, if given.
-        cameras: in the file, where it is one of points or cameras.
+        cameras: number of cameras in the file, if it is one of points or cameras.
     """
 
     file: str

@@ -1,4 +1,4 @@
-"""What is exported: a model, and from where it was photographed."""
+"""The source of an export: a model, and the cameras from which it was photographed."""
 
 from __future__ import annotations
 
@@ -17,45 +17,48 @@ from hyrfpack.format import describe, load
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 
-FITTED = 256  # cameras at most that colours are fitted at: each takes memory and time
-MEASURED = 12  # views at most that a loss is measured at
-HELD_OUT = 8  # every so many of the cameras that a file keeps are not fitted, but measured at
-FEW = 16  # cameras, of which none can be spared
-BETWEEN = 4  # places beside each coarse camera that are fitted, too
-RING, LIFTS = 24, (-0.2, 0.0, 0.2)  # cameras around what kept none: in rings, raised by so much of their distance
-TURNED = 0.5  # length of the mean downward direction up to which pictures count as turned against each other
+MAX_FIT_CAMERAS = 256  # because each camera takes memory and time
+MAX_MEASURED_VIEWS = 12
+HELD_OUT_INTERVAL = 8
+MIN_CAMERAS_TO_HOLD_OUT = 16
+VIEWS_BETWEEN_PER_CAMERA = 4
+RING_CAMERAS = 24
+RING_HEIGHT_RATIOS = (-0.2, 0.0, 0.2)  # over the cameras' distance from the centre
+# Downward axes of pictures that are rotated against each other cancel: their mean is shorter than this.
+MIN_MEAN_DOWN_LENGTH = 0.5
 
 
 @dataclass(frozen=True)
 class Source:
-    """A model and what is known of how it was photographed.
+    """A model with the cameras from which it was photographed.
 
     Attributes:
         model: the model.
-        cameras: those it was trained on, by name; empty where the file keeps none and there are no photos.
-        coarse: whether they are only about where these were, as small files keep them: not to train on.
-        fitted: those that colours shall be fitted at; where none are known, some around what the model shows.
-        measured: cameras to measure at, with their photos where there are any. None of them is fitted, but where
-            there are fewer than FEW in all.
-        up, center: (3,) which way is up, unit length, and what is looked at, world units.
-        error: mean squared error of its pictures against its photos, by its own account.
+        cameras: names and cameras of the training photos; empty if the file keeps none and no photos are given.
+        fit_cameras: cameras at which colours are fitted; made-up ones around the scene if none are known.
+        measured_views: cameras at which the loss is measured, with their photos or None. They are not fitted, unless
+            there are fewer than MIN_CAMERAS_TO_HOLD_OUT cameras in all.
+        up: (3,) unit vector that points up in the scene.
+        center: (3,) point at the centre of interest, world units.
+        photo_mse: mean squared error of the model's pictures against its photos, as stated in the file.
+        has_coarse_cameras: whether `cameras` are approximate, as small files keep them, and not to be trained on.
     """
 
     model: HybridModel
     cameras: list[tuple[str, Camera]]
-    fitted: list[Camera]
-    measured: list[tuple[Camera, View | None]]
+    fit_cameras: list[Camera]
+    measured_views: list[tuple[Camera, View | None]]
     up: np.ndarray
     center: np.ndarray
-    error: float
-    coarse: bool = False
+    photo_mse: float
+    has_coarse_cameras: bool = False
 
     @classmethod
     def read(cls, path: str | os.PathLike[str], data: Scene | None = None) -> Source:
-        """Read a `.hyrf` file; cameras are those of the photos, if given, or those that the file keeps.
+        """Read a `.hyrf` file, with the cameras of the given photos or else those that the file keeps.
 
         Raises:
-            HyrfError: the file cannot be read, or there is no Gaussian in it.
+            HyrfError: the file cannot be read or holds no Gaussian.
         """
         facts, model = describe(path), load(path)
         if not len(model):
@@ -63,46 +66,59 @@ class Source:
         capture = Capture(facts, data)
         try:
             viewpoint = capture.viewpoint
-        except HyrfDataError as error:  # photos are no way round it here
+        except HyrfDataError as error:  # photos would not help, because the model's own viewpoint is needed
             why = error.__cause__
             raise HyrfDataError(f"{path}: its viewpoint cannot be used ({why!s:.160}); train the model again") from why
         up, center = viewpoint.up / math.hypot(*viewpoint.up), viewpoint.center
         stated = stated_error(facts["provenance"])
         cameras = capture.cameras
-        measured: list[tuple[Camera, View | None]]
+        measured_views: list[tuple[Camera, View | None]]
         if data is not None and data.train:
             named = [(view.name, view.camera) for view in data.train]
-            measured = [(view.camera, view) for view in evenly_spaced(data.test, MEASURED)]
-            fitted = evenly_spaced(cameras, FITTED)
-            return cls(model, named, fitted, measured, _up_of(cameras, up), center, stated)
+            measured_views = [(view.camera, view) for view in evenly_spaced(data.test, MAX_MEASURED_VIEWS)]
+            fit_cameras = evenly_spaced(cameras, MAX_FIT_CAMERAS)
+            return cls(model, named, fit_cameras, measured_views, _choose_up(cameras, up), center, stated)
         if capture.is_synthetic:
-            between = evenly_spaced(cameras[1::2], MEASURED)  # of an orbit with twice as many cameras as RING
-            measured = [(camera, None) for camera in between]
-            return cls(model, [], _around(viewpoint, center, up), measured, up, center, stated)
+            between = evenly_spaced(
+                cameras[1::2], MAX_MEASURED_VIEWS
+            )  # of an orbit with twice as many cameras as RING_CAMERAS
+            measured_views = [(camera, None) for camera in between]
+            return cls(model, [], _make_ring_cameras(viewpoint, center, up), measured_views, up, center, stated)
         named = [(f"{number:04d}.png", camera) for number, camera in enumerate(cameras)]
-        spare = cameras[::HELD_OUT] if len(cameras) >= FEW else cameras
-        fitted = [c for number, c in enumerate(cameras) if number % HELD_OUT] if len(cameras) >= FEW else cameras
-        measured = [(camera, None) for camera in evenly_spaced(spare, MEASURED)]
+        spare = cameras[::HELD_OUT_INTERVAL] if len(cameras) >= MIN_CAMERAS_TO_HOLD_OUT else cameras
+        fit_cameras = (
+            [c for number, c in enumerate(cameras) if number % HELD_OUT_INTERVAL]
+            if len(cameras) >= MIN_CAMERAS_TO_HOLD_OUT
+            else cameras
+        )
+        measured_views = [(camera, None) for camera in evenly_spaced(spare, MAX_MEASURED_VIEWS)]
         if capture.is_coarse:
             # Too few to fit harmonics to by themselves: what lies between them counts more than where they stand.
-            between = [camera for seed in range(BETWEEN) for camera in interpolate_views(cameras, seed)]
-            fitted = [*cameras, *between, *_around(viewpoint, center, up)]
-        return cls(model, named, fitted, measured, _up_of(cameras, up), center, stated, capture.is_coarse)
+            between = [
+                camera for seed in range(VIEWS_BETWEEN_PER_CAMERA) for camera in interpolate_views(cameras, seed)
+            ]
+            fit_cameras = [*cameras, *between, *_make_ring_cameras(viewpoint, center, up)]
+        return cls(
+            model, named, fit_cameras, measured_views, _choose_up(cameras, up), center, stated, capture.is_coarse
+        )
 
 
-def _up_of(cameras: list[Camera], up: np.ndarray) -> np.ndarray:
-    """Which way is up, unit length: for cameras that look down on a flat scene and turn, as drones do, against them."""
+def _choose_up(cameras: list[Camera], up: np.ndarray) -> np.ndarray:
+    """Return the unit vector that points up, corrected for cameras that look down on a flat scene, as drones do.
+
+    Such cameras share a forward direction while their pictures are rotated against each other; up is opposite to it.
+    """
     forward = common_direction(cameras)
     downward = np.mean([camera.rotation[1] for camera in cameras], axis=0)
-    return up if forward is None or np.linalg.norm(downward) >= TURNED else -forward
+    return up if forward is None or np.linalg.norm(downward) >= MIN_MEAN_DOWN_LENGTH else -forward
 
 
-def _around(viewpoint: Viewpoint, center: np.ndarray, up: np.ndarray) -> list[Camera]:
-    """Where a scene may have been photographed from: rings about it, at several heights."""
+def _make_ring_cameras(viewpoint: Viewpoint, center: np.ndarray, up: np.ndarray) -> list[Camera]:
+    """Make cameras in rings around a scene, at several heights, as a photographer might have stood."""
     cameras = []
-    for camera in orbit(viewpoint, RING):
+    for camera in orbit(viewpoint, RING_CAMERAS):
         distance = np.linalg.norm(camera.position - center)
-        for lift in LIFTS:
+        for lift in RING_HEIGHT_RATIOS:
             pose = look_at(camera.position + lift * distance * up, center, up)
             cameras.append(replace(camera, camera_from_world=pose))
     return cameras

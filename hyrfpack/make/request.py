@@ -11,7 +11,7 @@ import torch
 from hyrfpack.data.folder import list_photos
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.export.folder import check_folder
-from hyrfpack.export.kinds import PLAYER, check_place, check_request, kind_of
+from hyrfpack.export.kinds import PLAYER_FOLDER, check_place, check_request, find_file_kind
 from hyrfpack.format.min_file_size import check_target_bytes
 from hyrfpack.make.source import Reading, Source
 from hyrfpack.make.stages import EXPORTED, PACKED
@@ -61,7 +61,7 @@ class Request:
     @property
     def makes_folder(self) -> bool:
         """Whether the output is a folder."""
-        return not self._is_model and kind_of(self.output) is PLAYER
+        return not self._is_model and find_file_kind(self.output) is PLAYER_FOLDER
 
     def check(self) -> None:
         """Raises HyrfError: what is asked for cannot be, or may or can not be written."""
@@ -90,7 +90,7 @@ class Request:
     def _check_options(self) -> None:
         source = self.source
         if not self._is_model:
-            check_request(kind_of(self.output, others=(".hyrf",)), self.output)
+            check_request(find_file_kind(self.output, other_endings=(".hyrf",)), self.output)
         elif source.kind == "model":
             raise HyrfError(f"{source.path}: this is a .hyrf file already; 'hyrfpack compress' makes it smaller")
         if source.kind in ("model", "splats"):
@@ -141,7 +141,7 @@ class Request:
         elif self.makes_folder:
             outputs.folder(self.output, [])
             model = self.source.path if self.source.kind == "model" else self.work / PACKED
-            check_folder(self.output, [model], [self.source.scene], overwrite=overwrite, listed=False)
+            check_folder(self.output, [model], [self.source.scene], overwrite=overwrite, is_gallery=False)
         else:
             check_place(self.output, outputs)
 

@@ -6,7 +6,7 @@ import torch
 from scenes import camera_at, ring, small_model
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.export.background import background_picture, background_splats, cell_centers, cells_of
+from hyrfpack.export.background import background_picture, background_splats, cell_centers, find_cells
 from hyrfpack.export.bake import bake
 from hyrfpack.model import BACKGROUND_RADIUS, Frame
 from hyrfpack.render import RenderSettings, render
@@ -25,11 +25,11 @@ def sky_model(fields: float = 1.0, **options):
 def test_cells_are_numbered_by_their_middles_and_cover_the_sphere(level):
     cells = np.arange(6 * 4**level)
     directions, sides = cell_centers(cells, level)
-    assert np.array_equal(cells_of(directions, level), cells)
+    assert np.array_equal(find_cells(directions, level), cells)
     assert np.allclose(np.linalg.norm(directions, axis=1), 1)
     if level == 4:
         assert np.sum(sides**2) == pytest.approx(4 * np.pi, rel=1e-3)
-        assert np.array_equal(cells_of(directions, 3), cells // 4)
+        assert np.array_equal(find_cells(directions, 3), cells // 4)
 
 
 def test_an_even_background_becomes_an_even_nearly_opaque_layer():

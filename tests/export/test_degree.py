@@ -11,8 +11,8 @@ from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
 from hyrfpack.export import degree as degrees
 from hyrfpack.export import export, pipeline
-from hyrfpack.export.bake import sights_of
-from hyrfpack.export.degree import choose_degree, lowest_as_good
+from hyrfpack.export.bake import compute_visibility
+from hyrfpack.export.degree import choose_degree, lowest_degree_within_tolerance
 from hyrfpack.export.source import Source
 from hyrfpack.format import save
 from hyrfpack.splats.files import read_splats
@@ -41,7 +41,7 @@ def test_colours_that_follow_no_direction_take_degree_0(tmp_path):
 def test_colours_that_follow_the_direction_take_more_and_the_reason_is_told(tmp_path):
     source, said = written(tmp_path / "m.hyrf", 4.0, ring(40)), []
     report = export(source, tmp_path / "a.ply", say=said.append)
-    assert report.degree >= 2 and report.degree == lowest_as_good(report.chosen_by)
+    assert report.degree >= 2 and report.degree == lowest_degree_within_tolerance(report.chosen_by)
     told = f"degree {report.degree} it is: {', '.join(f'{score:.2f}' for score in report.chosen_by.values())} dB"
     assert any(sentence.startswith(told) for sentence in said)
 
@@ -62,7 +62,7 @@ def test_a_degree_that_is_given_is_not_questioned(tmp_path, monkeypatch):
     ([40.0], 0),
 ])  # fmt: skip
 def test_the_lowest_degree_as_good_as_any_is_taken(scores, lowest):
-    assert lowest_as_good(dict(enumerate(scores))) == lowest
+    assert lowest_degree_within_tolerance(dict(enumerate(scores))) == lowest
 
 
 @pytest.mark.parametrize("count", [4, 16, 60])
@@ -75,19 +75,19 @@ def test_cameras_are_kept_back_unless_there_are_too_few_and_the_measured_ones_ne
 
     def watched_likeness(model, contenders, views, **options):
         judged.extend(camera.position.tobytes() for camera, _ in views)
-        return likeness(model, contenders, views, **options)
+        return measure_psnr(model, contenders, views, **options)
 
-    bake, likeness = degrees.bake, degrees.likeness
+    bake, measure_psnr = degrees.bake, degrees.measure_psnr
     monkeypatch.setattr(degrees, "bake", watched_bake)
-    monkeypatch.setattr(degrees, "likeness", watched_likeness)
+    monkeypatch.setattr(degrees, "measure_psnr", watched_likeness)
     source = Source.read(written(tmp_path / "m.hyrf", 1.0, ring(count)))
-    choose_degree(source.model, source.fitted, 3)
-    allowed = {camera.position.tobytes() for camera in source.fitted}
-    measured = {camera.position.tobytes() for camera, _ in source.measured}
+    choose_degree(source.model, source.fit_cameras, 3)
+    allowed = {camera.position.tobytes() for camera in source.fit_cameras}
+    measured = {camera.position.tobytes() for camera, _ in source.measured_views}
     assert judged and set(fitted) | set(judged) == allowed
     if count >= 16:
         assert not measured & (set(fitted) | set(judged))
-    if len(source.fitted) >= 16:
+    if len(source.fit_cameras) >= 16:
         assert not set(fitted) & set(judged)
 
 
@@ -103,8 +103,8 @@ def test_of_many_gaussians_some_are_chosen_by(monkeypatch):
     positions = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 3))
     model, cameras = small_model(positions, fields=4.0, direction_encoding="sh"), ring(40)
     whole = choose_degree(model, cameras, 3)
-    monkeypatch.setattr(degrees, "MANY", 60)
-    some = choose_degree(model, cameras, 3, sights_of(model, cameras))
+    monkeypatch.setattr(degrees, "MAX_GAUSSIANS", 60)
+    some = choose_degree(model, cameras, 3, compute_visibility(model, cameras))
     assert counts == [200, 50] and some[0] == whole[0] and some[1] != whole[1]
 
 

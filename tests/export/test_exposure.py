@@ -17,7 +17,7 @@ from hyrfpack.export import exposure as export_exposure
 from hyrfpack.export.background import BackgroundGains, background_picture, background_splats
 from hyrfpack.export.bake import bake
 from hyrfpack.export.exposure import SMOOTHING_NEIGHBORS, smooth_log_gains
-from hyrfpack.export.poster import model_poster
+from hyrfpack.export.poster import render_model_poster
 from hyrfpack.format import load, save
 from hyrfpack.model.exposure import ExposureMap
 from hyrfpack.render import RenderSettings, render
@@ -101,8 +101,8 @@ def test_each_direction_has_the_exposure_of_the_camera_that_looks_along_it():
     model.exposure = map_over([camera.position for camera in cameras], [LOG_GAINS, -LOG_GAINS])
     splats = bake(model, cameras, (1,))[1]
     for camera in cameras:
-        along = torch.nn.functional.normalize(torch.from_numpy(splats.positions - camera.position), dim=1).float()
-        seen = 0.5 + torch.einsum("nk,nkc->nc", harmonics_basis(along, 1), torch.from_numpy(splats.harmonics))
+        evaluate = torch.nn.functional.normalize(torch.from_numpy(splats.positions - camera.position), dim=1).float()
+        seen = 0.5 + torch.einsum("nk,nkc->nc", harmonics_basis(evaluate, 1), torch.from_numpy(splats.harmonics))
         assert np.allclose(seen, exposed_grey(gains_at(model, camera)), atol=0.01)
 
 
@@ -167,14 +167,14 @@ def test_the_background_has_the_exposure_of_the_cameras_that_see_it():
 
 def test_background_that_no_camera_sees_has_finite_gains_between_those_that_are_seen():
     model, cameras = sky_between(LOG_GAINS, -LOG_GAINS)
-    gains = BackgroundGains.of(model, cameras).along(torch.eye(3)).log().numpy()
+    gains = BackgroundGains.predict(model, cameras).evaluate(torch.eye(3)).log().numpy()
     assert np.isfinite(gains).all() and (np.abs(gains) <= LOG_GAINS + 1e-3).all()
 
 
 def test_without_cameras_the_background_has_the_maps_mean_exposure():
     model = small_model([[0.0, 0.0, 0.5]], background=True)
     model.exposure = replace(map_over([[0, 0, 0]], [[0, 0, 0]]), mean=LOG_GAINS.astype(np.float32))
-    assert np.allclose(BackgroundGains.of(model, []).along(torch.eye(3)).log(), LOG_GAINS, atol=1e-5)
+    assert np.allclose(BackgroundGains.predict(model, []).evaluate(torch.eye(3)).log(), LOG_GAINS, atol=1e-5)
 
 
 # -- files -----------------------------------------------------------------------------------------------------------
@@ -257,7 +257,7 @@ def test_an_unknown_exposure_is_refused(written, tmp_path):
 
 def test_posters_show_the_scene_as_photographed():
     model = half_bright()
-    poster = np.asarray(model_poster(model, RIGHT_CAMERA, 32)) / 255
+    poster = np.asarray(render_model_poster(model, RIGHT_CAMERA, 32)) / 255
     with torch.no_grad():
         own, consistent = (
             render(model, RIGHT_CAMERA, RenderSettings(exposure=word)).rgb.numpy()

@@ -11,7 +11,7 @@ from scenes import camera_at, ring, small_model, view_of
 
 from hyrfpack.export.background import background_picture
 from hyrfpack.export.bake import bake
-from hyrfpack.export.measure import _equirect_colors, likeness
+from hyrfpack.export.measure import _equirect_colors, measure_psnr
 from hyrfpack.scene import Camera, Picture
 from hyrfpack.splats.splats import Splats
 
@@ -67,9 +67,9 @@ def test_the_seam_is_no_edge():
 def test_the_models_background_as_a_picture_is_nearly_the_models_background():
     model = small_model(POSITIONS, fields=1.0, background=True, **FAINT)
     picture = background_picture(model, height=128)
-    scores = likeness(model, {"page": (nothing(), picture)}, [(c, None) for c in CAMERAS], sphere=True)
+    scores = measure_psnr(model, {"page": (nothing(), picture)}, [(c, None) for c in CAMERAS], sphere=True)
     assert scores["page"].model > 40
-    without = likeness(model, {"page": (nothing(), None)}, [(c, None) for c in CAMERAS], sphere=True)
+    without = measure_psnr(model, {"page": (nothing(), None)}, [(c, None) for c in CAMERAS], sphere=True)
     assert without["page"].model < 25
 
 
@@ -78,7 +78,7 @@ def test_the_models_background_as_a_picture_is_nearly_the_models_background():
 
 def test_a_model_is_like_itself():
     model = small_model(POSITIONS, color_logits=0.7)  # of one colour: degree 0 is exact
-    scores = likeness(model, {"0": (bake(model, [])[3], None)}, [(c, None) for c in CAMERAS], sphere=False)
+    scores = measure_psnr(model, {"0": (bake(model, [])[3], None)}, [(c, None) for c in CAMERAS], sphere=False)
     assert scores["model"].model == 100 and scores["model"].photos is None
     assert scores["0"].model > 60 and scores["0"].photos is None
 
@@ -87,7 +87,7 @@ def test_scores_are_means_over_views_of_the_psnr():
     model = small_model(POSITIONS, solid=(1.0, 1.0, 1.0), **FAINT)
     photos = [np.full((32, 32, 3), level, np.uint8) for level in (204, 153)]
     views = [(c, view_of("photo", c, Picture(photo))) for c, photo in zip(CAMERAS, photos, strict=False)]
-    scores = likeness(model, {"nothing": (nothing(), None)}, views, sphere=False)
+    scores = measure_psnr(model, {"nothing": (nothing(), None)}, views, sphere=False)
     expected = (-20 * math.log10(0.2) - 20 * math.log10(0.4)) / 2
     assert scores["model"].photos == pytest.approx(expected, abs=1e-4)
     assert scores["nothing"].photos == pytest.approx(expected, abs=1e-4)
@@ -97,7 +97,7 @@ def test_scores_are_means_over_views_of_the_psnr():
 def test_transparent_photos_lie_on_the_models_solid_colour():
     model = small_model(POSITIONS, solid=(1.0, 1.0, 1.0), **FAINT)
     clear = Picture(np.zeros((32, 32, 3), np.uint8), np.zeros((32, 32), np.uint8))
-    scores = likeness(model, {}, [(CAMERAS[0], view_of("photo", CAMERAS[0], clear))], sphere=False)
+    scores = measure_psnr(model, {}, [(CAMERAS[0], view_of("photo", CAMERAS[0], clear))], sphere=False)
     assert scores["model"].photos == 100
 
 
@@ -110,12 +110,12 @@ def test_only_what_masks_leave_counts_and_views_without_it_do_not():
         (c, view_of("photo", c, Picture(rgb, mask=mask)))
         for c, mask in zip(CAMERAS, (half, np.zeros_like(half)), strict=False)
     ]
-    assert likeness(model, {}, views, sphere=False)["model"].photos == 100
-    assert likeness(model, {}, views[1:], sphere=False) == {}
+    assert measure_psnr(model, {}, views, sphere=False)["model"].photos == 100
+    assert measure_psnr(model, {}, views[1:], sphere=False) == {}
 
 
 def test_photos_are_scored_where_all_views_have_them():
     model = small_model(POSITIONS)
     photo = Picture(np.zeros((32, 32, 3), np.uint8))
     views = [(CAMERAS[0], view_of("photo", CAMERAS[0], photo)), (CAMERAS[1], None)]
-    assert likeness(model, {}, views, sphere=False)["model"].photos is None
+    assert measure_psnr(model, {}, views, sphere=False)["model"].photos is None

@@ -16,7 +16,7 @@ from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.export import export
-from hyrfpack.export.pages import POSTER_BYTES
+from hyrfpack.export.pages import MAX_POSTER_BYTES
 from hyrfpack.export.poster import encode_poster
 from hyrfpack.format import load, save
 from hyrfpack.render import render
@@ -78,7 +78,7 @@ def test_a_poster_takes_no_more_bytes_than_it_may(form, most):
     data = encode_poster(noise, form, most)
     assert len(data) <= most and Image.open(io.BytesIO(data)).format == form
     plain = Image.new("RGB", (480, 360), (10, 20, 30))
-    assert Image.open(io.BytesIO(encode_poster(plain, form, POSTER_BYTES))).size == (480, 360)
+    assert Image.open(io.BytesIO(encode_poster(plain, form, MAX_POSTER_BYTES))).size == (480, 360)
 
 
 def test_a_file_that_keeps_no_cameras_is_seen_from_around_or_from_its_photos(compact, tmp_path):

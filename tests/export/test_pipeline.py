@@ -20,8 +20,8 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
 from hyrfpack.export import ExportReport, pipeline
 from hyrfpack.export.bake import bake
-from hyrfpack.export.kinds import COLMAP, ENDINGS, PLAYER, chosen, kind_of
-from hyrfpack.export.measure import likeness
+from hyrfpack.export.kinds import COLMAP_FOLDER, ENDINGS, PLAYER_FOLDER, find_file_kind, select_splats
+from hyrfpack.export.measure import measure_psnr
 from hyrfpack.export.source import Source
 from hyrfpack.format import load, save
 from hyrfpack.format.codec import load_with_provenance
@@ -71,7 +71,7 @@ def sphere(tmp_path_factory):
 @pytest.fixture
 def no_bake(monkeypatch):
     """Fails the test when work begins."""
-    for name in ("bake", "sights_of"):
+    for name in ("bake", "compute_visibility"):
         monkeypatch.setattr(pipeline, name, lambda *arguments: pytest.fail("the bake began"))
 
 
@@ -217,8 +217,8 @@ def test_psnr_rises_with_the_degree_where_colour_depends_on_the_direction(tmp_pa
 @pytest.mark.parametrize("ending", [".ply", ".spz", ".splat", ".sog"])
 def test_the_psnr_is_that_of_the_file(ending, plain, tmp_path):
     report = export(plain, tmp_path / f"a{ending}", degree=2)
-    views = [(camera, None) for camera in Source.read(plain).fitted]
-    file = likeness(load(plain), {"file": (read_back(tmp_path / f"a{ending}"), None)}, views, sphere=False)["file"]
+    views = [(camera, None) for camera in Source.read(plain).fit_cameras]
+    file = measure_psnr(load(plain), {"file": (read_back(tmp_path / f"a{ending}"), None)}, views, sphere=False)["file"]
     assert report.psnr == pytest.approx(file.model, abs=1e-3)
     assert (report.psnr == pytest.approx(report.psnr_baked, abs=1e-3)) == (ending == ".ply")
 
@@ -226,7 +226,7 @@ def test_the_psnr_is_that_of_the_file(ending, plain, tmp_path):
 def test_a_file_that_lost_something_scores_less(plain, tmp_path, monkeypatch):
     form = FORMATS[".ply"]
     lossy = replace(form, decode=lambda *arguments: form.decode(*arguments)[:20])
-    monkeypatch.setattr(pipeline, "kind_of", lambda *target: lossy)
+    monkeypatch.setattr(pipeline, "find_file_kind", lambda *target: lossy)
     report = export(plain, tmp_path / "a.ply")
     assert report.psnr < report.psnr_baked - 3
 
@@ -290,10 +290,10 @@ def test_rounding_that_photos_do_not_show_is_no_alarm(judged, tmp_path):
 
 def test_a_format_is_judged_by_the_photos_where_there_are_some():
     """Not by the model's own account, nor by how like the model's pictures those of the file are."""
-    cost = {"before": pipeline.Likeness(60, 30.0, 1), "after": pipeline.Likeness(20, 29.7, 1), "error": 1e-9}
-    assert pipeline._cost(**cost) == pytest.approx(0.3)
-    cost["after"] = pipeline.Likeness(20, None, 1)
-    assert pipeline._cost(**cost) == pytest.approx(10 * np.log10((1e-9 + 1e-2) / (1e-9 + 1e-6)))
+    cost = {"before": pipeline.PsnrScores(60, 30.0, 1), "after": pipeline.PsnrScores(20, 29.7, 1), "error": 1e-9}
+    assert pipeline._estimate_cost_db(**cost) == pytest.approx(0.3)
+    cost["after"] = pipeline.PsnrScores(20, None, 1)
+    assert pipeline._estimate_cost_db(**cost) == pytest.approx(10 * np.log10((1e-9 + 1e-2) / (1e-9 + 1e-6)))
 
 
 def test_held_out_photos_score_the_model_and_the_file_and_are_not_fitted(plain, tmp_path, monkeypatch):
@@ -362,17 +362,17 @@ def test_a_file_without_cameras_is_baked_and_measured_around_the_scene(plain, tm
 
 
 def test_the_ending_names_the_format():
-    assert [kind_of(f"a/b{ending}").ending for ending in ENDINGS] == list(ENDINGS)
-    assert kind_of("a/b") is PLAYER and kind_of("a/b", colmap=True) is COLMAP
+    assert [find_file_kind(f"a/b{ending}").ending for ending in ENDINGS] == list(ENDINGS)
+    assert find_file_kind("a/b") is PLAYER_FOLDER and find_file_kind("a/b", colmap=True) is COLMAP_FOLDER
     for name, ending in {"A/B.PLY": ".ply", "a.b/c": "", "my.scene.spz": ".spz"}.items():
-        assert kind_of(name).ending == ending
+        assert find_file_kind(name).ending == ending
     for name in ("a.xyz", "model.hyrf", "a.ply.txt"):
         with pytest.raises(HyrfError, match=rf"^{name}: the ending names the format; [^\n]*\.ply[^\n]*$"):
-            kind_of(name)
+            find_file_kind(name)
     with pytest.raises(HyrfError, match="compressed PLY is read, not written"):
-        kind_of("a.compressed.ply")
+        find_file_kind("a.compressed.ply")
     with pytest.raises(HyrfError, match=r"^a\.ply: a COLMAP model is a folder"):
-        kind_of("a.ply", colmap=True)
+        find_file_kind("a.ply", colmap=True)
 
 
 WRONG = [
@@ -448,7 +448,7 @@ def test_what_goes_wrong_leaves_the_old_file_as_it_was(failing, sphere, tmp_path
     if failing == "background_splats":
         monkeypatch.setattr(pipeline, failing, fail)
     else:
-        monkeypatch.setattr(pipeline, "kind_of", lambda *target: replace(FORMATS[".ply"], **{failing: fail}))
+        monkeypatch.setattr(pipeline, "find_file_kind", lambda *target: replace(FORMATS[".ply"], **{failing: fail}))
     (tmp_path / "a.ply").write_bytes(b"old")
     with pytest.raises(HyrfError, match="^no$"):
         export(sphere, tmp_path / "a.ply", degree=0)
@@ -477,4 +477,4 @@ def test_export_is_one_call_on_the_package(plain, tmp_path):
 
 def test_choosing_all_copies_nothing(plain):
     splats = bake(load(plain), [], (0,))[0]
-    assert chosen(splats) is splats
+    assert select_splats(splats) is splats

@@ -11,7 +11,7 @@ from scenes import ball_scene, ring, small_model
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
-from hyrfpack.export.source import FEW, MEASURED, Source
+from hyrfpack.export.source import MAX_MEASURED_VIEWS, MIN_CAMERAS_TO_HOLD_OUT, Source
 from hyrfpack.format import save
 from hyrfpack.scene import Camera, Scene
 
@@ -45,18 +45,18 @@ def split(scene: Scene) -> Scene:
     return replace(scene, train=[view for view in scene.train if view not in held], test=held)
 
 
-@pytest.mark.parametrize("count", [FEW, 40, 128])
+@pytest.mark.parametrize("count", [MIN_CAMERAS_TO_HOLD_OUT, 40, 128])
 def test_cameras_that_are_measured_at_are_not_fitted(count, written):
     source = Source.read(written(kept(count)))
-    fitted, measured = places(source.fitted), places(camera for camera, _ in source.measured)
-    assert not fitted & measured and 2 <= len(measured) <= MEASURED
+    fitted, measured = places(source.fit_cameras), places(camera for camera, _ in source.measured_views)
+    assert not fitted & measured and 2 <= len(measured) <= MAX_MEASURED_VIEWS
     assert len(source.cameras) == count and len(fitted) == count - len(range(0, count, 8))
 
 
 def test_of_few_cameras_none_is_spared(written):
-    source = Source.read(written(kept(FEW - 1)))
-    assert len(source.fitted) == FEW - 1
-    assert places(camera for camera, _ in source.measured) <= places(source.fitted)
+    source = Source.read(written(kept(MIN_CAMERAS_TO_HOLD_OUT - 1)))
+    assert len(source.fit_cameras) == MIN_CAMERAS_TO_HOLD_OUT - 1
+    assert places(camera for camera, _ in source.measured_views) <= places(source.fit_cameras)
 
 
 def test_a_camera_that_is_kept_is_the_one_that_was_photographed_with(written):
@@ -76,9 +76,9 @@ def test_which_way_is_up_and_what_is_looked_at_come_from_the_capture(written):
 @pytest.mark.parametrize("provenance", [None, {"viewpoint": Viewpoint.from_cameras(ring(9)).to_json()}])
 def test_without_cameras_rings_around_the_scene_serve(provenance, written):
     source = Source.read(written(provenance))
-    assert source.cameras == [] and source.fitted and len(source.measured) == MEASURED
-    assert not places(source.fitted) & places(camera for camera, _ in source.measured)
-    for camera in source.fitted:
+    assert source.cameras == [] and source.fit_cameras and len(source.measured_views) == MAX_MEASURED_VIEWS
+    assert not places(source.fit_cameras) & places(camera for camera, _ in source.measured_views)
+    for camera in source.fit_cameras:
         toward = source.center - camera.position
         assert camera.forward @ toward / np.linalg.norm(toward) == pytest.approx(1)
     assert np.linalg.norm(source.up) == pytest.approx(1)
@@ -88,17 +88,17 @@ def test_photos_come_before_the_cameras_that_the_file_keeps(written):
     scene = split(ball_scene(12))
     source = Source.read(written(kept(30)), scene)
     assert source.cameras == [(view.name, view.camera) for view in scene.train]
-    assert source.fitted == [view.camera for view in scene.train]
-    assert source.measured == [(view.camera, view) for view in scene.test]
+    assert source.fit_cameras == [view.camera for view in scene.train]
+    assert source.measured_views == [(view.camera, view) for view in scene.test]
 
 
 def test_at_most_so_many_held_out_photos_are_scored(written):
     scene = split(ball_scene(80, side=4))
-    assert len(Source.read(written(), scene).measured) == MEASURED < len(scene.test)
+    assert len(Source.read(written(), scene).measured_views) == MAX_MEASURED_VIEWS < len(scene.test)
 
 
 def test_without_held_out_photos_there_is_nothing_to_measure_at(written):
-    assert Source.read(written(), ball_scene(3)).measured == []
+    assert Source.read(written(), ball_scene(3)).measured_views == []
 
 
 BROKEN = {

@@ -21,9 +21,9 @@ import numpy as np
 import hyrfpack
 from hyrfpack.export.background import background_picture, background_splats
 from hyrfpack.export.bake import bake
-from hyrfpack.export.kinds import PAGE
-from hyrfpack.export.measure import Likeness, likeness
-from hyrfpack.export.pages import baked_page
+from hyrfpack.export.kinds import HTML_PAGE
+from hyrfpack.export.measure import PsnrScores, measure_psnr
+from hyrfpack.export.pages import encode_baked_page
 from hyrfpack.export.source import Source
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats, concatenate
@@ -57,12 +57,12 @@ def main() -> None:
 
     source = Source.read(arguments.model, hyrfpack.load_scene(arguments.data))
     degrees = sorted({0, *arguments.degrees})
-    baked, seconds = timed(lambda: bake(source.model, source.fitted, degrees))
-    print(f"{len(source.model):,} Gaussians, {len(source.measured)} views; baked in {seconds:.1f} s", end="")
+    baked, seconds = timed(lambda: bake(source.model, source.fit_cameras, degrees))
+    print(f"{len(source.model):,} Gaussians, {len(source.measured_views)} views; baked in {seconds:.1f} s", end="")
     behind, picture = None, None
     if source.model.config.background:
-        behind, seconds = timed(lambda: background_splats(source.model, source.fitted))
-        picture = background_picture(source.model, cameras=source.fitted)
+        behind, seconds = timed(lambda: background_splats(source.model, source.fit_cameras))
+        picture = background_picture(source.model, cameras=source.fit_cameras)
         print(f", the background as {len(behind):,} more in {seconds:.1f} s", end="")
     whole = {d: splats if behind is None else concatenate((splats, behind)) for d, splats in baked.items()}
     own = score(source, {})["model"]
@@ -70,7 +70,7 @@ def main() -> None:
     print("| format | degree | bytes | write (s) | read (s) | dB, model | dB, photos | checked by |")
     print("|---|---|---|---|---|---|---|---|")
     for name in formats:
-        kind = FORMATS.get(name.split()[0], PAGE)
+        kind = FORMATS.get(name.split()[0], HTML_PAGE)
         for degree in sorted({min(degree, kind.max_degree) for degree in arguments.degrees}):
             row(source, name, degree, baked, whole, picture)
 
@@ -84,8 +84,8 @@ def row(
     picture: np.ndarray | None,
 ) -> None:
     """Write, read, score and print one file."""
-    if name == PAGE.ending:
-        data, write = timed(lambda: baked_page(source, baked[degree], picture, "scene"))
+    if name == HTML_PAGE.ending:
+        data, write = timed(lambda: encode_baked_page(source, baked[degree], picture, "scene"))
         back, read = timed(lambda: decode_page(data, name))
     else:
         form = FORMATS[name.split()[0]]
@@ -100,9 +100,9 @@ def row(
     )
 
 
-def score(source: Source, contenders: dict[str, tuple[Splats, np.ndarray | None]]) -> dict[str, Likeness]:
+def score(source: Source, contenders: dict[str, tuple[Splats, np.ndarray | None]]) -> dict[str, PsnrScores]:
     """Of splats and what lies behind them, by name."""
-    return likeness(source.model, contenders, source.measured, sphere=source.model.config.background)
+    return measure_psnr(source.model, contenders, source.measured_views, sphere=source.model.config.background)
 
 
 def timed(action: Callable[[], Result]) -> tuple[Result, float]:

@@ -35,7 +35,7 @@ import hyrfpack
 from hyrfpack.evaluate.figures import blank_figure, save_figure
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.export.bake import bake
-from hyrfpack.export.kinds import chosen
+from hyrfpack.export.kinds import select_splats
 from hyrfpack.export.source import Source
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.model import HybridModel
@@ -210,7 +210,7 @@ class Measure:
         self.model = source.model
         self.views = held_out(self.model, test)
         self.trained = score([view.trained for view in self.views], self.views)
-        baked = bake(self.model, source.fitted, DEGREES)
+        baked = bake(self.model, source.fit_cameras, DEGREES)
         self.baked = {degree: gsplat_png.in_morton_order(splats) for degree, splats in baked.items()}
         self.baked_psnr = [self.splats(self.baked[degree])[0] for degree in DEGREES]
 
@@ -229,7 +229,7 @@ class Measure:
 
     def peer(self, setting: Setting) -> Row:
         """Write, read back, draw and score a peer's file."""
-        size, read = setting.run(chosen(self.baked[setting.degree], None, setting.min_opacity))
+        size, read = setting.run(select_splats(self.baked[setting.degree], None, setting.min_opacity))
         return self._row(setting.peer, str(setting), size, len(read), self.splats(read), setting.degree)
 
     def ours(self, path: Path, setting: str) -> Row:

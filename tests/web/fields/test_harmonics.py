@@ -17,8 +17,8 @@ import hyrfpack
 from hyrfpack.cameras.files import camera_to_json
 from hyrfpack.cameras.paths import Viewpoint, orbit
 from hyrfpack.cameras.view_sampling import shrink_camera
-from hyrfpack.export.bake import RIDGE, SPHERE_DIRECTIONS, SPHERE_WEIGHT, bake
-from hyrfpack.export.measure import likeness
+from hyrfpack.export.bake import RIDGE_WEIGHT, SPHERE_DIRECTIONS, SPHERE_WEIGHT, bake
+from hyrfpack.export.measure import measure_psnr
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.shade import encode_directions
@@ -77,7 +77,7 @@ def least_squares(model: HybridModel, cameras: list[Camera], degree: int) -> np.
     directions = torch.cat((directions, sphere.expand(count, -1, -1)), 1)
     weights = torch.cat((weights, torch.full((count, len(sphere)), SPHERE_WEIGHT / len(sphere))), 1).double()
     solved = np.empty((count, num_sh_bases(degree), 3))
-    coords, penalty = model.cube_coords(positions), RIDGE**0.5 * np.eye(num_sh_bases(degree))[1:]
+    coords, penalty = model.cube_coords(positions), RIDGE_WEIGHT**0.5 * np.eye(num_sh_bases(degree))[1:]
     for i in range(count):
         encoded = encode_directions(directions[i], model.config.direction_encoding)
         with torch.no_grad():
@@ -145,7 +145,7 @@ def test_the_splats_look_like_the_model_as_those_do_that_python_bakes(tmp_path: 
     model = ball_model()
     contenders = {"page": (splats, None), "bake": (bake(model, cameras, (3,))[3], None)}
     views = [(camera, None) for camera in ring(7, elevation=0.8, width=64, height=48)]
-    scores = likeness(model, contenders, views, sphere=False)
+    scores = measure_psnr(model, contenders, views, sphere=False)
     assert scores["page"].model > scores["bake"].model - 0.5
     assert scores["page"].model > 35
 
@@ -156,7 +156,7 @@ def test_a_file_without_cameras_is_fitted_from_rings_about_it(tmp_path: Path) ->
     model = ball_model()
     around = orbit(Viewpoint.from_frame(model.config.frame.center, model.config.frame.scale), 7)
     views = [(shrink_camera(camera, 64), None) for camera in around]
-    assert likeness(model, {"page": (splats, None)}, views, sphere=False)["page"].model > 35
+    assert measure_psnr(model, {"page": (splats, None)}, views, sphere=False)["page"].model > 35
 
 
 def test_a_model_of_no_gaussians_makes_no_splats(tmp_path: Path) -> None:

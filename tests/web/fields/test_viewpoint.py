@@ -16,7 +16,7 @@ from web.scripts import run_script
 import hyrfpack
 from hyrfpack.cameras.capture import scene_provenance
 from hyrfpack.cameras.files import camera_from_json, camera_to_json
-from hyrfpack.export.pages import PAGE_CAMERAS
+from hyrfpack.export.pages import MAX_PAGE_CAMERAS
 from hyrfpack.export.source import Source
 from hyrfpack.model import Frame
 from hyrfpack.scene import Camera, Scene, evenly_spaced
@@ -76,17 +76,17 @@ def test_the_page_is_shown_from_where_python_shows_it(name: str, tmp_path: Path)
     file = tmp_path / "model.hyrf"
     hyrfpack.save(small_model([[0, 0, 0]], frame=FRAME), file, provenance=GOOD[name])
     read = Source.read(file)
-    cameras = [camera for _, camera in read.cameras] or [camera for camera, _ in read.measured]
+    cameras = [camera for _, camera in read.cameras] or [camera for camera, _ in read.measured_views]
 
     (found,) = viewpoints(tmp_path, [metadata(GOOD[name])])
 
     close = {"rtol": 1e-9, "atol": 1e-9}
-    np.testing.assert_allclose(numbers_of(found["cameras"]), json_of(evenly_spaced(cameras, PAGE_CAMERAS)), **close)
+    np.testing.assert_allclose(numbers_of(found["cameras"]), json_of(evenly_spaced(cameras, MAX_PAGE_CAMERAS)), **close)
     np.testing.assert_allclose(found["up"], read.up, **close)
     np.testing.assert_allclose(found["target"], read.center, **close)
     assert found["madeUp"] is (not read.cameras)
     if found["madeUp"]:
-        np.testing.assert_allclose(numbers_of(found["fitted"]), json_of(read.fitted), **close)
+        np.testing.assert_allclose(numbers_of(found["fitted"]), json_of(read.fit_cameras), **close)
     else:
         np.testing.assert_allclose(numbers_of(found["fitted"]), json_of(evenly_spaced(cameras, 48)), **close)
 
