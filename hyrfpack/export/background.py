@@ -39,7 +39,7 @@ MAX_LIT_CELL_VIEW_RATIO = 0.4
 UNSEEN_COLOR_WEIGHT = 1e-6
 
 MIN_SPLAT_BUDGET = 1000
-SPLAT_BUDGET_RATIO = 0.1  # of the model's Gaussians
+SPLAT_BUDGET_PER_GAUSSIAN = 0.1
 MIN_DIVIDED_COLOR_STD = 1 / 512  # half a step of 8-bit colours
 SPLAT_OPACITY = 0.99  # the limit of the rasteriser
 SPLAT_SCALE_PER_CELL_SIDE = 0.7
@@ -69,7 +69,7 @@ def background_splats(
 
     All cells are coarse at first. Where cameras see light through the scene, cells are divided into four, in the order
     of their error in the pictures: the sum of squared differences of their colours from the mean, weighted by the
-    squared transmittance. The division ends at SPLAT_BUDGET_RATIO of the model's Gaussians, but not below
+    squared transmittance. The division ends at SPLAT_BUDGET_PER_GAUSSIAN times the model's Gaussians, but not below
     MIN_SPLAT_BUDGET. A model's exposure map is applied as described at `BackgroundGains`.
 
     Args:
@@ -91,7 +91,7 @@ def background_splats(
     visibility = compute_visibility(model, cameras) if visibility is None else visibility
     sums, largest = _accumulate_colors(model, cameras, visibility)
     directions, sides, levels, colors = _divide_sphere(
-        sums, largest, max(MIN_SPLAT_BUDGET, int(SPLAT_BUDGET_RATIO * len(model)))
+        sums, largest, max(MIN_SPLAT_BUDGET, int(SPLAT_BUDGET_PER_GAUSSIAN * len(model)))
     )
     gains = BackgroundGains.predict(model, cameras, visibility)
     if gains is not None:

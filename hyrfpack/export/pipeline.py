@@ -49,7 +49,7 @@ from hyrfpack.splats.splats import Splats, concatenate
 from hyrfpack.splats.table import FORMATS, FileKind, SplatFormat
 from hyrfpack.web.html import decode_page
 
-REPORTED_COST_DB = 1.0  # a format that costs more PSNR against photos causes a note
+MIN_REPORTED_COST_DB = 1.0
 
 Say = Callable[[str], None]
 
@@ -295,7 +295,7 @@ def _add_scores(
         return result
     file, before = scores["file"], scores["baked"]
     cost = _estimate_cost_db(before, file, loaded.photo_mse)
-    if cost > REPORTED_COST_DB:
+    if cost > MIN_REPORTED_COST_DB:
         seen = "" if loaded.cameras else ", seen from made-up viewpoints (name photos with `data` to be sure)"
         if loaded.model.config.antialiased and not kind.stores_antialiased:
             able = " or ".join(

@@ -14,7 +14,7 @@ from hyrfpack.splats.placement import local_origin, local_positions, upright_rot
 from hyrfpack.splats.splats import Splats
 
 _CAMERA_COLOR = (255, 106, 0, 255)  # orange, because it is rare in photos
-_FRUSTUM_DEPTH_RATIO = 0.06  # over the median distance from camera to scene
+_FRUSTUM_DEPTH_PER_CAMERA_DISTANCE = 0.06
 _DOTS_PER_EDGE = 16
 # One stroke through these vertices draws a frustum: 0 is the apex, 1 to 4 are the corners clockwise from the top left,
 # and 5 is a tip that shows which side is up.
@@ -91,7 +91,10 @@ def _make_frusta(cameras: Sequence[Camera], positions: np.ndarray) -> np.ndarray
         return np.zeros((0, 6, 3))
     centers = np.stack([camera.position for camera in cameras])
     middle = np.median(positions if len(positions) else centers, axis=0)
-    depth = _FRUSTUM_DEPTH_RATIO * float(np.median(np.linalg.norm(centers - middle, axis=1))) or _FRUSTUM_DEPTH_RATIO
+    depth = (
+        _FRUSTUM_DEPTH_PER_CAMERA_DISTANCE * float(np.median(np.linalg.norm(centers - middle, axis=1)))
+        or _FRUSTUM_DEPTH_PER_CAMERA_DISTANCE
+    )
     frusta = np.empty((len(cameras), 6, 3))
     for frustum, camera in zip(frusta, cameras, strict=True):
         width, height = camera.width, camera.height

@@ -23,7 +23,7 @@ HELD_OUT_INTERVAL = 8
 MIN_CAMERAS_TO_HOLD_OUT = 16
 VIEWS_BETWEEN_PER_CAMERA = 4
 RING_CAMERAS = 24
-RING_HEIGHT_RATIOS = (-0.2, 0.0, 0.2)  # over the cameras' distance from the centre
+RING_HEIGHTS_PER_DISTANCE = (-0.2, 0.0, 0.2)
 # Downward axes of pictures that are rotated against each other cancel: their mean is shorter than this.
 MIN_MEAN_DOWN_LENGTH = 0.5
 
@@ -79,9 +79,8 @@ class Source:
             fit_cameras = evenly_spaced(cameras, MAX_FIT_CAMERAS)
             return cls(model, named, fit_cameras, measured_views, _choose_up(cameras, up), center, stated)
         if capture.is_synthetic:
-            between = evenly_spaced(
-                cameras[1::2], MAX_MEASURED_VIEWS
-            )  # of an orbit with twice as many cameras as RING_CAMERAS
+            # The orbit has twice as many cameras as RING_CAMERAS; every other one lies between the fitted ones.
+            between = evenly_spaced(cameras[1::2], MAX_MEASURED_VIEWS)
             measured_views = [(camera, None) for camera in between]
             return cls(model, [], _make_ring_cameras(viewpoint, center, up), measured_views, up, center, stated)
         named = [(f"{number:04d}.png", camera) for number, camera in enumerate(cameras)]
@@ -93,7 +92,7 @@ class Source:
         )
         measured_views = [(camera, None) for camera in evenly_spaced(spare, MAX_MEASURED_VIEWS)]
         if capture.is_coarse:
-            # Too few to fit harmonics to by themselves: what lies between them counts more than where they stand.
+            # Coarse cameras are too few to fit harmonics, so cameras between them and around the scene are added.
             between = [
                 camera for seed in range(VIEWS_BETWEEN_PER_CAMERA) for camera in interpolate_views(cameras, seed)
             ]
@@ -118,7 +117,7 @@ def _make_ring_cameras(viewpoint: Viewpoint, center: np.ndarray, up: np.ndarray)
     cameras = []
     for camera in orbit(viewpoint, RING_CAMERAS):
         distance = np.linalg.norm(camera.position - center)
-        for lift in RING_HEIGHT_RATIOS:
+        for lift in RING_HEIGHTS_PER_DISTANCE:
             pose = look_at(camera.position + lift * distance * up, center, up)
             cameras.append(replace(camera, camera_from_world=pose))
     return cameras

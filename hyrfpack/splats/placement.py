@@ -17,14 +17,14 @@ _MAX_DISTANCE_IN_SCENE_SIZES = 8
 
 
 def upright_rotation(up: np.ndarray, target_up: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation that takes `up` to `target_up`.
+    """Return a rotation (3, 3) that maps `up` to `target_up`.
 
     Where the two point in opposite directions, a half turn about x comes first, as between the axes of OpenCV and
     OpenGL. The shortest rotation alone would change its heading with every small change of `up`.
 
     Args:
-        up: (3,) which way is up in the scene.
-        to: (3,) which way is up in the file: +y or +z. Both unit vectors.
+        up: (3,) unit vector that points up in the scene.
+        target_up: (3,) unit vector that points up in the file, +y or +z.
     """
     up, target_up = (np.asarray(vector, np.float64) for vector in (up, target_up))
     if up @ target_up < 0:

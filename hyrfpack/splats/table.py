@@ -56,7 +56,7 @@ def _usd_format(extension: usd.Extension) -> SplatFormat:
     return SplatFormat(ending=f".{extension}", encode=encode, decode=decode, package=usd.REQUIRED_PACKAGE)
 
 
-_ROWS = (
+_FORMAT_ROWS = (
     SplatFormat(ending=".ply", encode=ply.encode, decode=ply.decode, is_readable=True),
     SplatFormat(
         ending=".splat",
@@ -78,4 +78,4 @@ _ROWS = (
     *map(_usd_format, usd.EXTENSIONS),
     SplatFormat(ending=".sog", encode=sog.encode, decode=sog.decode, is_readable=True, stores_antialiased=True),
 )
-FORMATS = {row.ending: row for row in _ROWS}
+FORMATS = {row.ending: row for row in _FORMAT_ROWS}
