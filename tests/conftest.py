@@ -79,10 +79,10 @@ def signals() -> Iterator[None]:
 @pytest.fixture
 def short_imports(monkeypatch: pytest.MonkeyPatch) -> None:
     """As little work of an import as still makes a model."""
-    from hyrfpack.distill import pack, start
+    from hyrfpack.distill import initialize, pack
 
-    monkeypatch.setattr(start, "LEAST_STEPS", 100)
-    monkeypatch.setattr(pack, "TRIALS", 2)
+    monkeypatch.setattr(initialize, "MIN_STEPS", 100)
+    monkeypatch.setattr(pack, "MAX_TRIALS", 2)
 
 
 @pytest.fixture(scope="session")

@@ -169,13 +169,15 @@ def test_a_model_is_measured_packed_and_fine_tuned_on_a_gpu(gpu, few_pictures, t
 
 
 def test_gaussians_from_elsewhere_are_learnt_on_a_gpu(gpu, few_pictures, tmp_path, monkeypatch):
-    monkeypatch.setattr("hyrfpack.distill.start.LEAST_STEPS", 3)
-    monkeypatch.setattr("hyrfpack.distill.start.HashGridConfig", lambda log2, finest: HashGridConfig(log2, levels=2))
+    monkeypatch.setattr("hyrfpack.distill.initialize.MIN_STEPS", 3)
+    monkeypatch.setattr(
+        "hyrfpack.distill.initialize.HashGridConfig", lambda log2, finest: HashGridConfig(log2, levels=2)
+    )
     # One thread: the interpreter runs one kernel at a time.
     monkeypatch.setattr(
         "hyrfpack.data.PictureCache.stream", lambda cache, views: ((view, cache.get(view)) for view in views)
     )
-    monkeypatch.setattr("hyrfpack.distill.pack.TRIALS", 1)
+    monkeypatch.setattr("hyrfpack.distill.pack.MAX_TRIALS", 1)
     taught = []
     monkeypatch.setattr("hyrfpack.distill.fit.pack", lambda learnt, *rest: taught.append(learnt) or pack(learnt, *rest))
     cameras = [camera_at(place, width=12, height=12) for place in ((0.0, -3, 0.5), (0.0, 3, 0.5), (3.0, 0, -0.5))]

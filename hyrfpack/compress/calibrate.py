@@ -141,16 +141,16 @@ class ReferenceRenders:
     pictures: list[Tensor]
 
     @classmethod
-    def of(cls, model: HybridModel, cameras: Sequence[Camera], seed: int = 1) -> ReferenceRenders:
+    def from_model(cls, model: HybridModel, cameras: Sequence[Camera], seed: int = 1) -> ReferenceRenders:
         """Render a model, half of the views at some of its cameras and half between them."""
         count = (
             int(np.clip(TARGET_DRAWN_GAUSSIANS // max(len(model), 1), MIN_COMPARISON_VIEWS, MAX_COMPARISON_VIEWS)) // 2
         )
         at, between = sample_views(cameras, count, seed)
-        return cls.at_views([*at, *between], model)
+        return cls.from_views([*at, *between], model)
 
     @classmethod
-    def at_views(cls, views: list[Camera], model: HybridModel, decoded: Decoded | None = None) -> ReferenceRenders:
+    def from_views(cls, views: list[Camera], model: HybridModel, decoded: Decoded | None = None) -> ReferenceRenders:
         """Render a model at the given views; `decoded` is as in `measure_error`."""
         return cls(views, _render_views(model, views, decoded))
 
@@ -186,7 +186,7 @@ def measure_calibrated_sensitivity(
     """
     sensitivity = measure_sensitivity(model, cameras, report=report_part(report, 0.0, 0.5))
     report("drawing what files are compared with", 0.5)
-    references = ReferenceRenders.of(model, cameras)
+    references = ReferenceRenders.from_model(model, cameras)
     return calibrate(model, sensitivity, references, distortion, prune, report_part(report, 0.55, 1.0)), references
 
 
@@ -227,7 +227,7 @@ def calibrate(
             sensitivity, ((PRUNED,),), distortion, measure_pruning, report_part(report, 0.0, 0.2)
         )
     left, decoded = subset_of(indices_to_keep(sensitivity, per_number, prune))
-    unpruned_references = ReferenceRenders.at_views(references.views, left, decoded)
+    unpruned_references = ReferenceRenders.from_views(references.views, left, decoded)
     placed: tuple[np.ndarray, Plan, HybridModel] | None = None
 
     def measure_quantization(scaled: Sensitivity, parts: list[Part], report: Report) -> dict[Part, ErrorMeasurement]:

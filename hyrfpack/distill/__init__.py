@@ -1,4 +1,4 @@
-"""Explicit 3D Gaussians of other programs -> a hybrid model, without photos."""
+"""Distillation: turn explicit 3D Gaussians of other programs into a hybrid model, without photos."""
 
 from hyrfpack.distill.config import DistillConfig
 from hyrfpack.distill.fit import DistillReport, distill, distill_splats

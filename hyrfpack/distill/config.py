@@ -1,4 +1,4 @@
-"""What decides the outcome of a distillation."""
+"""The settings of a distillation."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from hyrfpack.train.config import LARGEST_SEED
 
 @dataclass(frozen=True)
 class DistillConfig:
-    """What decides the outcome of a distillation, besides the splats.
+    """Settings that, with the splats, determine the result of a distillation.
 
     Attributes:
-        steps: optimiser steps of fitting to the original's pictures, one each.
-        psnr: dB of held-out pictures against the original's that the file is made for: higher takes more bytes.
-        size: pixels of the longer side of pictures.
-        train_views, test_views: how many viewpoints are made up, to teach (at most) and to score.
-        seed: of viewpoints, first weights and order; 0 to LARGEST_SEED.
+        steps: optimiser steps of fitting to reference renders of the splats, one render per step.
+        psnr: target PSNR in dB of the file on held-out reference renders; a higher value takes more bytes.
+        size: longer side of the renders in pixels.
+        train_views, test_views: number of sampled viewpoints to train at (at most) and to score at.
+        seed: random seed of the viewpoints, initial weights and order; 0 to LARGEST_SEED.
     """
 
     steps: int = 300

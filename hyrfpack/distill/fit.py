@@ -1,4 +1,4 @@
-"""Distillation: a file of 3D Gaussians becomes a hybrid model, taught by the file's own pictures."""
+"""The public functions of distillation: from a file of 3D Gaussians, or from splats, to a `.hyrf` file."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_type
 from hyrfpack.device import choose_device
 from hyrfpack.distill.config import DistillConfig
+from hyrfpack.distill.distill_model import distill_model
 from hyrfpack.distill.pack import pack
-from hyrfpack.distill.teach import teach
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Report, no_report, report_part
 from hyrfpack.scene import Camera
@@ -29,20 +29,21 @@ from hyrfpack.splats.splats import Splats
 
 @dataclass(frozen=True)
 class DistillReport:
-    """What a distillation came to.
+    """The result of a distillation.
 
     Attributes:
-        gaussians_before, gaussians_after: of the original and of the file.
-        degree: of the original's spherical harmonics.
-        views: held-out viewpoints that the scores are of.
-        psnr: dB, mean over these views, of the decoded file's pictures against the original's, over black.
-        psnr_worst: of the view with the least.
-        psnr_unpacked: mean, of the model before it was packed.
-        psnr_asked: of `DistillConfig`.
-        bytes_source: of the original as it was given; None when it was no file.
-        bytes_ply: of the original as PLY in INRIA's layout, without the header: 4 (17 + 3 (K - 1)) for each Gaussian.
-        bytes_after: of the `.hyrf` file.
-        seconds: that it took.
+        gaussians_before, gaussians_after: number of Gaussians of the original and of the file.
+        degree: degree of the original's spherical harmonics.
+        views: number of held-out viewpoints that were scored.
+        psnr: mean PSNR over these views of the decoded file's renders against the original's, over black; dB.
+        psnr_worst: PSNR of the worst view; dB.
+        psnr_unpacked: mean PSNR of the model before compression; dB.
+        psnr_asked: the target PSNR of `DistillConfig`.
+        bytes_source: size of the original file; None if the splats did not come from a file.
+        bytes_ply: size of the original as PLY in INRIA's layout, without the header: 4 (17 + 3 (K - 1)) bytes for each
+            Gaussian with K harmonics.
+        bytes_after: size of the `.hyrf` file.
+        seconds: duration of the distillation.
         file: the path that was written.
     """
 
@@ -61,7 +62,7 @@ class DistillReport:
     file: str
 
     def to_dict(self) -> dict:
-        """Plain numbers, ready for JSON."""
+        """Return the attributes as a dictionary ready for JSON."""
         return asdict(self)
 
 
@@ -76,12 +77,14 @@ def distill(
     say: Callable[[str], None] = lambda sentence: None,
     report: Report = no_report,
 ) -> DistillReport:
-    """Make a `.hyrf` file from a file of 3D Gaussians; see `distill_splats`, and `read_splats` for what is read.
+    """Make a `.hyrf` file from a file of 3D Gaussians.
+
+    The arguments are those of `distill_splats`; `read_splats` describes which files can be read.
 
     Raises:
-        HyrfDataError: the source cannot be read, or there is nothing to be seen in it.
+        HyrfDataError: the source cannot be read, or no view shows any of its Gaussians.
         HyrfError: the target cannot be written.
-        TypeError: the settings or a camera are something else.
+        TypeError: the settings or a camera have the wrong type.
 
     Example:
         >>> import hyrfpack
@@ -114,55 +117,56 @@ def distill_splats(
     say: Callable[[str], None] = lambda sentence: None,
     report: Report = no_report,
 ) -> DistillReport:
-    """Turn splats into a hybrid model that looks like them, and pack it (profile compact).
+    """Distil splats into a hybrid model of the same appearance, and compress it with profile "compact".
 
-    Without cameras viewpoints are made up (`sample_viewpoints`). The faintest Gaussians, as seen from there, are left
-    out; the fields are fitted to the others' shapes and colours (`initial_model`), the whole is fitted to pictures of
-    the original. Same splats and settings, same bytes, on the CPU: on a GPU sums of gradients vary in their last bits.
+    Without cameras, viewpoints are sampled (`sample_viewpoints`). The Gaussians that contribute least to the renders
+    from there are left out. The fields are initialised by regression on the shapes and colours of the others
+    (`initial_model`), and the whole model is then fitted to renders of the original. On the CPU the same splats and
+    settings give the same bytes; on a GPU sums of gradients vary in their last bits.
 
     Args:
-        splats: in any units, anywhere.
-        target: the `.hyrf` file.
-        name: what messages call the splats.
-        cameras: that pictures shall hold at, made smaller where larger than `config.size`; one in TEST_EVERY is held
-            out.
-        overwrite: replace a file at `target`. Without it, one that is there is an error, and one that appears in the
-            meantime is kept: the result gets a free name beside it, which the report names.
-        device: where pictures are drawn and the model learns, see `hyrfpack.device.choose_device`.
-        say: told what is going on.
-        report: called with what is being done and the share of the work that is done, 0 to 1.
+        splats: the splats, in any units and at any place.
+        target: the `.hyrf` file to write.
+        name: name of the splats in messages.
+        cameras: viewpoints at which the model must match the splats, shrunk if larger than `config.size`; one in
+            TEST_EVERY is held out.
+        overwrite: replace a file at `target`. If False, an existing file is an error. A file that appears in the
+            meantime is kept, and the result is written beside it under a free name, which the report names.
+        device: device for rendering and training, see `hyrfpack.device.choose_device`.
+        say: called with a sentence for each step of the work.
+        report: called with the name of the current task and the completed share of the work, 0 to 1.
 
     Raises:
         HyrfDataError: no view shows any of the splats.
-        HyrfError: the file cannot be written, or there is no such device.
+        HyrfError: the file cannot be written, or the device does not exist.
     """
     started = time.perf_counter()
     Outputs(overwrite=overwrite).file(target)
-    place = choose_device(device, say)
-    taught = teach(
-        splats, config, name=name, cameras=cameras, device=place, say=say, report=report_part(report, 0.0, 0.7)
+    torch_device = choose_device(device, say)
+    distilled = distill_model(
+        splats, config, name=name, cameras=cameras, device=torch_device, say=say, report=report_part(report, 0.0, 0.7)
     )
-    unpacked = float(np.mean(taught.test.likeness(taught.model)))
-    say(f"{unpacked:.2f} dB before packing")
+    unpacked_psnr = float(np.mean(distilled.test.psnr_per_view(distilled.model)))
+    say(f"{unpacked_psnr:.2f} dB before packing")
     imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
-    provenance = {"steps": config.steps, "seed": config.seed, "psnr": unpacked, "choices": {"imported": imported}}
-    data = pack(taught, config.psnr, provenance, say, report_part(report, 0.7, 0.97))
-    written = write_atomic(target, data, overwrite=overwrite)  # only now: an interrupt leaves what was there before
+    provenance = {"steps": config.steps, "seed": config.seed, "psnr": unpacked_psnr, "choices": {"imported": imported}}
+    data = pack(distilled, config.psnr, provenance, say, report_part(report, 0.7, 0.97))
+    written = write_atomic(target, data, overwrite=overwrite)  # written last, so an interrupt keeps the old file
     report("scoring the file", 0.97)
-    decoded = hyrf_format.load(written).to(place)
-    decoded.precision = taught.model.precision
-    scores = taught.test.likeness(decoded)
-    reached = float(np.mean(scores))
-    if _below(reached, config.psnr):
-        say(_shortfall(reached, unpacked, config, made_up=cameras is None))
+    decoded = hyrf_format.load(written).to(torch_device)
+    decoded.precision = distilled.model.precision
+    scores = distilled.test.psnr_per_view(decoded)
+    reached_psnr = float(np.mean(scores))
+    if _falls_short(reached_psnr, config.psnr):
+        say(_shortfall(reached_psnr, unpacked_psnr, config, viewpoints_are_sampled=cameras is None))
     return DistillReport(
         gaussians_before=len(splats),
         gaussians_after=len(decoded),
         degree=splats.degree,
         views=len(scores),
-        psnr=reached,
+        psnr=reached_psnr,
         psnr_worst=min(scores),
-        psnr_unpacked=unpacked,
+        psnr_unpacked=unpacked_psnr,
         psnr_asked=config.psnr,
         bytes_source=None,
         bytes_ply=4 * len(splats) * (17 + 3 * (splats.harmonics.shape[1] - 1)),
@@ -172,17 +176,20 @@ def distill_splats(
     )
 
 
-def _below(reached: float, asked: float) -> bool:
-    """Whether a PSNR is less than was asked for, as it is told."""
-    return round(reached, 1) < asked
+def _falls_short(reached_psnr: float, asked: float) -> bool:
+    """Whether a PSNR, rounded as in messages, is less than the target."""
+    return round(reached_psnr, 1) < asked
 
 
-def _shortfall(reached: float, unpacked: float, config: DistillConfig, *, made_up: bool) -> str:
-    """What to do about a file that is less like the original than was asked for."""
-    told = (
-        f"asked for {config.psnr:g} dB and reached {reached:.1f} at held-out viewpoints, {unpacked:.1f} before packing"
+def _shortfall(
+    reached_psnr: float, unpacked_psnr: float, config: DistillConfig, *, viewpoints_are_sampled: bool
+) -> str:
+    """Describe how far the file falls short of the target PSNR, and what the user can do about it."""
+    outcome = (
+        f"asked for {config.psnr:g} dB and reached {reached_psnr:.1f} at held-out viewpoints, "
+        f"{unpacked_psnr:.1f} before packing"
     )
-    if not _below(unpacked, config.psnr):
-        return f"{told}: ask for more than you need with `psnr`"
-    where = ", or name with `cameras` from where it will be looked at" if made_up else ""
-    return f"{told}: learn longer, as with `steps={max(DistillConfig.steps, 2 * config.steps)}`{where}"
+    if not _falls_short(unpacked_psnr, config.psnr):
+        return f"{outcome}: ask for more than you need with `psnr`"
+    where = ", or name with `cameras` from where it will be looked at" if viewpoints_are_sampled else ""
+    return f"{outcome}: learn longer, as with `steps={max(DistillConfig.steps, 2 * config.steps)}`{where}"

@@ -1,4 +1,4 @@
-"""A taught model as a file, as small as the quality asked for allows."""
+"""Compression of a distilled model to the smallest file that reaches a target PSNR."""
 
 from __future__ import annotations
 
@@ -11,80 +11,95 @@ from scipy.optimize import brentq
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.packer import Packer
-from hyrfpack.distill.teach import Taught
+from hyrfpack.distill.distill_model import DistilledModel
 from hyrfpack.progress import Report, no_report, report_part, report_round
 
-PACKED = 0.8  # of what packing may add, to ask for
-LEAST_ADDED = 0.25  # of the error before packing, that packing may add in any case
-HOPELESS = 0.5  # of the error allowed, that it may add where that is passed already
-TRIALS = 5  # files that are made so
+# Compression is planned for this share of the error that it may add, because the measured error varies.
+PLANNED_ERROR_SHARE = 0.8
+# If the model's own error leaves too little of the allowed error, compression may still add this share of the model's
+# error, or this share of the allowed error, whichever is smaller.
+FALLBACK_MODEL_ERROR_SHARE = 0.25
+FALLBACK_ALLOWED_ERROR_SHARE = 0.5
+MAX_TRIALS = 5
 
 
 def pack(
-    taught: Taught,
+    distilled: DistilledModel,
     psnr: float,
     provenance: dict,
     say: Callable[[str], None] = lambda sentence: None,
     report: Report = no_report,
 ) -> bytes:
-    """A file as small as the quality that is asked for allows, as views tell that it has not learnt from.
+    """Encode the smallest file that reaches a target PSNR on the validation views.
 
     Args:
-        psnr: dB of its pictures against the original's.
-        provenance: that the file tells, besides where it is looked at from.
-        say: told what is going on.
-        report: called with what is being done and the share of the work that is done, 0 to 1.
+        distilled: the model, and reference renders of the original.
+        psnr: target PSNR in dB against the reference renders.
+        provenance: provenance to store in the file; the viewpoint is added to it.
+        say: called with a sentence for each step of the work.
+        report: called with the name of the current task and the completed share of the work, 0 to 1.
+
+    Returns:
+        The bytes of the file.
 
     Example:
         >>> from hyrfpack.distill import DistillConfig
-        >>> from hyrfpack.distill.teach import teach
+        >>> from hyrfpack.distill.distill_model import distill_model
         >>> from hyrfpack.splats.files import read_splats
-        >>> taught = teach(read_splats("bonsai.ply"), DistillConfig(steps=1, size=16, train_views=2, test_views=2))
-        >>> pack(taught, psnr=15, provenance={})[:4]
+        >>> quick = DistillConfig(steps=1, size=16, train_views=2, test_views=2)
+        >>> distilled = distill_model(read_splats("bonsai.ply"), quick)
+        >>> pack(distilled, psnr=15, provenance={})[:4]
         b'HYRF'
     """
-    model = taught.model
-    likeness = np.array(taught.deciding.likeness(model))
-    allowed, error = _mse(psnr), _mse(likeness.mean())
-    room = max(allowed - error, min(LEAST_ADDED * error, HOPELESS * allowed))
-    say(f"measuring what each number does to pictures, at {len(taught.train)} cameras and between them")
-    wanted = PACKED * added_to_each(_mse(likeness), error + room)
-    sensitivity, originals = measure_calibrated_sensitivity(
-        model, taught.train, wanted, report=report_part(report, 0.0, 0.7)
+    model = distilled.model
+    psnrs = np.array(distilled.validation.psnr_per_view(model))
+    allowed, error = _mse(psnr), _mse(psnrs.mean())
+    allowance = max(allowed - error, min(FALLBACK_MODEL_ERROR_SHARE * error, FALLBACK_ALLOWED_ERROR_SHARE * allowed))
+    say(f"measuring what each number does to pictures, at {len(distilled.train)} cameras and between them")
+    distortion = PLANNED_ERROR_SHARE * solve_added_error(_mse(psnrs), error + allowance)
+    sensitivity, references = measure_calibrated_sensitivity(
+        model, distilled.train, distortion, report=report_part(report, 0.0, 0.7)
     )
-    provenance = {**provenance, "viewpoint": Viewpoint.from_cameras(taught.train).to_json()}
-    making = report_part(report, 0.7, 0.85)
-    packer = Packer(model, provenance, sensitivity, scene=None, finetune_steps=0, prune=True, say=say, report=making)
-    trial = packer.encode_to_distortion(wanted, originals)
-    for number in range(TRIALS):
-        trying = report_round(report_part(report, 0.85, 1.0), number)
-        trying("comparing the file with the original", 0.0)
-        off = _mse(np.mean(taught.deciding.likeness(packer.decode(trial)))) - error
-        if off <= room:
+    provenance = {**provenance, "viewpoint": Viewpoint.from_cameras(distilled.train).to_json()}
+    encoding_report = report_part(report, 0.7, 0.85)
+    packer = Packer(
+        model, provenance, sensitivity, scene=None, finetune_steps=0, prune=True, say=say, report=encoding_report
+    )
+    candidate = packer.encode_to_distortion(distortion, references)
+    for number in range(MAX_TRIALS):
+        trial_report = report_round(report_part(report, 0.85, 1.0), number)
+        trial_report("comparing the file with the original", 0.0)
+        added_error = _mse(np.mean(distilled.validation.psnr_per_view(packer.decode(candidate)))) - error
+        if added_error <= allowance:
             break
-        wanted *= max(PACKED * room / off, 1 / 16)
-        say(f"packing adds {off:.2g} to the error instead of {room:.2g}: finer, for {wanted:.2g}")
-        trial = packer.encode(wanted, report_part(trying, 0.5, 1.0))
-    return trial.data
+        distortion *= max(PLANNED_ERROR_SHARE * allowance / added_error, 1 / 16)
+        say(f"packing adds {added_error:.2g} to the error instead of {allowance:.2g}: finer, for {distortion:.2g}")
+        candidate = packer.encode(distortion, report_part(trial_report, 0.5, 1.0))
+    return candidate.data
 
 
-def added_to_each(errors: np.ndarray, mean: float) -> float:
-    """What, added to the errors (n,) of all views, brings their geometric mean, that of the mean PSNR, to `mean`.
+def solve_added_error(errors: np.ndarray, mean: float) -> float:
+    """Solve for the error that, added to the error of each view, brings their geometric mean to `mean`.
 
-    It is less than `mean` less their own: the views that are nearly right lose most.
+    The geometric mean of the errors is the error of the mean PSNR. The solution is smaller than the difference of
+    `mean` and the present geometric mean, because the PSNR of the best views drops most.
+
+    Args:
+        errors: (n,) mean squared error of each view.
+        mean: geometric mean to reach.
 
     Example:
-        >>> round(added_to_each(np.array([1.0, 100.0]), 20.0), 2)
+        >>> round(solve_added_error(np.array([1.0, 100.0]), 20.0), 2)
         2.89
     """
 
-    def above(added: float) -> float:
+    def excess(added: float) -> float:
         return float(np.log(errors + added).mean() - np.log(mean))
 
     least = 1e-6 * mean
-    return least if above(least) >= 0 else float(brentq(above, least, mean, xtol=1e-3 * least))
+    return least if excess(least) >= 0 else float(brentq(excess, least, mean, xtol=1e-3 * least))
 
 
 def _mse(psnr: Any) -> Any:
-    """Mean squared errors, of colours in [0, 1], of PSNRs in dB."""
+    """Convert PSNRs in dB to mean squared errors of colours in [0, 1]."""
     return 10 ** (-psnr / 10)

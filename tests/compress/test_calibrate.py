@@ -48,7 +48,7 @@ def forecast(model: HybridModel, sensitivity: Sensitivity, distortion: float) ->
     quantized = decide(model, sensitivity, distortion)
     decoded = decode_model(encode_model(model, "compact", quantized=quantized))
     told = predict_errors(model, quantized.plan.apply(model), quantized, sensitivity)
-    return sum(told.values()), ReferenceRenders.of(model, ELSEWHERE).measure_error(decoded)
+    return sum(told.values()), ReferenceRenders.from_model(model, ELSEWHERE).measure_error(decoded)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def first_order(model) -> Sensitivity:
 
 @pytest.mark.parametrize("distortion", [1e-3, 1e-5])
 def test_where_gaussians_swap_their_order_the_loss_is_foretold_to_a_third(distortion, model, first_order):
-    sensitivity = calibrate(model, first_order, ReferenceRenders.of(model, CAMERAS), distortion)
+    sensitivity = calibrate(model, first_order, ReferenceRenders.from_model(model, CAMERAS), distortion)
 
     told, found = forecast(model, sensitivity, distortion)
 
@@ -77,7 +77,7 @@ def test_without_it_the_loss_is_not_foretold(model, first_order):
 
 
 def test_what_is_right_already_stays(model, first_order):
-    references = ReferenceRenders.of(model, CAMERAS)
+    references = ReferenceRenders.from_model(model, CAMERAS)
     once = calibrate(model, first_order, references, 1e-4)
 
     again = calibrate(model, once, references, 1e-4)
@@ -111,7 +111,7 @@ def test_where_pruning_darkens_pictures_more_than_the_sum_of_squares_less_is_pru
     sensitivity = measure_sensitivity(model, CAMERAS)
     distortion = 1e-4
 
-    calibrated = calibrate(model, sensitivity, ReferenceRenders.of(model, CAMERAS), distortion)
+    calibrated = calibrate(model, sensitivity, ReferenceRenders.from_model(model, CAMERAS), distortion)
 
     assert len(make_plan(model, calibrated, distortion).kept) > 2 * len(make_plan(model, sensitivity, distortion).kept)
     told, found = forecast(model, calibrated, distortion)
@@ -119,7 +119,7 @@ def test_where_pruning_darkens_pictures_more_than_the_sum_of_squares_less_is_pru
 
 
 def test_a_single_view_that_is_far_off_does_not_decide(model):
-    references = ReferenceRenders.of(model, CAMERAS)
+    references = ReferenceRenders.from_model(model, CAMERAS)
     broken = [torch.ones_like(picture) if n == 0 else picture for n, picture in enumerate(references.pictures)]
 
     assert ReferenceRenders(references.views, broken).measure_error(model) == 0.0
@@ -130,7 +130,7 @@ def test_parts_that_do_nothing_are_left_alone():
     model = small_model(ball_points(40)[0] * 0.1 + np.array([0.0, 0.0, 500.0]))
     sensitivity = measure_sensitivity(model, CAMERAS)
 
-    calibrated = calibrate(model, sensitivity, ReferenceRenders.of(model, CAMERAS), 1e-4)
+    calibrated = calibrate(model, sensitivity, ReferenceRenders.from_model(model, CAMERAS), 1e-4)
 
     for name in ("positions", "colors", "scales", "opacities"):
         np.testing.assert_array_equal(getattr(calibrated, name), getattr(sensitivity, name))
@@ -138,7 +138,7 @@ def test_parts_that_do_nothing_are_left_alone():
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_one_and_two_cameras_will_do(count, model, first_order):
-    references = ReferenceRenders.of(model, CAMERAS[:count])
+    references = ReferenceRenders.from_model(model, CAMERAS[:count])
 
     calibrated = calibrate(model, first_order, references, 1e-4)
 
@@ -189,7 +189,9 @@ def test_what_a_part_does_not_change_need_not_be_decoded_anew(part, says):
     other = {name: arrays[name] * generator.uniform(0.5, 1.5, arrays[name].shape).astype(np.float32) for name in part}
     changed.load_state_dict(dict(iter_parameters(other, changed)), strict=False)
 
-    found = ReferenceRenders.of(before, CAMERAS).measure_error(changed, _update_decoded(changed, before.decode(), part))
+    found = ReferenceRenders.from_model(before, CAMERAS).measure_error(
+        changed, _update_decoded(changed, before.decode(), part)
+    )
 
-    expected = ReferenceRenders.of(before, CAMERAS).measure_error(changed)
+    expected = ReferenceRenders.from_model(before, CAMERAS).measure_error(changed)
     assert found == pytest.approx(expected, rel=1e-3) and (expected > 1e-7 or not says)

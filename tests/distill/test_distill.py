@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 import hyrfpack
 from hyrfpack.compress import calibrate
-from hyrfpack.distill import DistillConfig, distill_splats, fit, pack, teach, teacher
-from hyrfpack.distill.teacher import Sample, teaching_scene
+from hyrfpack.distill import DistillConfig, distill_model, distill_splats, fit, pack, reference
+from hyrfpack.distill.reference import ReferenceViews, reference_scene
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
@@ -26,7 +26,7 @@ def test_report_says_what_is_in_the_file(tmp_path: Path) -> None:
     weighted = WeightedSplats.from_splats(splats, "ball")
     original = Drawable.from_splats(splats, weighted.frame)
     held_out = sample_viewpoints(weighted, original, LITTLE.test_views, LITTLE.size, 1)
-    scores = Sample.of(original, held_out).likeness(model)
+    scores = ReferenceViews.from_splats(original, held_out).psnr_per_view(model)
     assert (report.psnr, report.psnr_worst) == (np.mean(scores), min(scores))
     assert (report.gaussians_before, report.gaussians_after) == (200, len(model))
     assert report.bytes_after == target.stat().st_size
@@ -111,7 +111,7 @@ def test_cameras_that_look_away_are_one_sentence(tmp_path: Path) -> None:
 
 def test_folder_that_cannot_be_made_is_told_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_bytes(b"")
-    monkeypatch.setattr(teach, "_cameras", lambda *arguments: pytest.fail("the work began"))
+    monkeypatch.setattr(distill_model, "_choose_cameras", lambda *arguments: pytest.fail("the work began"))
     with pytest.raises(HyrfError, match="file is a file, not a folder"):
         distill_splats(ball(20), tmp_path / "file" / "x.hyrf", LITTLE)
 
@@ -121,7 +121,7 @@ def test_interrupt_while_packing_leaves_the_file_that_was_there(
 ) -> None:
     target = tmp_path / "x.hyrf"
     target.write_bytes(b"before")
-    monkeypatch.setattr(pack, "PACKED", 100.0)  # the first try will not do
+    monkeypatch.setattr(pack, "PLANNED_ERROR_SHARE", 100.0)  # the first try will not do
     monkeypatch.setattr(pack.Packer, "encode", _interrupted_at_the_second(pack.Packer.encode))
     with pytest.raises(KeyboardInterrupt):
         distill_splats(ball(20), target, LITTLE)
@@ -154,7 +154,7 @@ def test_nothing_is_measured_or_drawn_twice_however_often_packing_is_tried(
     monkeypatch.setattr(pack, "_mse", lambda psnr: 2.0**-psnr)  # what packing adds seems to be very much
     measured = counting(monkeypatch, calibrate, "measure_sensitivity")
     tried = counting(monkeypatch, pack.Packer, "encode")
-    drawn = counting(monkeypatch, teacher, "photograph")
+    drawn = counting(monkeypatch, reference, "render_reference")
 
     distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, steps=12))
 
@@ -166,9 +166,9 @@ def test_nothing_is_measured_or_drawn_twice_however_often_packing_is_tried(
 def test_a_short_import_looks_from_fewer_places_and_regresses_less(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looked = counting(monkeypatch, teach, "sample_viewpoints")
-    started = counting(monkeypatch, teach, "initial_model")
-    monkeypatch.setattr(teach, "_fit_to_pictures", lambda *args: None)
+    looked = counting(monkeypatch, distill_model, "sample_viewpoints")
+    started = counting(monkeypatch, distill_model, "initial_model")
+    monkeypatch.setattr(distill_model, "_fit_to_pictures", lambda *args: None)
     monkeypatch.setattr(fit, "pack", _interrupt)
     for steps in (1, DistillConfig.steps):
         with pytest.raises(KeyboardInterrupt):
@@ -196,10 +196,10 @@ def test_a_file_less_like_the_original_than_asked_for_says_so(tmp_path: Path) ->
 
 
 def test_what_packing_took_is_asked_for_and_not_learned() -> None:
-    told = fit._shortfall(36.5, 38.6, DistillConfig(psnr=37), made_up=True)
+    told = fit._shortfall(36.5, 38.6, DistillConfig(psnr=37), viewpoints_are_sampled=True)
     assert "reached 36.5" in told and told.endswith("with `psnr`") and "steps" not in told
-    assert "cameras" not in fit._shortfall(36.5, 36.6, DistillConfig(psnr=37), made_up=False)
-    assert not fit._below(36.96, 37) and fit._below(36.94, 37)
+    assert "cameras" not in fit._shortfall(36.5, 36.6, DistillConfig(psnr=37), viewpoints_are_sampled=False)
+    assert not fit._falls_short(36.96, 37) and fit._falls_short(36.94, 37)
 
 
 def test_settings_out_of_range_are_refused() -> None:
@@ -216,7 +216,7 @@ def test_teacher_shows_what_is_drawn() -> None:
     weighted = WeightedSplats.from_splats(splats, "ball")
     original = Drawable.from_splats(splats, weighted.frame)
     (camera,) = sample_viewpoints(weighted, original, 1, 32, 0)
-    scene = teaching_scene("ball", original, [camera], [])
+    scene = reference_scene("ball", original, [camera], [])
     picture = scene.train[0].load()
     drawn = draw(original, camera)
     np.testing.assert_allclose(picture.alpha / 255, 1 - drawn.transmittance, atol=0.5 / 255 + 1e-6)
@@ -229,7 +229,7 @@ def test_what_packing_adds_to_each_view_brings_their_mean_psnr_to_what_is_asked(
     errors = np.array(errors)
     own = np.exp(np.log(errors).mean())
 
-    added = pack.added_to_each(errors, factor * own)
+    added = pack.solve_added_error(errors, factor * own)
 
     # Where views are unequal, the nearly perfect ones lose most, and less is to be had.
     assert 0 < added <= (factor - 1) * own * (1 + 1e-6)
@@ -238,4 +238,4 @@ def test_what_packing_adds_to_each_view_brings_their_mean_psnr_to_what_is_asked(
 
 
 def test_what_is_added_to_views_without_error_is_all_that_is_asked():
-    assert pack.added_to_each(np.zeros(3), 1e-4) == pytest.approx(1e-4)
+    assert pack.solve_added_error(np.zeros(3), 1e-4) == pytest.approx(1e-4)

@@ -29,7 +29,7 @@ DATA = Path(os.environ.get("HYRFPACK_DATA") or ROOT.parent / "shared" / "data") 
 BLOCK = re.compile(r"^```python\n(?P<fenced>.*?)^```$|(?P<indented>(?:^    [^\n]*\n|^\n)+)", re.MULTILINE | re.DOTALL)
 FEWER = """
 import runpy, sys
-from hyrfpack.distill import DistillConfig, start
+from hyrfpack.distill import DistillConfig, initialize
 from hyrfpack.measure import timing
 from hyrfpack.train import TrainConfig
 def cut(settings):
@@ -40,7 +40,7 @@ def cut(settings):
     settings.__post_init__ = fewer
 cut(TrainConfig)
 cut(DistillConfig)
-start.LEAST_STEPS = start.MOST_STEPS = {steps}
+initialize.MIN_STEPS = initialize.MAX_STEPS = {steps}
 timing.WARM_UP_SECONDS = 0
 runpy.run_path(sys.argv[1], run_name="__main__")
 """

@@ -62,14 +62,14 @@ class Set:
         self.model, provenance = load_with_provenance(folder / "model.hyrf")
         self.provenance = quantized_provenance(provenance, self.model.config.frame.scale)
         self.raw = self.scores(self.model)
-        self.held_out = ReferenceRenders.at_views(
+        self.held_out = ReferenceRenders.from_views(
             [view.camera for view in evenly_spaced(self.scene.test, HELD_OUT)], self.model
         )
         start = time.perf_counter()
         cameras = [view.camera for view in self.scene.train]
         self.sensitivity, self.originals = (
             measure_sensitivity(self.model, cameras),
-            ReferenceRenders.of(self.model, cameras),
+            ReferenceRenders.from_model(self.model, cameras),
         )
         self.measuring = time.perf_counter() - start
 

@@ -26,8 +26,8 @@ import gsply
 import numpy as np
 
 from hyrfpack.distill import DistillConfig
+from hyrfpack.distill.distill_model import DistilledModel, distill_model
 from hyrfpack.distill.pack import pack
-from hyrfpack.distill.teach import Taught, teach
 from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.format.codec import decode_model
 from hyrfpack.splats.draw import Drawable, draw
@@ -66,17 +66,17 @@ class Point:
         return [self.encoder, self.setting, *sizes]
 
 
-def ours(taught: Taught, asked: list[float]) -> Iterator[Point]:
+def ours(taught: DistilledModel, asked: list[float]) -> Iterator[Point]:
     """Our files, packed for so many dB each."""
     for wanted in asked:
         began = time.perf_counter()
         data = pack(taught, wanted, {})
         seconds = time.perf_counter() - began
-        scores = taught.test.likeness(decode_model(data))
+        scores = taught.test.psnr_per_view(decode_model(data))
         yield Point("hyrfpack", f"--psnr {wanted:g}", len(data), float(np.mean(scores)), min(scores), seconds)
 
 
-def theirs(splats: Splats, taught: Taught, folder: Path) -> Iterator[Point]:
+def theirs(splats: Splats, taught: DistilledModel, folder: Path) -> Iterator[Point]:
     """Files of other programs, of these splats and of parts of them."""
     for degree in range(splats.degree, -1, -1):
         for least in MIN_OPACITIES:
@@ -107,7 +107,7 @@ def converted(source: Path, target: Path) -> None:
         raise SystemExit(f"splat-transform: {complaint}")
 
 
-def measured(encoder: str, setting: str, file: Path, taught: Taught, seconds: float) -> Point:
+def measured(encoder: str, setting: str, file: Path, taught: DistilledModel, seconds: float) -> Point:
     """A file of splats, beside the original."""
     drawable = Drawable.from_splats(read_splats(file), taught.model.config.frame)
     pairs = zip(taught.test.cameras, taught.test.pictures, strict=True)
@@ -139,7 +139,7 @@ def main() -> None:
     for file in args.files:
         splats = read_splats(file)
         began = time.perf_counter()
-        taught = teach(splats, DistillConfig(steps=args.steps, size=args.size, seed=args.seed), name=str(file))
+        taught = distill_model(splats, DistillConfig(steps=args.steps, size=args.size, seed=args.seed), name=str(file))
         print(f"\n{file.name}: {len(splats):,} Gaussians of degree {splats.degree}; "
               f"taught in {time.perf_counter() - began:.0f} s\n")  # fmt: skip
         mine = list(ours(taught, args.psnr))

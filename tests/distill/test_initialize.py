@@ -6,9 +6,9 @@ import torch
 from explicit_balls import ball
 from scipy.spatial.transform import Rotation
 
-from hyrfpack.distill import start
-from hyrfpack.distill.start import initial_model, rotations
-from hyrfpack.distill.teacher import teaching_scene
+from hyrfpack.distill import initialize
+from hyrfpack.distill.initialize import initial_model, rotations
+from hyrfpack.distill.reference import reference_scene
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
@@ -35,7 +35,7 @@ def test_rotations_are_those_of_scipy() -> None:
 
 @pytest.mark.parametrize("degree", [0, 1])
 def test_fields_learn_shapes_and_colours(degree: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(start, "LEAST_STEPS", 200)
+    monkeypatch.setattr(initialize, "MIN_STEPS", 200)
     splats = ball(100, degree)
     drawable, cameras = drawable_of(splats)
     model = initial_model(drawable, torch.ones(100), cameras, 0)
@@ -61,14 +61,14 @@ def test_many_gaussians_take_fewer_steps_of_larger_batches(monkeypatch: pytest.M
             taken.append(len(some))
             yield some
 
-    batches = start._batches
-    monkeypatch.setattr(start, "_batches", watched)
-    monkeypatch.setattr(start, "BATCH", 8)
-    monkeypatch.setattr(start, "EPOCHS", 16)
+    batches = initialize._batches
+    monkeypatch.setattr(initialize, "_batches", watched)
+    monkeypatch.setattr(initialize, "MIN_BATCH_GAUSSIANS", 8)
+    monkeypatch.setattr(initialize, "TARGET_EPOCHS", 16)
     drawable, cameras = drawable_of(ball(100))
     for work, steps, batch in ((10**9, 200, 8), (100 * 40, 40, 40), (100, 1, 100)):
         taken.clear()
-        monkeypatch.setattr(start, "MOST_WORK", work)
+        monkeypatch.setattr(initialize, "MAX_STEPS_TIMES_GAUSSIANS", work)
         initial_model(drawable, torch.ones(100), cameras, 0)
         assert len(taken) in (steps, steps + 1) and max(taken) == batch
 
@@ -78,7 +78,7 @@ def test_trainer_goes_on_with_a_model_that_is_given() -> None:
     drawable, cameras = drawable_of(splats)
     model = initial_model(drawable, torch.ones(50), cameras, 0)
     before = model.gaussians.color_logits.detach().clone()
-    scene = teaching_scene("ball", drawable, cameras, [])
+    scene = reference_scene("ball", drawable, cameras, [])
     trainer = Trainer(scene, TrainConfig(steps=2, density=DensityConfig(stop=0.0)), model=model)
     assert trainer.run()
     assert trainer.model is model

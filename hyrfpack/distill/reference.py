@@ -1,0 +1,103 @@
+"""Renders of the original splats: as a scene to train on, as references to compare with, and the light they send."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyrfpack.device import make_current
+from hyrfpack.evaluate.metrics import psnr
+from hyrfpack.model import HybridModel
+from hyrfpack.ops.rasterize.cull import frustum_cull
+from hyrfpack.ops.rasterize.light import sent_light
+from hyrfpack.parallel.pool import parallel_map, torch_on_one_thread
+from hyrfpack.render import RenderSettings, render
+from hyrfpack.scene import Camera, Picture, Scene, View
+from hyrfpack.splats.draw import Drawable, draw
+
+LIGHT_VIEWS_IN_MEMORY = 8
+# Division by a smaller alpha would amplify noise in the colours of nearly transparent pixels.
+MIN_ALPHA = 1e-6
+
+
+def reference_scene(name: str, drawable: Drawable, train: Sequence[Camera], test: Sequence[Camera]) -> Scene:
+    """Return a scene whose photos are renders of the splats with alpha; each is rendered when it is loaded."""
+    count = len(str(len(train) + len(test)))
+    train_views, test_views = (
+        [
+            View(f"{kind}/{number:0{count}d}", camera, partial(render_reference, drawable, camera))
+            for number, camera in enumerate(cameras)
+        ]
+        for kind, cameras in (("train", train), ("test", test))
+    )
+    return Scene(
+        name, "splats", train_views, test_views, np.zeros((0, 3)), np.zeros((0, 3), np.float32), has_alpha=True
+    )
+
+
+def render_reference(drawable: Drawable, camera: Camera) -> Picture:
+    """Render the splats from a camera as a picture of 8 bits with straight alpha."""
+    make_current(drawable.device)  # the current device is kept per thread, and this may be a prefetching thread
+    rendered = draw(drawable, camera)
+    alpha = 1 - rendered.transmittance
+    rgb = rendered.rgb / alpha.clamp_min(MIN_ALPHA)[..., None]
+    return Picture(*((values.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy() for values in (rgb, alpha)))
+
+
+@torch_on_one_thread()
+def mean_sent_light(drawable: Drawable, cameras: Sequence[Camera]) -> Tensor:
+    """Return the light (N,) that each Gaussian sends to a picture: the sum of T alpha in pixels, mean over cameras."""
+    total = torch.zeros(len(drawable.positions), device=drawable.device)
+    settings = RenderSettings()
+
+    def light(camera: Camera) -> tuple[Tensor, Tensor]:
+        pose = torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32)
+        size = camera.intrinsics, camera.width, camera.height
+        index = frustum_cull(drawable.positions, pose, *size, settings.near, settings.cull_tolerance)
+        gaussians = (drawable.positions, drawable.quats, drawable.scales, drawable.opacities)
+        means, quats, scales, opacities = (part[index] for part in gaussians)
+        light, _ = sent_light(
+            means, quats, scales, opacities, pose, *size, near=settings.near, antialiased=drawable.antialiased
+        )
+        return index, light
+
+    for first in range(0, len(cameras), LIGHT_VIEWS_IN_MEMORY):
+        for index, sent in parallel_map(light, cameras[first : first + LIGHT_VIEWS_IN_MEMORY], drawable.device):
+            total.index_add_(0, index, sent)
+    return total / max(1, len(cameras))
+
+
+@dataclass(frozen=True)
+class ReferenceViews:
+    """Reference renders of splats, against which models are compared.
+
+    Attributes:
+        cameras: the cameras that were rendered.
+        pictures: the render of each camera, (H, W, 3) over black, clamped to [0, 1].
+    """
+
+    cameras: list[Camera]
+    pictures: list[Tensor]
+
+    @classmethod
+    def from_splats(cls, drawable: Drawable, cameras: Sequence[Camera]) -> ReferenceViews:
+        """Render the splats from cameras."""
+        pictures = parallel_map(lambda camera: draw(drawable, camera).rgb.clamp(0, 1), cameras, drawable.device)
+        return cls(list(cameras), pictures)
+
+    @torch.no_grad()
+    def psnr_per_view(self, model: HybridModel) -> list[float]:
+        """Return the PSNR in dB of each view of a model, rendered over black and clamped to [0, 1]; on one device."""
+        decoded = model.decode()
+
+        @torch.no_grad()  # gradient mode is kept per thread
+        def score(index: int) -> float:
+            rendered = render(model, self.cameras[index], decoded=decoded).rgb
+            return psnr(rendered.clamp(0, 1), self.pictures[index])
+
+        return parallel_map(score, range(len(self.cameras)), model.gaussians.positions.device)
