@@ -9,7 +9,7 @@ from scenes import small_model
 
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfError, needs_package
-from hyrfpack.evaluate.figures import training_curve
+from hyrfpack.evaluate.figures import draw_training_curve
 from hyrfpack.format import save
 
 
@@ -55,4 +55,4 @@ def test_figures_without_matplotlib_are_refused(without, tmp_path):
     without("matplotlib")
 
     with pytest.raises(HyrfError, match="drawing figures needs matplotlib"):
-        training_curve([{"step": 1, "psnr": 20.0, "loss": 0.1, "gaussians": 1}], tmp_path / "curve.png")
+        draw_training_curve([{"step": 1, "psnr": 20.0, "loss": 0.1, "gaussians": 1}], tmp_path / "curve.png")

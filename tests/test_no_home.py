@@ -30,8 +30,8 @@ def test_the_library_says_nothing_of_it(tmp_path):
         "CompileResultCacheImpl._locator_classes = []\n"
         "import hyrfpack\n"
         f"hyrfpack.load({str(PACKED)!r})\n"
-        "from hyrfpack.evaluate.figures import training_curve\n"
-        "training_curve([{'step': 1, 'psnr': 20.0, 'loss': 0.1, 'gaussians': 1}], 'curve.png')\n"
+        "from hyrfpack.evaluate.figures import draw_training_curve\n"
+        "draw_training_curve([{'step': 1, 'psnr': 20.0, 'loss': 0.1, 'gaussians': 1}], 'curve.png')\n"
         "assert logging.getLogger('matplotlib').getEffectiveLevel() == logging.WARNING"
     )
     environment = {name: value for name, value in os.environ.items() if name not in HOMES}

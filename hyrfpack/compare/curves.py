@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from hyrfpack.compare.run import Run
-from hyrfpack.evaluate.figures import blank_figure, running_mean, svg_of
+from hyrfpack.evaluate.figures import blank_figure, figure_to_svg, running_mean
 
 # Of the runs, in turn (Okabe and Ito's, for all kinds of eyes, those that show on white and on black); then dashed.
 COLORS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9")
@@ -44,7 +44,7 @@ def draw_curves(runs: Sequence[Run]) -> str:
         axis.tick_params(colors=INK)
         axis.xaxis.label.set_color(INK)
         axis.yaxis.label.set_color(INK)
-    return svg_of(figure)
+    return figure_to_svg(figure)
 
 
 def seconds_of(run: Run) -> list[float]:

@@ -14,7 +14,7 @@ from hyrfpack.compare.differences import choices_that_differ, notes_that_differ,
 from hyrfpack.compare.run import Run
 from hyrfpack.compare.views import ComparedView, data_address
 from hyrfpack.errors import printable
-from hyrfpack.evaluate.figures import ERROR_LIMIT, SMOOTHING, error_colors
+from hyrfpack.evaluate.figures import ERROR_LIMIT, SMOOTHING_RADIUS_RECORDS, error_colors
 from hyrfpack.version import __version__
 from hyrfpack.web.player import content_policy, fill, json_text
 
@@ -140,7 +140,7 @@ def _address_of_svg(svg: str) -> str:
 
 
 def _about_curves(runs: Sequence[Run], names: Sequence[str]) -> str:
-    told = f"PSNR is that of the photos trained on, in running means of {2 * SMOOTHING + 1} records."
+    told = f"PSNR is that of the photos trained on, in running means of {2 * SMOOTHING_RADIUS_RECORDS + 1} records."
     timeless = [name for run, name in zip(runs, names, strict=True) if not keeps_times(run)]
     if timeless:
         told += f" No times of single steps were kept of {', '.join(timeless)}: the seconds are spread evenly there."

@@ -14,7 +14,7 @@ from PIL import Image
 from hyrfpack.compare.run import Run
 from hyrfpack.data.pictures import read_pixels
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.evaluate.figures import cut_comparison
+from hyrfpack.evaluate.figures import split_comparison
 
 SAME = 0.5  # levels of 255 that copies of a photo are apart at most, in the mean: decoders round differently
 
@@ -54,7 +54,7 @@ def read_views(runs: Sequence[Run]) -> list[ComparedView]:
 def _cut(path: Path) -> tuple[Image.Image, Image.Image]:
     pixels, _ = read_pixels(path)
     try:
-        photo, render, _ = cut_comparison(Image.fromarray(pixels))
+        photo, render, _ = split_comparison(Image.fromarray(pixels))
     except ValueError as error:
         raise HyrfDataError(
             f"{path}: this is no picture of photo, render and error map ({error}); remove it, and the view is left out"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hyrfpack.evaluate.metrics import stated_error
+from hyrfpack.evaluate.metrics import provenance_mse
 
 # Estimated loss of PSNR by default. At equal size, a model of more Gaussians with coarser numbers is better than one of
 # fewer Gaussians with finer numbers: docs/design-choices.md.
@@ -24,4 +24,4 @@ def default_distortion(provenance: dict, finetune_steps: int = 0) -> float:
         finetune_steps: steps of fine-tuning that the file will get; more steps allow a larger distortion.
     """
     ratio = FINETUNED_DISTORTION_RATIO ** min(1.0, finetune_steps / FULL_FINETUNING_STEPS)
-    return ratio * stated_error(provenance) * (10 ** (DEFAULT_PSNR_DROP_DB / 10) - 1)
+    return ratio * provenance_mse(provenance) * (10 ** (DEFAULT_PSNR_DROP_DB / 10) - 1)

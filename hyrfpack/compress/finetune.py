@@ -17,7 +17,7 @@ from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload
 from hyrfpack.errors import HyrfError, HyrfTrainingError
-from hyrfpack.evaluate.exposure import fitted_gains
+from hyrfpack.evaluate.exposure import fit_gains
 from hyrfpack.format.arrays import iter_parameters
 from hyrfpack.format.compact.plan import Plan, lattice_to_local
 from hyrfpack.format.compact.quantized import QuantizedModel
@@ -175,7 +175,7 @@ def fit_residual_gains(
     with closing((cache or PictureCache()).stream(views)) as pictures, torch_on_one_thread():
         for view, picture in pictures:
             photo, mask = upload(picture, solid, device)
-            fitted = fitted_gains(render(model, view.camera, decoded=decoded).rgb, photo, mask)
+            fitted = fit_gains(render(model, view.camera, decoded=decoded).rgb, photo, mask)
             gains[view.name] = torch.from_numpy(fitted).float().to(device)
     return gains
 

@@ -18,7 +18,7 @@ from hyrfpack.compress import compress
 from hyrfpack.data import load_scene
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.evaluate import evaluate
-from hyrfpack.evaluate.figures import comparison, contact_sheet
+from hyrfpack.evaluate.figures import draw_comparison, draw_contact_sheet
 from hyrfpack.evaluate.metrics import psnr, to_8bit
 from hyrfpack.export import ExportReport, export
 from hyrfpack.format import CompressionReport, load, repack
@@ -191,9 +191,9 @@ def _draw(model: HybridModel, scene: Scene, result: DemoResult) -> Image.Image:
     for view in evenly_spaced(scene.test, DRAWN_VIEWS):
         photo = torch.from_numpy(view.load().composite(solid))
         image = to_8bit(render(model, view.camera, decoded=decoded).rgb)
-        rows.append(comparison(photo, image, caption=f"{view.name}   {psnr(image, photo):.2f} dB"))
+        rows.append(draw_comparison(photo, image, caption=f"{view.name}   {psnr(image, photo):.2f} dB"))
     title = f"hyrfpack demo: {result.gaussians:,} Gaussians, {result.steps:,} steps in {result.train_seconds:.0f} s"
-    return contact_sheet(rows, title, result.table())
+    return draw_contact_sheet(rows, title, result.table())
 
 
 def _timed(action: Callable[[], CompressionReport]) -> tuple[CompressionReport, float]:

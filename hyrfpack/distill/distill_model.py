@@ -14,7 +14,7 @@ from hyrfpack.distill.config import DistillConfig
 from hyrfpack.distill.initialize import initial_model
 from hyrfpack.distill.reference import ReferenceViews, mean_sent_light, reference_scene
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.evaluate.metrics import decibels
+from hyrfpack.evaluate.metrics import psnr_from_mse
 from hyrfpack.model import HybridModel
 from hyrfpack.progress import Report, no_report, report_part
 from hyrfpack.scene import Camera, Scene, evenly_spaced
@@ -153,7 +153,7 @@ def _fit_to_pictures(
     trainer = Trainer(scene, settings, cache, model.gaussians.positions.device, model)
 
     def report_step(trainer: Trainer, loss: float, mse: float) -> None:
-        progress = f"training, step {trainer.step:,} of {config.steps:,}, PSNR {decibels(mse):.1f} dB"
+        progress = f"training, step {trainer.step:,} of {config.steps:,}, PSNR {psnr_from_mse(mse):.1f} dB"
         report(progress, trainer.step / config.steps)
 
     trainer.run(report=report_step)

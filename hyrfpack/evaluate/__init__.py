@@ -1,4 +1,4 @@
-"""Scores of a model against photos it has not seen."""
+"""Scores of a model against held-out photos."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from hyrfpack.checks import check_type
 from hyrfpack.choices import AS_PHOTOGRAPHED, CONSISTENT_EXPOSURE
 from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate.exposure import corrected
-from hyrfpack.evaluate.figures import comparison
+from hyrfpack.evaluate.exposure import correct_colors
+from hyrfpack.evaluate.figures import draw_comparison
 from hyrfpack.evaluate.lpips import LPIPS
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.lock import exclusive_folder
@@ -30,8 +30,8 @@ from hyrfpack.render.files import save_picture, unique_stems
 from hyrfpack.scene import Camera, View, evenly_spaced
 from hyrfpack.splats.draw import Drawable, draw
 
-PICTURES = 6  # of photo, render and error beside each other that are written, unless told otherwise
-NO_LPIPS = (
+DEFAULT_PICTURE_COUNT = 6
+NO_LPIPS_REASON = (
     "no weights: LPIPS needs the trained network of the lpips package; "
     'pass a file made by torch.save(lpips.LPIPS(net="alex").state_dict(), FILE)'
 )
@@ -39,7 +39,7 @@ NO_LPIPS = (
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One held-out view, as in `Evaluation`."""
+    """Scores of one held-out view; the quantities are those of `Evaluation`."""
 
     name: str
     psnr: float
@@ -54,18 +54,19 @@ class Evaluation:
     """Scores on held-out views; the first five are means over `views`.
 
     Attributes:
-        psnr: dB, pooled over each picture's pixels and channels, then averaged over views; of renders as photographed,
-            which is what `hyrfpack.render` shows, unless `settings` ask for the consistent exposure.
-        psnr_consistent: of renders at the model's one consistent exposure; None of a model without an exposure map, and
-            of splats.
-        psnr_corrected: of renders brought to the colours of the very photo that they are scored against, see
+        psnr: PSNR in dB, from the squared error pooled over the pixels and channels of each view, averaged over views.
+            Renders are at the exposure as photographed, like those of `hyrfpack.render`, unless `settings` ask for the
+            consistent exposure.
+        psnr_consistent: PSNR of renders at the model's consistent exposure; None for splats and for models without an
+            exposure map.
+        psnr_corrected: PSNR of renders after an affine colour correction to the photo that they are scored against, see
             `hyrfpack.evaluate.exposure.corrected`.
-        ssim: 11x11 Gaussian window, sigma 1.5; of the renders of `psnr`.
-        lpips: perceptual distance, or None.
-        lpips_reason: why lpips is None, or which network made it.
-        gaussians: how many the model has.
-        seconds_per_frame: median time to render a view, everything warm and what does not depend on the view decoded
-            beforehand.
+        ssim: SSIM of the renders of `psnr`, with a Gaussian window of 11x11 pixels and sigma 1.5.
+        lpips: LPIPS of the renders of `psnr`, or None without weights.
+        lpips_reason: why lpips is None, or the network that computed it.
+        gaussians: number of Gaussians of the model.
+        seconds_per_frame: median time to render a view after warm-up, with everything that does not depend on the view
+            decoded beforehand.
         views: scores of each view.
         skipped: names of views whose mask leaves no pixel to score.
     """
@@ -82,7 +83,7 @@ class Evaluation:
     skipped: list[str] = field(default_factory=list)
 
     def to_dict(self) -> dict:
-        """Plain numbers, strings, lists and dictionaries, ready for JSON."""
+        """Return the attributes as nested dictionaries and lists, ready for JSON."""
         return asdict(self)
 
 
@@ -94,7 +95,7 @@ def evaluate(
     lpips_weights: str | os.PathLike[str] | None = None,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     pictures: str | os.PathLike[str] | None = None,
-    picture_count: int = PICTURES,
+    picture_count: int = DEFAULT_PICTURE_COUNT,
     overwrite: bool = True,
     report: Report = no_report,
     warn: Callable[[str], None] | None = None,
@@ -102,25 +103,28 @@ def evaluate(
 ) -> Evaluation:
     """Render held-out views and score them against their photos.
 
-    Renders are clamped and rounded to 8 bits first, as they would be saved. Photos with transparency are laid over
-    the model's solid colour; splats have none, and are shown over black like the photos. Masked pixels do not count.
+    Renders are first clamped and rounded to 8 bits, as in saved pictures. Photos with transparency are composited over
+    the model's solid colour. Splats have no such colour, so both renders and photos are composited over black. Masked
+    pixels are ignored.
 
     Args:
-        model: what to score, or splats ready to be drawn (`hyrfpack.splats.draw.Drawable`).
-        views: photos to compare with, not used in training.
-        lpips_weights: see `hyrfpack.evaluate.lpips`; without it lpips is None.
-        settings: how to render, and at which exposure.
-        pictures: folder for photo | render | error pictures of `picture_count` views spread over `views`.
-        overwrite: replace files in `pictures`; without it, one that is there is an error.
-        report: told of each view before it is scored, and the share of the work that is done. Each of several
+        model: the model to score, or splats prepared for rendering (`hyrfpack.splats.draw.Drawable`).
+        views: photos to compare with, which were not used in training.
+        lpips_weights: path of the LPIPS weights, see `hyrfpack.evaluate.lpips`; without it lpips is None.
+        settings: render settings, including the exposure.
+        pictures: folder for pictures of photo | render | error.
+        picture_count: number of views with a picture, spread evenly over `views`.
+        overwrite: replace files in `pictures`; if False, an existing file is an error.
+        report: called before each view with a description and the completed share of the work, 0 to 1. Each of several
             processes reports its own share.
-        warn: told of each picture that cannot be written, while scoring continues; without it that is an error.
-        ranks: processes that share the views, each of which gets all scores.
+        warn: called with a message for each picture that cannot be written, while scoring continues. Without it, such
+            a picture is an error.
+        ranks: processes that share the views; each of them gets all scores.
 
     Raises:
-        HyrfError: there is no view to score, a file cannot be read or written, or another call is at work in the
+        HyrfError: there is no view to score, a file cannot be read or written, or another call is writing into the
             folder `pictures`.
-        TypeError: the model, a view or the settings are something else.
+        TypeError: the model, a view or the settings have the wrong type.
 
     Example:
         >>> import hyrfpack
@@ -141,12 +145,12 @@ def evaluate(
     else:
         solid, device = np.array(model.config.solid, dtype=np.float32), model.gaussians.positions.device
         count = len(model)
-    drawn = picture_names(views, picture_count)
+    pictures_to_write = picture_names(views, picture_count)
 
-    def scored() -> list[tuple[int, ViewScore | None, float]]:
-        """Place, score (None where the mask leaves nothing) and seconds of each view that is this rank's."""
+    def score_own_views() -> list[tuple[int, ViewScore | None, float]]:
+        """Return index, score (None if the mask leaves no pixel) and render seconds of each view of this rank."""
         draw_colors = _color_renderer(model, settings)
-        draw_colors(views[0].camera)  # compiles kernels and fills caches
+        draw_colors(views[0].camera)  # warm-up: compiles kernels and fills caches
         scores: list[tuple[int, ViewScore | None, float]] = []
         own = ranks.share(list(enumerate(views)))
         for done, (number, view) in enumerate(own):
@@ -156,27 +160,27 @@ def evaluate(
             if mask is not None and not mask.any():
                 scores.append((number, None, 0.0))
                 continue
-            started = _now(device)
+            started = _synchronized_seconds(device)
             rgb, consistent = draw_colors(view.camera)
-            seconds = _now(device) - started
+            seconds = _synchronized_seconds(device) - started
             image = to_8bit(rgb)
             distance = None
             if perceptual is not None:
-                seen = image if mask is None else torch.where(mask[..., None], image, reference)
-                distance = perceptual(seen, reference)
+                unmasked = image if mask is None else torch.where(mask[..., None], image, reference)
+                distance = perceptual(unmasked, reference)
             score = ViewScore(
                 name=view.name,
                 psnr=psnr(image, reference, mask),
                 psnr_consistent=None if consistent is None else psnr(to_8bit(consistent), reference, mask),
-                psnr_corrected=psnr(corrected(image, reference, mask), reference, mask),
+                psnr_corrected=psnr(correct_colors(image, reference, mask), reference, mask),
                 ssim=ssim(image, reference, mask),
                 lpips=distance,
             )
             scores.append((number, score, seconds))
-            if pictures is not None and number in drawn:
-                sheet = comparison(reference, image, mask, _caption(score))
+            if pictures is not None and number in pictures_to_write:
+                sheet = draw_comparison(reference, image, mask, _caption(score))
                 try:
-                    save_picture(Path(pictures, drawn[number]), sheet, overwrite=overwrite, rename=False)
+                    save_picture(Path(pictures, pictures_to_write[number]), sheet, overwrite=overwrite, rename=False)
                 except HyrfError as error:
                     if warn is None:
                         raise
@@ -185,9 +189,9 @@ def evaluate(
         return scores
 
     with nullcontext() if pictures is None else exclusive_folder(pictures, ranks=ranks):
-        rows_of_ranks = ranks.all_gather(ranks.run_on_all(scored))
-        told = sorted((row for rows in rows_of_ranks for row in rows), key=lambda row: row[0])
-    scores = [score for _, score, _ in told if score is not None]
+        rows_of_ranks = ranks.all_gather(ranks.run_on_all(score_own_views))
+        all_rows = sorted((row for rows in rows_of_ranks for row in rows), key=lambda row: row[0])
+    scores = [score for _, score, _ in all_rows if score is not None]
     if not scores:
         raise HyrfError("the masks of all views leave no pixel to score; check that white means 'use this pixel'")
     return Evaluation(
@@ -196,11 +200,11 @@ def evaluate(
         psnr_corrected=statistics.fmean(score.psnr_corrected for score in scores),
         ssim=statistics.fmean(score.ssim for score in scores),
         lpips=_mean(score.lpips for score in scores),
-        lpips_reason=NO_LPIPS if perceptual is None else f"network {perceptual.name}",
+        lpips_reason=NO_LPIPS_REASON if perceptual is None else f"network {perceptual.name}",
         gaussians=count,
-        seconds_per_frame=statistics.median(seconds for _, score, seconds in told if score is not None),
+        seconds_per_frame=statistics.median(seconds for _, score, seconds in all_rows if score is not None),
         views=scores,
-        skipped=[views[number].name for number, score, _ in told if score is None],
+        skipped=[views[number].name for number, score, _ in all_rows if score is None],
     )
 
 
@@ -209,8 +213,8 @@ def _color_renderer(
 ) -> Callable[[Camera], tuple[torch.Tensor, torch.Tensor | None]]:
     """Return a function that renders a camera: (H, W, 3) as `settings` ask, and (H, W, 3) at the consistent exposure.
 
-    The second is None of a model without an exposure map and of splats. What does not depend on the view is decoded
-    once.
+    The second is None for splats and for models without an exposure map. Everything that does not depend on the view
+    is decoded once.
     """
     if isinstance(model, Drawable):
         return lambda camera: (draw(model, camera, settings).rgb, None)
@@ -226,13 +230,13 @@ def _color_renderer(
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
-    """The mean of those that are there, None of none."""
-    there = [value for value in values if value is not None]
-    return statistics.fmean(there) if there else None
+    """Return the mean of the values that are not None, or None if there is none."""
+    present = [value for value in values if value is not None]
+    return statistics.fmean(present) if present else None
 
 
-def picture_names(views: Sequence[View], count: int = PICTURES) -> dict[int, str]:
-    """What `evaluate` writes into its folder of pictures: the views' places in the list, and names of files."""
+def picture_names(views: Sequence[View], count: int = DEFAULT_PICTURE_COUNT) -> dict[int, str]:
+    """Return the names of the pictures that `evaluate` writes, by the index of their view."""
     names = unique_stems([view.name for view in views])
     return {place: f"{names[place]}.png" for place in evenly_spaced(range(len(views)), count)}
 
@@ -242,7 +246,7 @@ def _caption(score: ViewScore) -> str:
     return f"{score.name}   {score.psnr:.2f} dB   SSIM {score.ssim:.3f}{perceptual}"
 
 
-def _now(device: torch.device) -> float:
+def _synchronized_seconds(device: torch.device) -> float:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()

@@ -1,4 +1,4 @@
-"""How near a rendered picture is to a photo: PSNR and SSIM, on 8-bit values, with masks."""
+"""PSNR and SSIM of a rendered picture against a photo, on 8-bit values, with masks."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ from torch import Tensor
 
 from hyrfpack.ops.ssim import photometric_loss
 
-IDENTICAL_PSNR = 100.0  # dB, what two pictures without any difference score (the formula says infinity)
-ASSUMED_PSNR = 30.0  # dB, of a model that does not say how well it fits its photos
+# PSNR in dB of two identical pictures, for which the formula gives infinity; also the upper limit of other PSNRs.
+IDENTICAL_PSNR = 100.0
+# PSNR in dB assumed for a model whose provenance does not state how well it fits its photos.
+ASSUMED_PSNR = 30.0
 
 
 def to_8bit(image: Tensor) -> Tensor:
     """Clamp to [0, 1] and round to the 256 levels of a saved picture, still float32 in [0, 1].
 
-    Renders are scored after this, so that a score is what anyone measures on the PNG files.
+    Renders are rounded before they are scored, so scores equal those measured on the saved PNG files.
     """
     return (image.detach().float().clamp(0, 1) * 255).round() / 255
 
@@ -34,21 +36,21 @@ def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
         dB; `IDENTICAL_PSNR` at most.
     """
     squares = (image.double() - reference.double()) ** 2
-    return decibels(float(squares.mean() if mask is None else squares[mask].mean()))
+    return psnr_from_mse(float(squares.mean() if mask is None else squares[mask].mean()))
 
 
-def decibels(mse: float) -> float:
-    """The PSNR of a mean squared error of colours in [0, 1]: dB, `IDENTICAL_PSNR` at most."""
+def psnr_from_mse(mse: float) -> float:
+    """Convert a mean squared error of colours in [0, 1] to PSNR in dB, at most `IDENTICAL_PSNR`."""
     return min(float(-10 * np.log10(mse)), IDENTICAL_PSNR) if mse > 0 else IDENTICAL_PSNR
 
 
-def stated_error(provenance: dict) -> float:
-    """Mean squared error of a model's pictures against its photos, by its file's own account.
+def provenance_mse(provenance: dict) -> float:
+    """Return the mean squared error of a model against its photos, as stated in its file's provenance.
 
-    What packing or a format adds to it has nothing to do with it, so the two add up.
+    The error that compression or a file format adds is independent of it, so the two errors add up.
 
     Args:
-        provenance: of the file; its `psnr` counts, or ASSUMED_PSNR where there is none that makes sense.
+        provenance: provenance of the file. Its `psnr` is used, or ASSUMED_PSNR if that is missing or out of range.
     """
     stated = provenance.get("psnr")
     if not isinstance(stated, int | float) or not 0 < stated < IDENTICAL_PSNR:
@@ -59,8 +61,8 @@ def stated_error(provenance: dict) -> float:
 def ssim(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
     """Structural similarity: Gaussian window 11x11 with sigma 1.5, zeros around the picture, mean over channels.
 
-    Pixels that do not count are set to the photo's on both sides, so that nothing rendered there leaks into the
-    windows of their neighbours, and are left out of the mean.
+    Ignored pixels are left out of the mean. In both pictures they are set to the photo's values, so that the render
+    there does not affect the windows of their neighbours.
 
     Args:
         image, reference: (H, W, 3) in [0, 1].

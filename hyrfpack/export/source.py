@@ -12,7 +12,7 @@ from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.paths import Viewpoint, common_direction, look_at, orbit
 from hyrfpack.cameras.view_sampling import interpolate_views
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.evaluate.metrics import stated_error
+from hyrfpack.evaluate.metrics import provenance_mse
 from hyrfpack.format import describe, load
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
@@ -70,7 +70,7 @@ class Source:
             why = error.__cause__
             raise HyrfDataError(f"{path}: its viewpoint cannot be used ({why!s:.160}); train the model again") from why
         up, center = viewpoint.up / math.hypot(*viewpoint.up), viewpoint.center
-        stated = stated_error(facts["provenance"])
+        stated = provenance_mse(facts["provenance"])
         cameras = capture.cameras
         measured_views: list[tuple[Camera, View | None]]
         if data is not None and data.train:

@@ -20,7 +20,7 @@ from hyrfpack.device import describe_device
 from hyrfpack.distill import DistillConfig, distill
 from hyrfpack.errors import HyrfError, HyrfSizeError
 from hyrfpack.evaluate import evaluate
-from hyrfpack.evaluate.metrics import decibels
+from hyrfpack.evaluate.metrics import psnr_from_mse
 from hyrfpack.export import export
 from hyrfpack.format import describe, load
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
@@ -157,7 +157,7 @@ class _TrainingProgress:
         self._begin("training")
         if not math.isnan(mse):
             self._mse = mse if math.isnan(self._mse) else SMOOTHING * mse + (1 - SMOOTHING) * self._mse
-        quality = () if math.isnan(self._mse) else (f"PSNR {decibels(self._mse):.2f}",)
+        quality = () if math.isnan(self._mse) else (f"PSNR {psnr_from_mse(self._mse):.2f}",)
         self._reporter.update(step / self._steps, f"{step:,}/{self._steps:,}", *quality, f"{gaussians:,} Gaussians")
         if step == self._steps:
             self._begin("results")

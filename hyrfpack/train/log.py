@@ -17,7 +17,7 @@ import torch
 
 from hyrfpack.atomic import describe_rename, numbered_names
 from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate.metrics import decibels
+from hyrfpack.evaluate.metrics import psnr_from_mse
 from hyrfpack.train.progress import Pace
 from hyrfpack.train.trainer import is_recorded
 
@@ -91,7 +91,7 @@ class TrainingLog:
             "step": step,
             "steps": self.steps,
             "loss": sum(self.losses) / count if count else None,
-            "psnr": decibels(sum(self.errors) / count) if count else None,
+            "psnr": psnr_from_mse(sum(self.errors) / count) if count else None,
             "gaussians": gaussians,
             "memory_bytes": peak_memory(),
             "gpu_memory_bytes": torch.cuda.max_memory_allocated(self.device) if self.device.type == "cuda" else None,

@@ -13,7 +13,7 @@ from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.live import Live
 from rich.text import Text
 
-from hyrfpack.evaluate.metrics import decibels
+from hyrfpack.evaluate.metrics import psnr_from_mse
 
 SMOOTHING = 0.05  # weight of the newest step in the running means
 LOG_EVERY = 15.0  # seconds between lines when standard error is not a terminal
@@ -103,7 +103,7 @@ class ProgressLine:
             "steps": f"{step:,}/{self.steps:,}",
             "speed": f"{speed:.1f} steps/s" if speed >= 1 else f"{1 / speed:.1f} s/step",
             "loss": f"loss {self.loss:.4f}",
-            "psnr": f"PSNR {decibels(self.mse):.2f}",
+            "psnr": f"PSNR {psnr_from_mse(self.mse):.2f}",
             "gaussians": f"{gaussians:,} Gaussians",
             "gone": f"{duration(now - self.start)} gone",
             "left": f"{duration(left)} left",

@@ -25,7 +25,7 @@ from hyrfpack.cameras.capture import scene_provenance
 from hyrfpack.device import describe_device
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate import evaluate, picture_names
-from hyrfpack.evaluate.figures import training_curve
+from hyrfpack.evaluate.figures import draw_training_curve
 from hyrfpack.format.codec import write_model
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.model import HybridModel
@@ -238,7 +238,7 @@ def write_results(
             reasons += unwritten
     phase(f"drawing {CURVE}", 0, 0)
     try:
-        training_curve(metrics["curve"], out / CURVE, overwrite=overwrite)
+        draw_training_curve(metrics["curve"], out / CURVE, overwrite=overwrite)
     except HyrfError as error:
         missing.append(CURVE)
         reasons.append(str(error))

@@ -18,7 +18,7 @@ from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload_array
 from hyrfpack.errors import HyrfError, HyrfTrainingError
-from hyrfpack.evaluate.metrics import decibels
+from hyrfpack.evaluate.metrics import psnr_from_mse
 from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
@@ -278,7 +278,7 @@ class Trainer:
     def _record(self, loss: float, mse: float) -> None:
         """Keep what the step came to for the curve, unless all of its photo is masked."""
         if not np.isnan(mse) and is_recorded(self.step, self.steps):
-            record = {"step": self.step, "loss": loss, "psnr": decibels(mse), "gaussians": len(self.model)}
+            record = {"step": self.step, "loss": loss, "psnr": psnr_from_mse(mse), "gaussians": len(self.model)}
             self.records.append({**record, "seconds": round(self.elapsed, 3)})
 
     def _solid(self) -> np.ndarray | None:

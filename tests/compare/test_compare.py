@@ -21,7 +21,7 @@ from scenes import ball_scene
 import hyrfpack
 from hyrfpack.compare.run import read_run, short_names
 from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate.figures import PAPER
+from hyrfpack.evaluate.figures import PAPER_COLOR
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig
 
@@ -215,7 +215,7 @@ def test_nothing_out_of_files_is_taken_for_html(runs, tmp_path):
 def repaint(sheet: Path) -> None:
     """Give a picture another photo: darker, captions and gaps as they were."""
     pixels = np.array(Image.open(sheet).convert("RGB"))
-    pixels[(pixels != PAPER).any(axis=2)] //= 2
+    pixels[(pixels != PAPER_COLOR).any(axis=2)] //= 2
     Image.fromarray(pixels).save(sheet)
 
 

@@ -14,7 +14,7 @@ from hyrfpack.cameras.capture import has_mean_exposure
 from hyrfpack.compress import compress, packer
 from hyrfpack.compress.finetune import fit_residual_gains
 from hyrfpack.evaluate import evaluate
-from hyrfpack.evaluate.exposure import fitted_gains
+from hyrfpack.evaluate.exposure import fit_gains
 from hyrfpack.format import describe, load, save
 from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.render import RenderSettings, render
@@ -75,7 +75,7 @@ def drift(before: Path, after: Path, scene: Scene) -> float:
     """The mean log gain by which renders at one exposure of one file differ from those of another."""
     models, settings = (load(before), load(after)), RenderSettings(exposure="consistent")
     pairs = [[render(model, view.camera, settings).rgb for model in models] for view in scene.train]
-    return float(np.mean([np.log(fitted_gains(*pair)) for pair in pairs]))
+    return float(np.mean([np.log(fit_gains(*pair)) for pair in pairs]))
 
 
 def test_without_a_map_gains_are_those_of_the_photos_about_the_mean_exposure(trained, scene):

@@ -14,7 +14,13 @@ from torch import nn
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate
-from hyrfpack.evaluate.figures import ERROR_LIMIT, comparison, contact_sheet, cut_comparison, training_curve
+from hyrfpack.evaluate.figures import (
+    ERROR_LIMIT,
+    draw_comparison,
+    draw_contact_sheet,
+    draw_training_curve,
+    split_comparison,
+)
 from hyrfpack.evaluate.lpips import LPIPS
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR, psnr, ssim, to_8bit
 from hyrfpack.render.files import render_files
@@ -296,7 +302,7 @@ def test_comparison_shows_errors_on_a_fixed_scale():
     render = photo.clone()
     render[:, 100:200] += ERROR_LIMIT
     render[:, 200:] += 1.5 * ERROR_LIMIT
-    sheet = np.asarray(comparison(photo, render))
+    sheet = np.asarray(draw_comparison(photo, render))
     error = sheet[sheet.shape[0] // 2, -400:]
     assert tuple(error[50]) == (0, 0, 4)  # inferno's first colour
     assert tuple(error[150]) == tuple(error[300]) == (252, 255, 164)  # and its last
@@ -305,13 +311,13 @@ def test_comparison_shows_errors_on_a_fixed_scale():
 def test_comparison_hides_errors_under_the_mask():
     photo, render = torch.zeros(50, 400, 3), torch.ones(50, 400, 3)
     mask = torch.zeros(50, 400, dtype=torch.bool)
-    sheet = np.asarray(comparison(photo, render, mask))
+    sheet = np.asarray(draw_comparison(photo, render, mask))
     assert tuple(sheet[sheet.shape[0] // 2, -200]) == (0, 0, 4)
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (48, 48), (401, 3), (2000, 1500)])
 def test_comparison_takes_any_size(width, height):
-    sheet = comparison(torch.zeros(height, width, 3), torch.ones(height, width, 3), caption="a photo")
+    sheet = draw_comparison(torch.zeros(height, width, 3), torch.ones(height, width, 3), caption="a photo")
     assert 3 * 200 < sheet.width < 2100
 
 
@@ -319,7 +325,7 @@ def test_comparison_takes_any_size(width, height):
 def test_a_comparison_can_be_cut_into_its_pictures_again(width, height):
     photo, render = two_pictures(height, width)
     photo, render = to_8bit(photo), to_8bit(render)
-    cut = cut_comparison(comparison(photo, render, caption="a photo"))
+    cut = split_comparison(draw_comparison(photo, render, caption="a photo"))
     times = cut[0].width // width
     for picture, pixels in zip(cut, (photo, render), strict=False):
         assert picture.size == (times * width, times * height)
@@ -329,16 +335,16 @@ def test_a_comparison_can_be_cut_into_its_pictures_again(width, height):
 @pytest.mark.parametrize("size", [(1, 1), (16, 40), (616, 200), (1216, 20), (1216, 351)])
 def test_other_pictures_are_not_cut(size):
     with pytest.raises(ValueError, match="beside each other|would meet"):
-        cut_comparison(Image.new("RGB", size, (0, 0, 0)))
+        split_comparison(Image.new("RGB", size, (0, 0, 0)))
 
 
 def test_contact_sheet_is_wide_enough_for_its_text():
-    row = comparison(torch.zeros(20, 401, 3), torch.zeros(20, 401, 3))
-    sheet = contact_sheet([row, row], "title", ["x" * 300])
+    row = draw_comparison(torch.zeros(20, 401, 3), torch.zeros(20, 401, 3))
+    sheet = draw_contact_sheet([row, row], "title", ["x" * 300])
     assert sheet.width > 300 * 5 and sheet.height > 2 * row.height
 
 
 def test_training_curve_is_a_picture(tmp_path):
     records = [{"step": n, "psnr": 20 + n, "loss": 0.1 / n, "gaussians": 100 * n} for n in range(1, 9)]
-    training_curve(records, tmp_path / "curve.png")
+    draw_training_curve(records, tmp_path / "curve.png")
     assert Image.open(tmp_path / "curve.png").size == (1080, 720)

@@ -11,7 +11,7 @@ from exposures import random_map
 from scenes import ball_points, ball_scene, small_model
 
 from hyrfpack.evaluate import evaluate
-from hyrfpack.evaluate.exposure import corrected, fitted_gains
+from hyrfpack.evaluate.exposure import correct_colors, fit_gains
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR, psnr, ssim, to_8bit
 from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import apply_exposure_gains
@@ -31,7 +31,7 @@ def test_gains_are_found_beside_things_the_render_has_wrong_and_pixels_that_are_
     photo[:8] = a_picture(8, 30, seed=1)  # a fifth of the picture shows something else
     photo[8:12] *= 9
 
-    np.testing.assert_allclose(fitted_gains(image, photo.clamp(0, 1)), GAINS, rtol=0.01)
+    np.testing.assert_allclose(fit_gains(image, photo.clamp(0, 1)), GAINS, rtol=0.01)
 
 
 def test_masked_pixels_have_no_part_in_gains_and_corrections():
@@ -39,25 +39,25 @@ def test_masked_pixels_have_no_part_in_gains_and_corrections():
     mask[10:30] = True
     photo = torch.where(mask[..., None], apply_exposure_gains(image, torch.full((3,), 0.6)), 1.0 - image)
 
-    np.testing.assert_allclose(fitted_gains(image, photo, mask), 0.6, rtol=1e-4)
-    assert psnr(corrected(image, photo, mask), to_8bit(photo), mask) > 35
+    np.testing.assert_allclose(fit_gains(image, photo, mask), 0.6, rtol=1e-4)
+    assert psnr(correct_colors(image, photo, mask), to_8bit(photo), mask) > 35
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 5)])
 def test_too_few_pixels_leave_the_exposure_as_it_is(shape):
-    np.testing.assert_array_equal(fitted_gains(torch.full((*shape, 3), 0.2), torch.full((*shape, 3), 0.4)), 1)
+    np.testing.assert_array_equal(fit_gains(torch.full((*shape, 3), 0.2), torch.full((*shape, 3), 0.4)), 1)
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0])
 def test_black_and_white_pictures_leave_the_exposure_as_it_is(level):
-    np.testing.assert_array_equal(fitted_gains(torch.full((9, 9, 3), level), torch.full((9, 9, 3), 0.4)), 1)
+    np.testing.assert_array_equal(fit_gains(torch.full((9, 9, 3), level), torch.full((9, 9, 3), 0.4)), 1)
 
 
 def test_a_correction_undoes_any_affine_map_of_colours():
     photo = a_picture()
     map_of_colours = torch.tensor([[0.8, 0.1, 0.0], [0.05, 0.9, 0.1], [0.0, -0.1, 0.7]])
 
-    assert psnr(corrected(photo @ map_of_colours + 0.03, photo), to_8bit(photo)) > 60
+    assert psnr(correct_colors(photo @ map_of_colours + 0.03, photo), to_8bit(photo)) > 60
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (6, 6)])
@@ -65,10 +65,10 @@ def test_a_picture_of_one_colour_is_corrected_to_the_mean_of_its_photo(shape):
     photo = a_picture(*shape)
     expected = to_8bit(photo.mean((0, 1)).expand_as(photo))
 
-    torch.testing.assert_close(corrected(torch.full_like(photo, 0.3), photo), expected, atol=1.01 / 255, rtol=0)
+    torch.testing.assert_close(correct_colors(torch.full_like(photo, 0.3), photo), expected, atol=1.01 / 255, rtol=0)
 
 
-@pytest.mark.parametrize("function", [fitted_gains, corrected])
+@pytest.mark.parametrize("function", [fit_gains, correct_colors])
 def test_pictures_that_are_not_finite_are_refused(function):
     picture, broken = a_picture(), a_picture()
     broken[3, 4, 1] = torch.nan

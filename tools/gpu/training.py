@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from statistics import fmean
 
-from hyrfpack.evaluate.metrics import decibels
+from hyrfpack.evaluate.metrics import psnr_from_mse
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, Trainer
@@ -80,7 +80,7 @@ def timed_training(room: str, scene: Scene, model: HybridModel, setup: Setup) ->
         model=trainer.model,
         steps=steps,
         seconds=seconds,
-        psnr=(decibels(fmean(errors[:5])), decibels(fmean(errors[-5:]))),
+        psnr=(psnr_from_mse(fmean(errors[:5])), psnr_from_mse(fmean(errors[-5:]))),
         stages=dict(sorted(stages.items(), key=lambda item: -item[1])),
         peak=peak,
         profile=profile,

@@ -18,7 +18,7 @@ from PIL import Image
 
 import hyrfpack
 from hyrfpack.device import upload
-from hyrfpack.evaluate.figures import comparison
+from hyrfpack.evaluate.figures import draw_comparison
 from hyrfpack.evaluate.metrics import to_8bit
 from hyrfpack.render.files import save_picture
 from hyrfpack.scene import Scene
@@ -36,7 +36,7 @@ def worst_view(name: str, scene: Scene, model: hyrfpack.HybridModel) -> Image.Im
     photo, mask = upload(view.load(), np.array(model.config.solid, np.float32), torch.device("cpu"))
     render = to_8bit(hyrfpack.render(model, view.camera).rgb)
     caption = f"{name}: {worst.name}, {worst.psnr:.2f} dB, SSIM {worst.ssim:.3f} (mean {scores.psnr:.2f} dB)"
-    return comparison(photo, render, mask, caption)
+    return draw_comparison(photo, render, mask, caption)
 
 
 def stacked(rows: list[Image.Image]) -> Image.Image:
