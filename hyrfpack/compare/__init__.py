@@ -1,4 +1,4 @@
-"""Training runs side by side, as one page."""
+"""Comparison of finished training runs side by side, as one HTML page."""
 
 from hyrfpack.compare.report import ComparisonReport, compare
 

@@ -1,4 +1,4 @@
-"""How the trainings of several runs went, in one figure."""
+"""The figure of a comparison: training curves of several runs."""
 
 from __future__ import annotations
 
@@ -7,19 +7,24 @@ from collections.abc import Sequence
 from hyrfpack.compare.run import Run
 from hyrfpack.evaluate.figures import blank_figure, figure_to_svg, running_mean
 
-# Of the runs, in turn (Okabe and Ito's, for all kinds of eyes, those that show on white and on black); then dashed.
-COLORS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9")
-DASHES = ("", "6 3", "2 3")  # of SVG
-INK = "#5a6068"  # as --dim in the style
+# Okabe and Ito's colours for all kinds of colour vision, those that are visible on white and on black.
+LINE_COLORS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9")
+# Dash patterns of SVG. Runs take the colours in turn with the first pattern, then with the next one.
+LINE_DASHES = ("", "6 3", "2 3")
+# The value of --dim in style.css for light backgrounds.
+LIGHT_TEXT_COLOR = "#5a6068"
 
 
 def line_style(number: int) -> tuple[str, str]:
-    """The colour of a run's line, and its dashes as SVG has them."""
-    return COLORS[number % len(COLORS)], DASHES[number // len(COLORS) % len(DASHES)]
+    """Return the colour of a run's line and its dash pattern in SVG's notation, by the run's index."""
+    return LINE_COLORS[number % len(LINE_COLORS)], LINE_DASHES[number // len(LINE_COLORS) % len(LINE_DASHES)]
 
 
 def draw_curves(runs: Sequence[Run]) -> str:
-    """PSNR over steps and seconds, Gaussians over steps, as SVG: on no ground, in INK, and no word of files in it."""
+    """Draw PSNR over steps and seconds, and Gaussians over steps, as SVG.
+
+    The background is transparent and text has the colour LIGHT_TEXT_COLOR. The figure contains no text from files.
+    """
     figure = blank_figure(12, 3.7)
     figure.patch.set_alpha(0)
     by_step, by_time, counts = figure.subplots(1, 3)
@@ -30,7 +35,7 @@ def draw_curves(runs: Sequence[Run]) -> str:
         steps = [record.step for record in run.curve]
         psnr = running_mean([record.psnr for record in run.curve])
         by_step.plot(steps, psnr, **options)
-        by_time.plot(seconds_of(run), psnr, **options)
+        by_time.plot(record_seconds(run), psnr, **options)
         counts.plot(steps, [record.gaussians for record in run.curve], **options)
     by_step.set(xlabel="step", ylabel="training PSNR (dB)")
     by_time.set(xlabel="seconds of training", ylabel="training PSNR (dB)")
@@ -40,20 +45,20 @@ def draw_curves(runs: Sequence[Run]) -> str:
         axis.patch.set_alpha(0)
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
-        axis.spines[["left", "bottom"]].set_color(INK)
-        axis.tick_params(colors=INK)
-        axis.xaxis.label.set_color(INK)
-        axis.yaxis.label.set_color(INK)
+        axis.spines[["left", "bottom"]].set_color(LIGHT_TEXT_COLOR)
+        axis.tick_params(colors=LIGHT_TEXT_COLOR)
+        axis.xaxis.label.set_color(LIGHT_TEXT_COLOR)
+        axis.yaxis.label.set_color(LIGHT_TEXT_COLOR)
     return figure_to_svg(figure)
 
 
-def seconds_of(run: Run) -> list[float]:
-    """When each record of the curve was made; spread evenly over the steps where the run kept no times."""
-    if keeps_times(run):
+def record_seconds(run: Run) -> list[float]:
+    """Return the training seconds of each record of the curve, spread evenly over the steps if the run has no times."""
+    if has_times(run):
         return [record.seconds for record in run.curve if record.seconds is not None]
     return [run.seconds * record.step / run.settings["steps"] for record in run.curve]
 
 
-def keeps_times(run: Run) -> bool:
-    """Whether each record of the curve says when it was made."""
+def has_times(run: Run) -> bool:
+    """Whether each record of the run's curve has its time."""
     return all(record.seconds is not None for record in run.curve)

@@ -1,4 +1,4 @@
-"""What tells runs apart, and whether their scores may be compared at all."""
+"""Differences between runs, and checks whether their scores can be compared."""
 
 from __future__ import annotations
 
@@ -8,32 +8,32 @@ from collections.abc import Iterator, Mapping, Sequence
 from hyrfpack.compare.run import Run
 from hyrfpack.errors import HyrfDataError
 
-SHOWN_ANYWAY = ("steps", "seed")
+ALWAYS_SHOWN_SETTINGS = ("steps", "seed")
 
 
 def settings_that_differ(runs: Sequence[Run]) -> dict[str, list[str]]:
-    """Values of each setting, of the scene's facts and of the device that are not the same in all runs, in words."""
-    told = []
+    """Return, by name, the values of all runs for settings, scene facts and device that differ between runs."""
+    values_of_runs = []
     for run in runs:
-        settings = {name: value for name, value in run.settings.items() if name not in SHOWN_ANYWAY}
+        settings = {name: value for name, value in run.settings.items() if name not in ALWAYS_SHOWN_SETTINGS}
         scene = {f"scene: {name}": value for name, value in run.scene.items()}
-        told.append({**dict(_flat(settings)), **dict(_flat(scene)), "device": run.device})
-    return _rows(told)
+        values_of_runs.append({**dict(_flatten(settings)), **dict(_flatten(scene)), "device": run.device})
+    return _differing_rows(values_of_runs)
 
 
 def choices_that_differ(runs: Sequence[Run]) -> dict[str, list[str]]:
-    """What was chosen, with its reason, where that is not the same in all runs."""
-    return _rows([run.choices for run in runs])
+    """Return, by name, the automatic choices of all runs, with reasons, where they differ between runs."""
+    return _differing_rows([run.choices for run in runs])
 
 
 def notes_that_differ(runs: Sequence[Run]) -> list[list[str]]:
-    """Of each run the notes that not all runs have."""
+    """Return for each run its notes that are not common to all runs."""
     common = set.intersection(*(set(run.notes) for run in runs))
     return [[note for note in run.notes if note not in common] for run in runs]
 
 
 def check_scores(runs: Sequence[Run], names: Sequence[str]) -> None:
-    """Refuse runs whose scores are of different photos.
+    """Check that the scores of all runs are of the same photos.
 
     Raises:
         HyrfDataError: two runs have held-out photos of different names.
@@ -44,28 +44,30 @@ def check_scores(runs: Sequence[Run], names: Sequence[str]) -> None:
             odd = min(other.held_out ^ first.held_out)
             raise HyrfDataError(
                 f"{other.folder}: other photos are held out of '{name}' ({len(other.held_out)}) than of '{first_name}' "
-                f"({len(first.held_out)}; '{odd}' of one of them alone), so that scores cannot be compared; train both "
-                "on the same photos with the same `test_every`"
+                f"({len(first.held_out)}; '{odd}' of one of them alone), so that scores cannot be compared; train "
+                "both on the same photos with the same `test_every`"
             )
 
 
-def doubts(runs: Sequence[Run], names: Sequence[str], changed: Sequence[str]) -> list[str]:
-    """One sentence for each reason why runs cannot be compared by all their numbers.
+def comparability_warnings(runs: Sequence[Run], names: Sequence[str], changed: Sequence[str]) -> list[str]:
+    """Return a sentence for each reason why some numbers of the runs cannot be compared.
 
     Args:
-        changed: names of held-out photos that do not look the same in all runs' pictures.
+        runs: the runs.
+        names: their names on the page.
+        changed: names of held-out photos that differ between the pictures of the runs.
     """
     found = []
-    without = [name for run, name in zip(runs, names, strict=True) if not run.scores]
-    if without and len(without) < len(runs):
+    without_scores = [name for run, name in zip(runs, names, strict=True) if not run.scores]
+    if without_scores and len(without_scores) < len(runs):
         found.append(
-            f"No photo is held out of {_listed(without)}, so that only the curves and the sizes can be compared."
+            f"No photo is held out of {_quoted(without_scores)}, so that only the curves and the sizes can be compared."
         )
-    elif without:
+    elif without_scores:
         found.append("No photo is held out of these runs, so that only their curves and sizes are compared.")
     if changed:
         found.append(
-            f"Held-out photos are not the same pictures in all runs ({_listed(changed[:1])} for one): another scene, "
+            f"Held-out photos are not the same pictures in all runs ({_quoted(changed[:1])} for one): another scene, "
             "size or undistortion, or another colour behind transparent photos; the scores cannot be compared."
         )
     elif any(run.cameras != runs[0].cameras for run in runs):
@@ -76,31 +78,31 @@ def doubts(runs: Sequence[Run], names: Sequence[str], changed: Sequence[str]) ->
     return found
 
 
-def _listed(names: Sequence[str]) -> str:
+def _quoted(names: Sequence[str]) -> str:
     quoted = [f"'{name}'" for name in names]
     return quoted[0] if len(quoted) == 1 else f"{', '.join(quoted[:-1])} and {quoted[-1]}"
 
 
-def _flat(values: Mapping, above: str = "") -> Iterator[tuple[str, str]]:
+def _flatten(values: Mapping, prefix: str = "") -> Iterator[tuple[str, str]]:
     for name, value in values.items():
         if isinstance(value, dict):
-            yield from _flat(value, f"{above}{name}: ")
+            yield from _flatten(value, f"{prefix}{name}: ")
         else:
-            yield f"{above}{name}".replace("_", " "), _in_words(value)
+            yield f"{prefix}{name}".replace("_", " "), _format_value(value)
 
 
-def _in_words(value: object) -> str:
+def _format_value(value: object) -> str:
     if value is None:
         return "not given"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list):
-        return ", ".join(map(_in_words, value))
+        return ", ".join(map(_format_value, value))
     return f"{value:,}" if isinstance(value, int) else str(value)
 
 
-def _rows(told: Sequence[Mapping[str, str]]) -> dict[str, list[str]]:
-    """By name, the values of all runs where they are not the same; a dash where a run has none."""
-    names = dict.fromkeys(itertools.chain.from_iterable(told))
-    rows = {name: [values.get(name, "-") for values in told] for name in names}
+def _differing_rows(values_of_runs: Sequence[Mapping[str, str]]) -> dict[str, list[str]]:
+    """Return, by name, the values of all runs where they differ; a dash stands for a missing value."""
+    names = dict.fromkeys(itertools.chain.from_iterable(values_of_runs))
+    rows = {name: [values.get(name, "-") for values in values_of_runs] for name in names}
     return {name.replace("_", " "): row for name, row in rows.items() if len(set(row)) > 1}

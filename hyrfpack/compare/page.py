@@ -1,4 +1,4 @@
-"""The page itself: one HTML file that holds everything, in which nothing out of files is taken for HTML."""
+"""The HTML page of a comparison, a single file. All texts from files are escaped."""
 
 from __future__ import annotations
 
@@ -9,56 +9,57 @@ from importlib.resources import files
 
 import numpy as np
 
-from hyrfpack.compare.curves import INK, draw_curves, keeps_times, line_style
+from hyrfpack.compare.curves import LIGHT_TEXT_COLOR, draw_curves, has_times, line_style
 from hyrfpack.compare.differences import choices_that_differ, notes_that_differ, settings_that_differ
 from hyrfpack.compare.run import Run
-from hyrfpack.compare.views import ComparedView, data_address
+from hyrfpack.compare.views import ComparedView, webp_data_uri
 from hyrfpack.errors import printable
 from hyrfpack.evaluate.figures import ERROR_LIMIT, SMOOTHING_RADIUS_RECORDS, error_colors
 from hyrfpack.version import __version__
 from hyrfpack.web.player import content_policy, fill, json_text
 
-DARK_INK = "#a6acb3"  # as --dim in the style, where it is dark
+# The value of --dim in style.css for dark backgrounds.
+DARK_TEXT_COLOR = "#a6acb3"
 
 
 def encode_comparison(
     runs: Sequence[Run], names: Sequence[str], views: Sequence[ComparedView], doubts: Sequence[str]
 ) -> bytes:
-    """A page that shows runs side by side.
+    """Encode a page that shows runs side by side.
 
     Args:
-        runs: two or more.
-        names: what to call them.
-        views: held-out views to look at.
-        doubts: sentences on why the runs cannot be compared by all their numbers.
+        runs: two or more runs.
+        names: their names on the page.
+        views: held-out views to show.
+        doubts: sentences on why some numbers of the runs cannot be compared.
 
     Returns:
-        The file, UTF-8. The same arguments give the same bytes.
+        The HTML file, UTF-8. The same arguments give the same bytes.
     """
-    style, script = _part("style.css"), _part("script.js")
+    style, script = _read_asset("style.css"), _read_asset("script.js")
     values = {
         "policy": content_policy(style, [script]),
         "version": __version__,
-        "title": _escaped(f"{len(runs)} training runs: {', '.join(names)}"),
+        "title": _escape(f"{len(runs)} training runs: {', '.join(names)}"),
         "style": style,
-        "doubts": "\n".join(f'<p class="doubt">{_escaped(sentence)}</p>' for sentence in doubts),
+        "doubts": "\n".join(f'<p class="doubt">{_escape(sentence)}</p>' for sentence in doubts),
         "tables": "\n".join(_tables(runs, names, ranked=not doubts)),
         "legend": _legend(names),
         "curves": _curves(runs, names),
-        "told": _escaped(_about_curves(runs, names)),
-        "views": _part("views.html") if views else "",
-        "texts": json_text("compared", _compared(runs, names, views)) if views else "",
+        "told": _escape(_curves_note(runs, names)),
+        "views": _read_asset("views.html") if views else "",
+        "texts": json_text("compared", _view_data(runs, names, views)) if views else "",
         "script": script,
     }
-    return fill(_part("page.html"), values).encode()
+    return fill(_read_asset("page.html"), values).encode()
 
 
 def _tables(runs: Sequence[Run], names: Sequence[str], ranked: bool) -> list[str]:
-    """Numbers, and what differs; with `ranked`, the best scores stand out."""
+    """Return the tables of numbers and of differences as HTML; with `ranked`, the best scores are marked."""
     numbers = [
-        *_scores("held-out PSNR (dB)", [run.psnr for run in runs], 2, max if ranked else None),
-        *_scores("held-out SSIM", [run.ssim for run in runs], 4, max if ranked else None),
-        *_scores("held-out LPIPS", [run.lpips for run in runs], 4, min if ranked else None),
+        *_score_rows("held-out PSNR (dB)", [run.psnr for run in runs], 2, max if ranked else None),
+        *_score_rows("held-out SSIM", [run.ssim for run in runs], 4, max if ranked else None),
+        *_score_rows("held-out LPIPS", [run.lpips for run in runs], 4, min if ranked else None),
         _row("Gaussians", [f"{run.gaussians:,}" for run in runs]),
     ]
     for file in dict.fromkeys(file for run in runs for file in run.files):
@@ -78,17 +79,17 @@ def _tables(runs: Sequence[Run], names: Sequence[str], ranked: bool) -> list[str
     tables = [_table("Numbers", names, numbers)]
     for kind, rows in differing.items():
         if rows:
-            written = [_row(name, cells) for name, cells in rows.items()]
-            tables.append(_table(f"{kind} that differ", names, written))
+            formatted = [_row(name, cells) for name, cells in rows.items()]
+            tables.append(_table(f"{kind} that differ", names, formatted))
     if same := [kind.lower() for kind, rows in differing.items() if not rows]:
         tables.append(f'<p class="small">The same in all runs: {", ".join(same)}.</p>')
     return tables
 
 
 def _table(caption: str, names: Sequence[str], rows: Sequence[str]) -> str:
-    heads = "".join(f'<th scope="col">{_swatch(number)}{_escaped(name)}</th>' for number, name in enumerate(names))
+    heads = "".join(f'<th scope="col">{_swatch(number)}{_escape(name)}</th>' for number, name in enumerate(names))
     return "\n".join([
-        f'<div class="wide"><table><caption>{_escaped(caption)}</caption>',
+        f'<div class="wide"><table><caption>{_escape(caption)}</caption>',
         f"<thead><tr><td></td>{heads}</tr></thead>",
         "<tbody>",
         *rows,
@@ -96,28 +97,28 @@ def _table(caption: str, names: Sequence[str], rows: Sequence[str]) -> str:
     ])  # fmt: skip
 
 
-def _scores(name: str, scores: Sequence[float | None], digits: int, best: Callable | None) -> list[str]:
-    """A row of scores if there are any, the best one marked."""
-    there = [round(score, digits) for score in scores if score is not None]
-    if not there:
+def _score_rows(name: str, scores: Sequence[float | None], digits: int, best: Callable | None) -> list[str]:
+    """Return a row of scores with the best one marked, or no row if there are no scores."""
+    present = [round(score, digits) for score in scores if score is not None]
+    if not present:
         return []
     cells = ["-" if score is None else f"{score:.{digits}f}" for score in scores]
-    return [_row(name, cells, f"{best(there):.{digits}f}" if best and len(set(there)) > 1 else None)]
+    return [_row(name, cells, f"{best(present):.{digits}f}" if best and len(set(present)) > 1 else None)]
 
 
 def _row(name: str, cells: Sequence[str], best: str | None = None) -> str:
-    opened = ('<td class="best">' if cell == best else "<td>" for cell in cells)
-    written = "".join(f"{tag}{_escaped(cell)}</td>" for tag, cell in zip(opened, cells, strict=True))
-    return f'<tr><th scope="row">{_escaped(name)}</th>{written}</tr>'
+    tags = ('<td class="best">' if cell == best else "<td>" for cell in cells)
+    formatted = "".join(f"{tag}{_escape(cell)}</td>" for tag, cell in zip(tags, cells, strict=True))
+    return f'<tr><th scope="row">{_escape(name)}</th>{formatted}</tr>'
 
 
 def _legend(names: Sequence[str]) -> str:
-    items = (f"<li>{_swatch(number)}{_escaped(name)}</li>" for number, name in enumerate(names))
+    items = (f"<li>{_swatch(number)}{_escape(name)}</li>" for number, name in enumerate(names))
     return f'<ul class="legend">{"".join(items)}</ul>'
 
 
 def _swatch(number: int) -> str:
-    """A piece of a run's line."""
+    """Return a sample of a run's line as SVG."""
     color, dashes = line_style(number)
     dashed = f' stroke-dasharray="{dashes}"' if dashes else ""
     line = f'<path d="M0 4h26" stroke="{color}" stroke-width="3"{dashed}/>'
@@ -125,30 +126,30 @@ def _swatch(number: int) -> str:
 
 
 def _curves(runs: Sequence[Run], names: Sequence[str]) -> str:
-    """The figure, in an ink for light and one for dark."""
+    """Return the figure as HTML, with one image for light and one for dark backgrounds."""
     svg = draw_curves(runs)
-    light, dark = (_address_of_svg(svg.replace(INK, ink)) for ink in (INK, DARK_INK))
-    told = "Training PSNR over steps, training PSNR over seconds and Gaussians over steps, the table's runs as lines"
+    light, dark = (_svg_data_uri(svg.replace(LIGHT_TEXT_COLOR, ink)) for ink in (LIGHT_TEXT_COLOR, DARK_TEXT_COLOR))
+    note = "Training PSNR over steps, training PSNR over seconds and Gaussians over steps, the table's runs as lines"
     return (
         f'<div class="wide"><picture><source media="(prefers-color-scheme: dark)" srcset="{dark}">'
-        f'<img class="curves" src="{light}" alt="{told}"></picture></div>'
+        f'<img class="curves" src="{light}" alt="{note}"></picture></div>'
     )
 
 
-def _address_of_svg(svg: str) -> str:
+def _svg_data_uri(svg: str) -> str:
     return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
 
 
-def _about_curves(runs: Sequence[Run], names: Sequence[str]) -> str:
-    told = f"PSNR is that of the photos trained on, in running means of {2 * SMOOTHING_RADIUS_RECORDS + 1} records."
-    timeless = [name for run, name in zip(runs, names, strict=True) if not keeps_times(run)]
+def _curves_note(runs: Sequence[Run], names: Sequence[str]) -> str:
+    note = f"PSNR is that of the photos trained on, in running means of {2 * SMOOTHING_RADIUS_RECORDS + 1} records."
+    timeless = [name for run, name in zip(runs, names, strict=True) if not has_times(run)]
     if timeless:
-        told += f" No times of single steps were kept of {', '.join(timeless)}: the seconds are spread evenly there."
-    return told
+        note += f" No times of single steps were kept of {', '.join(timeless)}: the seconds are spread evenly there."
+    return note
 
 
-def _compared(runs: Sequence[Run], names: Sequence[str], views: Sequence[ComparedView]) -> dict:
-    """What the script shows: of each view the photo and the renders, and the scores of each run."""
+def _view_data(runs: Sequence[Run], names: Sequence[str], views: Sequence[ComparedView]) -> dict:
+    """Return the data of the page's script: photo, renders and scores of each view, and the error colours."""
     scores = [{score.name: [score.psnr, score.ssim, score.lpips] for score in run.scores} for run in runs]
     ramp = (error_colors(np.linspace(0, ERROR_LIMIT, 256)) * 255).round().astype(np.uint8)
     return {
@@ -156,7 +157,7 @@ def _compared(runs: Sequence[Run], names: Sequence[str], views: Sequence[Compare
         "views": [
             {
                 "name": view.name,
-                "pictures": [data_address(picture) for picture in (view.photo, *view.renders)],
+                "pictures": [webp_data_uri(picture) for picture in (view.photo, *view.renders)],
                 "scores": [of_run.get(view.name, [None] * 3) for of_run in scores],
             }
             for view in views
@@ -166,9 +167,9 @@ def _compared(runs: Sequence[Run], names: Sequence[str], views: Sequence[Compare
     }
 
 
-def _part(name: str) -> str:
+def _read_asset(name: str) -> str:
     return files("hyrfpack.compare").joinpath(name).read_text("utf-8")
 
 
-def _escaped(text: str) -> str:
+def _escape(text: str) -> str:
     return html.escape(printable(text))

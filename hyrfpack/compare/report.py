@@ -1,4 +1,4 @@
-"""The comparison of training runs, from their folders to a page."""
+"""The public function of comparisons: from the folders of training runs to a page."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hyrfpack.atomic import write_atomic
-from hyrfpack.compare.differences import check_scores, doubts
+from hyrfpack.compare.differences import check_scores, comparability_warnings
 from hyrfpack.compare.page import encode_comparison
 from hyrfpack.compare.run import read_run, short_names
 from hyrfpack.compare.views import read_views
@@ -19,14 +19,14 @@ from hyrfpack.outputs import Outputs, StrPath
 
 @dataclass(frozen=True)
 class ComparisonReport:
-    """What a comparison came to.
+    """The result of a comparison.
 
     Attributes:
-        file: the page.
-        bytes: of it.
-        runs: what the page calls the runs.
-        views: names of the held-out photos whose renders can be looked at.
-        doubts: a sentence for each reason why runs cannot be compared by all their numbers; the page says so, too.
+        file: path of the page.
+        bytes: size of the page.
+        runs: names of the runs on the page.
+        views: names of the held-out photos whose renders the page shows.
+        doubts: a sentence for each reason why some numbers of the runs cannot be compared; the page shows them, too.
     """
 
     file: str
@@ -39,20 +39,20 @@ class ComparisonReport:
 def compare(runs: Sequence[StrPath], out: StrPath, *, overwrite: bool = False) -> ComparisonReport:
     """Write one page that shows finished training runs side by side.
 
-    It has a table of scores, sizes, times and whatever settings and choices differ; the training curves; and held-out
-    photos against renders, or renders of two runs against each other, with a slider. Everything is inside the page,
-    which fetches nothing. Pictures come from the runs' own, so that neither photos nor rendering are needed.
+    The page has a table of scores, sizes, times and of all settings and choices that differ; the training curves; and
+    held-out photos against renders, or renders of two runs against each other, with a slider. It is a single file that
+    fetches nothing. Its pictures come from the folders of the runs, so neither photos nor rendering are needed.
 
     Args:
         runs: folders that `hyrfpack.train` wrote to, two or more.
-        out: the page, an .html file.
-        overwrite: replace the file if it is there. Without it, a file that appears in the meantime is kept, too:
-            the page gets a free name beside it, which the report names.
+        out: the page to write, an .html file.
+        overwrite: replace an existing file. If False, an existing file is an error. A file that appears in the meantime
+            is kept, and the page is written beside it under a free name, which the report names.
 
     Raises:
-        TypeError: `runs` is one path.
-        HyrfError: there are fewer than two runs or the same one twice, one is not finished or its files are damaged,
-            the scores are of different photos, or the page cannot be written, or not without overwriting.
+        TypeError: `runs` is a single path.
+        HyrfError: there are fewer than two runs, a run is given twice or not finished, its files are damaged, the
+            scores are of different photos, or the page cannot be written.
 
     Example:
         >>> import hyrfpack
@@ -65,16 +65,18 @@ def compare(runs: Sequence[StrPath], out: StrPath, *, overwrite: bool = False) -
     folders = [Path(run) for run in runs]
     if len({os.path.realpath(folder) for folder in folders}) < max(2, len(folders)):
         raise HyrfError("there are not two different runs to compare; name two folders of runs or more, each once")
-    found = [read_run(folder) for folder in folders]
-    read = [
-        path for run in found for path in (run.folder / METRICS_FILE, run.folder / MODEL_FILE, *run.pictures.values())
+    loaded_runs = [read_run(folder) for folder in folders]
+    source_files = [
+        path
+        for run in loaded_runs
+        for path in (run.folder / METRICS_FILE, run.folder / MODEL_FILE, *run.pictures.values())
     ]
-    Outputs(*read, overwrite=overwrite).file(out, ".html", ".htm")
+    Outputs(*source_files, overwrite=overwrite).file(out, ".html", ".htm")
     names = short_names(folders)
-    check_scores(found, names)
-    views = read_views(found)
-    said = doubts(found, names, [view.name for view in views if not view.same])
+    check_scores(loaded_runs, names)
+    views = read_views(loaded_runs)
+    sentences = comparability_warnings(loaded_runs, names, [view.name for view in views if not view.same])
     views = [view for view in views if view.same]
-    page = encode_comparison(found, names, views, said)
+    page = encode_comparison(loaded_runs, names, views, sentences)
     written = write_atomic(out, page, overwrite=overwrite)
-    return ComparisonReport(str(written), len(page), names, [view.name for view in views], said)
+    return ComparisonReport(str(written), len(page), names, [view.name for view in views], sentences)

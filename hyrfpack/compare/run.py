@@ -1,4 +1,4 @@
-"""What a training run left in its folder, checked."""
+"""Reading and checking the folder of a finished training run."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from hyrfpack.outputs import StrPath
 from hyrfpack.render.files import unique_stems
 from hyrfpack.train.run import VIEWS
 
-LARGEST = 1e15  # no step, count, size or time in the metrics of a run that ever was is larger
-KINDS: dict[type, str] = {str: "text", list: "a list", dict: "an object"}
+# Steps, counts, sizes and times of real runs are smaller; a larger number means that the metrics are damaged.
+MAX_NUMBER = 1e15
+TYPE_NAMES: dict[type, str] = {str: "text", list: "a list", dict: "an object"}
 
 
 @dataclass(frozen=True)
 class Record:
-    """A step of a run; `seconds` of training up to its end, None in runs of versions that kept none."""
+    """A recorded training step; `seconds` is the training time up to its end, None in runs of older versions."""
 
     step: int
     psnr: float
@@ -32,7 +33,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Score:
-    """A held-out view: PSNR in dB, SSIM, and LPIPS where it was measured."""
+    """Scores of a held-out view: PSNR in dB, SSIM, and LPIPS, which is None if it was not measured."""
 
     name: str
     psnr: float
@@ -45,19 +46,20 @@ class Run:
     """A finished training run.
 
     Attributes:
-        folder: where it lies.
+        folder: folder of the run.
         files: bytes of each `.hyrf` file in the folder, by name, the model first.
-        gaussians, seconds: of the model; of its training.
-        settings, scene: as the metrics tell them.
-        device: where it was trained.
-        choices: what was chosen, each with its reason.
-        notes: what the reader of photos had to say.
-        curve: at least one record.
-        psnr, ssim, lpips: means over the held-out photos; None where there are none.
-        scores: of each held-out photo.
-        skipped: names of held-out photos that their masks leave nothing of.
-        pictures: the file of photo, render and error map, by the name of its photo.
-        cameras: that it was trained from, in the numbers of the model's file.
+        gaussians: number of Gaussians of the model.
+        seconds: training time.
+        settings, scene: the settings and the scene facts of the metrics.
+        device: device of the training.
+        choices: automatic choices by name, each with its reason.
+        notes: notes of the reader of photos.
+        curve: recorded training steps, at least one.
+        psnr, ssim, lpips: means over the held-out photos; None if there are none.
+        scores: scores of each held-out photo.
+        skipped: names of held-out photos whose mask leaves no pixel to score.
+        pictures: path of the picture of photo, render and error map, by the name of the photo.
+        cameras: training cameras, as in the provenance of the model's file.
     """
 
     folder: Path
@@ -84,16 +86,16 @@ class Run:
         return {score.name for score in self.scores} | set(self.skipped)
 
 
-class _Broken(Exception):
-    """What is wrong with the metrics, in a few words."""
+class _DamagedMetrics(Exception):
+    """The metrics are damaged; the message describes the damage in a few words."""
 
 
 def read_run(folder: StrPath) -> Run:
-    """Read what `hyrfpack train` left in a folder.
+    """Read a folder that `hyrfpack train` wrote.
 
     Raises:
-        HyrfDataError: there is no finished run in it, or its metrics are damaged.
-        HyrfFormatError: its model is damaged.
+        HyrfDataError: the folder has no finished run, or the metrics are damaged.
+        HyrfFormatError: the model is damaged.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -109,10 +111,10 @@ def read_run(folder: StrPath) -> Run:
     path = folder / METRICS_FILE
     try:
         metrics = json.loads(path.read_text("utf-8"), parse_constant=_refuse_constant)
-        return _run(folder, metrics)
+        return _parse_run(folder, metrics)
     except OSError as error:
         raise HyrfDataError(f"{path}: the file cannot be read ({error.strerror}); check its permissions") from error
-    except _Broken as error:
+    except _DamagedMetrics as error:
         reason = str(error)
     except (ValueError, RecursionError):
         reason = "it is no JSON"
@@ -120,92 +122,95 @@ def read_run(folder: StrPath) -> Run:
 
 
 def _refuse_constant(name: str) -> None:
-    raise _Broken(f"a number in it is {name}")
+    raise _DamagedMetrics(f"a number in it is {name}")
 
 
-def _run(folder: Path, metrics: Any) -> Run:
-    """A run of what its metrics say; raises _Broken where they make no sense."""
+def _parse_run(folder: Path, metrics: Any) -> Run:
+    """Return the run that the metrics describe; raise _DamagedMetrics if they are damaged."""
     if not isinstance(metrics, dict):
-        raise _Broken("it is no object")
-    evaluation = _take(metrics, "evaluation", dict) if "evaluation" in metrics else {}
-    scores = [_score(values) for values in _take(evaluation, "views", list)] if evaluation else []
-    skipped = list(map(str, _take(evaluation, "skipped", list))) if evaluation else []
-    curve = [_record(values) for values in _take(metrics, "curve", list)]
+        raise _DamagedMetrics("it is no object")
+    evaluation = _read_field(metrics, "evaluation", dict) if "evaluation" in metrics else {}
+    scores = [_parse_score(values) for values in _read_field(evaluation, "views", list)] if evaluation else []
+    skipped = list(map(str, _read_field(evaluation, "skipped", list))) if evaluation else []
+    curve = [_parse_record(values) for values in _read_field(metrics, "curve", list)]
     if not curve:
-        raise _Broken("'curve' is empty")
-    settings = _take(metrics, "settings", dict)
+        raise _DamagedMetrics("'curve' is empty")
+    settings = _read_field(metrics, "settings", dict)
     for name in ("steps", "seed"):
-        _number(settings, name, int, most=2**64)
+        _read_number(settings, name, int, most=2**64)
     if settings["steps"] < 1:
-        raise _Broken("'steps' is not a number that can be")
+        raise _DamagedMetrics("'steps' is not a number that can be")
     return Run(
         folder=folder,
-        files=_files(folder),
-        gaussians=_number(metrics, "gaussians", int),
-        seconds=_number(metrics, "seconds"),
+        files=_file_sizes(folder),
+        gaussians=_read_number(metrics, "gaussians", int),
+        seconds=_read_number(metrics, "seconds"),
         settings=settings,
-        scene=_take(metrics, "scene", dict),
+        scene=_read_field(metrics, "scene", dict),
         device=str(metrics.get("device", "")),
-        choices={name: str(reason) for name, reason in _take(metrics, "choices", dict).items()},
-        notes=list(map(str, _take(metrics, "notes", list))),
+        choices={name: str(reason) for name, reason in _read_field(metrics, "choices", dict).items()},
+        notes=list(map(str, _read_field(metrics, "notes", list))),
         curve=curve,
-        psnr=_number(evaluation, "psnr") if evaluation else None,
-        ssim=_number(evaluation, "ssim") if evaluation else None,
-        lpips=_optional(evaluation, "lpips"),
+        psnr=_read_number(evaluation, "psnr") if evaluation else None,
+        ssim=_read_number(evaluation, "ssim") if evaluation else None,
+        lpips=_read_optional_number(evaluation, "lpips"),
         scores=scores,
         skipped=skipped,
-        pictures=_pictures(folder, [*(score.name for score in scores), *skipped]),
+        pictures=_existing_pictures(folder, [*(score.name for score in scores), *skipped]),
         cameras=describe(folder / MODEL_FILE)["provenance"].get("cameras"),
     )
 
 
-def _score(values: Any) -> Score:
+def _parse_score(values: Any) -> Score:
     return Score(
-        _take(values, "name", str), _number(values, "psnr"), _number(values, "ssim"), _optional(values, "lpips")
+        _read_field(values, "name", str),
+        _read_number(values, "psnr"),
+        _read_number(values, "ssim"),
+        _read_optional_number(values, "lpips"),
     )
 
 
-def _record(values: Any) -> Record:
+def _parse_record(values: Any) -> Record:
     return Record(
-        _number(values, "step", int),
-        _number(values, "psnr"),
-        _number(values, "gaussians", int),
-        _optional(values, "seconds"),
+        _read_number(values, "step", int),
+        _read_number(values, "psnr"),
+        _read_number(values, "gaussians", int),
+        _read_optional_number(values, "seconds"),
     )
 
 
-def _take(values: Any, name: str, kind: type) -> Any:
+def _read_field(values: Any, name: str, kind: type) -> Any:
     if not isinstance(values, dict) or not isinstance(values.get(name), kind):
-        raise _Broken(f"'{name}' is missing or not {KINDS[kind]}")
+        raise _DamagedMetrics(f"'{name}' is missing or not {TYPE_NAMES[kind]}")
     return values[name]
 
 
-def _number(values: Any, name: str, kind: type = float, most: float = LARGEST) -> Any:
+def _read_number(values: Any, name: str, kind: type = float, most: float = MAX_NUMBER) -> Any:
     value: Any = values.get(name) if isinstance(values, dict) else None
-    right = isinstance(value, int | float if kind is float else int) and not isinstance(value, bool)
-    if not right or not abs(value) <= most:  # NaN is not, either
-        raise _Broken(f"'{name}' is missing or not a number that can be")
+    has_right_type = isinstance(value, int | float if kind is float else int) and not isinstance(value, bool)
+    if not has_right_type or not abs(value) <= most:  # also rejects NaN
+        raise _DamagedMetrics(f"'{name}' is missing or not a number that can be")
     return value
 
 
-def _optional(values: Mapping, name: str) -> float | None:
-    return None if values.get(name) is None else _number(values, name)
+def _read_optional_number(values: Mapping, name: str) -> float | None:
+    return None if values.get(name) is None else _read_number(values, name)
 
 
-def _files(folder: Path) -> dict[str, int]:
-    """Bytes of each `.hyrf` file, the model first."""
+def _file_sizes(folder: Path) -> dict[str, int]:
+    """Return the bytes of each `.hyrf` file, the model first."""
     names = sorted(path.name for path in folder.glob("*.hyrf") if path.is_file() and path.name != MODEL_FILE)
     return {name: os.path.getsize(folder / name) for name in (MODEL_FILE, *names)}
 
 
-def _pictures(folder: Path, names: Sequence[str]) -> dict[str, Path]:
-    """The files of `evaluate`'s pictures that are there, by the name of their photo."""
+def _existing_pictures(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """Return the paths of those of `evaluate`'s pictures that exist, by the name of their photo."""
     files = {name: folder / VIEWS / f"{file}.png" for name, file in zip(names, unique_stems(names), strict=True)}
     return {name: path for name, path in files.items() if path.is_file()}
 
 
 def short_names(folders: Sequence[Path]) -> list[str]:
-    """What to call runs: as many of the last parts of their paths as tell them apart."""
+    """Return names of runs: as many of the last parts of their paths as are needed to tell them apart."""
     parts = [Path(os.path.abspath(folder)).parts for folder in folders]
     for count in range(1, max(map(len, parts)) + 1):
         names = ["/".join(part[-count:]) for part in parts]

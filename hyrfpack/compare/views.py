@@ -1,4 +1,4 @@
-"""Held-out views as runs rendered them, cut out of the pictures that lie in the runs' folders."""
+"""Held-out views of several runs, cut out of the comparison pictures in the folders of the runs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from hyrfpack.data.pictures import read_pixels
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.evaluate.figures import split_comparison
 
-SAME = 0.5  # levels of 255 that copies of a photo are apart at most, in the mean: decoders round differently
+# Mean difference, in levels of 255, up to which two pictures count as the same photo: decoders round differently.
+MAX_MEAN_DIFFERENCE_LEVELS = 0.5
 
 
 @dataclass(frozen=True)
@@ -24,9 +25,9 @@ class ComparedView:
     """A held-out view that all runs have a picture of.
 
     Attributes:
-        name: of the photo.
-        photo: as the runs were scored on it.
-        renders: of each run.
+        name: name of the photo.
+        photo: the photo as the runs were scored on it.
+        renders: the render of each run.
         same: whether the photo looks the same in all runs.
     """
 
@@ -37,21 +38,21 @@ class ComparedView:
 
 
 def read_views(runs: Sequence[Run]) -> list[ComparedView]:
-    """The held-out views that all runs have pictures of.
+    """Read the held-out views of which all runs have pictures.
 
     Raises:
-        HyrfDataError: a picture cannot be read, or is no photo beside its render.
+        HyrfDataError: a picture cannot be read, or does not show a photo beside its render.
     """
     names = [name for name in runs[0].pictures if all(name in run.pictures for run in runs)]
     views = []
     for name in names:
-        photos, renders = zip(*(_cut(run.pictures[name]) for run in runs), strict=True)
-        same = all(_is_same(photos[0], photo) for photo in photos[1:])
+        photos, renders = zip(*(_read_photo_and_render(run.pictures[name]) for run in runs), strict=True)
+        same = all(_look_same(photos[0], photo) for photo in photos[1:])
         views.append(ComparedView(name, photos[0], list(renders), same))
     return views
 
 
-def _cut(path: Path) -> tuple[Image.Image, Image.Image]:
+def _read_photo_and_render(path: Path) -> tuple[Image.Image, Image.Image]:
     pixels, _ = read_pixels(path)
     try:
         photo, render, _ = split_comparison(Image.fromarray(pixels))
@@ -62,14 +63,17 @@ def _cut(path: Path) -> tuple[Image.Image, Image.Image]:
     return photo, render
 
 
-def _is_same(first: Image.Image, other: Image.Image) -> bool:
+def _look_same(first: Image.Image, other: Image.Image) -> bool:
     if first.size != other.size:
         return False
-    return float(np.abs(np.asarray(first, np.float32) - np.asarray(other, np.float32)).mean()) <= SAME
+    return (
+        float(np.abs(np.asarray(first, np.float32) - np.asarray(other, np.float32)).mean())
+        <= MAX_MEAN_DIFFERENCE_LEVELS
+    )
 
 
-def data_address(image: Image.Image) -> str:
-    """A picture as an address that holds it: lossless WebP."""
+def webp_data_uri(image: Image.Image) -> str:
+    """Encode a picture as a data URI of lossless WebP."""
     data = io.BytesIO()
-    image.save(data, "WEBP", lossless=True, method=2)  # finer search is 3 times as slow and saves a twentieth
+    image.save(data, "WEBP", lossless=True, method=2)  # higher methods take 3 times as long and save 5 %
     return "data:image/webp;base64," + base64.b64encode(data.getbuffer()).decode()

@@ -1,4 +1,4 @@
-"""Snapshots of a model in training, served to the player's page."""
+"""Live view: snapshots of a model in training, served to the page of the player."""
 
 from __future__ import annotations
 
@@ -14,21 +14,25 @@ from hyrfpack.train import Trainer
 from hyrfpack.web.player import encode_player
 from hyrfpack.web.serve import MemoryFile, serving
 
-SCENE, UPDATES = "scene.hyrf", "training.json"  # names in the page's address
-MIN_INTERVAL_SECONDS = 10.0  # between two snapshots
-MIN_INTERVAL_RATIO = 40.0  # the same, in units of the time that the last snapshot took: it costs 2.5 % at most
+# File names under which the page fetches the snapshot and the progress.
+SCENE_NAME = "scene.hyrf"
+UPDATES_NAME = "training.json"
+MIN_INTERVAL_SECONDS = 10.0
+# The interval between snapshots is at least this many times as long as the last snapshot took, so that snapshots take
+# at most 2.5 % of the time.
+MIN_INTERVAL_RATIO = 40.0
 
 
 class LiveView:
-    """Takes snapshots of the model that a trainer trains; an observer of `hyrfpack.train.train`.
+    """Observer of `hyrfpack.train.train` that takes snapshots of the model in training.
 
-    A snapshot is a `.hyrf` file of profile raw in memory, the profile that takes the least time to write. The first
-    step and the last one have one, and those between as far apart as MIN_INTERVAL_SECONDS and MIN_INTERVAL_RATIO say.
-    The model is only read, so that a training with a view gives the same model, bit by bit, as one without.
+    A snapshot is a `.hyrf` file in memory with profile "raw", which is the fastest to write. Snapshots are taken after
+    the first and the last step, and in between at intervals of at least MIN_INTERVAL_SECONDS and MIN_INTERVAL_RATIO.
+    The model is only read, so a training with a live view gives the same model, bit by bit, as one without.
 
     Attributes:
         scene: the newest snapshot.
-        updates: JSON of its number (0 while there is none), its step, and the number of steps.
+        updates: JSON with the number of the newest snapshot (0 if there is none), its step, and the number of steps.
 
     Example:
         >>> view = LiveView()
@@ -36,21 +40,25 @@ class LiveView:
     """
 
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:
-        """Args: clock: gives seconds."""
+        """Create a view without a snapshot.
+
+        Args:
+            clock: returns the present time in seconds.
+        """
         self.scene = MemoryFile(b"")
-        self.updates = MemoryFile(_progress(0, 0, 0))
+        self.updates = MemoryFile(_encode_progress(0, 0, 0))
         self._clock = clock
         self._count = 0
-        self._next = 0.0  # when the next snapshot may be taken, by the clock
+        self._next = 0.0  # earliest time of the next snapshot, in seconds of the clock
         self._capture: dict | None = None
 
     def observe(self, trainer: Trainer) -> None:
         """Take a snapshot if one is due; called after each step.
 
-        A model that cannot be written, as one whose numbers are not finite, is left out: the trainer speaks of that.
+        A model that cannot be written, such as one with non-finite numbers, is skipped: the trainer reports it.
         """
-        began = self._clock()
-        if self._count and began < self._next and trainer.step < trainer.steps:
+        started = self._clock()
+        if self._count and started < self._next and trainer.step < trainer.steps:
             return
         if self._capture is None:
             self._capture = scene_provenance(trainer.scene)
@@ -60,33 +68,33 @@ class LiveView:
             return
         self._count += 1
         self.scene.replace(data)
-        self.updates.replace(_progress(self._count, trainer.step, trainer.steps))
+        self.updates.replace(_encode_progress(self._count, trainer.step, trainer.steps))
         now = self._clock()
-        self._next = now + max(MIN_INTERVAL_SECONDS, MIN_INTERVAL_RATIO * (now - began))
+        self._next = now + max(MIN_INTERVAL_SECONDS, MIN_INTERVAL_RATIO * (now - started))
 
 
 @contextmanager
 def live_view(title: str, *, port: int = 0, say: Callable[[str], None]) -> Iterator[LiveView]:
-    """Serve a page that shows a training to this machine, while the block runs.
+    """Serve a page that shows the training to browsers of this machine, until the block ends.
 
     Args:
-        title: of the page.
-        port: to listen at, 0 to 65535; 0 takes a free one.
-        say: called with a sentence that names the page's address.
+        title: title of the page.
+        port: port to listen on, 0 to 65535; 0 takes a free one.
+        say: called with a sentence that contains the page's address.
 
     Raises:
-        HyrfError: nothing can listen at this port.
+        HyrfError: the port cannot be used.
 
     Example:
         >>> with live_view("bonsai", say=print) as view:
         ...     hyrfpack.train(scene, "runs/bonsai", observer=view.observe)
     """
     view = LiveView()
-    page = encode_player(title, content=SCENE, updates=UPDATES, fetches="'self'")
-    with serving(page, {SCENE: view.scene, UPDATES: view.updates}, port=port) as address:
+    page = encode_player(title, content=SCENE_NAME, updates=UPDATES_NAME, fetches="'self'")
+    with serving(page, {SCENE_NAME: view.scene, UPDATES_NAME: view.updates}, port=port) as address:
         say(f"the training can be seen at {address} until the command ends")
         yield view
 
 
-def _progress(snapshot: int, step: int, steps: int) -> bytes:
+def _encode_progress(snapshot: int, step: int, steps: int) -> bytes:
     return json.dumps({"snapshot": snapshot, "step": step, "steps": steps}).encode()

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from hyrfpack.compare.curves import COLORS, DASHES, line_style
+from hyrfpack.compare.curves import LINE_COLORS, LINE_DASHES, line_style
 from hyrfpack.compare.page import encode_comparison
 from hyrfpack.compare.run import Record, Run, Score
 from hyrfpack.compare.views import ComparedView
@@ -91,5 +91,5 @@ def test_the_script_is_one_that_node_reads_and_a_page_can_hold(tmp_path: Path):
 
 
 def test_lines_of_many_runs_can_be_told_apart():
-    styles = [line_style(number) for number in range(len(COLORS) * len(DASHES))]
+    styles = [line_style(number) for number in range(len(LINE_COLORS) * len(LINE_DASHES))]
     assert len(set(styles)) == len(styles) == 18
