@@ -226,16 +226,16 @@ def calibrate(
         sensitivity = _correct_by_measurement(
             sensitivity, ((PRUNED,),), distortion, measure_pruning, report_part(report, 0.0, 0.2)
         )
-    left, decoded = subset_of(indices_to_keep(sensitivity, per_number, prune))
-    unpruned_references = ReferenceRenders.from_views(references.views, left, decoded)
-    placed: tuple[np.ndarray, Plan, HybridModel] | None = None
+    pruned_model, decoded = subset_of(indices_to_keep(sensitivity, per_number, prune))
+    pruned_references = ReferenceRenders.from_views(references.views, pruned_model, decoded)
+    last_planned: tuple[np.ndarray, Plan, HybridModel] | None = None
 
     def measure_quantization(scaled: Sensitivity, parts: list[Part], report: Report) -> dict[Part, ErrorMeasurement]:
-        nonlocal placed
-        if placed is None or not np.array_equal(placed[0], scaled.positions):
+        nonlocal last_planned
+        if last_planned is None or not np.array_equal(last_planned[0], scaled.positions):
             plan = make_plan(model, scaled, distortion, prune)
-            placed = scaled.positions, plan, plan.apply(model)
-        _, plan, planned = placed
+            last_planned = scaled.positions, plan, plan.apply(model)
+        _, plan, planned = last_planned
         quantized = quantize(planned, plan, scaled, sections=[name for part in parts for name in part])
         predicted, stored = _predict_quantization_errors(planned, quantized, scaled), quantized.arrays()
         # Sorted like the Gaussians that are left, so that their decoded values can be reused for the unchanged parts.
@@ -244,9 +244,9 @@ def calibrate(
 
         def measured_error(part: Part) -> float:
             if part == (POSITIONS,):
-                return unpruned_references.measure_error(planned)
-            changed = _replace_arrays(left, {name: stored[name] for name in part})
-            return unpruned_references.measure_error(changed, _update_decoded(changed, decoded, part))
+                return pruned_references.measure_error(planned)
+            changed = _replace_arrays(pruned_model, {name: stored[name] for name in part})
+            return pruned_references.measure_error(changed, _update_decoded(changed, decoded, part))
 
         measurements = {}
         for number, part in enumerate(parts):

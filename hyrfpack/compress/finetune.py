@@ -61,7 +61,7 @@ def finetune(
     report: Callable[[int, float], None] = lambda step, loss: None,
     ranks: Ranks = SINGLE_PROCESS,
 ) -> tuple[HybridModel, Plan]:
-    """Fit a model's numbers to the photos while they are quantised as in the file.
+    """Fit a model to the photos with its numbers quantised as in the file.
 
     Each step renders the model with quantised numbers (a straight-through estimator passes the gradients) and adds
 

@@ -50,7 +50,7 @@ PSNR_DROP_VIEWS = 8
 # A file is encoded again if the measured error is off by more than this ratio from the intended one.
 DISTORTION_TOLERANCE_RATIO = 1.2
 MAX_CORRECTIONS = 3
-# Largest change of the distortion from one file to the next.
+# The distortion changes at most by these ratios from one file to the next.
 MAX_COARSENING_RATIO = 2.0
 MAX_REFINING_RATIO = 16.0
 # Fine-tuning takes long, so a search over fine-tuned files makes fewer.
@@ -124,7 +124,7 @@ def compress(
         settings: settings of "paper", see `hyrfpack.format.paper`; `noise` is the deprecated name of `distortion`.
 
     Raises:
-        HyrfError: a file cannot be read or written, source and target are the same file, the options exclude each
+        HyrfError: a file cannot be read or written, the target would replace an input, the options exclude each
             other, or no file meets the limits.
         TypeError: `data` is not a Scene.
 
