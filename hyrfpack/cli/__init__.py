@@ -1,7 +1,8 @@
-"""The command line: parses, calls the library, prints. No numerics.
+"""The command line, which parses arguments, calls the library and prints results, and computes nothing itself.
 
-Exit codes: 0 done, 1 a bug of ours or interrupted, 2 something the user can correct (one sentence on standard error).
-Nothing here imports torch or numpy before a command needs it, so that `hyrfpack info` answers at once.
+Exit codes: 0 for success, 1 for a bug in hyrfpack or an interruption, 2 for an error that the user can correct (one
+sentence on standard error). No module here imports torch or numpy before a command needs them, so that commands such as
+`hyrfpack info` answer at once.
 """
 
 from __future__ import annotations
@@ -18,31 +19,38 @@ import click
 from hyrfpack.cli.bench import bench
 from hyrfpack.cli.common import print_json
 from hyrfpack.cli.compare import compare
+from hyrfpack.cli.console import (
+    add_verbosity_options,
+    is_verbose,
+    note,
+    repair_std_streams,
+    store_arguments,
+    stored_arguments,
+)
 from hyrfpack.cli.convert import convert
 from hyrfpack.cli.demo import demo
 from hyrfpack.cli.export import export
 from hyrfpack.cli.files import compress, decompress, info
 from hyrfpack.cli.imports import import_
 from hyrfpack.cli.make import make
-from hyrfpack.cli.manners import add_manners, arguments_of, is_verbose, keep_arguments, mend_streams, note
 from hyrfpack.cli.poses import poses
 from hyrfpack.cli.train import train
 from hyrfpack.cli.view import view
 from hyrfpack.cli.views import evaluate, render
-from hyrfpack.cli.wording import with_options
+from hyrfpack.cli.wording import use_option_names
 from hyrfpack.errors import HyrfError, printable
 from hyrfpack.version import __version__
 
 
-class _Commands(click.Group):
-    """A group of commands that turns errors of the user's into one sentence and exit code 2."""
+class _CommandGroup(click.Group):
+    """A group of commands that reports errors of the user as one sentence, with exit code 2."""
 
     def main(self, *args: Any, **options: Any) -> Any:
-        mend_streams()
+        repair_std_streams()
         return super().main(*args, **options)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        keep_arguments(ctx, args)
+        store_arguments(ctx, args)
         return super().parse_args(ctx, args)
 
     def make_context(
@@ -52,7 +60,7 @@ class _Commands(click.Group):
             return super().make_context(info_name, args, parent, **extra)
 
     def invoke(self, ctx: click.Context) -> Any:
-        with _errors_as_json(arguments_of(ctx)):
+        with _errors_as_json(stored_arguments(ctx)):
             return self._invoke(ctx)
 
     def _invoke(self, ctx: click.Context) -> Any:
@@ -61,21 +69,21 @@ class _Commands(click.Group):
         except HyrfError as error:
             if is_verbose():
                 traceback.print_exc()
-            raise _Refusal(with_options(str(error))) from error
+            raise _UserError(use_option_names(str(error))) from error
         except OSError as error:
-            # Files are written by functions that raise HyrfError: what is left is printing onto a full disk.
+            # Functions that write files raise HyrfError, so that this error comes from printing onto a full disk.
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
-            raise _Refusal(f"the output cannot be printed ({error.strerror}); send it elsewhere") from error
-        _tell_of_kernels()
+            raise _UserError(f"the output cannot be printed ({error.strerror}); send it elsewhere") from error
+        _note_uncached_kernels()
         return result
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(self.commands)  # in the order of use, not of the alphabet
+        return list(self.commands)  # help lists commands in the order of their use, not of the alphabet
 
 
-def _tell_of_kernels() -> None:
-    """Say it where the kernels that a command has compiled are lost with it."""
+def _note_uncached_kernels() -> None:
+    """Print a note if the command has loaded compiled kernels and they cannot be cached on disk."""
     kernels = sys.modules.get("hyrfpack.parallel.compiled")
     if kernels is not None and not kernels.can_cache_kernels():
         note(
@@ -86,22 +94,24 @@ def _tell_of_kernels() -> None:
 
 @contextmanager
 def _errors_as_json(arguments: Sequence[str]) -> Iterator[None]:
-    """Print an error that the user can correct on standard output, too, where --json is among the arguments."""
+    """Print an error that the user can correct as JSON on standard output, too, if the arguments contain --json."""
     as_json = "--json" in arguments
     try:
         yield
     except click.ClickException as error:
         if as_json:
-            with suppress(OSError):  # standard output may be what the error is about
+            with suppress(OSError):  # the error may be that standard output cannot be written
                 print_json({"error": printable(error.format_message())})
         raise
 
 
-class _Refusal(click.ClickException):
+class _UserError(click.ClickException):
+    """An error that the user can correct."""
+
     exit_code = 2
 
 
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group(cls=_CommandGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(__version__, prog_name="hyrfpack")
 def main() -> None:
     """Make small .hyrf files of photos or a video: find poses, train hybrid radiance fields, compress, render, export.
@@ -142,5 +152,5 @@ _COMMANDS = (
 )
 for _command in _COMMANDS:
     main.add_command(_command)
-    add_manners(_command)
-add_manners(main)
+    add_verbosity_options(_command)
+add_verbosity_options(main)

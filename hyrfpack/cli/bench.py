@@ -1,4 +1,4 @@
-"""`hyrfpack bench`."""
+"""The command `hyrfpack bench`."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ import click
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
+    format_table,
     json_option,
-    named_model,
     note,
     note_rename,
     overwrite_option,
     print_json,
     read_scene,
+    resolve_model_file,
     scene_options,
-    table,
 )
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 
-GROUPS = ("rasterize", "hash_encode", "mlp", "render", "codec")  # hyrfpack.bench.GROUPS, without loading torch
+# The same as `hyrfpack.bench.GROUPS`, which cannot be imported without torch.
+GROUPS = ("rasterize", "hash_encode", "mlp", "render", "codec")
 
 
 @click.command(short_help="Measure speed against error.")
@@ -42,7 +43,7 @@ GROUPS = ("rasterize", "hash_encode", "mlp", "render", "codec")  # hyrfpack.benc
 def bench(
     model: Path | None,
     data: Path | None,
-    reading: dict[str, Any],
+    reader_options: dict[str, Any],
     repeats: int,
     only: tuple[str, ...],
     output: Path,
@@ -64,44 +65,44 @@ def bench(
     """
     if data is not None and model is None:
         raise click.UsageError("--data are the photos of MODEL; name the model too")
-    # The references run on torch's own threads, which would go on spinning on the cores of the kernels timed next.
+    # The references run on torch's own threads, which would keep spinning on the cores of the kernels timed next.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from hyrfpack.atomic import write_atomic
     from hyrfpack.bench import bench as measure
-    from hyrfpack.bench import tables as words
+    from hyrfpack.bench import tables
     from hyrfpack.bench.figure import plot, plot_format
     from hyrfpack.format import describe
     from hyrfpack.measure.machine import format_machine
 
-    model = None if model is None else named_model(model)
+    model = None if model is None else resolve_model_file(model)
     plot_format(output)
-    scene = None if data is None or model is None else read_scene(data, reading, describe(model))
+    scene = None if data is None or model is None else read_scene(data, reader_options, describe(model))
     outputs = Outputs(model, scene=scene, overwrite=overwrite)
     outputs.file(output)
     page = _read_page(markdown)
-    if page:  # does it have all places? Better asked now than after minutes
-        words.fill_page(page, dict.fromkeys(("machine", *(only or GROUPS)), ""), str(markdown))
-    if markdown is not None:  # a page with the places is not replaced, they are filled
+    if page:  # check before minutes of work that the page has a place for each table
+        tables.fill_page(page, dict.fromkeys(("machine", *(only or GROUPS)), ""), str(markdown))
+    if markdown is not None:  # an existing page with places is filled, which needs no permission to overwrite
         Outputs(model, scene=scene, overwrite=overwrite or bool(page)).file(markdown)
     result = measure(model, scene, repeats=repeats, only=only or None, say=note)
     if as_json:
         print_json(result.to_dict())
     else:
         click.echo(f"{format_machine(result.machine)}\n{result.subject}")
-        for part in words.build_tables(result.rows):
-            click.echo(f"\n{part.title}\n{table(part.header, part.cells)}")
+        for part in tables.build_tables(result.rows):
+            click.echo(f"\n{part.title}\n{format_table(part.header, part.cells)}")
         for sentence in result.notes:
             click.echo(f"\nnote: {sentence}")
     note(f"{note_rename(output, plot(result.rows, output, overwrite=overwrite))}: time against error")
     if markdown is not None:
-        blocks = words.format_markdown(result)
-        page = page and _read_page(markdown)  # again: it may have been edited while this command measured
-        filled = words.fill_page(page or words.empty_page(blocks), blocks, str(markdown)).encode()
+        blocks = tables.format_markdown(result)
+        page = page and _read_page(markdown)  # read again, because it may have been edited during the measurements
+        filled = tables.fill_page(page or tables.empty_page(blocks), blocks, str(markdown)).encode()
         note_rename(markdown, write_atomic(markdown, filled, overwrite=overwrite or bool(page)))
 
 
 def _read_page(path: Path | None) -> str:
-    """What a Markdown file says now; empty when there is none."""
+    """Return the text of a Markdown file, or "" if there is none."""
     if path is None or not path.exists():
         return ""
     try:

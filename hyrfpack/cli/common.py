@@ -1,4 +1,4 @@
-"""What several commands share: options of data sets, and how results are printed."""
+"""Options, argument types and printing functions that several commands share."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import click
 
 from hyrfpack.atomic import describe_rename
 from hyrfpack.choices import AS_PHOTOGRAPHED, LAYOUTS, PRECISIONS, RENDER_EXPOSURES
-from hyrfpack.cli.manners import detail, note
+from hyrfpack.cli.console import note, note_if_verbose
 from hyrfpack.errors import HyrfError
 
 if TYPE_CHECKING:
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 Command = TypeVar("Command", bound=Callable)
 
 PATH = click.Path(path_type=Path)
-SEED = click.IntRange(0, 2**64 - 1)  # hyrfpack.train.config.LARGEST_SEED, without loading torch
-_SIZE = re.compile(r"([0-9.]+)\s*([kmg]?)b?", re.IGNORECASE)
+SEED = click.IntRange(0, 2**64 - 1)  # the limit of hyrfpack.train.config, which cannot be imported without torch
+_SIZE_PATTERN = re.compile(r"([0-9.]+)\s*([kmg]?)b?", re.IGNORECASE)
 
 
 class _OutputPath(click.ParamType):
-    """Where to write. Unlike a path to read it has a name of its own."""
+    """Path of an output. Unlike the path of an input it may not be empty or "-"."""
 
     name = "path"
 
@@ -44,13 +44,13 @@ class _OutputPath(click.ParamType):
 OUTPUT = _OutputPath()
 
 
-class _Bytes(click.ParamType):
-    """A size such as 2MB, 350k or 1500000; k, M and G are powers of 1000."""
+class _Size(click.ParamType):
+    """Number of bytes, such as 2MB, 350k or 1500000; k, M and G are powers of 1000."""
 
     name = "size"
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        match = _SIZE.fullmatch(str(value).strip())
+        match = _SIZE_PATTERN.fullmatch(str(value).strip())
         try:
             size = int(float(match[1]) * 1000 ** " kmg".index(match[2].lower() or " ")) if match else 0
         except (ValueError, OverflowError):
@@ -60,15 +60,15 @@ class _Bytes(click.ParamType):
         return size
 
 
-SIZE = _Bytes()
+SIZE = _Size()
 
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace files that are there; what the command reads is never replaced."
 )
 
 
-def number(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
-    """Refuse NaN, which no range does."""
+def reject_nan(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
+    """Reject NaN, which click's ranges accept; a callback of options."""
     if value is not None and math.isnan(value):
         raise click.BadParameter("NaN is not a number", ctx, param)
     return value
@@ -78,13 +78,14 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print one JS
 
 
 def scene_options(command: Command) -> Command:
-    """Options that say how a data folder is read, which the command gets as one argument, `reading`, for `read_scene`.
+    """Add the options that say how a folder of photos and poses is read.
 
-    --test-every, --images, --max-size, --layout, --model.
+    They are --test-every, --images, --max-size, --layout and --model. The command gets them as one argument,
+    `reader_options`, for `read_scene`.
     """
 
     @functools.wraps(command)
-    def with_reading(
+    def with_reader_options(
         *args: Any,
         test_every: int,
         images: str | None,
@@ -93,10 +94,10 @@ def scene_options(command: Command) -> Command:
         colmap_model: str | None,
         **others: Any,
     ) -> Any:
-        reading = {"test_every": test_every, "images": images, "max_size": max_size, "layout": layout}
-        return command(*args, reading={**reading, "model": colmap_model}, **others)
+        reader_options = {"test_every": test_every, "images": images, "max_size": max_size, "layout": layout}
+        return command(*args, reader_options={**reader_options, "model": colmap_model}, **others)
 
-    with_options: Any = with_reading
+    with_options: Any = with_reader_options
     for option in (
         click.option(
             "--model",
@@ -147,7 +148,7 @@ exposure_option = click.option(
 
 
 def device_options(command: Command) -> Command:
-    """Options that say where the work is done, and how exactly there: --device, --precision."""
+    """Add the options that choose the device and the precision there: --device, --precision."""
     precision = click.option(
         "--precision",
         type=click.Choice(PRECISIONS),
@@ -158,32 +159,45 @@ def device_options(command: Command) -> Command:
     return device_option(precision(command))
 
 
-def chosen_device(name: str, ranks: Ranks | None = None) -> torch.device:
-    """The device of --device, with a word about it where it is slow; each of several processes has its own."""
+def choose_command_device(name: str, ranks: Ranks | None = None) -> torch.device:
+    """Choose the device that --device names, and print a note where it is slow.
+
+    Args:
+        name: value of the option.
+        ranks: processes that work together, all of which call this; each gets a device of its own.
+
+    Raises:
+        HyrfError: as `hyrfpack.device.choose_own_device`.
+    """
     from hyrfpack.device import choose_own_device, describe_device
     from hyrfpack.parallel.ranks import SINGLE_PROCESS
 
     device = choose_own_device(name, ranks or SINGLE_PROCESS, note)
-    detail(f"device: {describe_device(device)}")
+    note_if_verbose(f"device: {describe_device(device)}")
     return device
 
 
-def read_scene(path: Path, reading: dict[str, Any], model: dict | None = None) -> Scene:
-    """Read a data folder and tell what the reader has to say about it, and whether a model is of other photos.
+def read_scene(path: Path, reader_options: dict[str, Any], model: dict | None = None) -> Scene:
+    """Read a folder of photos and poses, and print the reader's notes.
+
+    A further note says whether a model was trained on other photos.
 
     Args:
-        path: the folder.
-        reading: from `scene_options`.
-        model: facts of the model file (`hyrfpack.describe`) that the photos are of, if any: it says how large they
-            are wanted where --max-size does not.
+        path: the folder, or an archive of it.
+        reader_options: values of the options of `scene_options`.
+        model: description (`hyrfpack.describe`) of the model file that belongs to the photos, if any. It gives the size
+            of the photos where --max-size does not.
+
+    Raises:
+        HyrfError: as `hyrfpack.load_scene`.
     """
     from hyrfpack.cameras.capture import Capture
     from hyrfpack.data import load_scene
     from hyrfpack.scene import DEFAULT_MAX_SIZE
 
-    if reading["max_size"] is None:
-        reading = {**reading, "max_size": DEFAULT_MAX_SIZE if model is None else Capture(model).max_size}
-    scene = load_scene(path, **reading)
+    if reader_options["max_size"] is None:
+        reader_options = {**reader_options, "max_size": DEFAULT_MAX_SIZE if model is None else Capture(model).max_size}
+    scene = load_scene(path, **reader_options)
     for sentence in scene.notes:
         note(sentence)
     if model is not None and (mismatch := Capture(model, scene).mismatch):
@@ -192,17 +206,17 @@ def read_scene(path: Path, reading: dict[str, Any], model: dict | None = None) -
 
 
 def note_rename(asked: Path, written: Path | str) -> Path:
-    """The path that was written, with a note where it is not the one that was asked for."""
+    """Return the path that was written, and print a note if another one was requested."""
     if Path(written) != asked:
         note(describe_rename(asked, written))
     return Path(written)
 
 
-def named_model(path: Path) -> Path:
-    """Return the `.hyrf` file that an argument names, see `hyrfpack.format.find_model`.
+def resolve_model_file(path: Path) -> Path:
+    """Return the `.hyrf` file that an argument names by its path or by the folder of its run.
 
     Raises:
-        HyrfError: it is a folder without a model, or names splats, which have to be imported first.
+        HyrfError: the argument is a folder without a model, or splats, which have to be imported first.
     """
     from hyrfpack.format import find_model
     from hyrfpack.splats.names import is_splats
@@ -213,11 +227,11 @@ def named_model(path: Path) -> Path:
     return find_model(path)
 
 
-def split_views(scene: Scene, split: str) -> list[View]:
-    """The views of a split.
+def select_views(scene: Scene, split: str) -> list[View]:
+    """Return the views of a split: "test", "train" or "all".
 
     Raises:
-        HyrfError: it has none.
+        HyrfError: the split has no views.
     """
     views = {"test": scene.test, "train": scene.train, "all": scene.views}[split]
     if not views:
@@ -225,28 +239,28 @@ def split_views(scene: Scene, split: str) -> list[View]:
     return views
 
 
-def largest_picture(cameras: Iterable[Camera]) -> tuple[int, int]:
-    """(width, height) in pixels of the largest picture that cameras make."""
+def largest_picture_size(cameras: Iterable[Camera]) -> tuple[int, int]:
+    """Return (width, height) in pixels of the largest picture that any of the cameras makes."""
     return max(((camera.width, camera.height) for camera in cameras), key=lambda size: size[0] * size[1])
 
 
-def at_one_exposure(psnr_consistent: float | None) -> str:
-    """Return what is printed behind a PSNR: that of renders at one exposure, or "" for a model without a map."""
+def format_consistent_psnr(psnr_consistent: float | None) -> str:
+    """Return the PSNR of renders at one exposure, to be printed behind another; "" for a model without a map."""
     return "" if psnr_consistent is None else f" ({psnr_consistent:.2f} dB at one exposure)"
 
 
 def print_json(values: dict) -> None:
-    """Print one JSON object, the only thing a command puts on standard output under --json."""
+    """Print one JSON object, which is all that a command prints on standard output with --json."""
     click.echo(json.dumps(values, indent=1, allow_nan=False))
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Rows of words and numbers as aligned text: the first column to the left, the others to the right."""
+def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Format rows as aligned text, the first column to the left and the others to the right."""
     lines = [list(header), *map(list, rows)]
-    widths = [max(_columns(line[column]) for line in lines) for column in range(len(header))]
+    widths = [max(_display_width(line[column]) for line in lines) for column in range(len(header))]
 
     def align(line: Sequence[str]) -> str:
-        gaps = [" " * (width - _columns(cell)) for cell, width in zip(line, widths, strict=True)]
+        gaps = [" " * (width - _display_width(cell)) for cell, width in zip(line, widths, strict=True)]
         cells = [line[0] + gaps[0], *(gap + cell for cell, gap in zip(line[1:], gaps[1:], strict=True))]
         return "  ".join(cells).rstrip()
 
@@ -254,8 +268,8 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([first, "  ".join("-" * width for width in widths), *others])
 
 
-def _columns(text: str) -> int:
-    """How many columns of a terminal a text takes: wide characters (CJK) take two."""
+def _display_width(text: str) -> int:
+    """Return the number of terminal columns that a text takes; wide characters (CJK) take two."""
     if text.isascii():
         return len(text)
     from rich.cells import cell_len

@@ -1,4 +1,4 @@
-"""`hyrfpack compare`."""
+"""The command `hyrfpack compare`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`hyrfpack convert`."""
+"""The command `hyrfpack convert`."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hyrfpack.cli.common import OUTPUT, PATH, json_option, note, note_rename, overwrite_option, print_json, table
+from hyrfpack.cli.common import OUTPUT, PATH, format_table, json_option, note, note_rename, overwrite_option, print_json
 from hyrfpack.cli.export import crop_option, min_opacity_option
-from hyrfpack.cli.progress import shown_progress
+from hyrfpack.cli.progress import show_progress
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def convert(
 
     find_target_format(source, target)
     Outputs(source, folder=sog_folder(source), overwrite=overwrite).file(target)
-    with shown_progress("convert") as progress:
+    with show_progress("convert") as progress:
         report = run(
             source,
             target,
@@ -72,13 +72,13 @@ def convert(
     if as_json:
         print_json(report.to_dict())
         return
-    _print(source, report)
+    _print_report(source, report)
 
 
-def _print(source: Path, report: ConversionReport) -> None:
+def _print_report(source: Path, report: ConversionReport) -> None:
     before = [source.name, f"{report.gaussians_before:,}", str(report.degree_before), f"{report.bytes_before:,}"]
     after = [Path(report.file).name, f"{report.gaussians_after:,}", str(report.degree_after), f"{report.bytes_after:,}"]
-    click.echo(table(["file", "Gaussians", "SH degree", "bytes"], [before, after]))
+    click.echo(format_table(["file", "Gaussians", "SH degree", "bytes"], [before, after]))
     click.echo(
         f"{report.views} views of the file against the same of {source.name}: PSNR {report.psnr:.2f} dB, the worst "
         f"{report.psnr_worst:.2f}"

@@ -1,4 +1,4 @@
-"""`hyrfpack demo`."""
+"""The command `hyrfpack demo`."""
 
 from __future__ import annotations
 

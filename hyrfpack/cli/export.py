@@ -1,4 +1,4 @@
-"""`hyrfpack export`."""
+"""The command `hyrfpack export`."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from hyrfpack.choices import LOCAL_EXPOSURE, SPLAT_EXPOSURES
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
+    format_table,
     json_option,
     note,
     note_rename,
@@ -20,9 +21,8 @@ from hyrfpack.cli.common import (
     print_json,
     read_scene,
     scene_options,
-    table,
 )
-from hyrfpack.cli.progress import shown_progress
+from hyrfpack.cli.progress import show_progress
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 class _Box(click.ParamType):
-    """Six numbers with commas between: the least x, y, z, then the greatest."""
+    """An axis-aligned box as six numbers with commas between: minimum x, y, z, then maximum x, y, z."""
 
     name = "box"
 
@@ -48,8 +48,8 @@ class _Box(click.ParamType):
         return numbers
 
 
-class _Degree(click.ParamType):
-    """A degree of spherical harmonics, or the word for choosing one."""
+class _HarmonicsDegree(click.ParamType):
+    """A degree of spherical harmonics, or "auto", which becomes None."""
 
     name = "degree"
 
@@ -80,7 +80,7 @@ min_opacity_option = click.option(
 @click.option(
     "--sh-degree",
     "degree",
-    type=_Degree(),
+    type=_HarmonicsDegree(),
     default="auto",
     show_default=True,
     metavar="0-3|auto",
@@ -121,7 +121,7 @@ def export(
     spz_version: str,
     data: tuple[Path, ...],
     overwrite: bool,
-    reading: dict[str, Any],
+    reader_options: dict[str, Any],
     as_json: bool,
 ) -> None:
     """Write MODEL, a .hyrf file or the folder of a run, as what other programs read, and say what was lost on the way.
@@ -159,19 +159,19 @@ def export(
         raise HyrfError(f"{output}: {what}; name one MODEL")
     splats = [model for model in models if is_splats(model)]
     if splats and kind is not PLAYER_FOLDER:
-        raise HyrfError(_how_to_write_splats(splats[0], output, kind))
+        raise HyrfError(_splats_message(splats[0], output, kind))
     files = [model if model in splats else find_model(model) for model in models]
     if splats and data:
         raise HyrfError(f"{splats[0]}: photos go with .hyrf files only; leave out --data, or this file")
     if data and len(data) != len(models):
         raise HyrfError(f"--data is given {len(data)} times, for {len(models)} models; give it once for each, or not")
     check_request(kind, output, degree, crop, min_opacity, background, baked, exposure)
-    scenes = [read_scene(path, reading, describe(model)) for path, model in zip(data, files, strict=False)]
+    scenes = [read_scene(path, reader_options, describe(model)) for path, model in zip(data, files, strict=False)]
     if kind is PLAYER_FOLDER:
         check_folder(output, models, scenes, overwrite=overwrite, is_gallery=len(models) > 1)
     else:
         check_place(output, Outputs(*files, scene=scenes[0] if scenes else None, overwrite=overwrite), colmap)
-    with shown_progress("export") as progress:
+    with show_progress("export") as progress:
         if len(models) > 1:
             report = gallery(models, output, data=scenes, overwrite=overwrite, say=note)
         elif not models:
@@ -197,11 +197,11 @@ def export(
     if as_json:
         print_json(asdict(report))
         return
-    _print(report)
+    _print_report(report)
 
 
-def _how_to_write_splats(source: Path, output: Path, kind: FileKind) -> str:
-    """The sentence that names the command for splats of another program."""
+def _splats_message(source: Path, output: Path, kind: FileKind) -> str:
+    """Return the error message that names the right command for splats of another program."""
     from hyrfpack.splats.table import FORMATS
 
     if kind.ending in FORMATS:
@@ -213,7 +213,7 @@ def _how_to_write_splats(source: Path, output: Path, kind: FileKind) -> str:
 
 
 def _print_exposures(report: ExportReport) -> None:
-    """What local and consistent exposure of baked splats cost, as a table."""
+    """Print a table of the PSNR of baked splats with local and with consistent exposure."""
     photos = report.photos_by_exposure
     head = ["exposure of baked splats, not yet written", "PSNR (dB) as photographed"]
     rows = [
@@ -221,10 +221,10 @@ def _print_exposures(report: ExportReport) -> None:
         + ([f"{photos[name]:.2f}"] if photos else [])
         for name, psnr in report.psnr_by_exposure.items()
     ]
-    click.echo(table(head + (["PSNR (dB), held-out photos"] if photos else []), rows))
+    click.echo(format_table(head + (["PSNR (dB), held-out photos"] if photos else []), rows))
 
 
-def _print(report: ExportReport) -> None:
+def _print_report(report: ExportReport) -> None:
     if report.native:
         click.echo(
             f"{report.file}: {report.bytes:,} bytes, {report.gaussians:,} Gaussians, as they are: nothing is baked"
@@ -236,7 +236,7 @@ def _print(report: ExportReport) -> None:
             [f"baked to harmonics of degree {report.degree}, not yet written", f"{report.psnr_baked:.2f}"],
             [f"read back from the {ending} file", f"{report.psnr:.2f}"],
         ]
-        click.echo(table([f"against the model's own pictures, {report.views} views", "PSNR (dB)"], rows))
+        click.echo(format_table([f"against the model's own pictures, {report.views} views", "PSNR (dB)"], rows))
         click.echo(
             f"the first row is what baking loses, the second what baking and the rounding of {ending} lose together; "
             "neither compares with photos"

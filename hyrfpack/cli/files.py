@@ -1,4 +1,4 @@
-"""`hyrfpack compress`, `decompress` and `info`."""
+"""The commands `hyrfpack compress`, `decompress` and `info`."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
     SIZE,
-    at_one_exposure,
-    chosen_device,
+    choose_command_device,
     device_option,
+    format_consistent_psnr,
+    format_table,
     json_option,
-    named_model,
     note,
     note_rename,
-    number,
     overwrite_option,
     print_json,
     read_scene,
+    reject_nan,
+    resolve_model_file,
     scene_options,
-    table,
 )
-from hyrfpack.cli.processes import on_processes
-from hyrfpack.cli.progress import shown_progress
+from hyrfpack.cli.processes import processes_option
+from hyrfpack.cli.progress import show_progress
 from hyrfpack.errors import printable
 from hyrfpack.outputs import ARCHIVE_SUFFIXES, PICTURE_SUFFIXES, VIDEO_SUFFIXES, Outputs
 from hyrfpack.progress import report_part
@@ -40,8 +40,9 @@ if TYPE_CHECKING:
     from hyrfpack.progress import Report
     from hyrfpack.scene import Scene
 
-# Those of hyrfpack.format.codec, without loading torch.
-PROFILES, DEFAULT_PROFILE = ("raw", "paper", "compact"), "compact"
+# The same as in `hyrfpack.format.codec`, which cannot be imported without torch.
+PROFILES = ("raw", "paper", "compact")
+DEFAULT_PROFILE = "compact"
 
 
 @click.command(short_help="Pack a model into a small file.")
@@ -72,7 +73,7 @@ PROFILES, DEFAULT_PROFILE = ("raw", "paper", "compact"), "compact"
 @click.option(
     "--max-psnr-drop",
     type=click.FloatRange(min=0),
-    callback=number,
+    callback=reject_nan,
     metavar="DB",
     help="As small as can be for so many dB lost on the held-out photos of --data.",
 )
@@ -80,7 +81,7 @@ PROFILES, DEFAULT_PROFILE = ("raw", "paper", "compact"), "compact"
     "--report", type=OUTPUT, metavar="DIR", help="Write a page there: size against loss, pictures, error maps."
 )
 @overwrite_option
-@on_processes
+@processes_option
 @scene_options
 @device_option
 @json_option
@@ -96,7 +97,7 @@ def compress(
     max_psnr_drop: float | None,
     report: Path | None,
     overwrite: bool,
-    reading: dict[str, Any],
+    reader_options: dict[str, Any],
     device: str,
     as_json: bool,
     ranks: Ranks,
@@ -121,14 +122,14 @@ def compress(
     from hyrfpack.compress.report_page import REPORT_FILES
     from hyrfpack.format import describe
 
-    model = named_model(model)
-    place = chosen_device(device, ranks)
+    model = resolve_model_file(model)
+    torch_device = choose_command_device(device, ranks)
 
     def read() -> Scene | None:
         if data is not None:
-            scene: Scene | None = read_scene(data, reading, describe(model))
+            scene: Scene | None = read_scene(data, reader_options, describe(model))
         else:
-            scene = None if no_data or profile != DEFAULT_PROFILE else _photos_of(model)
+            scene = None if no_data or profile != DEFAULT_PROFILE else _load_training_photos(model)
         outputs = Outputs(model, scene=scene, overwrite=overwrite)
         outputs.file(output, ".hyrf")
         if report is not None:
@@ -136,7 +137,7 @@ def compress(
         return scene
 
     scene = ranks.run_on_all(read)
-    with shown_progress("compress") as progress:
+    with show_progress("compress") as progress:
         result = pack(
             model,
             output,
@@ -147,19 +148,19 @@ def compress(
             target_bytes=target_size,
             max_psnr_drop=max_psnr_drop,
             overwrite=overwrite,
-            device=place,
+            device=torch_device,
             say=note,
             report=report_part(progress, 0.0, 0.9),
             ranks=ranks,
         )
         if not ranks.is_main:
             return
-        scores = _scores(model, Path(result.file), scene, report_part(progress, 0.9, 1.0))
+        scores = _score_both_files(model, Path(result.file), scene, report_part(progress, 0.9, 1.0))
     written = note_rename(output, result.file)
     if report is not None:
         from hyrfpack.compress.report import write_report
 
-        command = _typed(click.get_current_context())
+        command = _command_as_typed(click.get_current_context())
         write_report(report, model, written, result, scene, command=command, overwrite=overwrite, say=note)
     _print_report(result, scores, as_json)
 
@@ -170,7 +171,7 @@ def compress(
 @click.option(
     "--fraction",
     type=click.FloatRange(0, 1),
-    callback=number,
+    callback=reject_nan,
     metavar="F",
     help="Use only so much of the file, from its start, such as 0.6: a coarser model.",
 )
@@ -190,7 +191,7 @@ def decompress(file: Path, output: Path, fraction: float | None, overwrite: bool
     """
     from hyrfpack.format import repack
 
-    file = named_model(file)
+    file = resolve_model_file(file)
     Outputs(file, overwrite=overwrite).file(output, ".hyrf")
     result = repack(file, output, fraction=fraction, overwrite=overwrite)
     note_rename(output, result.file)
@@ -223,22 +224,22 @@ def info(path: Path, as_json: bool) -> None:
     from hyrfpack.splats.names import is_splats
 
     if is_run_folder(path):
-        _describe_run(path, as_json)
+        _print_run(path, as_json)
     elif is_splats(path):
-        _describe_splats(path, as_json)
+        _print_splats(path, as_json)
     elif path.is_dir() or (
         path.is_file() and path.suffix.lower() in (*ARCHIVE_SUFFIXES, *VIDEO_SUFFIXES, *PICTURE_SUFFIXES)
     ):
-        _describe_photos(path, as_json)
+        _print_photos(path, as_json)
     else:
-        _describe_model(path, as_json)
+        _print_model(path, as_json)
 
 
-def _describe_photos(path: Path, as_json: bool) -> None:
+def _print_photos(path: Path, as_json: bool) -> None:
     from hyrfpack.cli.survey import print_survey
     from hyrfpack.make.survey import describe_photos
 
-    with shown_progress("info") as progress:
+    with show_progress("info") as progress:
         survey = describe_photos(path, report=progress)
     if as_json:
         print_json(asdict(survey))
@@ -246,7 +247,7 @@ def _describe_photos(path: Path, as_json: bool) -> None:
         print_survey(survey)
 
 
-def _describe_run(folder: Path, as_json: bool) -> None:
+def _print_run(folder: Path, as_json: bool) -> None:
     from hyrfpack.format import describe, read_run_status
     from hyrfpack.format.run_folder import MODEL_FILE, describe_unfinished_run
 
@@ -258,20 +259,20 @@ def _describe_run(folder: Path, as_json: bool) -> None:
     if run.finished:
         steps = "" if run.steps is None else f": {run.steps:,} steps"
         seconds = "" if run.seconds is None else f" in {run.seconds:,.0f} s"
-        _say(f"{folder}: a finished training run{steps}{seconds}")
+        _print_line(f"{folder}: a finished training run{steps}{seconds}")
     else:
-        _say(f"{folder}: {describe_unfinished_run(run)}")
+        _print_line(f"{folder}: {describe_unfinished_run(run)}")
     if run.photos is not None:
-        _say(f"photos: {run.photos}, {run.train} to train on and {run.test} held out")
+        _print_line(f"photos: {run.photos}, {run.train} to train on and {run.test} held out")
     if run.psnr is not None and run.ssim is not None:
-        consistent = at_one_exposure(run.psnr_consistent)
-        _say(f"held-out photos: PSNR {run.psnr:.2f} dB{consistent}, SSIM {run.ssim:.4f}")
+        consistent = format_consistent_psnr(run.psnr_consistent)
+        _print_line(f"held-out photos: PSNR {run.psnr:.2f} dB{consistent}, SSIM {run.ssim:.4f}")
     if facts:
         click.echo()
-        _print_model(folder / MODEL_FILE, facts)
+        _print_model_facts(folder / MODEL_FILE, facts)
 
 
-def _describe_splats(path: Path, as_json: bool) -> None:
+def _print_splats(path: Path, as_json: bool) -> None:
     from hyrfpack.splats.facts import describe_splats
     from hyrfpack.splats.files import read_splats
 
@@ -289,51 +290,51 @@ def _describe_splats(path: Path, as_json: bool) -> None:
         low, high = (", ".join(f"{value:.4g}" for value in corner) for corner in (facts.low, facts.high))
         rows += [("centres", f"from ({low}) to ({high}), world units"), ("opacity", f"median {facts.opacity:.2f}")]
     for name, text in rows:
-        _say(f"  {name:<14}  {text}")
+        _print_line(f"  {name:<14}  {text}")
 
 
-def _describe_model(file: Path, as_json: bool) -> None:
+def _print_model(file: Path, as_json: bool) -> None:
     from hyrfpack.format import describe
 
     facts = describe(file)
     if as_json:
         print_json(facts)
     else:
-        _print_model(file, facts)
+        _print_model_facts(file, facts)
 
 
-def _print_model(file: Path, facts: dict) -> None:
+def _print_model_facts(file: Path, facts: dict) -> None:
     config, provenance = facts["config"], facts["provenance"]
     click.echo(f"{file}: {facts['bytes']:,} bytes, {facts['gaussians']:,} Gaussians")
-    _say(f"written by {facts['writer']}, format {facts['version']}, profile {facts['profile']}")
+    _print_line(f"written by {facts['writer']}, format {facts['version']}, profile {facts['profile']}")
     click.echo("\n" + _section_table(facts["sections"], facts["bytes"], facts["gaussians"]))
     click.echo("\nmodel")
     frame = config["frame"]
     center = ", ".join(f"{value:.4g}" for value in frame["center"])
     half = " x ".join(f"{2.0 * value * frame['scale']:.4g}" for value in frame["half_extent"])
-    _say(f"  {'box':<18}  {half} around ({center}), world units")
+    _print_line(f"  {'box':<18}  {half} around ({center}), world units")
     for name in ("geometry", "radiance"):
-        _say(f"  {name + ' grid':<18}  {_in_words(config[name])}")
+        _print_line(f"  {name + ' grid':<18}  {_format_settings(config[name])}")
     if (exposure := facts["exposure"]) is not None:
         lowest, highest = exposure["stops"]
-        _say(f"  {'exposure map':<18}  {exposure['centers']} centres, {lowest:+.2f} to {highest:+.2f} stops")
+        _print_line(f"  {'exposure map':<18}  {exposure['centers']} centres, {lowest:+.2f} to {highest:+.2f} stops")
     for name, value in config.items():
         if name not in ("frame", "geometry", "radiance"):
-            _say(f"  {name.replace('_', ' '):<18}  {value}")
+            _print_line(f"  {name.replace('_', ' '):<18}  {value}")
     choices = provenance.get("choices")
     if choices and isinstance(choices, dict):
         click.echo("\nchosen in training")
         for name, reason in choices.items():
-            _say(f"  {name.replace('_', ' '):<18}  {reason}")
+            _print_line(f"  {name.replace('_', ' '):<18}  {reason}")
 
 
-def _say(line: str) -> None:
-    """Print a line with words of the file in it."""
+def _print_line(line: str) -> None:
+    """Print a line that may quote the file; its unprintable characters become escapes."""
     click.echo(printable(line))
 
 
-def _typed(context: click.Context) -> str:
-    """The command as it was given, from its parameters."""
+def _command_as_typed(context: click.Context) -> str:
+    """Return the command line of a command, with the parameters that were given there."""
     words = ["hyrfpack", str(context.info_name)]
     for parameter in context.command.params:
         given = context.get_parameter_source(str(parameter.name)) is click.core.ParameterSource.COMMANDLINE
@@ -349,8 +350,8 @@ def _typed(context: click.Context) -> str:
     return shlex.join(words)
 
 
-def _photos_of(model: Path) -> Scene | None:
-    """Those that a run's model was trained on, unless they cannot be had, which is said."""
+def _load_training_photos(model: Path) -> Scene | None:
+    """Load the photos that the model of a run was trained on; None, with a note, where they cannot be read."""
     from hyrfpack.errors import HyrfDataError
     from hyrfpack.train import photos_of
 
@@ -364,8 +365,8 @@ def _photos_of(model: Path) -> Scene | None:
     return scene
 
 
-def _scores(before: Path, after: Path, scene: Scene | None, report: Report) -> dict[str, float]:
-    """Mean PSNR and SSIM on held-out photos of both files, where there are photos."""
+def _score_both_files(before: Path, after: Path, scene: Scene | None, report: Report) -> dict[str, float]:
+    """Return mean PSNR and SSIM of both files on the held-out photos; empty if there are none."""
     if scene is None or not scene.test:
         return {}
     from hyrfpack.evaluate import evaluate
@@ -397,7 +398,7 @@ def _print_report(report: CompressionReport, scores: dict[str, float], as_json: 
 
 
 def _section_table(sections: list[dict], total: int, gaussians: int, shares: dict[str, float] | None = None) -> str:
-    """Bytes of each section, all layers together, and what part of the loss comes from it where that is known."""
+    """Format a table of the bytes of each section, summed over its layers, and of its share of the loss if known."""
     from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, SECTION_CONTENTS, group_and_layer
 
     together: dict[str, list] = {}
@@ -426,8 +427,8 @@ def _section_table(sections: list[dict], total: int, gaussians: int, shares: dic
     if shares:
         left_out = sum(share for part, share in shares.items() if part not in together)
         rows.append(["Gaussians left out", "", "", "", "", "", f"{left_out:.1%}"])
-    return table([*header, *(["of the loss"] if shares else [])], rows)
+    return format_table([*header, *(["of the loss"] if shares else [])], rows)
 
 
-def _in_words(values: dict) -> str:
+def _format_settings(values: dict) -> str:
     return ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in values.items())

@@ -1,4 +1,4 @@
-"""`hyrfpack import`."""
+"""The command `hyrfpack import`."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
     SEED,
-    chosen_device,
+    choose_command_device,
     device_option,
+    format_table,
     json_option,
     note,
     note_rename,
-    number,
     overwrite_option,
     print_json,
-    table,
+    reject_nan,
 )
-from hyrfpack.cli.progress import shown_progress
+from hyrfpack.cli.progress import show_progress
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 @click.option(
     "--psnr",
     type=click.FloatRange(10, 60),
-    callback=number,
+    callback=reject_nan,
     default=37.0,
     show_default=True,
     metavar="DB",
@@ -85,45 +85,53 @@ def import_(
       hyrfpack import scene.spz -o scene.hyrf --steps 1500 --psnr 40
       hyrfpack import room.ply -o room.hyrf --cameras photos/room --size 800
     """
-    loose = source.parent if source.name == "meta.json" else source  # a SOG is a folder, or a file
-    Outputs(source, cameras, folder=loose, overwrite=overwrite).file(output, ".hyrf")
+    folder = source.parent if source.name == "meta.json" else source  # a SOG may be a folder that holds meta.json
+    Outputs(source, cameras, folder=folder, overwrite=overwrite).file(output, ".hyrf")
     from hyrfpack.distill import DistillConfig, distill
 
-    cameras = cameras or _left_beside(source)
-    given = None if cameras is None else _cameras(cameras)
-    place = chosen_device(device)
+    cameras = cameras or _find_training_cameras(source)
+    given = None if cameras is None else _read_cameras(cameras)
+    torch_device = choose_command_device(device)
     config = DistillConfig(steps=steps, psnr=psnr, size=size, seed=seed)
-    with shown_progress("import") as progress:
+    with show_progress("import") as progress:
         report = distill(
-            source, output, config, cameras=given, overwrite=overwrite, device=place, say=note, report=progress
+            source, output, config, cameras=given, overwrite=overwrite, device=torch_device, say=note, report=progress
         )
     written = note_rename(output, report.file)
     if as_json:
         print_json(report.to_dict())
         return
     rows = [
-        [source.name, f"{report.gaussians_before:,}", f"{report.bytes_source:,}", _times(report, report.bytes_source)],
-        ["as PLY", f"{report.gaussians_before:,}", f"{report.bytes_ply:,}", _times(report, report.bytes_ply)],
+        [
+            source.name,
+            f"{report.gaussians_before:,}",
+            f"{report.bytes_source:,}",
+            _format_ratio(report, report.bytes_source),
+        ],
+        ["as PLY", f"{report.gaussians_before:,}", f"{report.bytes_ply:,}", _format_ratio(report, report.bytes_ply)],
         [written.name, f"{report.gaussians_after:,}", f"{report.bytes_after:,}", ""],
     ]
-    click.echo(table(["file", "Gaussians", "bytes", "smaller by"], rows))
+    click.echo(format_table(["file", "Gaussians", "bytes", "smaller by"], rows))
     click.echo(
         f"{report.views} held-out views: {report.psnr:.2f} dB against the original, the worst {report.psnr_worst:.2f}; "
         f"{report.seconds:.0f} s"
     )
 
 
-def _left_beside(source: Path) -> Path | None:
-    """The cameras of 3DGS training, whose output is cameras.json and point_cloud/iteration_30000/point_cloud.ply."""
-    left = source.absolute().parents[2:3]
-    if source.name != "point_cloud.ply" or not left or not (left[0] / "cameras.json").is_file():
+def _find_training_cameras(source: Path) -> Path | None:
+    """Return the cameras.json that 3DGS training has left, whose splats these are; None if there is none.
+
+    That training writes cameras.json and point_cloud/iteration_30000/point_cloud.ply into one folder.
+    """
+    folders = source.absolute().parents[2:3]
+    if source.name != "point_cloud.ply" or not folders or not (folders[0] / "cameras.json").is_file():
         return None
-    note(f"taking the cameras of the training: {left[0] / 'cameras.json'}")
-    return left[0] / "cameras.json"
+    note(f"taking the cameras of the training: {folders[0] / 'cameras.json'}")
+    return folders[0] / "cameras.json"
 
 
-def _cameras(path: Path) -> list[Camera]:
-    """Of a file of cameras, or of photos and poses."""
+def _read_cameras(path: Path) -> list[Camera]:
+    """Read the cameras of a JSON file, or of a folder or archive of photos and poses."""
     from hyrfpack.cameras.files import cameras_from_json
     from hyrfpack.data import load_scene
     from hyrfpack.data.archive import is_archive
@@ -133,5 +141,6 @@ def _cameras(path: Path) -> list[Camera]:
     return [camera for _, camera in cameras_from_json(path)]
 
 
-def _times(report: DistillReport, size: int | None) -> str:
+def _format_ratio(report: DistillReport, size: int | None) -> str:
+    """Return how many times larger a size is than that of the file written; "" for no size."""
     return "" if size is None else f"{size / report.bytes_after:.1f}x"

@@ -1,4 +1,4 @@
-"""The options --view and --view-port of commands that train."""
+"""The options --view and --view-port of commands that train a model."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Command = TypeVar("Command", bound=Callable)
 
 
 def view_options(command: Command) -> Command:
-    """Options that show the training in a browser: --view, --view-port."""
+    """Add the options that show the training in a browser: --view, --view-port."""
     with_options: Any = command
     for option in (
         click.option(
@@ -31,18 +31,21 @@ def view_options(command: Command) -> Command:
 
 
 @contextmanager
-def training_view(
+def serve_training_view(
     title: str, view: bool, view_port: int | None, say: Callable[[str], None]
 ) -> Iterator[Callable[[Trainer], None] | None]:
-    """The observer of a training that --view asks for; None without it.
+    """Serve a page that shows the training, if --view asks for it, while the block runs.
+
+    Yields:
+        The observer of the training that updates the page; None without --view.
 
     Args:
-        title: of the page.
-        view, view_port: the options.
+        title: title of the page.
+        view, view_port: values of the options.
         say: called with a sentence that names the page's address.
 
     Raises:
-        UsageError: --view-port is given alone.
+        UsageError: --view-port is given without --view.
         HyrfError: nothing can listen at this port.
     """
     if view_port is not None and not view:

@@ -1,4 +1,4 @@
-"""`hyrfpack make`."""
+"""The command `hyrfpack make`."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from hyrfpack.cli.common import (
     PATH,
     SEED,
     SIZE,
-    at_one_exposure,
-    chosen_device,
+    choose_command_device,
+    format_consistent_psnr,
     json_option,
     note,
     note_rename,
-    number,
     overwrite_option,
     print_json,
+    reject_nan,
 )
-from hyrfpack.cli.live import training_view, view_options
+from hyrfpack.cli.live import serve_training_view, view_options
 
 if TYPE_CHECKING:
     from hyrfpack.make import MakeResult
 
-LISTED = 5  # photos that were left out
+MAX_LISTED_PHOTOS = 5
 
 
 @click.command(short_help="Photos in, scene out: the whole way.")
@@ -37,7 +37,7 @@ LISTED = 5  # photos that were left out
 @click.option(
     "--minutes",
     type=click.FloatRange(min=0, min_open=True),
-    callback=number,
+    callback=reject_nan,
     metavar="N",
     help="Instead of a quality: be ready in about so many minutes, poses included.",
 )
@@ -114,15 +114,15 @@ def make(
         raise click.UsageError("--quality and --minutes each decide how long to work; give one of them")
     if target_size is not None and max_gaussians is not None:
         raise click.UsageError("--max-gaussians and --target-size each decide how large the model is; give one of them")
-    from hyrfpack.cli.progress import command_display
+    from hyrfpack.cli.progress import create_command_display
     from hyrfpack.make import Stopped
     from hyrfpack.make import make as run
 
-    place = chosen_device(device)
+    torch_device = choose_command_device(device)
     try:
         with (
-            command_display() as display,
-            training_view(output.name, view, view_port, display.say) as observer,
+            create_command_display() as display,
+            serve_training_view(output.name, view, view_port, display.say) as observer,
         ):
             result = run(
                 photos,
@@ -138,7 +138,7 @@ def make(
                 max_gaussians=max_gaussians,
                 preset=preset,
                 seed=seed,
-                device=place,
+                device=torch_device,
                 overwrite=overwrite,
                 report=display.show,
                 say=display.say,
@@ -151,35 +151,38 @@ def make(
     if as_json:
         print_json(result.to_dict())
         return
-    _print(result)
+    _print_result(result)
 
 
-def _print(result: MakeResult) -> None:
-    """The end of it in short: doubts about poses were told as they came up, and all figures are in the work folder."""
+def _print_result(result: MakeResult) -> None:
+    """Print a summary of the result.
+
+    Doubts about poses have been printed as they came up, and the work folder holds all figures.
+    """
     poses = result.poses
     if poses:
         sure = f", {poses['sure']} of them sure" if poses["sure"] < poses["registered"] else ""
         click.echo(f"poses: {poses['registered']} of {poses['photos']} photos{sure}")
-        for name, reason in list(poses["left_out"].items())[:LISTED]:
+        for name, reason in list(poses["left_out"].items())[:MAX_LISTED_PHOTOS]:
             click.echo(f"  left out: {name}, {reason}")
-        if (more := len(poses["left_out"]) - LISTED) > 0:
+        if (more := len(poses["left_out"]) - MAX_LISTED_PHOTOS) > 0:
             click.echo(f"  left out: {more} more, see {result.work / 'scene' / 'poses.json'}")
     times = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())
     total = f"{result.total_seconds:.0f} s in all"
     click.echo(f"times: {times}, {total}; {result.work} keeps what each stage made, and may be deleted")
     if result.psnr is not None:
         photos = f"{result.views} photo{'s' if result.views > 1 else ''}"
-        consistent = at_one_exposure(result.psnr_consistent)
+        consistent = format_consistent_psnr(result.psnr_consistent)
         click.echo(f"{photos} held out: PSNR {result.psnr:.2f} dB{consistent}, SSIM {result.ssim:.4f}")
     elif result.training:
         click.echo("no photo is held out, so that nothing is scored")
     if result.note:
         click.echo(result.note)
-    click.echo(f"{result.output}: {result.bytes:,} bytes, {result.gaussians:,} Gaussians; {_where_to_look(result)}")
+    click.echo(f"{result.output}: {result.bytes:,} bytes, {result.gaussians:,} Gaussians; {_viewing_hint(result)}")
 
 
-def _where_to_look(result: MakeResult) -> str:
-    """What to do to see it."""
+def _viewing_hint(result: MakeResult) -> str:
+    """Return what the user can do to look at the result."""
     output = result.output
     if output.suffix.lower() == ".html":
         return "open it in a browser"

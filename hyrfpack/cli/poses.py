@@ -1,4 +1,4 @@
-"""`hyrfpack poses`."""
+"""The command `hyrfpack poses`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING
 import click
 
 from hyrfpack.choices import MATCHING_METHODS
-from hyrfpack.cli.common import OUTPUT, PATH, SEED, detail, json_option, note, print_json
+from hyrfpack.cli.common import OUTPUT, PATH, SEED, json_option, note, note_if_verbose, print_json
 
 if TYPE_CHECKING:
     from hyrfpack.poses import PosesReport
 
-_TOLD = 5  # photos that are named, of each reason that some were left out for
+# Photos without a pose that are named for each reason; the others are counted.
+_MAX_NAMED_PHOTOS = 5
 
 
 @click.command(short_help="Find where photos were taken, or the frames of a video.")
@@ -47,15 +48,15 @@ def poses(
       hyrfpack poses clip.mp4 -o scenes/clip
       hyrfpack train scenes/garden -o runs/garden
     """
-    from hyrfpack.cli.progress import command_display
+    from hyrfpack.cli.progress import create_command_display
     from hyrfpack.make.progress import Reporter
     from hyrfpack.poses import estimate_poses
 
     try:
-        with command_display() as display:
+        with create_command_display() as display:
             reporter = Reporter(["poses"], display.show)
             reporter.begin("poses")
-            found = estimate_poses(
+            result = estimate_poses(
                 photos,
                 out,
                 matching=matching,
@@ -68,21 +69,21 @@ def poses(
     except KeyboardInterrupt:
         note("stopped; the same command goes on from here")
         click.get_current_context().exit(1)
-    detail("seconds: " + ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in found.seconds.items()))
+    note_if_verbose("seconds: " + ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in result.seconds.items()))
     if as_json:
-        print_json(asdict(found) | {"scene": str(found.scene)})
+        print_json(asdict(result) | {"scene": str(result.scene)})
     else:
-        _print(found)
+        _print_result(result)
 
 
-def _print(found: PosesReport) -> None:
-    """What came out, what is in doubt, and what comes next."""
+def _print_result(result: PosesReport) -> None:
+    """Print how many photos have a pose, which were left out and why, and the next command."""
     click.echo(
-        f"{found.scene}: {found.registered} of {found.photos} photos have a pose, {found.sure} of them for sure; "
-        f"{found.why}"
+        f"{result.scene}: {result.registered} of {result.photos} photos have a pose, {result.sure} of them for sure; "
+        f"{result.why}"
     )
-    for reason, count in Counter(found.left_out.values()).most_common():
-        names = [name for name, why in found.left_out.items() if why == reason]
-        more = f" and {count - _TOLD} more" if count > _TOLD else ""
-        click.echo(f"left out, {reason}: {', '.join(names[:_TOLD])}{more}")
-    click.echo(f"next: hyrfpack train {found.scene} -o runs/{found.scene.resolve().name}")
+    for reason, count in Counter(result.left_out.values()).most_common():
+        names = [name for name, why in result.left_out.items() if why == reason]
+        more = f" and {count - _MAX_NAMED_PHOTOS} more" if count > _MAX_NAMED_PHOTOS else ""
+        click.echo(f"left out, {reason}: {', '.join(names[:_MAX_NAMED_PHOTOS])}{more}")
+    click.echo(f"next: hyrfpack train {result.scene} -o runs/{result.scene.resolve().name}")

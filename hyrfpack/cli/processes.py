@@ -1,4 +1,4 @@
-"""--processes: commands that several processes carry out together, and what only one of them says."""
+"""The option --processes of commands that several processes carry out together, of which only rank 0 prints."""
 
 from __future__ import annotations
 
@@ -10,39 +10,42 @@ from typing import Any, TypeVar
 
 import click
 
-from hyrfpack.cli.manners import arguments_of, note
+from hyrfpack.cli.console import note, stored_arguments
 from hyrfpack.errors import HyrfError
 
 Command = TypeVar("Command", bound=Callable)
 
-OPTION = "--processes"
+PROCESSES_OPTION = "--processes"
 
 
-def on_processes(command: Command) -> Command:
-    """Give a command --processes, and let it run on those that torchrun or srun has started, which it gets as `ranks`.
+def processes_option(command: Command) -> Command:
+    """Add the option --processes to a command, and let it run in several processes.
 
-    Rank 0 alone speaks.
+    The option starts them; torchrun or srun may have started them instead. The command gets them as the argument
+    `ranks`. Only rank 0 prints.
     """
 
     @functools.wraps(command)
-    def together(*args: Any, processes: int | None, **options: Any) -> Any:
+    def run_in_group(*args: Any, processes: int | None, **options: Any) -> Any:
         from hyrfpack.parallel.ranks import join_processes, ranks_from_environment
 
         started = ranks_from_environment(os.environ)
         if processes is not None and not started.is_single:
-            with _heard(started.is_main):
-                raise click.UsageError(f"torchrun or srun has started {started.size} processes; leave out {OPTION}")
+            with _silence_unless(started.is_main):
+                raise click.UsageError(
+                    f"torchrun or srun has started {started.size} processes; leave out {PROCESSES_OPTION}"
+                )
         if processes is not None and processes > 1:
             from hyrfpack.parallel.launch import launch
 
             ctx = click.get_current_context()
-            ctx.exit(launch(without(arguments_of(ctx)), processes, note))
-        with join_processes() as ranks, _heard(ranks.is_main):
+            ctx.exit(launch(remove_option(stored_arguments(ctx)), processes, note))
+        with join_processes() as ranks, _silence_unless(ranks.is_main):
             return command(*args, ranks=ranks, **options)
 
-    with_option: Any = together
+    with_option: Any = run_in_group
     option = click.option(
-        OPTION,
+        PROCESSES_OPTION,
         type=click.IntRange(1, 1024),
         metavar="N",
         help="Share the work among N processes of this machine, one a GPU; torchrun starts them on several.",
@@ -51,9 +54,9 @@ def on_processes(command: Command) -> Command:
 
 
 @contextmanager
-def _heard(leads: bool) -> Iterator[None]:
-    """Say nothing where rank 0 says it."""
-    if leads:
+def _silence_unless(is_main: bool) -> Iterator[None]:
+    """Suppress all output in the block unless this is the main process, which prints the same."""
+    if is_main:
         yield
         return
     try:
@@ -63,11 +66,11 @@ def _heard(leads: bool) -> Iterator[None]:
         click.get_current_context().exit(2)
 
 
-def without(arguments: Sequence[str], option: str = OPTION) -> list[str]:
-    """Arguments less an option and its value.
+def remove_option(arguments: Sequence[str], option: str = PROCESSES_OPTION) -> list[str]:
+    """Return arguments without an option and its value.
 
     Example:
-        >>> without(["train", "photos", "--processes", "2", "--steps", "9"])
+        >>> remove_option(["train", "photos", "--processes", "2", "--steps", "9"])
         ['train', 'photos', '--steps', '9']
     """
     left, words = [], iter(arguments)

@@ -1,4 +1,4 @@
-"""How commands show that long work goes on."""
+"""Progress of long commands on standard error."""
 
 from __future__ import annotations
 
@@ -6,30 +6,30 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from hyrfpack.cli.wording import with_options
+from hyrfpack.cli.wording import use_option_names
 
 if TYPE_CHECKING:
     from hyrfpack.make.display import Display
     from hyrfpack.progress import Report
 
 
-def command_display() -> Display:
-    """Return the display of a command, which names options where library sentences name Python arguments."""
+def create_command_display() -> Display:
+    """Return a progress display that names options where messages of the library name Python arguments."""
     from hyrfpack.make.display import Display
 
-    return Display(with_options)
+    return Display(use_option_names)
 
 
 @contextmanager
-def shown_progress(command: str) -> Iterator[Report]:
-    """Show the progress of a command on standard error: what it is doing, the time gone and the time left.
+def show_progress(command: str) -> Iterator[Report]:
+    """Show the progress of a command on standard error: what it is doing, elapsed time and remaining time.
 
     Yields:
-        What the work reports to. Sentences printed meanwhile appear above the line.
+        The function that the work reports its progress to. Sentences printed meanwhile appear above the line.
     """
     from hyrfpack.make.progress import Reporter
 
-    with command_display() as display:
+    with create_command_display() as display:
         reporter = Reporter([command], display.show)
         reporter.begin(command)
         yield lambda doing, share: reporter.update(share, doing)

@@ -1,4 +1,4 @@
-"""How `hyrfpack info` prints what photos or a video are like."""
+"""Printing of the survey of photos or a video for `hyrfpack info`."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hyrfpack.cli.wording import with_options
+from hyrfpack.cli.wording import use_option_names
 from hyrfpack.errors import printable
 
 if TYPE_CHECKING:
     from hyrfpack.make.survey import PhotoSurvey
 
-_LISTED = 4  # sizes and cameras
+_MAX_LISTED_KINDS = 4  # sizes of photos, or cameras
 
 
 def print_survey(survey: PhotoSurvey) -> None:
-    """Print a survey: a line for each fact, then what is wrong and what to do."""
+    """Print a survey: a line for each fact, then each problem with what to do."""
     video = survey.kind == "video"
     things = "frames" if video else "photo" if survey.photos == 1 else "photos"
-    _say(f"{survey.path}: {survey.photos:,} {things}")
+    _print_line(f"{survey.path}: {survey.photos:,} {things}")
     rows = [
         ("poses", f"{survey.posed:,} as {survey.layout}, {survey.points:,} points" if survey.layout else "none"),
-        ("sizes", _counts(survey.sizes)),
-        ("cameras", _counts(survey.cameras)),
+        ("sizes", _format_counts(survey.sizes)),
+        ("cameras", _format_counts(survey.cameras)),
         ("preset", survey.preset),
     ]
     if video:
@@ -34,20 +34,21 @@ def print_survey(survey: PhotoSurvey) -> None:
         rows.append(("light", f"{survey.luminance:.2f} of white in the mean, even within {survey.stops:.1f} stops"))
     for name, text in rows:
         if text:
-            _say(f"  {name:<10} {text}")
+            _print_line(f"  {name:<10} {text}")
     for note in survey.notes:
-        _say(f"  {with_options(note)}")
+        _print_line(f"  {use_option_names(note)}")
     click.echo("\nwhat to do" if survey.problems else "\nnothing is wrong with it")
     for problem in survey.problems:
-        _say(f"  - {with_options(problem)}")
+        _print_line(f"  - {use_option_names(problem)}")
 
 
-def _counts(counted: dict[str, int]) -> str:
-    """ "98 of 400 x 266, 2 of 266 x 400" """
-    parts = [f"{count:,} of {name}" for name, count in list(counted.items())[:_LISTED]]
-    more = len(counted) - _LISTED
+def _format_counts(counts: dict[str, int]) -> str:
+    """Return counts by name as text, such as "98 of 400 x 266, 2 of 266 x 400"."""
+    parts = [f"{count:,} of {name}" for name, count in list(counts.items())[:_MAX_LISTED_KINDS]]
+    more = len(counts) - _MAX_LISTED_KINDS
     return ", ".join(parts) + (f" and {more} more kinds" if more > 0 else "")
 
 
-def _say(line: str) -> None:
+def _print_line(line: str) -> None:
+    """Print a line that may quote file names; their unprintable characters become escapes."""
     click.echo(printable(line))

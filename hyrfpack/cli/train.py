@@ -1,4 +1,4 @@
-"""`hyrfpack train`."""
+"""The command `hyrfpack train`."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from hyrfpack.cli.common import (
     PATH,
     SEED,
     SIZE,
-    at_one_exposure,
-    chosen_device,
-    detail,
+    choose_command_device,
     device_options,
+    format_consistent_psnr,
     json_option,
     note,
+    note_if_verbose,
     note_rename,
     print_json,
     read_scene,
     scene_options,
 )
-from hyrfpack.cli.live import training_view, view_options
-from hyrfpack.cli.processes import on_processes
+from hyrfpack.cli.live import serve_training_view, view_options
+from hyrfpack.cli.processes import processes_option
 from hyrfpack.errors import HyrfNoPosesError
 
 if TYPE_CHECKING:
@@ -77,13 +77,13 @@ BACKGROUND_COLORS = ("black", "white", "random")
 @click.option("--poses", is_flag=True, help="Where DATA has no poses, estimate them first, into RUN/scene.")
 @click.option("--resume", is_flag=True, help="Go on from the run's checkpoint.")
 @click.option("--overwrite", is_flag=True, help="Replace what an earlier run left in the folder.")
-@on_processes
+@processes_option
 @device_options
 @json_option
 def train(
     data: Path,
     out: Path,
-    reading: dict[str, Any],
+    reader_options: dict[str, Any],
     cache_mb: int | None,
     log: Path | None,
     view: bool,
@@ -133,29 +133,33 @@ def train(
     from hyrfpack.train import train as run
     from hyrfpack.train.run import is_begun, resuming
 
-    place = chosen_device(device, ranks)
+    torch_device = choose_command_device(device, ranks)
     try:
-        scene = ranks.run_on_all(lambda: read_scene(data, reading))
+        scene = ranks.run_on_all(lambda: read_scene(data, reader_options))
     except HyrfNoPosesError:
         if not poses:
             raise
-        scene = read_scene(_posed(data, out, reading["images"], resume, overwrite), {**reading, "images": None})
-    where = describe_device(place) + ("" if ranks.is_single else f" in each of {ranks.size} processes")
+        scene = read_scene(
+            _estimate_poses(data, out, reader_options["images"], resume, overwrite), {**reader_options, "images": None}
+        )
+    where = describe_device(torch_device) + ("" if ranks.is_single else f" in each of {ranks.size} processes")
     note(f"{scene.layout} scene: {len(scene.train)} photos to train on, {len(scene.test)} held out; on {where}")
     cache = None if cache_mb is None else PictureCache(cache_mb * 2**20 // ranks.local_size)
     config = TrainConfig(**settings)
-    with training_view(out.name, view and ranks.is_main, view_port, note) as observer:
+    with serve_training_view(out.name, view and ranks.is_main, view_port, note) as observer:
         try:
             result = run(
-                scene, out, config, resume=resume, overwrite=overwrite, cache=cache, device=place, observer=observer,
-                log=log, ranks=ranks,
+                scene, out, config, resume=resume, overwrite=overwrite, cache=cache, device=torch_device,
+                observer=observer, log=log, ranks=ranks,
             )  # fmt: skip
         except KeyboardInterrupt:
             if not is_begun(out):
                 raise
             note(f"stopped; {resuming(overwrite)} goes on")
             click.get_current_context().exit(1)
-    detail("seconds: " + ", ".join(f"{part} {t:.1f}" for part, t in result.metrics.get("stage_seconds", {}).items()))
+    note_if_verbose(
+        "seconds: " + ", ".join(f"{part} {t:.1f}" for part, t in result.metrics.get("stage_seconds", {}).items())
+    )
     if not result.complete and result.step == 0:
         note("stopped before the first step; the same command begins anew")
     elif not result.complete:
@@ -173,7 +177,7 @@ def train(
             f"{metrics['seconds']:.0f} s of training"
         )
         if scores := metrics.get("evaluation"):
-            consistent = at_one_exposure(scores.get("psnr_consistent"))
+            consistent = format_consistent_psnr(scores.get("psnr_consistent"))
             click.echo(f"held-out views: {scores['psnr']:.2f} dB{consistent}, SSIM {scores['ssim']:.4f}")
         if view:
             note(f"'hyrfpack view {result.model}' shows the model again")
@@ -181,13 +185,13 @@ def train(
         click.get_current_context().exit(1)
 
 
-def _posed(photos: Path, run: Path, images: str | None, resume: bool, overwrite: bool) -> Path:
-    """The folder of the scene that photos without poses become."""
-    from hyrfpack.cli.progress import command_display
+def _estimate_poses(photos: Path, run: Path, images: str | None, resume: bool, overwrite: bool) -> Path:
+    """Estimate the poses of photos and return the folder of the scene, which lies in the folder of the run."""
+    from hyrfpack.cli.progress import create_command_display
     from hyrfpack.make.posed import SCENE, posed
 
     try:
-        with command_display() as display:
+        with create_command_display() as display:
             return posed(
                 photos, run, images=images, resume=resume, overwrite=overwrite, report=display.show, say=display.say
             )

@@ -1,4 +1,4 @@
-"""`hyrfpack view`."""
+"""The command `hyrfpack view`."""
 
 from __future__ import annotations
 

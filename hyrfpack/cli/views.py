@@ -1,4 +1,4 @@
-"""`hyrfpack render` and `evaluate`."""
+"""The commands `hyrfpack render` and `evaluate`."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from hyrfpack.choices import AS_PHOTOGRAPHED
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
-    at_one_exposure,
-    chosen_device,
+    choose_command_device,
     device_options,
     exposure_option,
+    format_consistent_psnr,
+    format_table,
     json_option,
-    largest_picture,
+    largest_picture_size,
     note,
     note_rename,
     overwrite_option,
     print_json,
     read_scene,
     scene_options,
-    split_views,
-    table,
+    select_views,
 )
-from hyrfpack.cli.manners import counted
-from hyrfpack.cli.processes import on_processes
-from hyrfpack.cli.progress import shown_progress
+from hyrfpack.cli.console import show_progress_bar
+from hyrfpack.cli.processes import processes_option
+from hyrfpack.cli.progress import show_progress
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from hyrfpack.cli.subject import Subject
+    from hyrfpack.cli.render_source import RenderSource
     from hyrfpack.evaluate import Evaluation, ViewScore
     from hyrfpack.model import HybridModel
     from hyrfpack.parallel.ranks import Ranks
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from hyrfpack.splats.draw import Drawable
 
 SPLITS = ("test", "train", "all")
-DEFAULT_ORBIT = 60  # frames
+DEFAULT_ORBIT_FRAMES = 60
 
 
 @click.command(short_help="Render views to pictures.")
@@ -62,7 +62,7 @@ DEFAULT_ORBIT = 60  # frames
 )
 @exposure_option
 @overwrite_option
-@on_processes
+@processes_option
 @device_options
 @json_option
 def render(
@@ -70,7 +70,7 @@ def render(
     output: Path,
     data: Path | None,
     split: str,
-    reading: dict[str, Any],
+    reader_options: dict[str, Any],
     cameras: Path | None,
     orbit: int | None,
     depth: bool,
@@ -101,61 +101,62 @@ def render(
         raise click.UsageError("--data, --cameras and --orbit each say what to render; give one of them")
     from hyrfpack.cameras.files import cameras_from_json
     from hyrfpack.cameras.paths import orbit as orbit_around
-    from hyrfpack.cli.subject import Subject
+    from hyrfpack.cli.render_source import RenderSource
     from hyrfpack.lock import exclusive_folder
     from hyrfpack.render import RenderSettings
     from hyrfpack.render.files import make_renderer, render_file_names, write_pictures
     from hyrfpack.render.video import has_ffmpeg, write_video
     from hyrfpack.splats.draw import Drawable, draw
 
-    place, settings = chosen_device(device, ranks), RenderSettings(exposure=exposure)
-    subject, scene = ranks.run_on_all(lambda: Subject.of(model, place, precision, allow_partial)), None
+    torch_device, settings = choose_command_device(device, ranks), RenderSettings(exposure=exposure)
+    source, scene = ranks.run_on_all(lambda: RenderSource.open(model, torch_device, precision, allow_partial)), None
     if data is not None:
-        scene = ranks.run_on_all(lambda: read_scene(data, reading, subject.facts))
-        views = split_views(scene, split)
+        scene = ranks.run_on_all(lambda: read_scene(data, reader_options, source.facts))
+        views = select_views(scene, split)
         named = [(view.name, view.camera) for view in views]
     elif cameras is not None:
         named = cameras_from_json(cameras)
     else:
-        cameras_around = orbit_around(subject.viewpoint, orbit or DEFAULT_ORBIT)
+        cameras_around = orbit_around(source.viewpoint, orbit or DEFAULT_ORBIT_FRAMES)
         named = [(f"{number:04d}", camera) for number, camera in enumerate(cameras_around)]
-    film = output / "video.mp4" if video and has_ffmpeg() else None
+    video_path = output / "video.mp4" if video and has_ffmpeg() else None
     names = render_file_names([name for name, _ in named], depth)
-    names += [film.name] if film else []
+    names += [video_path.name] if video_path else []
 
     def check(replace: bool) -> None:
         if ranks.is_main:
-            outputs = Outputs(subject.path, cameras, folder=subject.folder, scene=scene, overwrite=replace)
+            outputs = Outputs(source.path, cameras, folder=source.folder, scene=scene, overwrite=replace)
             outputs.folder(output, names)
 
     def write() -> list[Path]:
-        shown = subject.load()
+        shown = source.load()
         if isinstance(shown, Drawable):
             picture_of: Callable[[Camera], ColorAndDepth] = partial(draw, shown, settings=settings, depth=depth)
         else:
             picture_of = make_renderer(shown, depth=depth, settings=settings)
         pictures = write_pictures(picture_of, named, output, overwrite=overwrite, ranks=ranks)
-        return list(counted(pictures, len(ranks.share(named)), "rendering"))
+        return list(show_progress_bar(pictures, len(ranks.share(named)), "rendering"))
 
     # This first check ignores existing files. It keeps a folder from being created where nothing may be written.
     ranks.run_on_all(lambda: check(replace=True))
-    with exclusive_folder(output, ranks=ranks):  # until the video is written, too
+    with exclusive_folder(output, ranks=ranks):  # the lock is held until the video is written, too
         ranks.run_on_all(lambda: check(replace=overwrite))
         parts = ranks.all_gather(ranks.run_on_all(write))
         if not ranks.is_main:
             return
         written = [parts[place % ranks.size][place // ranks.size] for place in range(len(named))]
-        if film:
-            film = note_rename(film, write_video(written, film, overwrite=overwrite))
+        if video_path:
+            video_path = note_rename(video_path, write_video(written, video_path, overwrite=overwrite))
     for name, path in zip(render_file_names([name for name, _ in named]), written, strict=True):
         note_rename(output / name, path)
-    if video and not film:
+    if video and not video_path:
         note("there is no ffmpeg program, so no video was made; the pictures are in place")
     if as_json:
-        print_json({"pictures": [str(path) for path in written], "video": str(film) if film else None})
+        print_json({"pictures": [str(path) for path in written], "video": str(video_path) if video_path else None})
     else:
-        width, height = largest_picture(camera for _, camera in named)
-        click.echo(f"{output}: {len(written)} pictures{f' and {film.name}' if film else ''}, {width} x {height} pixels")
+        width, height = largest_picture_size(camera for _, camera in named)
+        film = f" and {video_path.name}" if video_path else ""
+        click.echo(f"{output}: {len(written)} pictures{film}, {width} x {height} pixels")
 
 
 @click.command(short_help="Score a model against photos.")
@@ -170,14 +171,14 @@ def render(
 )
 @exposure_option
 @overwrite_option
-@on_processes
+@processes_option
 @device_options
 @json_option
 def evaluate(
     model: Path,
     data: Path,
     split: str,
-    reading: dict[str, Any],
+    reader_options: dict[str, Any],
     lpips_weights: Path | None,
     pictures: Path | None,
     allow_partial: bool,
@@ -204,25 +205,25 @@ def evaluate(
       hyrfpack evaluate bonsai.hyrf --data photos/bonsai --pictures compare --json
       hyrfpack evaluate bonsai.ply --data photos/bonsai
     """
-    from hyrfpack.cli.subject import Subject
+    from hyrfpack.cli.render_source import RenderSource
     from hyrfpack.evaluate import evaluate as score
     from hyrfpack.evaluate import picture_names
     from hyrfpack.render import RenderSettings
 
-    device_here = chosen_device(device, ranks)
+    torch_device = choose_command_device(device, ranks)
 
-    def read() -> tuple[Subject, HybridModel | Drawable, Scene, list[View]]:
-        subject = Subject.of(model, device_here, precision, allow_partial)
-        shown = subject.load()
-        scene = read_scene(data, reading, subject.facts)
-        views = split_views(scene, split)
+    def read() -> tuple[RenderSource, HybridModel | Drawable, Scene, list[View]]:
+        source = RenderSource.open(model, torch_device, precision, allow_partial)
+        shown = source.load()
+        scene = read_scene(data, reader_options, source.facts)
+        views = select_views(scene, split)
         if pictures is not None:
-            outputs = Outputs(subject.path, lpips_weights, folder=subject.folder, scene=scene, overwrite=overwrite)
+            outputs = Outputs(source.path, lpips_weights, folder=source.folder, scene=scene, overwrite=overwrite)
             outputs.folder(pictures, picture_names(views).values())
-        return subject, shown, scene, views
+        return source, shown, scene, views
 
-    subject, shown, scene, views = ranks.run_on_all(read)
-    with shown_progress("evaluate") as progress:
+    source, shown, scene, views = ranks.run_on_all(read)
+    with show_progress("evaluate") as progress:
         scores = score(
             shown,
             views,
@@ -235,24 +236,24 @@ def evaluate(
         )
     if not ranks.is_main:
         return
-    size = subject.bytes
-    width, height = largest_picture(view.camera for view in views)
+    size = source.bytes
+    width, height = largest_picture_size(view.camera for view in views)
     if scores.skipped:
         note(f"{len(scores.skipped)} photos were not scored because their masks leave no pixel")
     if as_json:
         print_json({"bytes": size, "max_size": scene.max_size, "picture_size": [width, height], **scores.to_dict()})
         return
-    rows = [*(_row(view.name, view) for view in scores.views), _row("mean", scores)]
-    click.echo(table(["view", "PSNR (dB)", "corrected", "SSIM", "LPIPS"], rows))
+    rows = [*(_score_row(view.name, view) for view in scores.views), _score_row("mean", scores)]
+    click.echo(format_table(["view", "PSNR (dB)", "corrected", "SSIM", "LPIPS"], rows))
     limit = f"--max-size {scene.max_size}" if scene.max_size else "as they are stored"
     click.echo(f"{len(scores.views)} photos of up to {width} x {height} pixels ({limit})")
     if scores.psnr_consistent is not None and exposure == AS_PHOTOGRAPHED:
-        click.echo(f"mean PSNR {scores.psnr:.2f} dB{at_one_exposure(scores.psnr_consistent)}")
+        click.echo(f"mean PSNR {scores.psnr:.2f} dB{format_consistent_psnr(scores.psnr_consistent)}")
     click.echo(f"{model}: {size:,} bytes, {scores.gaussians:,} Gaussians, {scores.seconds_per_frame:.4f} s a frame")
     if scores.lpips is None:
         click.echo(f"LPIPS: {scores.lpips_reason}")
 
 
-def _row(name: str, scores: ViewScore | Evaluation) -> list[str]:
+def _score_row(name: str, scores: ViewScore | Evaluation) -> list[str]:
     perceptual = "-" if scores.lpips is None else f"{scores.lpips:.4f}"
     return [name, f"{scores.psnr:.2f}", f"{scores.psnr_corrected:.2f}", f"{scores.ssim:.4f}", perceptual]

@@ -13,7 +13,7 @@ from exposures import random_map
 from PIL import Image
 
 from hyrfpack import format as hyrf_format
-from hyrfpack.cli.make import _print as print_result
+from hyrfpack.cli.make import _print_result as print_result
 from hyrfpack.data import load_scene
 from hyrfpack.format import load
 from hyrfpack.format.codec import load_with_provenance

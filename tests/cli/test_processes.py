@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ranked import Ended, commanded, needs_ranks, told_by_torchrun
 
-from hyrfpack.cli.processes import without
+from hyrfpack.cli.processes import remove_option
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.errors import HyrfError
 from hyrfpack.parallel.launch import launch
@@ -83,7 +83,7 @@ def model(trained) -> Path:
     ],
 )
 def test_the_option_is_taken_out_with_its_value(words, left):
-    assert without(words.split()) == left.split()
+    assert remove_option(words.split()) == left.split()
 
 
 @given(
@@ -92,7 +92,7 @@ def test_the_option_is_taken_out_with_its_value(words, left):
 def test_all_other_words_stay_in_their_order(words, number, joined):
     for place in range(len(words) + 1):
         option = [f"--processes={number}"] if joined else ["--processes", str(number)]
-        assert without([*words[:place], *option, *words[place:]]) == words
+        assert remove_option([*words[:place], *option, *words[place:]]) == words
 
 
 def test_processes_cannot_be_asked_for_within_one_of_several(monkeypatch, tmp_path):

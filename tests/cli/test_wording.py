@@ -11,7 +11,7 @@ import pytest
 from commands import refused
 
 import hyrfpack
-from hyrfpack.cli.wording import with_options
+from hyrfpack.cli.wording import use_option_names
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 
@@ -48,7 +48,7 @@ def test_every_argument_in_a_library_message_is_an_option_of_some_command():
         (module, found) for module, text in library_strings() for found in re.findall(r"`[a-z_0-9]+(?:=[^`]+)?`", text)
     ]
     assert len(arguments) > 40
-    assert [(module, found) for module, found in arguments if with_options(found) == found] == []
+    assert [(module, found) for module, found in arguments if use_option_names(found) == found] == []
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_every_argument_in_a_library_message_is_an_option_of_some_command():
     ],
 )
 def test_arguments_become_options(message, expected):
-    assert with_options(message) == expected
+    assert use_option_names(message) == expected
 
 
 def test_the_same_refusal_names_an_argument_in_python_and_an_option_on_the_command_line(tmp_path):

@@ -1,4 +1,7 @@
-"""What `hyrfpack render` and `evaluate` draw: a model, or splats of another program. Loads torch."""
+"""The source of pictures that `hyrfpack render` and `evaluate` draw: a model, or splats of another program.
+
+This module imports torch.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +22,15 @@ from hyrfpack.splats.viewpoints import WeightedSplats
 
 
 @dataclass(frozen=True)
-class Subject:
+class RenderSource:
     """A model or splats to be drawn.
 
     Attributes:
-        path: the file, that of a run where its folder was named.
-        device, precision: where and how exactly to draw; splats are drawn in float32.
-        fraction: how much of the file must be there, see `hyrfpack.load`.
-        facts: of a model, see `hyrfpack.describe`; None of splats.
-        splats: ready to be drawn; None of a model, which `load` reads.
+        path: path of the file; of a run, that of its model.
+        device, precision: device and precision of drawing; splats are drawn in float32.
+        fraction: share of the file that must exist, see `hyrfpack.load`.
+        facts: description of a model, see `hyrfpack.describe`; None for splats.
+        splats: the splats, ready to be drawn; None for a model, which `load` reads.
     """
 
     path: Path
@@ -38,11 +41,11 @@ class Subject:
     splats: Drawable | None = None
 
     @classmethod
-    def of(cls, path: Path, device: torch.device, precision: str, allow_partial: bool) -> Subject:
-        """Read what a path names: splats whole, of a model its first kilobytes.
+    def open(cls, path: Path, device: torch.device, precision: str, allow_partial: bool) -> RenderSource:
+        """Read splats whole, or of a model the first kilobytes.
 
         Raises:
-            HyrfError: it cannot be read, or what is asked for is not known of splats.
+            HyrfError: the file cannot be read, or an option does not apply to splats.
         """
         if is_splats(path):
             if allow_partial:
@@ -54,7 +57,7 @@ class Subject:
         return cls(model, device, precision, fraction, facts=describe(model, fraction))
 
     def load(self) -> HybridModel | Drawable:
-        """Return what is to be drawn, on the device."""
+        """Return the model or the splats on the device."""
         if self.splats is not None:
             return self.splats
         model = load(self.path, self.device, self.fraction)
@@ -63,7 +66,7 @@ class Subject:
 
     @property
     def viewpoint(self) -> Viewpoint:
-        """What an orbit goes around: what the photos showed, or the middle of the splats."""
+        """The viewpoint that an orbit goes around: what the photos showed, or the middle of the splats."""
         if self.splats is not None:
             frame = self.splats.frame
             return Viewpoint.from_frame(frame.center, frame.scale)
@@ -71,10 +74,10 @@ class Subject:
 
     @property
     def folder(self) -> Path | None:
-        """The folder all of whose files are read; None where one file is."""
+        """The folder whose files are all read; None where a single file is read."""
         return sog_folder(self.path) if self.splats is not None else None
 
     @property
     def bytes(self) -> int:
-        """On disk."""
+        """Size on disk in bytes."""
         return bytes_on_disk(self.path)

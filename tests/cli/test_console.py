@@ -18,8 +18,8 @@ from rich.cells import cell_len
 from scenes import small_model
 
 from hyrfpack.cli import main
-from hyrfpack.cli.common import note, table
-from hyrfpack.cli.files import _typed
+from hyrfpack.cli.common import format_table, note
+from hyrfpack.cli.files import _command_as_typed
 from hyrfpack.format import describe, save
 
 ROOT = Path(__file__).parents[2]
@@ -130,7 +130,7 @@ def test_quiet_and_verbose_exclude_each_other(arguments):
 def test_the_command_that_a_report_shows_is_without_them(model):
     command = main.commands["compress"]
     with command.make_context("compress", [str(model), "-o", "b.hyrf", "--verbose", "--no-prune"]) as context:
-        assert _typed(context) == f"hyrfpack compress {model} --output b.hyrf --no-prune"
+        assert _command_as_typed(context) == f"hyrfpack compress {model} --output b.hyrf --no-prune"
 
 
 # -- streams that are not there --------------------------------------------------------------------------------------
@@ -191,7 +191,9 @@ def test_names_that_the_encoding_lacks_are_printed_with_escapes(model, tmp_path)
 
 
 def test_columns_of_a_table_stand_under_each_other_with_wide_characters():
-    text = table(["文件", "dB", "名"], [["写真.png", "1.00", "ü"], ["a.png", "-", "日本"], ["e\u0301.png", "12", ""]])
+    text = format_table(
+        ["文件", "dB", "名"], [["写真.png", "1.00", "ü"], ["a.png", "-", "日本"], ["e\u0301.png", "12", ""]]
+    )
     lines = text.splitlines()
     assert cell_len(lines[1]) == max(map(cell_len, lines))
     assert [cell_len(line[: line.index(word)]) for line, word in zip(lines[2:4], ("1.00", "-"), strict=True)] == [

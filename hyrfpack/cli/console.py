@@ -1,0 +1,145 @@
+"""Output of all commands to the terminal: --quiet, --verbose, notes, progress bars, and streams that are closed."""
+
+from __future__ import annotations
+
+import errno
+import os
+import platform
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import redirect_stderr, suppress
+from typing import Any, TextIO, TypeVar, cast
+
+import click
+
+from hyrfpack.cli.wording import use_option_names
+from hyrfpack.version import __version__
+
+T = TypeVar("T")
+# Keys of values in click's context, which all commands share.
+_VERBOSITY_KEY = "hyrfpack.verbosity"
+_START_TIME_KEY = "hyrfpack.start_time"
+_ARGUMENTS_KEY = "hyrfpack.arguments"
+_REPORTED_PACKAGES = ("torch", "numpy", "numba", "triton", "pycolmap")
+
+
+def add_verbosity_options(command: click.Command) -> None:
+    """Add the options --quiet and --verbose to a command or a group."""
+    for flag, help in (
+        ("--quiet", "Say nothing on standard error but errors."),
+        ("--verbose", "Say what a bug report needs: versions, device, times, tracebacks."),
+    ):
+        command.params.append(
+            click.Option([flag], is_flag=True, expose_value=False, callback=_set_verbosity, help=help)
+        )
+
+
+def _set_verbosity(ctx: click.Context, option: click.Parameter, given: bool) -> None:
+    """Apply --quiet or --verbose to all that follows; a callback of these options."""
+    if not given or ctx.resilient_parsing or ctx.meta.get(_VERBOSITY_KEY) == option.name:
+        return
+    root = ctx.find_root()
+    if _VERBOSITY_KEY in ctx.meta:
+        root.close()  # this restores standard error, where the message goes
+        raise click.UsageError("--quiet and --verbose contradict each other; give one of them", ctx)
+    ctx.meta[_VERBOSITY_KEY] = option.name
+    if option.name == "quiet":  # silences progress and libraries, too; errors are printed after the root is closed
+        root.with_resource(redirect_stderr(root.with_resource(open(os.devnull, "w", encoding="utf-8"))))
+        return
+    ctx.meta[_START_TIME_KEY] = time.perf_counter()
+    note(f"{_versions()}; on {platform.platform()} with {os.cpu_count()} cores")
+    root.call_on_close(lambda: note(f"the end, after {time.process_time():.1f} s of processors"))
+
+
+def _versions() -> str:
+    """Return the versions of hyrfpack, Python and the packages that matter in a bug report."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    known = [f"hyrfpack {__version__}", f"Python {platform.python_version()}"]
+    for package in _REPORTED_PACKAGES:
+        with suppress(PackageNotFoundError):
+            known.append(f"{package} {version(package)}")
+    return ", ".join(known)
+
+
+def store_arguments(ctx: click.Context, arguments: Iterable[str]) -> None:
+    """Store the arguments that follow `hyrfpack` on the command line."""
+    ctx.meta[_ARGUMENTS_KEY] = list(arguments)
+
+
+def stored_arguments(ctx: click.Context) -> list[str]:
+    """Return the arguments that follow `hyrfpack` on the command line."""
+    return ctx.meta[_ARGUMENTS_KEY]
+
+
+def is_verbose() -> bool:
+    """Return whether the running command was given --verbose."""
+    ctx = click.get_current_context(silent=True)
+    return ctx is not None and ctx.meta.get(_VERBOSITY_KEY) == "verbose"
+
+
+def note(sentence: str) -> None:
+    """Print a sentence on standard error; with --verbose, the seconds since the start precede it.
+
+    Python arguments that the sentence names become options, see `use_option_names`.
+    """
+    sentence = use_option_names(sentence)
+    if is_verbose():
+        sentence = f"[{time.perf_counter() - click.get_current_context().meta[_START_TIME_KEY]:7.2f} s] {sentence}"
+    with suppress(OSError):  # a full disk or a closed terminal must not end the work
+        click.echo(sentence, err=True)
+
+
+def show_progress_bar(items: Iterable[T], length: int, label: str) -> Iterator[T]:
+    """Yield the items and show a progress bar on standard error; errors of drawing it are ignored."""
+    with click.progressbar(items, length, label, file=cast(TextIO, _TolerantStderr())) as bar:
+        yield from bar
+
+
+class _TolerantStderr:
+    """Standard error, but text that cannot be written is dropped."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(sys.stderr, name)
+
+    def write(self, text: str) -> int:
+        with suppress(OSError):
+            sys.stderr.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            sys.stderr.flush()
+
+
+def note_if_verbose(sentence: str) -> None:
+    """Print a note that only --verbose shows."""
+    if is_verbose():
+        note(sentence)
+
+
+def repair_std_streams() -> None:
+    """Replace closed standard streams by the null device, and make standard output accept all characters.
+
+    If a stream stayed closed (`2>&-`), the next file to be opened would get its number, and whatever a library prints
+    to the stream. Characters that the terminal's encoding lacks are printed as escapes.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if _is_closed(getattr(sys, name), mode):
+            number = os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(number, True)
+            setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))
+    if hasattr(sys.stdout, "reconfigure"):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def _is_closed(stream: TextIO | None, mode: str) -> bool:
+    """Return whether a standard stream is closed; `mode` is "r" for standard input and "w" for the others."""
+    if stream is None or mode == "r":
+        return stream is None
+    try:
+        os.write(stream.fileno(), b"")
+    except OSError as error:  # a stream of a test or a notebook has no number, which is another error than EBADF
+        return error.errno == errno.EBADF
+    return False
