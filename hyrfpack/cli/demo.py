@@ -22,12 +22,12 @@ def demo(output: Path, steps: int, overwrite: bool, as_json: bool) -> None:
     Example:
       hyrfpack demo -o demo
     """
-    from hyrfpack.demo.run import FILES, PAGE, PICTURE, run_demo
+    from hyrfpack.demo.run import PAGE_FILE, PICTURE_FILE, RESULT_FILES, run_demo
 
-    Outputs(overwrite=overwrite).folder(output, FILES)
+    Outputs(overwrite=overwrite).folder(output, RESULT_FILES)
     result = run_demo(output, steps=steps, overwrite=overwrite, say=note)
-    note_rename(output / PICTURE, result.picture)
-    note_rename(output / PAGE, result.page.file)
+    note_rename(output / PICTURE_FILE, result.picture)
+    note_rename(output / PAGE_FILE, result.page.file)
     if as_json:
         print_json(result.to_dict())
         return

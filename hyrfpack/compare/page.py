@@ -16,7 +16,7 @@ from hyrfpack.compare.views import ComparedView, webp_data_uri
 from hyrfpack.errors import printable
 from hyrfpack.evaluate.figures import ERROR_LIMIT, SMOOTHING_RADIUS_RECORDS, error_colors
 from hyrfpack.version import __version__
-from hyrfpack.web.player import content_policy, fill, json_text
+from hyrfpack.web.player import content_security_policy, fill_template, json_element
 
 # The value of --dim in style.css for dark backgrounds.
 DARK_TEXT_COLOR = "#a6acb3"
@@ -38,7 +38,7 @@ def encode_comparison(
     """
     style, script = _read_asset("style.css"), _read_asset("script.js")
     values = {
-        "policy": content_policy(style, [script]),
+        "policy": content_security_policy(style, [script]),
         "version": __version__,
         "title": _escape(f"{len(runs)} training runs: {', '.join(names)}"),
         "style": style,
@@ -48,10 +48,10 @@ def encode_comparison(
         "curves": _curves(runs, names),
         "told": _escape(_curves_note(runs, names)),
         "views": _read_asset("views.html") if views else "",
-        "texts": json_text("compared", _view_data(runs, names, views)) if views else "",
+        "texts": json_element("compared", _view_data(runs, names, views)) if views else "",
         "script": script,
     }
-    return fill(_read_asset("page.html"), values).encode()
+    return fill_template(_read_asset("page.html"), values).encode()
 
 
 def _tables(runs: Sequence[Run], names: Sequence[str], ranked: bool) -> list[str]:

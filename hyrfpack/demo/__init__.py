@@ -1,1 +1,1 @@
-"""The built-in scene, and the round through everything on it."""
+"""The built-in scene, and the demo that runs all stages on it."""

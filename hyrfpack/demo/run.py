@@ -1,4 +1,4 @@
-"""Everything once, on a scene made on the spot: photos, training, compression, decompression, rendering, scores."""
+"""The demo: all stages on a procedural scene, from photos to training, compression, rendering and scores."""
 
 from __future__ import annotations
 
@@ -31,31 +31,37 @@ from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train import TrainConfig, train
 
 DRAWN_VIEWS = 4
-SCENE, RUN, RENDERS, PAGE, PICTURE, BACK = "scene", "run", "renders", "demo.html", "demo.png", "back.hyrf"
-PACKED = {profile: f"{profile}.hyrf" for profile in ("paper", "compact")}
-FILES = (  # what a demo leaves, one of each kind
-    PICTURE,
-    PAGE,
-    BACK,
-    *PACKED.values(),
-    f"{SCENE}/transforms.json",
-    f"{SCENE}/images/0000.png",
-    f"{RUN}/model.hyrf",
-    f"{RENDERS}/0000.png",
+SCENE_FOLDER = "scene"
+RUN_FOLDER = "run"
+RENDERS_FOLDER = "renders"
+PAGE_FILE = "demo.html"
+PICTURE_FILE = "demo.png"
+UNPACKED_FILE = "back.hyrf"
+PACKED_FILES = {profile: f"{profile}.hyrf" for profile in ("paper", "compact")}
+# Files that a demo writes; of numbered pictures, the first.
+RESULT_FILES = (
+    PICTURE_FILE,
+    PAGE_FILE,
+    UNPACKED_FILE,
+    *PACKED_FILES.values(),
+    f"{SCENE_FOLDER}/transforms.json",
+    f"{SCENE_FOLDER}/images/0000.png",
+    f"{RUN_FOLDER}/model.hyrf",
+    f"{RENDERS_FOLDER}/0000.png",
 )
 
 
 @dataclass(frozen=True)
 class ProfileResult:
-    """One profile of the demo's model, measured on the decoded file.
+    """Scores, size and times of the demo's model in one profile, measured on the decoded file.
 
     Attributes:
         profile: "raw", "paper" or "compact".
-        psnr, ssim: means over the held-out views.
-        bytes: on disk.
-        compress_seconds: reading the trained file and writing this one, for "compact" with the measuring; None for the
-            file that training wrote.
-        decompress_seconds: reading this file and writing it as raw.
+        psnr, ssim: mean PSNR (dB) and SSIM of the held-out views.
+        bytes: size on disk.
+        compress_seconds: time to read the trained file and write this one, for "compact" including its measurements;
+            None for the file that training wrote.
+        decompress_seconds: time to read this file and write it as raw.
     """
 
     profile: str
@@ -68,15 +74,15 @@ class ProfileResult:
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What a demo came to.
+    """The result of a demo.
 
     Attributes:
-        steps, gaussians: of the training.
-        train_seconds: its time, kernels compiled on the way included.
-        frames_per_second: one over the median time to render a held-out view from the compact file.
-        profiles: raw, paper, compact.
-        picture: path of the picture that shows it.
-        page: what the page takes that holds the compact file and plays it in a browser.
+        steps, gaussians: number of training steps and of trained Gaussians.
+        train_seconds: time of the training, including the compilation of kernels.
+        frames_per_second: inverse of the median time to render a held-out view from the compact file.
+        profiles: results of the profiles raw, paper and compact.
+        picture: path of the picture that shows the result.
+        page: report of the page that holds the compact file and plays it in a browser.
     """
 
     steps: int
@@ -88,7 +94,7 @@ class DemoResult:
     page: ExportReport
 
     def table(self) -> list[str]:
-        """The profiles as lines of aligned text, then the speed, and what the page takes."""
+        """Return lines of text: a table of the profiles, the speed, and the size of the page."""
         lines = ["profile  PSNR (dB)    SSIM       bytes  compress (s)  decompress (s)"]
         for p in self.profiles:
             there = "-" if p.compress_seconds is None else f"{p.compress_seconds:.2f}"
@@ -99,7 +105,7 @@ class DemoResult:
         return [*lines, speed, f"{self.page.bytes:,} bytes: a web page with the compact file and its player inside"]
 
     def to_dict(self) -> dict:
-        """Plain numbers, strings, lists and dictionaries, ready for JSON."""
+        """Return the result as numbers, strings, lists and dictionaries, ready for JSON."""
         return {**asdict(self), "picture": str(self.picture)}
 
 
@@ -112,70 +118,70 @@ def run_demo(
     overwrite: bool = True,
     say: Callable[[str], None] = lambda sentence: None,
 ) -> DemoResult:
-    """Make a scene, train on it, compress, decompress, render, score, export, and draw one picture of it.
+    """Write a scene, train on it, compress, decompress, render, score, export, and draw a picture of the result.
 
-    Leaves in `folder`: `scene/` (photos and poses), `run/` (the training), `paper.hyrf`, `compact.hyrf`, `back.hyrf`
-    (compact.hyrf decompressed), `renders/` (held-out views from compact.hyrf), `demo.html` (compact.hyrf in a page that
-    plays it) and `demo.png`.
+    Writes into `folder`: `scene/` (photos and poses), `run/` (the training), `paper.hyrf`, `compact.hyrf`, `back.hyrf`
+    (compact.hyrf decompressed), `renders/` (held-out views from compact.hyrf), `demo.html` (a page that holds
+    compact.hyrf and plays it) and `demo.png`.
 
     Args:
-        folder: made if missing.
-        steps: of the training.
-        views, size: how many photos, and their width and height in pixels.
-        overwrite: replace files that are there; without it, they are an error.
-        say: told what is going on, a sentence before each part.
+        folder: folder of the results; created if missing.
+        steps: number of training steps.
+        views, size: number of photos, and their width and height in pixels.
+        overwrite: replace existing files; without it, they are an error.
+        say: called with a sentence before each stage.
 
     Raises:
-        HyrfError: something cannot be written, or another call is at work in the folder.
+        HyrfError: a file cannot be written, or another call is at work in the folder.
     """
     folder = Path(folder)
-    Outputs(overwrite=True).folder(folder, FILES)
+    Outputs(overwrite=True).folder(folder, RESULT_FILES)
     with exclusive_folder(folder):
-        Outputs(overwrite=overwrite).folder(folder, FILES)
+        Outputs(overwrite=overwrite).folder(folder, RESULT_FILES)
         return _run_demo(folder, steps, views, size, overwrite, say)
 
 
 def _run_demo(
     folder: Path, steps: int, views: int, size: int, overwrite: bool, say: Callable[[str], None]
 ) -> DemoResult:
-    """As `run_demo`, in a folder that this call holds."""
+    """Run the demo as `run_demo` does, in a folder that is locked."""
     say(f"making a scene of {views} photos")
-    write_demo_scene(folder / SCENE, views=views, size=size, overwrite=overwrite)
-    scene = load_scene(folder / SCENE)
+    write_demo_scene(folder / SCENE_FOLDER, views=views, size=size, overwrite=overwrite)
+    scene = load_scene(folder / SCENE_FOLDER)
     say(f"training {steps:,} steps on {len(scene.train)} photos, {len(scene.test)} held out")
-    trained = train(scene, folder / RUN, TrainConfig(steps=steps), overwrite=overwrite)
+    trained = train(scene, folder / RUN_FOLDER, TrainConfig(steps=steps), overwrite=overwrite)
     if trained.model is None:
         raise KeyboardInterrupt
 
     say("compressing, decompressing and scoring")
-    back, profiles, replace = folder / BACK, [], overwrite
-    for profile in ("raw", *PACKED):
+    unpacked_path, profiles, replace = folder / UNPACKED_FILE, [], overwrite
+    for profile in ("raw", *PACKED_FILES):
         path, compress_seconds = trained.model, None
         if profile != "raw":
             packed, compress_seconds = _timed(
-                partial(compress, trained.model, folder / PACKED[profile], profile, overwrite=overwrite)
+                partial(compress, trained.model, folder / PACKED_FILES[profile], profile, overwrite=overwrite)
             )
             path = Path(packed.file)
-        unpacked, decompress_seconds = _timed(partial(repack, path, back, overwrite=replace))
-        back, replace = Path(unpacked.file), True  # from now on it is of this call
-        scores = evaluate(load(back), scene.test)
+        unpacked, decompress_seconds = _timed(partial(repack, path, unpacked_path, overwrite=replace))
+        unpacked_path, replace = Path(unpacked.file), True  # this call has written the file and may replace it
+        scores = evaluate(load(unpacked_path), scene.test)
         stored = path.stat().st_size
         profiles.append(ProfileResult(profile, scores.psnr, scores.ssim, stored, compress_seconds, decompress_seconds))
 
     say("rendering held-out views")
     model = load(path)
     held_out = [(view.name, view.camera) for view in scene.test]
-    for _ in render_files(model, held_out, folder / RENDERS, overwrite=overwrite):
+    for _ in render_files(model, held_out, folder / RENDERS_FOLDER, overwrite=overwrite):
         pass
     say("making a page for the browser")
-    page = export(path, folder / PAGE, data=scene, overwrite=overwrite)
+    page = export(path, folder / PAGE_FILE, data=scene, overwrite=overwrite)
     result = DemoResult(
         steps=steps,
         gaussians=len(model),
         train_seconds=trained.metrics["seconds"],
         frames_per_second=1 / scores.seconds_per_frame,
         profiles=profiles,
-        picture=folder / PICTURE,
+        picture=folder / PICTURE_FILE,
         page=page,
     )
     picture = save_picture(result.picture, _draw(model, scene, result), overwrite=overwrite)
@@ -184,7 +190,7 @@ def _run_demo(
 
 @torch.no_grad()
 def _draw(model: HybridModel, scene: Scene, result: DemoResult) -> Image.Image:
-    """The demo's picture: held-out views of the compact file under the table."""
+    """Draw the demo's picture: held-out views of the compact file, and the table of results."""
     decoded = model.decode()
     solid = np.array(model.config.solid, np.float32)
     rows = []
@@ -197,7 +203,7 @@ def _draw(model: HybridModel, scene: Scene, result: DemoResult) -> Image.Image:
 
 
 def _timed(action: Callable[[], CompressionReport]) -> tuple[CompressionReport, float]:
-    """What an action returns, and the seconds that it took."""
+    """Return the result of an action, and the seconds that it took."""
     start = time.perf_counter()
     report = action()
     return report, time.perf_counter() - start

@@ -27,9 +27,9 @@ from hyrfpack.outputs import Outputs
 from hyrfpack.scene import Scene
 from hyrfpack.splats.files import READABLE_ENDINGS, read_splats
 from hyrfpack.web.gallery import Card, encode_gallery
-from hyrfpack.web.html import stage
-from hyrfpack.web.player import element_script, encode_player, encode_readme
-from hyrfpack.web.view import playable_file
+from hyrfpack.web.html import encode_stage
+from hyrfpack.web.player import encode_element_script, encode_player, encode_readme
+from hyrfpack.web.view import find_playable_file
 
 POSTER_LONGEST_SIDE_PIXELS = 640
 MAX_POSTER_BYTES = 30_000
@@ -94,7 +94,7 @@ def _write_player(source: StrPath | None, output: _OutputFolder, data: Scene | N
     description, count = "A player of 3D scenes", 0
     if source is not None:
         title = Path(source).stem
-        source = playable_file(source)
+        source = find_playable_file(source)
         scene = _PlayableContent.read(source, data, say, with_quality=False)
         count = scene.count
         content, poster = _choose_file_names([source], is_gallery=False)[0]
@@ -105,7 +105,7 @@ def _write_player(source: StrPath | None, output: _OutputFolder, data: Scene | N
         else:
             output.write(poster, encode_poster(scene.poster, "JPEG", MAX_POSTER_BYTES))
         description = f"{count:,} Gaussians, {scene.length:,} bytes"
-    output.write(ELEMENT_SCRIPT_NAME, element_script())
+    output.write(ELEMENT_SCRIPT_NAME, encode_element_script())
     output.write(README_NAME, encode_readme(title, INDEX_NAME, INDEX_NAME, element=content or "URL"))
     output.write(
         INDEX_NAME, encode_player(title, content=content, poster=poster, description=description, stages=stages)
@@ -160,12 +160,12 @@ def _write_gallery(
     contents = []
     for source, scene in zip(sources, scenes, strict=True):  # all are read before anything is written
         say(f"reading {source}")
-        contents.append(_PlayableContent.read(playable_file(source), scene, say, with_quality=True))
+        contents.append(_PlayableContent.read(find_playable_file(source), scene, say, with_quality=True))
     cards = []
     for source, shown, (content, poster) in zip(
         sources, contents, _choose_file_names(sources, is_gallery=True), strict=True
     ):
-        output.copy(content, playable_file(source))
+        output.copy(content, find_playable_file(source))
         if shown.poster is not None:
             output.write(poster, encode_poster(shown.poster, "JPEG", MAX_POSTER_BYTES))
         picture = None if shown.poster is None else poster
@@ -194,7 +194,7 @@ def check_folder(
     """
     names = [name for pair in _choose_file_names(sources, is_gallery=is_gallery) for name in pair]
     names += [README_NAME, INDEX_NAME, GALLERY_PLAYER_NAME if is_gallery else ELEMENT_SCRIPT_NAME]
-    files = [playable_file(source) for source in sources]
+    files = [find_playable_file(source) for source in sources]
     for scene in scenes or [None]:
         Outputs(*files, scene=scene, overwrite=overwrite).folder(folder, names)
 
@@ -208,7 +208,7 @@ class _PlayableContent:
         length: size in bytes.
         poster: a picture of the scene, or None if none can be made.
         quality: quality of the model in words; empty if unknown.
-        stage: initial cameras for the page, see `hyrfpack.web.html.stage`; None for splats.
+        stage: initial cameras for the page, see `hyrfpack.web.html.encode_stage`; None for splats.
     """
 
     count: int
@@ -237,7 +237,7 @@ class _PlayableContent:
         quality = _describe_quality(path, loaded.model, data, say) if with_quality else ""
         cameras = page_cameras(loaded)
         poster = render_model_poster(loaded.model, cameras[0], POSTER_LONGEST_SIDE_PIXELS)
-        return cls(len(loaded.model), length, poster, quality, stage(cameras, loaded.up, loaded.center))
+        return cls(len(loaded.model), length, poster, quality, encode_stage(cameras, loaded.up, loaded.center))
 
 
 def _describe_quality(path: StrPath, model: HybridModel, data: Scene | None, say: Say) -> str:

@@ -18,7 +18,7 @@ from hyrfpack.model import BACKGROUND_RADIUS
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera, evenly_spaced
 from hyrfpack.splats.splats import Splats
-from hyrfpack.web.html import encode_native, encode_page
+from hyrfpack.web.html import encode_model_page, encode_splats_page
 
 MAX_PAGE_CAMERAS = 12
 POSTER_LONGEST_SIDE_PIXELS = 480
@@ -43,7 +43,7 @@ def encode_baked_page(loaded: Source, splats: Splats, picture: np.ndarray | None
     """
     frame = loaded.model.config.frame
     near, sphere = RenderSettings().near * frame.scale, (frame.center, BACKGROUND_RADIUS * frame.scale)
-    return encode_page(splats, background=picture, near=near, sphere=sphere, **_page_settings(loaded, title))
+    return encode_splats_page(splats, background=picture, near=near, sphere=sphere, **_page_settings(loaded, title))
 
 
 def encode_native_page(loaded: Source, data: bytes, title: str) -> bytes:
@@ -54,7 +54,7 @@ def encode_native_page(loaded: Source, data: bytes, title: str) -> bytes:
         data: bytes of the `.hyrf` file.
         title: title of the page.
     """
-    return encode_native(
+    return encode_model_page(
         data, count=len(loaded.model), frame=loaded.model.config.frame, **_page_settings(loaded, title)
     )
 

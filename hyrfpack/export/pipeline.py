@@ -47,7 +47,7 @@ from hyrfpack.scene import Scene
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats, concatenate
 from hyrfpack.splats.table import FORMATS, FileKind, SplatFormat
-from hyrfpack.web.html import decode_page
+from hyrfpack.web.html import decode_splats_page
 
 MIN_REPORTED_COST_DB = 1.0
 
@@ -269,7 +269,7 @@ ShownSplats = dict[str, tuple[Splats, np.ndarray | None]]
 def _pack_page(loaded: Source, splats: Splats, picture: np.ndarray | None, target: Path) -> tuple[bytes, ShownSplats]:
     """Encode a page of splats, and return its bytes with the splats before and after encoding."""
     data = encode_baked_page(loaded, splats, picture, target.stem)
-    return data, {"baked": (splats, picture), "file": decode_page(data, str(target))}
+    return data, {"baked": (splats, picture), "file": decode_splats_page(data, str(target))}
 
 
 def _pack_splats(

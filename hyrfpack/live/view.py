@@ -12,7 +12,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.format import encode_model
 from hyrfpack.train import Trainer
 from hyrfpack.web.player import encode_player
-from hyrfpack.web.serve import MemoryFile, serving
+from hyrfpack.web.serve import MemoryFile, serve_in_thread
 
 # File names under which the page fetches the snapshot and the progress.
 SCENE_NAME = "scene.hyrf"
@@ -91,7 +91,7 @@ def live_view(title: str, *, port: int = 0, say: Callable[[str], None]) -> Itera
     """
     view = LiveView()
     page = encode_player(title, content=SCENE_NAME, updates=UPDATES_NAME, fetches="'self'")
-    with serving(page, {SCENE_NAME: view.scene, UPDATES_NAME: view.updates}, port=port) as address:
+    with serve_in_thread(page, {SCENE_NAME: view.scene, UPDATES_NAME: view.updates}, port=port) as address:
         say(f"the training can be seen at {address} until the command ends")
         yield view
 

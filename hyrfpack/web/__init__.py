@@ -1,1 +1,1 @@
-"""The page that shows a scene in a browser, made into one file or served."""
+"""The web page that shows a scene in a browser, as a single file or served over HTTP."""

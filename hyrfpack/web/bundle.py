@@ -1,4 +1,4 @@
-"""Modules of JavaScript as one script, for pages that are a single file."""
+"""Bundling of JavaScript modules into one script, for pages that are a single file."""
 
 from __future__ import annotations
 
@@ -8,75 +8,79 @@ import re
 from functools import cache
 from importlib.resources import files
 
-_NAMES = r"\{ [\w$]+(?:, [\w$]+)* \}"
-_IMPORT = re.compile(rf'^import {_NAMES} from "(\.{{1,2}}/[\w./-]+\.js)";$')
-_AGAIN = re.compile(rf"^export {_NAMES};$")
-_EXPORT = re.compile(r"^export (?=(?:async )?function|class|const|let)")
-_NAME = re.compile(r"^(?:export )?(?:async )?(?:function\*?|class|const|let) ([\w$]+)", re.MULTILINE)
-_BLOCK = re.compile(r"^[ \t]*/\*(?:(?!\*/).)*\*/[ \t]*$", re.DOTALL | re.MULTILINE)
-_TRAILING = re.compile(r"\s+// [^\"'`]*$")
-_OUT = re.compile(r"</script|<!--", re.IGNORECASE)  # what ends a script element, or changes where it ends
+_NAME_LIST = r"\{ [\w$]+(?:, [\w$]+)* \}"
+_IMPORT_LINE = re.compile(rf'^import {_NAME_LIST} from "(\.{{1,2}}/[\w./-]+\.js)";$')
+_EXPORT_LIST_LINE = re.compile(rf"^export {_NAME_LIST};$")
+_EXPORT_KEYWORD = re.compile(r"^export (?=(?:async )?function|class|const|let)")
+_TOP_LEVEL_NAME = re.compile(r"^(?:export )?(?:async )?(?:function\*?|class|const|let) ([\w$]+)", re.MULTILINE)
+_BLOCK_COMMENT = re.compile(r"^[ \t]*/\*(?:(?!\*/).)*\*/[ \t]*$", re.DOTALL | re.MULTILINE)
+_TRAILING_COMMENT = re.compile(r"\s+// [^\"'`]*$")
+_SCRIPT_ELEMENT_END = re.compile(r"</script|<!--", re.IGNORECASE)  # "<!--" changes where the element ends
 
 
 @cache
 def bundle(entry: str) -> str:
-    """A module below `hyrfpack/web` and all that it imports as one classic script, those first that others need.
+    """Return a module below `hyrfpack/web` and all that it imports as one classic script, in order of dependency.
 
-    Modules must keep to what this understands: `import { a, b } from "./x.js";` on a line, `export` before a
-    declaration or as `export { a, b };` on a line, and names at the top level that no other module has. Comments and
-    indentation are left out.
+    Modules may use only these forms: `import { a, b } from "./x.js";` on one line, and `export` before a declaration or
+    as `export { a, b };` on one line. No two modules may define the same top-level name. Comments and indentation are
+    removed.
+
+    Args:
+        entry: path of the module, relative to `hyrfpack/web`.
 
     Raises:
-        ValueError: a module does not keep to it, modules import each other in a circle, or two have the same name, or
-            what would end the script element that the script is put into.
+        ValueError: a module uses another form, modules import each other in a circle, two modules define the same name,
+            or the script holds text that would end its script element.
     """
-    placed: dict[str, str | None] = {}
+    placed: dict[str, str | None] = {}  # module path -> its bare text, None while its imports are placed
     owners: dict[str, str] = {}
 
     def place(path: str) -> None:
+        """Place a module after those that it imports."""
         if path in placed:
             if placed[path] is None:
                 raise ValueError(f"{path} is imported in a circle")
             return
         placed[path] = None
-        text = part(path)
-        for name in _NAME.findall(text):
+        text = read_web_file(path)
+        for name in _TOP_LEVEL_NAME.findall(text):
             if name in owners:
                 raise ValueError(f"'{name}' is defined in {owners[name]} and in {path}; give one another name")
             owners[name] = path
         needed, lines = [], []
-        for line in bare_script(text).splitlines():
-            if match := _IMPORT.match(line):
+        for line in strip_comments(text).splitlines():
+            if match := _IMPORT_LINE.match(line):
                 needed.append(posixpath.normpath(posixpath.join(posixpath.dirname(path), match[1])))
-            elif _AGAIN.match(line):
+            elif _EXPORT_LIST_LINE.match(line):
                 continue
             elif line.startswith(("import ", "import{", "export {", "export *", "export default")):
                 raise ValueError(f"{path}: '{line}' is not understood")
             else:
-                lines.append(_EXPORT.sub("", line))
+                lines.append(_EXPORT_KEYWORD.sub("", line))
         for other in needed:
             place(other)
-        del placed[path]  # to the end: after what it needs
+        del placed[path]  # inserted again, it comes after the modules that it needs
         placed[path] = "\n".join(lines)
 
     place(entry)
     script = '"use strict";\n' + "\n".join(text for text in placed.values() if text)
-    if match := _OUT.search(script):
+    if match := _SCRIPT_ELEMENT_END.search(script):
         raise ValueError(f"{entry}: '{match[0]}' in a script would end the page's script element; write it otherwise")
     return script
 
 
-def bare_script(text: str) -> str:
-    """JavaScript or GLSL without comments that begin a line, those that end one, and indentation."""
-    lines = (_TRAILING.sub("", line.strip()) for line in _BLOCK.sub("", text).splitlines())
+def strip_comments(text: str) -> str:
+    """Return JavaScript or GLSL without indentation, empty lines, and comments at the start or end of a line."""
+    lines = (_TRAILING_COMMENT.sub("", line.strip()) for line in _BLOCK_COMMENT.sub("", text).splitlines())
     return "\n".join(line for line in lines if line and not line.startswith("//"))
 
 
-def part(path: str) -> str:
-    """The text of a file below `hyrfpack/web`."""
+def read_web_file(path: str) -> str:
+    """Return the text of a file below `hyrfpack/web`."""
     return files("hyrfpack.web").joinpath(*path.split("/")).read_text("utf-8")
 
 
-def digest(script: str) -> str:
-    """What tells a script from every other one: SHA-256 in hexadecimal."""
+def script_digest(script: str) -> str:
+    """Return the SHA-256 of a script in hexadecimal."""
     return hashlib.sha256(script.encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""The page that lists several scenes, each with a picture and a link to the player."""
+"""The gallery page, which lists several scenes, each with a picture and a link to the player."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from dataclasses import dataclass
 from urllib.parse import quote, urlencode
 
 from hyrfpack.version import __version__
-from hyrfpack.web.bundle import part
-from hyrfpack.web.player import content_policy, fill, meta_tags
+from hyrfpack.web.bundle import read_web_file
+from hyrfpack.web.player import content_security_policy, fill_template, meta_tags
 
 
 @dataclass(frozen=True)
 class Card:
-    """What a gallery tells of a scene.
+    """The entry of a scene in a gallery.
 
     Attributes:
-        title: its name.
+        title: name of the scene.
         content, poster: addresses of its file and its picture (None for none) relative to the gallery.
-        count: Gaussians in the file.
-        length: bytes of the file.
-        quality: how good it is, in words; empty where nothing is known.
+        count: number of Gaussians in the file.
+        length: size of the file in bytes.
+        quality: quality of the scene in words; empty where nothing is known.
     """
 
     title: str
@@ -33,43 +33,44 @@ class Card:
 
 
 def encode_gallery(title: str, cards: Sequence[Card], player: str) -> bytes:
-    """A page of cards without scripts; nothing of what it is told is taken for HTML.
+    """Return a page of cards without scripts; all texts are escaped, so that none is read as HTML.
 
     Args:
-        title: of the page.
-        cards: one a scene.
-        player: address of the page that plays them, relative to this one.
+        title: title of the page.
+        cards: the entries, one for each scene.
+        player: address of the page that plays the scenes, relative to this one.
 
     Returns:
         The file, UTF-8. The same arguments give the same bytes.
     """
-    style = part("hosted/gallery.css")
+    style = read_web_file("hosted/gallery.css")
     posters = [quote(card.poster) for card in cards if card.poster]
     tags = meta_tags(title, f"{len(cards)} scenes in 3D", posters[0] if posters else None)
     values = {
-        "policy": content_policy(style, fetches="'self'"),
+        "policy": content_security_policy(style, fetches="'self'"),
         "version": __version__,
         "title": html.escape(title),
         "meta": tags,
         "style": style,
         "cards": "\n".join(_card(card, player) for card in cards),
     }
-    return fill(part("hosted/gallery.html"), values).encode()
+    return fill_template(read_web_file("hosted/gallery.html"), values).encode()
 
 
 def _card(card: Card, player: str) -> str:
+    """Return the HTML of a card."""
     named = {"content": card.content, **({"poster": card.poster} if card.poster else {})}
     address = f"{player}?{urlencode(named, quote_via=quote)}"
     picture = '<div class="picture"></div>'
     if card.poster:
         picture = f'<img class="picture" src="{html.escape(quote(card.poster))}" alt="" loading="lazy">'
-    facts = [f"{card.count:,} Gaussians", size_of(card.length), *([card.quality] if card.quality else [])]
+    facts = [f"{card.count:,} Gaussians", format_bytes(card.length), *([card.quality] if card.quality else [])]
     return (
         f'<li>{picture}<h2><a href="{html.escape(address)}">{html.escape(card.title)}</a></h2>'
         f"<p>{html.escape(' · '.join(facts))}</p></li>"
     )
 
 
-def size_of(length: int) -> str:
-    """Bytes in the unit that people think in: "86 kB", "1.5 MB"."""
+def format_bytes(length: int) -> str:
+    """Return a number of bytes in kB or MB: "86 kB", "1.5 MB"."""
     return f"{length / 1e6:,.1f} MB" if length >= 999_500 else f"{max(1, round(length / 1e3))} kB"

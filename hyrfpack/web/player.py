@@ -1,4 +1,4 @@
-"""The player's page, empty: what it is made of, what it may do, and what lies beside it in a folder to be hosted."""
+"""The page of the player without a scene: its parts, its content security policy, and the files hosted beside it."""
 
 from __future__ import annotations
 
@@ -13,14 +13,18 @@ from functools import cache
 from importlib.resources import files
 
 from hyrfpack.version import __version__
-from hyrfpack.web.bundle import bare_script, bundle, digest, part
+from hyrfpack.web.bundle import bundle, read_web_file, script_digest, strip_comments
 
-SCRIPTS = ("boot.js", "element.js", "main.js", "worker.js", "worker_model.js")
-MODEL, SPLATS = ".hyrf", (".ply", ".spz", ".splat", ".sog")  # endings of what it plays
-SHADERS = (".vert", ".frag", ".glsl")
-BLOCK = 3 << 20  # bytes of a block of base64, which is unpacked while the next one comes in; a multiple of 3
-GZIP = 31  # zlib's number for a gzip header, without a time or a name, around the largest window
-ANYWHERE = "'self' https: http:"  # what a player may fetch that others host: its address names it
+SCRIPT_NAMES = ("boot.js", "element.js", "main.js", "worker.js", "worker_model.js")
+# Suffixes of the files that the page plays.
+MODEL_SUFFIX = ".hyrf"
+SPLATS_SUFFIXES = (".ply", ".spz", ".splat", ".sog")
+SHADER_SUFFIXES = (".vert", ".frag", ".glsl")
+# The browser decodes one base64 block while it loads the next one. A multiple of 3 needs no padding.
+PAYLOAD_BLOCK_BYTES = 3 << 20
+GZIP_WINDOW_BITS = 31  # zlib's value for the largest window with a gzip header, which holds no time and no name
+# Sources in the content security policy of a player whose address may name a file on any server.
+ANY_SOURCE = "'self' https: http:"
 
 
 def encode_player(
@@ -29,22 +33,24 @@ def encode_player(
     content: str | None = None,
     poster: str | None = None,
     description: str = "A player of 3D scenes",
-    fetches: str = ANYWHERE,
+    fetches: str = ANY_SOURCE,
     stages: Mapping[str, dict] | None = None,
     updates: str | None = None,
 ) -> bytes:
-    """The page that plays a file beside it or one that its address names, as `?content=URL`; or that is dropped on it.
+    """Return a page that plays a file beside it, a file that its address names (`?content=URL`), or a dropped file.
 
     Args:
-        title: of the page.
-        content: address of the file that it plays when its own names none, relative to the page; None for none.
-        poster: address of the picture that is shown while that file comes in, relative to the page; None for none.
-        description: for those who share the page.
-        fetches: what it may fetch, as a content security policy has it.
-        stages: from where to look at `.hyrf` files beside the page, by their address relative to it; see `html.stage`.
+        title: title of the page.
+        content: address, relative to the page, of the file that it plays when its own address names none; None for
+            none.
+        poster: address, relative to the page, of the picture that is shown while that file loads; None for none.
+        description: description for those who share the page.
+        fetches: sources that the page may fetch from, in the syntax of a content security policy.
+        stages: from where to look at `.hyrf` files beside the page, by their address relative to it; see
+            `html.encode_stage`.
         updates: address of a JSON file that says which snapshot of a training `content` is: {"snapshot": number from 1,
-            0 while there is none, "step", "steps"}. The page asks for it again and again and shows newer snapshots from
-            where the viewer stands. None for a file that stays.
+            0 while there is none, "step", "steps"}. The page requests it repeatedly and shows newer snapshots from the
+            viewer's current viewpoint. None for a file that does not change.
 
     Returns:
         The file, UTF-8. The same arguments give the same bytes.
@@ -52,13 +58,13 @@ def encode_player(
     beside: dict = {"content": content, "title": title, "stages": stages or {}}
     if updates is not None:
         beside["updates"] = updates
-    texts = [json_text("content", beside)] if content is not None or stages else []
+    texts = [json_element("content", beside)] if content is not None or stages else []
     if poster is not None:
         texts.append(f'<img id="poster" alt="" src="{html.escape(poster)}">')
-    return player_page(title, texts, description, image=poster, fetches=fetches)
+    return assemble_player_page(title, texts, description, image=poster, fetches=fetches)
 
 
-def player_page(
+def assemble_player_page(
     title: str,
     texts: list[str],
     description: str,
@@ -68,53 +74,56 @@ def player_page(
     fetches: str = "",
     readers: bool = True,
 ) -> bytes:
-    """The player's page around a scene.
+    """Return the player's page around the elements of a scene, as UTF-8.
 
     Args:
-        title: of the page.
-        texts: elements that its scripts find by their names, see `text` and `json_text`.
-        description: for those who share the page.
-        payload: a file inside it, empty for none.
-        image: address of a picture for those who share the page.
-        fetches: what it may fetch, as a content security policy has it.
-        readers: whether files of splats can be played, too: a third more to carry.
+        title: title of the page.
+        texts: elements that the scripts find by their names, see `text_element` and `json_element`.
+        description: description for those who share the page.
+        payload: a file that the page holds, empty for none.
+        image: address of a picture for those who share the page; None for none.
+        fetches: sources that the page may fetch from, in the syntax of a content security policy.
+        readers: include the readers of splats, which make the page a third larger.
     """
-    style, script = part("viewer/style.css"), script_of("boot.js")
-    main, packed = _scripts("worker.js" if readers else "worker_model.js")
+    style, script = read_web_file("viewer/style.css"), read_script("boot.js")
+    main, packed = _pack_scripts("worker.js" if readers else "worker_model.js")
     view = memoryview(payload)
-    blocks = (base64.b64encode(view[at : at + BLOCK]).decode() for at in range(0, len(view), BLOCK))
+    blocks = (
+        base64.b64encode(view[at : at + PAYLOAD_BLOCK_BYTES]).decode()
+        for at in range(0, len(view), PAYLOAD_BLOCK_BYTES)
+    )
     values = {
-        "policy": content_policy(style, [script, main], fetches),
+        "policy": content_security_policy(style, [script, main], fetches),
         "version": __version__,
         "title": html.escape(title),
         "meta": meta_tags(title, description, image),
         "style": style,
-        "accept": ",".join([MODEL, *SPLATS] if readers else [MODEL]),
-        "texts": "\n".join([*texts, text("player", packed)]),
+        "accept": ",".join([MODEL_SUFFIX, *SPLATS_SUFFIXES] if readers else [MODEL_SUFFIX]),
+        "texts": "\n".join([*texts, text_element("player", packed)]),
         "script": script,
         "payload": "\n".join(f'<script type="text/plain" class="payload">{block}</script>' for block in blocks),
     }
-    return fill(part("viewer/page.html"), values).encode()
+    return fill_template(read_web_file("viewer/page.html"), values).encode()
 
 
-def content_policy(style: str, scripts: Sequence[str] = (), fetches: str = "") -> str:
-    """A content security policy: of code, only what is in the page runs, and only what `fetches` allows is fetched.
+def content_security_policy(style: str, scripts: Sequence[str] = (), fetches: str = "") -> str:
+    """Return a content security policy by which only the page's own scripts run and only `fetches` are fetched.
 
     Args:
-        style: the text in the page's style element.
-        scripts: those of its script elements.
+        style: text of the page's style element.
+        scripts: texts of its script elements.
         fetches: sources of files and pictures besides the page itself.
     """
-    allowed = {"default-src": "'none'", "style-src": _hash(style), "img-src": f"{fetches} data: blob:".strip()}
+    allowed = {"default-src": "'none'", "style-src": _hash_source(style), "img-src": f"{fetches} data: blob:".strip()}
     if scripts:
-        allowed |= {"script-src": " ".join(map(_hash, scripts)), "worker-src": "blob:"}
+        allowed |= {"script-src": " ".join(map(_hash_source, scripts)), "worker-src": "blob:"}
         allowed |= {"connect-src": fetches} if fetches else {}
     allowed |= {"base-uri": "'none'", "form-action": "'none'"}
     return "; ".join(f"{what} {where}" for what, where in allowed.items())
 
 
 def meta_tags(title: str, description: str, image: str | None = None) -> str:
-    """What those who share a page's address are shown of it.
+    """Return the meta elements of a page, from which programs show a preview of its address.
 
     Args:
         title, description: plain text.
@@ -125,56 +134,63 @@ def meta_tags(title: str, description: str, image: str | None = None) -> str:
     return "\n".join([*tags, f'<meta name="description" content="{html.escape(description)}">'])
 
 
-def element_script() -> bytes:
-    """The script that defines <hyrf-viewer> for other people's pages, whose names it leaves alone."""
-    return f"(() => {{\n{script_of('element.js')}\n}})();\n".encode()
+def encode_element_script() -> bytes:
+    """Return the script that defines <hyrf-viewer> for other people's pages and adds no global names to them."""
+    return f"(() => {{\n{read_script('element.js')}\n}})();\n".encode()
 
 
 def encode_readme(title: str, entry: str, index: str, *, element: str | None = None) -> bytes:
-    """What to do with a folder of static files.
+    """Return the README of a folder of static files, which says how to host and embed them.
 
     Args:
-        title: of what is shown.
-        entry: name of the page that plays.
+        title: title of the scene or the gallery.
+        entry: name of the player's page.
         index: name of the page that is opened first.
-        element: name of a file that <hyrf-viewer>, whose script lies there, too, may show; None without that script.
+        element: name of a file that <hyrf-viewer> can show; None if its script is not in the folder.
     """
     line = f'  <script src="hyrf-viewer.js"></script> <hyrf-viewer src="{element}"></hyrf-viewer>\n' if element else ""
     values = {"title": title, "version": __version__, "entry": entry, "index": index, "element": line}
-    return fill(part("hosted/README.txt"), values).encode()
+    return fill_template(read_web_file("hosted/README.txt"), values).encode()
 
 
-def fill(template: str, values: dict[str, str]) -> str:
-    """A text with each {{name}} in it replaced."""
+def fill_template(template: str, values: dict[str, str]) -> str:
+    """Return a template with each {{name}} replaced by its value."""
     return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], template)
 
 
 @cache
-def _scripts(worker: str) -> tuple[str, str]:
-    """The player's script, and it with the worker and the shaders as `boot.js` unpacks them: base64 of gzipped JSON."""
+def _pack_scripts(worker: str) -> tuple[str, str]:
+    """Return the player's script, and all scripts and shaders in the form that `boot.js` unpacks.
+
+    That form is base64 of gzipped JSON.
+
+    Args:
+        worker: name of the script of the worker.
+    """
     names = sorted(entry.name for entry in files("hyrfpack.web").joinpath("viewer").iterdir())
-    texts = {name: bare_script(part(f"viewer/{name}")) for name in names if name.endswith(SHADERS)}
-    texts |= {"worker.js": script_of(worker), "main.js": script_of("main.js")}
-    packer = zlib.compressobj(9, zlib.DEFLATED, GZIP, 9)
+    texts = {name: strip_comments(read_web_file(f"viewer/{name}")) for name in names if name.endswith(SHADER_SUFFIXES)}
+    texts |= {"worker.js": read_script(worker), "main.js": read_script("main.js")}
+    packer = zlib.compressobj(9, zlib.DEFLATED, GZIP_WINDOW_BITS, 9)
     packed = packer.compress(json.dumps(texts).encode()) + packer.flush()
     return texts["main.js"], base64.b64encode(packed).decode()
 
 
-def script_of(name: str) -> str:
-    """One of SCRIPTS, with short names where `make player` has been run since it last changed."""
-    script, short = bundle(f"viewer/{name}"), json.loads(part("shortened.json")).get(name, {})
-    return short["script"] if short.get("of") == digest(script) else script
+def read_script(name: str) -> str:
+    """Return one of SCRIPT_NAMES, in its shortened form if `make player` has been run since it last changed."""
+    script, short = bundle(f"viewer/{name}"), json.loads(read_web_file("shortened.json")).get(name, {})
+    return short["script"] if short.get("of") == script_digest(script) else script
 
 
-def _hash(text: str) -> str:
+def _hash_source(text: str) -> str:
+    """Return the source by which a content security policy allows an inline text."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def text(name: str, text: str) -> str:
-    """A text that scripts find by its name; there is no "</script" in it."""
+def text_element(name: str, text: str) -> str:
+    """Return an element with a text that scripts find by its name; the text must not contain "</script"."""
     return f'<script type="text/plain" id="{name}">{text}</script>'
 
 
-def json_text(name: str, value: dict) -> str:
-    """The same of what comes from files: no "<" is left in it."""
-    return text(name, json.dumps(value).replace("<", "\\u003c"))
+def json_element(name: str, value: dict) -> str:
+    """Return an element with JSON that scripts find by its name; each "<" is escaped, since it may come from files."""
+    return text_element(name, json.dumps(value).replace("<", "\\u003c"))

@@ -1,4 +1,4 @@
-"""A page and the files that it plays, from disk or from memory, served to browsers of this machine."""
+"""An HTTP server of a page and the files that it plays, from disk or from memory."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from typing import Any, BinaryIO
 
 from hyrfpack.errors import HyrfError
 
-LOCAL = "127.0.0.1"
-BINARY = "application/octet-stream"
-PIECE = 1 << 18  # bytes of a file that are held at once
-POLL_SECONDS = 0.1  # that a server in a thread takes to end, at most
-_RANGE = re.compile(r"bytes=(\d*)-(\d*)", re.ASCII)
+LOCAL_HOST = "127.0.0.1"
+BINARY_CONTENT_TYPE = "application/octet-stream"
+CHUNK_BYTES = 1 << 18  # bounds the memory that sending a large file takes
+SHUTDOWN_POLL_SECONDS = 0.1  # bounds the time that a server in a thread takes to end
+_RANGE_PATTERN = re.compile(r"bytes=(\d*)-(\d*)", re.ASCII)
 
 
 class MemoryFile:
-    """A file that is served from memory and may be replaced meanwhile; each request gets one whole version of it."""
+    """A file that is served from memory and can be replaced at any time; each request gets one whole version."""
 
     def __init__(self, data: bytes) -> None:
         self._version = 0, data
 
     def replace(self, data: bytes) -> None:
-        """Give it another content: its ETag changes, too."""
+        """Replace the content of the file, which changes its ETag."""
         self._version = self._version[0] + 1, data
 
     def open(self) -> tuple[BinaryIO, int, str]:
-        """The present version to be read, its length in bytes and its ETag."""
+        """Return the current version for reading, its length in bytes and its ETag."""
         number, data = self._version
         return io.BytesIO(data), len(data), f'"{number:x}-{len(data):x}"'
 
@@ -49,58 +49,58 @@ def serve(
     page: bytes,
     files: Files | None = None,
     *,
-    host: str = LOCAL,
+    host: str = LOCAL_HOST,
     port: int = 0,
     open_browser: bool,
     say: Callable[[str], None],
 ) -> None:
-    """Serve a page, and files beside it, until interrupted (Ctrl-C), which is how it ends without an error.
+    """Serve a page, and files beside it, until interrupted (Ctrl-C), which is the normal end.
 
-    Files on disk are read in pieces as they are asked for, whole or in ranges of bytes (RFC 9110, one range a
-    request); one that has changed meanwhile has another ETag, and one that has gone is not found.
+    Files on disk are read in chunks on request, whole or by byte range (RFC 9110, one range for each request). A file
+    that changes gets another ETag, and a file that is removed is not found.
 
     Args:
-        page: HTML, UTF-8, at "/".
-        files: what else there is, by the name that follows "/" in its address.
-        host: the address to listen at. Others than the default let other machines look.
-        port: to listen at, 0 to 65535; 0 takes a free one.
-        open_browser: whether to open the page in the person's browser.
-        say: told the page's address, once it can be opened.
+        page: HTML, UTF-8, which is served at "/".
+        files: the files, by the name that follows "/" in their address.
+        host: address to listen at. Any other than the default lets other machines connect.
+        port: port to listen at, 0 to 65535; 0 takes a free one.
+        open_browser: open the page in the user's browser.
+        say: called with the page's address, once it can be opened.
 
     Raises:
-        HyrfError: nothing can listen there.
+        HyrfError: the server cannot listen at this address.
     """
-    with _server(host, port, page, files or {}) as server:
-        address = _address(host, server)
+    with _create_server(host, port, page, files or {}) as server:
+        address = _page_address(host, server)
         say(address)
-        if open_browser:  # beside us: some browsers do not return before they are closed
+        if open_browser:  # in a thread, because some browsers do not return before they are closed
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
         with contextlib.suppress(KeyboardInterrupt):
             server.serve_forever()
 
 
 @contextlib.contextmanager
-def serving(page: bytes, files: Files, *, port: int = 0) -> Iterator[str]:
-    """Serve a page and files to this machine in a thread, while the block runs; gives the page's address.
+def serve_in_thread(page: bytes, files: Files, *, port: int = 0) -> Iterator[str]:
+    """Serve a page and files to this machine in a thread while the block runs, and yield the page's address.
 
     Args:
-        page, files, port: as of `serve`.
+        page, files, port: as for `serve`.
 
     Raises:
-        HyrfError: nothing can listen at this port.
+        HyrfError: the server cannot listen at this port.
     """
-    with _server(LOCAL, port, page, files) as server:
-        thread = threading.Thread(target=server.serve_forever, args=(POLL_SECONDS,), daemon=True)
+    with _create_server(LOCAL_HOST, port, page, files) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(SHUTDOWN_POLL_SECONDS,), daemon=True)
         thread.start()
         try:
-            yield _address(LOCAL, server)
+            yield _page_address(LOCAL_HOST, server)
         finally:
             server.shutdown()
             thread.join()
-            server.page, server.files = b"", {}  # for connections that browsers keep open
+            server.page, server.files = b"", {}  # connections that browsers keep open must find nothing any more
 
 
-def _address(host: str, server: _Server) -> str:
+def _page_address(host: str, server: _Server) -> str:
     name = f"[{host}]" if ":" in host else host
     return f"http://{name}:{server.server_port}/"
 
@@ -110,29 +110,29 @@ class _Server(ThreadingHTTPServer):
     files: Mapping[str, Path | MemoryFile] = {}
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):  # the browser went away
+        if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):  # the browser has closed the connection
             super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
-    timeout = 60  # s: a silent browser does not keep a thread for ever
+    timeout = 60  # seconds, so that a silent browser does not occupy a thread for ever
     server: _Server
 
     def do_GET(self) -> None:
         path = self.path.partition("?")[0]
         if path == "/":
-            self._head(HTTPStatus.OK, "text/html; charset=utf-8", len(self.server.page))
+            self._send_headers(HTTPStatus.OK, "text/html; charset=utf-8", len(self.server.page))
             if self.command == "GET":
                 self.wfile.write(self.server.page)
         elif path in self.server.files:
-            self._file(self.server.files[path])
+            self._send_file(self.server.files[path])
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
 
     do_HEAD = do_GET
 
-    def _file(self, served: Path | MemoryFile) -> None:
+    def _send_file(self, served: Path | MemoryFile) -> None:
         try:
             file, size, tag = served.open() if isinstance(served, MemoryFile) else _open_on_disk(served)
         except OSError:
@@ -140,23 +140,28 @@ class _Handler(BaseHTTPRequestHandler):
             return
         with file:
             shared = {"Accept-Ranges": "bytes", "ETag": tag}
-            part = self._asked(size, tag)
+            part = self._requested_range(size, tag)
             if part is None:
-                self._head(HTTPStatus.OK, BINARY, size, shared)
+                self._send_headers(HTTPStatus.OK, BINARY_CONTENT_TYPE, size, shared)
                 part = range(size)
             elif part:
-                extent = f"bytes {part.start}-{part.stop - 1}/{size}"
-                self._head(HTTPStatus.PARTIAL_CONTENT, BINARY, len(part), {**shared, "Content-Range": extent})
+                more = {**shared, "Content-Range": f"bytes {part.start}-{part.stop - 1}/{size}"}
+                self._send_headers(HTTPStatus.PARTIAL_CONTENT, BINARY_CONTENT_TYPE, len(part), more)
             else:
-                none = {**shared, "Content-Range": f"bytes */{size}"}
-                self._head(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, BINARY, 0, none)
+                more = {**shared, "Content-Range": f"bytes */{size}"}
+                self._send_headers(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, BINARY_CONTENT_TYPE, 0, more)
             if self.command == "GET":
-                self._send(file, part)
+                self._send_range(file, part)
 
-    def _asked(self, size: int, tag: str) -> range | None:
-        """The bytes that are asked for; an empty range for some beyond the end; None for all, or what is not known."""
-        asked, only_if = self.headers.get("Range"), self.headers.get("If-Range")
-        match = _RANGE.fullmatch(asked.strip()) if asked else None
+    def _requested_range(self, size: int, tag: str) -> range | None:
+        """Return the requested bytes of a file of `size` bytes.
+
+        Returns:
+            The range, which is empty for a request beyond the end; None for the whole file, also where the request
+            names no range, has a form that is not supported, or is for another version of the file.
+        """
+        requested, only_if = self.headers.get("Range"), self.headers.get("If-Range")
+        match = _RANGE_PATTERN.fullmatch(requested.strip()) if requested else None
         if match is None or self.command != "GET" or (only_if is not None and only_if.strip() != tag):
             return None
         first, last = match.groups()
@@ -166,16 +171,16 @@ class _Handler(BaseHTTPRequestHandler):
             return None
         return range(min(int(first), size), min(int(last) + 1, size) if last else size)
 
-    def _send(self, file: BinaryIO, part: range) -> None:
-        """Send a part of a file; where it has become shorter meanwhile, what was promised ends with the connection."""
+    def _send_range(self, file: BinaryIO, part: range) -> None:
+        """Send a range of a file; if the file has become shorter meanwhile, close the connection after its end."""
         file.seek(part.start)
         left = len(part)
-        while left and (piece := file.read(min(PIECE, left))):
-            self.wfile.write(piece)
-            left -= len(piece)
+        while left and (chunk := file.read(min(CHUNK_BYTES, left))):
+            self.wfile.write(chunk)
+            left -= len(chunk)
         self.close_connection = self.close_connection or left > 0
 
-    def _head(self, status: HTTPStatus, kind: str, length: int, more: Mapping[str, str] | None = None) -> None:
+    def _send_headers(self, status: HTTPStatus, kind: str, length: int, more: Mapping[str, str] | None = None) -> None:
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(length))
@@ -186,29 +191,33 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def log_message(self, format: str, *args: object) -> None:
-        """Requests are nobody's news."""
+        """Print nothing, because requests are of no interest to the user."""
 
 
 def _open_on_disk(path: Path) -> tuple[BinaryIO, int, str]:
-    """A file to be read, its length in bytes and its ETag. Raises OSError."""
-    if not path.is_file():  # asked before opening: opening a pipe would wait for a writer
+    """Open a file for reading and return it with its length in bytes and its ETag.
+
+    Raises:
+        OSError: it is not a regular file, or cannot be opened.
+    """
+    if not path.is_file():  # checked before opening, because opening a pipe would wait for a writer
         raise FileNotFoundError(path)
     file = path.open("rb")
     status = os.fstat(file.fileno())
     return file, status.st_size, f'"{status.st_ino:x}-{status.st_mtime_ns:x}-{status.st_size:x}"'
 
 
-def _server(host: str, port: int, page: bytes, files: Files) -> _Server:
-    """A server that listens and does not answer yet."""
+def _create_server(host: str, port: int, page: bytes, files: Files) -> _Server:
+    """Create a server that listens but does not answer yet."""
 
     class Server(_Server):
         address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
 
-    if not host.strip():  # to the socket, this is every address
-        raise HyrfError(f"'{host}' is not an address to listen at; name {LOCAL}, or 0.0.0.0 to let others look")
+    if not host.strip():  # a socket would listen at every address
+        raise HyrfError(f"'{host}' is not an address to listen at; name {LOCAL_HOST}, or 0.0.0.0 to let others look")
     try:
         server = Server((host, port), _Handler)
-    except (OSError, UnicodeError) as error:  # the latter of a name that can be none
+    except (OSError, UnicodeError) as error:  # UnicodeError comes from a malformed host name
         if getattr(error, "errno", None) == errno.EADDRINUSE:
             raise HyrfError(
                 f"port {port} of {host} is taken by another program; name another, or 0 for any free one"

@@ -1,4 +1,4 @@
-"""A file of a scene, looked at in a browser of this machine."""
+"""Viewing of a scene's file in a browser of this machine."""
 
 from __future__ import annotations
 
@@ -9,45 +9,46 @@ from pathlib import Path
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.format import describe, find_model
 from hyrfpack.splats.names import is_splats, sog_folder
-from hyrfpack.web.player import MODEL, SPLATS, encode_player
-from hyrfpack.web.serve import LOCAL, serve
+from hyrfpack.web.player import MODEL_SUFFIX, SPLATS_SUFFIXES, encode_player
+from hyrfpack.web.serve import LOCAL_HOST, serve
 
 
 def view(
     path: str | os.PathLike[str],
     *,
-    host: str = LOCAL,
+    host: str = LOCAL_HOST,
     port: int = 0,
     open_browser: bool,
     say: Callable[[str], None],
 ) -> None:
-    """Serve a scene's file and a player for it until interrupted. Nothing is decoded here: the page does that.
+    """Serve a scene's file and a player for it until interrupted; the page decodes the file.
 
     Args:
-        path: a `.hyrf` file or the folder of a run, or a file of splats with an ending of `hyrfpack.web.player.SPLATS`.
-        host, port, open_browser, say: as of `hyrfpack.web.serve.serve`.
+        path: a `.hyrf` file, the folder of a run, or a file of splats with one of the suffixes
+            `hyrfpack.web.player.SPLATS_SUFFIXES`.
+        host, port, open_browser, say: as for `hyrfpack.web.serve.serve`.
 
     Raises:
-        HyrfError: there is no such file, or its first kilobytes are damaged, or nothing can listen there.
+        HyrfError: there is no such file, its first kilobytes are damaged, or the server cannot listen at the address.
     """
-    title, path = Path(path).stem, playable_file(path)
-    ending = path.suffix.lower()
-    if ending in SPLATS:
-        _check_there(path)
+    title, path = Path(path).stem, find_playable_file(path)
+    suffix = path.suffix.lower()
+    if suffix in SPLATS_SUFFIXES:
+        _check_readable(path)
     else:
-        ending = MODEL
+        suffix = MODEL_SUFFIX
         describe(path)
-    name = f"scene{ending}"
+    name = f"scene{suffix}"
     page = encode_player(title, content=name, fetches="'self'")
     serve(page, {name: path}, host=host, port=port, open_browser=open_browser, say=say)
 
 
-def playable_file(path: str | os.PathLike[str]) -> Path:
-    """Return the one file that a page plays: splats, or a model, named by its path or by the folder of its run.
+def find_playable_file(path: str | os.PathLike[str]) -> Path:
+    """Return the file that a page plays: splats, or a model that is named by its path or by the folder of its run.
 
     Raises:
-        HyrfDataError: it is a SOG that is not bundled.
-        HyrfFormatError: it is a folder without a model.
+        HyrfDataError: the splats are a SOG folder, which has to be bundled into one file first.
+        HyrfFormatError: the path is a folder without a model.
     """
     if not is_splats(path):
         return find_model(path)
@@ -56,7 +57,8 @@ def playable_file(path: str | os.PathLike[str]) -> Path:
     return Path(path)
 
 
-def _check_there(path: str | os.PathLike[str]) -> None:
+def _check_readable(path: str | os.PathLike[str]) -> None:
+    """Raise HyrfDataError unless the file can be read and is not empty."""
     try:
         with open(path, "rb") as file:
             if not file.read(1):

@@ -265,7 +265,7 @@ def _make_blender(root: Path, photos: list[Path], frames: list[dict]) -> None:
 def _make_foreign(folder: Path, photo: str) -> None:
     """Files that other programs made, named as the commands' own."""
     from hyrfpack.compress.report_page import REPORT_FILES
-    from hyrfpack.demo.run import FILES as DEMO
+    from hyrfpack.demo.run import RESULT_FILES as DEMO
 
     scored = f"{Path(photo).stem}.png"
     names = [f"a{ending}" for ending in (".hyrf", ".png", ".json", ".md", *KINDS)]

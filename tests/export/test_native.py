@@ -20,7 +20,7 @@ from hyrfpack.export.pages import MAX_POSTER_BYTES
 from hyrfpack.export.poster import encode_poster
 from hyrfpack.format import load, save
 from hyrfpack.render import render
-from hyrfpack.web.html import payload_of
+from hyrfpack.web.html import extract_payload
 
 POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
 
@@ -44,7 +44,7 @@ def compact(model, tmp_path_factory):
 def test_the_page_holds_the_file_and_what_is_known_of_it(model, tmp_path):
     report = export(model, tmp_path / "room.html")
     page = (tmp_path / "room.html").read_bytes()
-    scene, inside = payload_of(page, "page")
+    scene, inside = extract_payload(page, "page")
     assert inside == model.read_bytes() and b"<title>room</title>" in page
     frame = load(model).config.frame
     assert (scene["kind"], scene["title"], scene["count"]) == ("hyrf", "room", 40)
@@ -84,7 +84,7 @@ def test_a_poster_takes_no_more_bytes_than_it_may(form, most):
 def test_a_file_that_keeps_no_cameras_is_seen_from_around_or_from_its_photos(compact, tmp_path):
     export(compact, tmp_path / "a.html")
     export(compact, tmp_path / "b.html", data=ball_scene(5))
-    made_up, photos = (payload_of((tmp_path / name).read_bytes(), name)[0] for name in ("a.html", "b.html"))
+    made_up, photos = (extract_payload((tmp_path / name).read_bytes(), name)[0] for name in ("a.html", "b.html"))
     assert len(made_up["cameras"]) == 12 and len(photos["cameras"]) == 5
     assert np.allclose(photos["cameras"][0]["camera_from_world"], ball_scene(5).train[0].camera.camera_from_world)
 

@@ -29,7 +29,7 @@ from hyrfpack.model import Frame
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, Picture, Scene
 from hyrfpack.splats.table import FORMATS
-from hyrfpack.web.html import decode_page
+from hyrfpack.web.html import decode_splats_page
 
 POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
 FOUR = ring(4)
@@ -77,7 +77,9 @@ def no_bake(monkeypatch):
 
 def read_back(path):
     data = path.read_bytes()
-    return decode_page(data, "page")[0] if path.suffix == ".html" else FORMATS[path.suffix].decode(data, str(path))
+    return (
+        decode_splats_page(data, "page")[0] if path.suffix == ".html" else FORMATS[path.suffix].decode(data, str(path))
+    )
 
 
 def nearest(points: np.ndarray, others: np.ndarray) -> np.ndarray:

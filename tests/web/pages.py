@@ -15,7 +15,7 @@ from hyrfpack.model import Frame
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.splats import Splats, normalized_quats
-from hyrfpack.web.html import encode_page
+from hyrfpack.web.html import encode_splats_page
 from tools.browser.chromium import Chromium
 from tools.browser.firefox import Firefox
 
@@ -57,7 +57,7 @@ def sky() -> np.ndarray:
 def page_of(splats: Splats, background: np.ndarray | None = None, title: str = "a scene", **more: object) -> bytes:
     cameras = [camera(), camera(1.5), camera(4.0)]
     settings = {"title": title, "cameras": cameras, "up": UP, "center": CENTER, "solid": SOLID, "near": NEAR}
-    return encode_page(splats, background=background, **{**settings, **more})
+    return encode_splats_page(splats, background=background, **{**settings, **more})
 
 
 def opened(browser: Browser, tmp_path: Path, page: bytes, hash: str = "") -> Browser:

@@ -36,7 +36,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import ExposureMap
 from hyrfpack.render import render
 from hyrfpack.scene import Camera
-from hyrfpack.web.player import element_script, encode_player
+from hyrfpack.web.player import encode_element_script, encode_player
 from tools.safety.plans import encode
 
 LARGEST_LOG_GAIN = 1.0
@@ -348,7 +348,7 @@ def host():
         here.files = {
             "/index.html": encode_player("player"),
             "/scene.hyrf": encode_model(mapped(60)),
-            "/hyrf-viewer.js": element_script(),
+            "/hyrf-viewer.js": encode_element_script(),
         }
         yield here
 

@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from hyrfpack.web.gallery import Card, encode_gallery, size_of
+from hyrfpack.web.gallery import Card, encode_gallery, format_bytes
 
 HOSTILE = "\"><script>alert(1)</script>'&{{style}}"
 
@@ -90,4 +90,4 @@ def test_text_stands_out_in_light_and_dark():
     [(1, "1 kB"), (85_952, "86 kB"), (999_400, "999 kB"), (999_500, "1.0 MB"), (2**30, "1,073.7 MB")],
 )
 def test_sizes_are_in_units_that_people_think_in(length, said):
-    assert size_of(length) == said
+    assert format_bytes(length) == said

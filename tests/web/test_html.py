@@ -12,7 +12,7 @@ from web.pages import CASES, UP, Browser, camera, cloud, drawn, opened, page_of,
 from hyrfpack.cameras.paths import look_at
 from hyrfpack.model import Frame
 from hyrfpack.splats.formats import ply
-from hyrfpack.web.html import decode_page
+from hyrfpack.web.html import decode_splats_page
 
 
 def test_pictures_are_those_of_our_rasterizer(browser: Browser, tmp_path: Path):
@@ -21,7 +21,7 @@ def test_pictures_are_those_of_our_rasterizer(browser: Browser, tmp_path: Path):
     opened(browser, tmp_path, page)
     for case, at in CASES.items():
         picture = shown(browser, at)
-        assert psnr(picture, drawn(decode_page(page, "page")[0], at, sky_seen(at))) > 45, case
+        assert psnr(picture, drawn(decode_splats_page(page, "page")[0], at, sky_seen(at))) > 45, case
         assert psnr(picture, drawn(splats, at, sky_seen(at))) > 38, case
     assert browser.complaints() == []
 
@@ -36,7 +36,7 @@ def test_a_scene_of_another_program_looks_as_our_rasterizer_draws_it(
     page = page_of(splats, cameras=[at], near=0.01 * size)
     frame = Frame(tuple(middle), size, (1.0, 1.0, 1.0))
     picture = shown(opened(browser, tmp_path, page), at)
-    assert psnr(picture, drawn(decode_page(page, "page")[0], at, frame=frame)) > 45
+    assert psnr(picture, drawn(decode_splats_page(page, "page")[0], at, frame=frame)) > 45
     assert psnr(picture, drawn(splats, at, frame=frame)) > 38
 
 
@@ -44,7 +44,7 @@ def test_a_scene_of_another_program_looks_as_our_rasterizer_draws_it(
 def test_lower_degrees_and_compensated_opacities_look_right(browser: Browser, tmp_path: Path, degree: int):
     page = page_of(replace(cloud(400, degree), antialiased=degree != 1))
     opened(browser, tmp_path, page)
-    assert psnr(shown(browser, camera(6.0)), drawn(decode_page(page, "page")[0], camera(6.0))) > 50
+    assert psnr(shown(browser, camera(6.0)), drawn(decode_splats_page(page, "page")[0], camera(6.0))) > 50
 
 
 def test_where_targets_of_floats_are_missing_eight_bits_serve(browser: Browser, tmp_path: Path):
@@ -52,7 +52,7 @@ def test_where_targets_of_floats_are_missing_eight_bits_serve(browser: Browser, 
     with browser.before_every_page(script):
         page = page_of(cloud())
         opened(browser, tmp_path, page)
-        assert psnr(shown(browser, camera()), drawn(decode_page(page, "page")[0], camera())) > 35
+        assert psnr(shown(browser, camera()), drawn(decode_splats_page(page, "page")[0], camera())) > 35
 
 
 def test_a_page_without_splats_shows_its_background(browser: Browser, tmp_path: Path):

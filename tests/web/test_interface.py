@@ -32,7 +32,7 @@ from web.pages import (
 )  # fmt: skip
 from web.scripts import run_script
 
-from hyrfpack.web.html import decode_page
+from hyrfpack.web.html import decode_splats_page
 
 pytestmark = pytest.mark.in_turn
 PHONE = {"dense": 2.0, "phone": True}
@@ -298,7 +298,7 @@ def test_a_picture_is_what_the_window_shows(browser: Browser, tmp_path: Path):
         seen = np.asarray(picture.convert("RGB"), np.float64)
     at = eye(browser)
     assert seen.shape == (at.height, at.width, 3) == (180, 240, 3)
-    assert psnr(seen, drawn(decode_page(page, "page")[0], at)) > 40
+    assert psnr(seen, drawn(decode_splats_page(page, "page")[0], at)) > 40
     assert np.abs(shown(browser, at) - seen).max() <= 3
 
 

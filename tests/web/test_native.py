@@ -18,7 +18,7 @@ from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Camera
-from hyrfpack.web.html import encode_native
+from hyrfpack.web.html import encode_model_page
 from tools.safety.plans import encode
 
 FRAME = Frame((10.0, -20.0, 5.0), 7.0, (1.0, 0.5, 0.8))
@@ -74,7 +74,7 @@ def _scaled(camera: Camera) -> np.ndarray:
 def page_of(model: HybridModel, data: bytes | None = None) -> bytes:
     data = encode_model(model) if data is None else data
     facts = {"count": len(model), "frame": model.config.frame, "solid": model.config.solid}
-    return encode_native(data, title="a model", cameras=cameras(), up=UP, center=CENTER, **facts)
+    return encode_model_page(data, title="a model", cameras=cameras(), up=UP, center=CENTER, **facts)
 
 
 def rendered(model: HybridModel, camera: Camera) -> np.ndarray:
@@ -521,7 +521,7 @@ def test_photos_may_be_larger_than_pictures_that_are_drawn(one_browser: Browser,
     model = made_up(50)
     large = [replace(camera, width=12000, height=9000) for camera in cameras()]
     facts = {"count": 50, "frame": FRAME, "solid": model.config.solid, "up": UP, "center": CENTER}
-    loaded(one_browser, tmp_path, encode_native(encode_model(model), title="large", cameras=large, **facts))
+    loaded(one_browser, tmp_path, encode_model_page(encode_model(model), title="large", cameras=large, **facts))
     assert one_browser.evaluate("hyrfpack.player.cameras[0].width") == 12000
 
 

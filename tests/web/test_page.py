@@ -20,8 +20,8 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.model import Frame
 from hyrfpack.scene import Camera
 from hyrfpack.splats.splats import Splats, normalized_quats
-from hyrfpack.web.html import decode_page, encode_native, encode_page, payload_of
-from hyrfpack.web.player import encode_player, player_page
+from hyrfpack.web.html import decode_splats_page, encode_model_page, encode_splats_page, extract_payload
+from hyrfpack.web.player import assemble_player_page, encode_player
 
 UP, CENTER = np.array([0.0, -1.0, 0.0]), np.array([1000.0, -50.0, 20.0])
 FRAME = Frame((1000.0, -50.0, 20.0), 4.0, (1.0, 1.0, 1.0))
@@ -44,11 +44,13 @@ def stage(**more: object) -> dict:
 
 
 def baked(splats: Splats | None = None, **more: object) -> bytes:
-    return encode_page(cloud() if splats is None else splats, **stage(**{"near": 0.01, "background": None, **more}))
+    return encode_splats_page(
+        cloud() if splats is None else splats, **stage(**{"near": 0.01, "background": None, **more})
+    )
 
 
 def native(data: bytes = b"a model", **more: object) -> bytes:
-    return encode_native(data, count=1234, frame=FRAME, **stage(**more))
+    return encode_model_page(data, count=1234, frame=FRAME, **stage(**more))
 
 
 def packed_texts(page: bytes) -> dict[str, str]:
@@ -120,7 +122,7 @@ def test_a_player_is_told_what_lies_beside_it():
 
 @pytest.mark.parametrize(("readers", "most"), [(False, 51_800), (True, 59_400)])
 def test_the_player_alone_is_small(readers, most):
-    assert len(gzip.compress(player_page("hyrfpack", [], "a player", readers=readers))) <= most
+    assert len(gzip.compress(assemble_player_page("hyrfpack", [], "a player", readers=readers))) <= most
 
 
 def test_a_native_page_is_little_more_than_its_file():
@@ -130,10 +132,10 @@ def test_a_native_page_is_little_more_than_its_file():
 
 @pytest.mark.parametrize("length", [0, 1, 2, 3, 1000, 10_000])
 def test_the_file_inside_a_native_page_is_the_file(length, monkeypatch):
-    monkeypatch.setattr("hyrfpack.web.player.BLOCK", 3000)
+    monkeypatch.setattr("hyrfpack.web.player.PAYLOAD_BLOCK_BYTES", 3000)
     data = np.random.default_rng(0).bytes(length)
     page = native(data)
-    scene, inside = payload_of(page, "page")
+    scene, inside = extract_payload(page, "page")
     assert inside == data and page.count(b'class="payload"') == -(-length // 3000)
     assert (scene["kind"], scene["title"], scene["count"], len(scene["cameras"])) == ("hyrf", "a scene", 1234, 1)
     assert (scene["center"], scene["unit"], scene["near"]) == ([1000.0, -50.0, 20.0], 4.0, 0.01)
@@ -161,7 +163,7 @@ def test_a_page_holds_its_splats_as_finely_as_spz_far_from_the_origin_and_in_any
     for factor in (1e-6, 1.0, 1e6):
         splats = cloud(300)
         splats = replace(splats, positions=splats.positions * factor, scales=splats.scales * np.float32(factor))
-        back, _ = decode_page(baked(splats), "page")
+        back, _ = decode_splats_page(baked(splats), "page")
         extent = np.ptp(splats.positions, axis=0).max()
         assert np.abs(back.positions - splats.positions).max() < extent * 2**-21
         assert np.abs(np.log(back.scales / splats.scales)).max() < 1 / 31
@@ -170,15 +172,15 @@ def test_a_page_holds_its_splats_as_finely_as_spz_far_from_the_origin_and_in_any
 
 
 def test_many_splats_come_in_blocks_that_unpack_apart(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("hyrfpack.web.player.BLOCK", 3000)
+    monkeypatch.setattr("hyrfpack.web.player.PAYLOAD_BLOCK_BYTES", 3000)
     page = baked()
-    assert page.count(b'class="payload"') > 10 and len(decode_page(page, "page")[0]) == 1500
+    assert page.count(b'class="payload"') > 10 and len(decode_splats_page(page, "page")[0]) == 1500
 
 
 @pytest.mark.parametrize("data", [b"", b"<html>", b'<script type="text/plain" id="scene">{}</script>', native()])
 def test_what_is_no_page_of_splats_is_refused_in_one_sentence(data: bytes):
     with pytest.raises(HyrfDataError, match=r"^x\.html: this is not a page"):
-        decode_page(data, "x.html")
+        decode_splats_page(data, "x.html")
 
 
 def test_damaged_pages_give_splats_or_one_sentence():
@@ -189,16 +191,16 @@ def test_damaged_pages_give_splats_or_one_sentence():
         damaged, (first, last) = bytearray(page), places[rng.integers(2)]
         damaged[rng.integers(first, last)] = rng.integers(256)
         try:
-            decode_page(bytes(damaged), "x.html")
+            decode_splats_page(bytes(damaged), "x.html")
         except HyrfDataError as error:
             assert str(error).startswith("x.html: ") and "\n" not in str(error)
 
 
 def test_the_viewers_endings_of_splats_are_those_that_hyrfpack_reads():
     from hyrfpack.splats.files import READABLE_ENDINGS
-    from hyrfpack.web.player import SPLATS
+    from hyrfpack.web.player import SPLATS_SUFFIXES
 
-    assert set(SPLATS) == set(READABLE_ENDINGS)
+    assert set(SPLATS_SUFFIXES) == set(READABLE_ENDINGS)
 
 
 def test_the_page_and_its_parts_are_installed_with_the_package():

@@ -18,10 +18,10 @@ import pytest
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.web import serve as serving
-from hyrfpack.web.serve import PIECE, MemoryFile, serve
+from hyrfpack.web.serve import CHUNK_BYTES, MemoryFile, serve
 
 PAGE = b"<!DOCTYPE html><title>served</title>"
-DATA = np.random.default_rng(0).bytes(3 * PIECE + 17)
+DATA = np.random.default_rng(0).bytes(3 * CHUNK_BYTES + 17)
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def scene(tmp_path: Path) -> Path:
 @pytest.fixture
 def port(scene: Path) -> Iterator[int]:
     """Of a server with a page and a file."""
-    with serving._server("127.0.0.1", 0, PAGE, {"scene.hyrf": scene}) as server:
+    with serving._create_server("127.0.0.1", 0, PAGE, {"scene.hyrf": scene}) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.02,))
         thread.start()
         yield server.server_port
@@ -73,7 +73,7 @@ END = len(DATA) - 1
 RANGES = {
     "bytes=0-0": (0, 0),
     "bytes=5-9": (5, 9),
-    f"bytes={PIECE - 1}-{2 * PIECE}": (PIECE - 1, 2 * PIECE),
+    f"bytes={CHUNK_BYTES - 1}-{2 * CHUNK_BYTES}": (CHUNK_BYTES - 1, 2 * CHUNK_BYTES),
     "bytes=100-": (100, END),
     "bytes=-7": (END - 6, END),
     f"bytes=-{10 * len(DATA)}": (0, END),
@@ -134,7 +134,7 @@ def test_a_file_that_shrinks_while_it_is_sent_ends_the_connection_short(port, sc
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
     connection.request("GET", "/scene.hyrf")
     answer = connection.getresponse()
-    os.truncate(scene, PIECE)
+    os.truncate(scene, CHUNK_BYTES)
     with pytest.raises(http.client.IncompleteRead):
         answer.read()
     connection.close()
@@ -228,7 +228,7 @@ def port_of(address: str) -> int:
 
 
 def test_a_file_in_memory_is_served_whole_and_in_ranges():
-    with serving.serving(PAGE, {"scene.hyrf": MemoryFile(DATA)}) as address:
+    with serving.serve_in_thread(PAGE, {"scene.hyrf": MemoryFile(DATA)}) as address:
         port = port_of(address)
         assert ask(port, "/")[2] == PAGE and ask(port)[2] == DATA
         status, headers, body = ask(port, Range="bytes=5-9")
@@ -237,7 +237,7 @@ def test_a_file_in_memory_is_served_whole_and_in_ranges():
 
 def test_a_file_in_memory_that_is_replaced_has_another_tag_and_none_gets_parts_of_both():
     file = MemoryFile(DATA)
-    with serving.serving(PAGE, {"scene.hyrf": file}) as address:
+    with serving.serve_in_thread(PAGE, {"scene.hyrf": file}) as address:
         tag = ask(port_of(address))[1]["ETag"]
         file.replace(DATA[::-1])
         status, headers, body = ask(port_of(address), Range="bytes=5-9", If_Range=tag)
@@ -245,7 +245,7 @@ def test_a_file_in_memory_that_is_replaced_has_another_tag_and_none_gets_parts_o
 
 
 def test_serving_in_a_thread_ends_with_the_block():
-    with serving.serving(PAGE, {"scene.hyrf": MemoryFile(DATA)}) as address:
+    with serving.serve_in_thread(PAGE, {"scene.hyrf": MemoryFile(DATA)}) as address:
         kept = http.client.HTTPConnection("127.0.0.1", port_of(address), timeout=20)
         kept.request("GET", "/scene.hyrf")
         assert kept.getresponse().read() == DATA

@@ -6,13 +6,13 @@ import json
 
 import pytest
 
-from hyrfpack.web.bundle import bundle, digest, part
-from hyrfpack.web.player import SCRIPTS, script_of
+from hyrfpack.web.bundle import bundle, read_web_file, script_digest
+from hyrfpack.web.player import SCRIPT_NAMES, read_script
 
 
-@pytest.mark.parametrize("name", SCRIPTS)
+@pytest.mark.parametrize("name", SCRIPT_NAMES)
 def test_short_names_were_given_to_the_scripts_as_they_are(name):
-    entry = json.loads(part("shortened.json")).get(name, {})
-    assert entry.get("of") == digest(bundle(f"viewer/{name}")), "a script has changed: run 'make player'"
-    assert script_of(name) == entry["script"] and len(entry["script"]) < len(bundle(f"viewer/{name}"))
+    entry = json.loads(read_web_file("shortened.json")).get(name, {})
+    assert entry.get("of") == script_digest(bundle(f"viewer/{name}")), "a script has changed: run 'make player'"
+    assert read_script(name) == entry["script"] and len(entry["script"]) < len(bundle(f"viewer/{name}"))
     assert "</script" not in entry["script"] and "<!--" not in entry["script"]

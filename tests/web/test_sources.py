@@ -18,7 +18,7 @@ from web.pages import CENTER, Browser, cloud, message, opened, page_of, until
 
 from hyrfpack.splats.formats import spz
 from hyrfpack.splats.formats.hints import Hints
-from hyrfpack.web.player import element_script, encode_player
+from hyrfpack.web.player import encode_element_script, encode_player
 
 pytestmark = pytest.mark.in_turn
 GOLDEN = (Path(__file__).parents[1] / "golden" / "v1.1_compact.hyrf").read_bytes()
@@ -98,7 +98,7 @@ def host() -> Iterator[Site]:
             "/index.html": encode_player("player"),
             "/some scene.hyrf": GOLDEN,
             "/cloud.spz": spz.encode(cloud(300), Hints(spz_version=3)),
-            "/hyrf-viewer.js": element_script(),
+            "/hyrf-viewer.js": encode_element_script(),
         }
         yield here
 

@@ -18,7 +18,7 @@ from hyrfpack.format import encode_model
 from hyrfpack.model import Frame
 from hyrfpack.model.exposure import ExposureMap
 from hyrfpack.web.player import encode_player
-from hyrfpack.web.serve import MemoryFile, serving
+from hyrfpack.web.serve import MemoryFile, serve_in_thread
 
 pytestmark = pytest.mark.in_turn
 COUNT = "window.hyrfpack?.player?.loaded && hyrfpack.player.scene.count"
@@ -58,7 +58,7 @@ def trained(browser: Browser, *first: tuple[bytes, int]) -> Iterator[tuple[Train
     page = encode_player("fern", content="scene.hyrf", updates="training.json", fetches="'self'")
     with ExitStack() as server:
         files = {"scene.hyrf": training.scene, "training.json": training.updates}
-        browser.open(server.enter_context(serving(page, files)))
+        browser.open(server.enter_context(serve_in_thread(page, files)))
         yield training, server.close
 
 

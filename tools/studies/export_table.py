@@ -28,7 +28,7 @@ from hyrfpack.export.source import Source
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats, concatenate
 from hyrfpack.splats.table import FORMATS
-from hyrfpack.web.html import decode_page
+from hyrfpack.web.html import decode_splats_page
 
 Result = TypeVar("Result")
 
@@ -86,7 +86,7 @@ def row(
     """Write, read, score and print one file."""
     if name == HTML_PAGE.ending:
         data, write = timed(lambda: encode_baked_page(source, baked[degree], picture, "scene"))
-        back, read = timed(lambda: decode_page(data, name))
+        back, read = timed(lambda: decode_splats_page(data, name))
     else:
         form = FORMATS[name.split()[0]]
         hints = Hints(source.up, source.cameras[0][1], 4 if name.endswith("v4") else 3)
