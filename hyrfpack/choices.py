@@ -4,9 +4,12 @@ They stand here, below the rooms that implement them, so that the command line l
 """
 
 # How renders are exposed: each like the photos taken near its camera, or all alike.
-AS_PHOTOGRAPHED, CONSISTENT_EXPOSURE = RENDER_EXPOSURES = ("as-photographed", "consistent")
+AS_PHOTOGRAPHED = "as-photographed"
+CONSISTENT_EXPOSURE = "consistent"
+RENDER_EXPOSURES = (AS_PHOTOGRAPHED, CONSISTENT_EXPOSURE)
 # How the splats that a model is baked to are exposed: each like the photos that see it, or all alike.
-LOCAL_EXPOSURE, _ = SPLAT_EXPOSURES = ("local", CONSISTENT_EXPOSURE)
+LOCAL_EXPOSURE = "local"
+SPLAT_EXPOSURES = (LOCAL_EXPOSURE, CONSISTENT_EXPOSURE)
 # Layouts of photos and poses. They are the keys of `hyrfpack.data.LAYOUTS`.
 LAYOUTS = (
     "colmap",

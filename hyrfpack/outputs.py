@@ -43,7 +43,7 @@ RAW_PHOTO_SUFFIXES = (
 )
 PICTURE_SUFFIXES = (*READABLE_PICTURE_SUFFIXES, *RAW_PHOTO_SUFFIXES)
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv")
-ARCHIVE_SUFFIXES = (".zip", ".r3d")  # of photos and poses in one file
+ARCHIVE_SUFFIXES = (".zip", ".r3d")  # an archive may hold a whole set of photos and poses
 COLMAP_TABLE_NAMES = tuple(f"{table}{kind}" for table in ("cameras", "images", "points3D") for kind in (".bin", ".txt"))
 # Names of files and folders that hold poses, besides the tables of COLMAP.
 POSE_FILE_NAMES = (
@@ -160,6 +160,7 @@ class Outputs:
         self._check_folder_not_read(_resolved_folder(path))
 
     def _check_folder_not_read(self, folder: StrPath) -> None:
+        """Refuse a folder whose photos or poses are read."""
         if _file_ids([folder]) & self._folders:
             raise HyrfError(f"{folder}: the same command reads what lies in this folder; name another to write into")
 
@@ -235,6 +236,7 @@ def _belongs_to_photo_set(folder: Path) -> bool:
 
 
 def _has_poses(folder: Path) -> bool:
+    """Return whether a folder holds poses in any known layout."""
     if not _entry_names(folder).isdisjoint((*COLMAP_TABLE_NAMES, *POSE_FILE_NAMES)):
         return True
     models = [folder / name for name in COLMAP_MODEL_FOLDERS]
@@ -243,6 +245,7 @@ def _has_poses(folder: Path) -> bool:
 
 
 def _has_pictures(folder: Path) -> bool:
+    """Return whether a folder itself holds pictures."""
     return any(name.lower().endswith(PICTURE_SUFFIXES) for name in _entry_names(folder))
 
 

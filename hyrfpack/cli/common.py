@@ -68,7 +68,7 @@ overwrite_option = click.option(
 
 
 def reject_nan(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
-    """Reject NaN, which click's ranges accept; a callback of options."""
+    """Reject NaN, which click's ranges accept, as the callback of an option."""
     if value is not None and math.isnan(value):
         raise click.BadParameter("NaN is not a number", ctx, param)
     return value

@@ -36,7 +36,7 @@ def add_verbosity_options(command: click.Command) -> None:
 
 
 def _set_verbosity(ctx: click.Context, option: click.Parameter, given: bool) -> None:
-    """Apply --quiet or --verbose to all that follows; a callback of these options."""
+    """Apply --quiet or --verbose, as the callback of these options."""
     if not given or ctx.resilient_parsing or ctx.meta.get(_VERBOSITY_KEY) == option.name:
         return
     root = ctx.find_root()

@@ -27,6 +27,7 @@ from hyrfpack.cli.live import serve_training_view, view_options
 if TYPE_CHECKING:
     from hyrfpack.make import MakeResult
 
+# Photos without a pose that are listed; the others are only counted.
 MAX_LISTED_PHOTOS = 5
 
 

@@ -12,7 +12,8 @@ from hyrfpack.errors import printable
 if TYPE_CHECKING:
     from hyrfpack.make.survey import PhotoSurvey
 
-_MAX_LISTED_KINDS = 4  # sizes of photos, or cameras
+# Sizes of photos, and cameras, that are listed; the others are only counted.
+_MAX_LISTED_KINDS = 4
 
 
 def print_survey(survey: PhotoSurvey) -> None:

@@ -30,7 +30,7 @@ from hyrfpack.render.files import render_files, save_picture
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train import TrainConfig, train
 
-DRAWN_VIEWS = 4
+DRAWN_VIEW_COUNT = 4
 SCENE_FOLDER = "scene"
 RUN_FOLDER = "run"
 RENDERS_FOLDER = "renders"
@@ -194,7 +194,7 @@ def _draw(model: HybridModel, scene: Scene, result: DemoResult) -> Image.Image:
     decoded = model.decode()
     solid = np.array(model.config.solid, np.float32)
     rows = []
-    for view in evenly_spaced(scene.test, DRAWN_VIEWS):
+    for view in evenly_spaced(scene.test, DRAWN_VIEW_COUNT):
         photo = torch.from_numpy(view.load().composite(solid))
         image = to_8bit(render(model, view.camera, decoded=decoded).rgb)
         rows.append(draw_comparison(photo, image, caption=f"{view.name}   {psnr(image, photo):.2f} dB"))

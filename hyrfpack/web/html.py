@@ -190,7 +190,10 @@ def _scene_element(
 
 
 def encode_stage(cameras: Sequence[Camera], up: np.ndarray, center: np.ndarray) -> dict:
-    """Return from where the player looks at a scene, ready for JSON; the arguments are those of `encode_model_page`."""
+    """Return the cameras, the upward direction and the centre of orbits for the player, ready for JSON.
+
+    The arguments are those of `encode_model_page`.
+    """
     return {
         "cameras": [camera_to_json(camera) for camera in cameras],
         "up": np.asarray(up, np.float64).tolist(),
@@ -199,7 +202,7 @@ def encode_stage(cameras: Sequence[Camera], up: np.ndarray, center: np.ndarray) 
 
 
 def _page_description(count: int, length: int) -> str:
-    """Return what those who share the page see of it."""
+    """Return the description that programs show with the shared address of a page."""
     return f"{count:,} Gaussians, {length:,} bytes"
 
 

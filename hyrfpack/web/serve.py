@@ -42,12 +42,12 @@ class MemoryFile:
         return io.BytesIO(data), len(data), f'"{number:x}-{len(data):x}"'
 
 
-Files = Mapping[str, str | os.PathLike[str] | MemoryFile]
+ServedFiles = Mapping[str, str | os.PathLike[str] | MemoryFile]
 
 
 def serve(
     page: bytes,
-    files: Files | None = None,
+    files: ServedFiles | None = None,
     *,
     host: str = LOCAL_HOST,
     port: int = 0,
@@ -80,7 +80,7 @@ def serve(
 
 
 @contextlib.contextmanager
-def serve_in_thread(page: bytes, files: Files, *, port: int = 0) -> Iterator[str]:
+def serve_in_thread(page: bytes, files: ServedFiles, *, port: int = 0) -> Iterator[str]:
     """Serve a page and files to this machine in a thread while the block runs, and yield the page's address.
 
     Args:
@@ -207,7 +207,7 @@ def _open_on_disk(path: Path) -> tuple[BinaryIO, int, str]:
     return file, status.st_size, f'"{status.st_ino:x}-{status.st_mtime_ns:x}-{status.st_size:x}"'
 
 
-def _create_server(host: str, port: int, page: bytes, files: Files) -> _Server:
+def _create_server(host: str, port: int, page: bytes, files: ServedFiles) -> _Server:
     """Create a server that listens but does not answer yet."""
 
     class Server(_Server):

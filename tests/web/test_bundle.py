@@ -17,7 +17,7 @@ from hyrfpack.web.bundle import bundle, strip_comments
 def modules(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, str]]:
     """Made-up modules by path."""
     made: dict[str, str] = {}
-    monkeypatch.setattr(bundling, "part", made.__getitem__)
+    monkeypatch.setattr(bundling, "read_web_file", made.__getitem__)
     bundle.cache_clear()
     yield made
     bundle.cache_clear()

@@ -148,7 +148,7 @@ def test_a_large_file_is_not_held_in_memory(tmp_path):
 import resource, socket, sys, threading
 from hyrfpack.web import serve
 from pathlib import Path
-with serve._server("127.0.0.1", 0, b"", {"scene.hyrf": Path(sys.argv[1])}) as server:
+with serve._create_server("127.0.0.1", 0, b"", {"scene.hyrf": Path(sys.argv[1])}) as server:
     threading.Thread(target=server.serve_forever, daemon=True).start()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with socket.create_connection(("127.0.0.1", server.server_port)) as client:
