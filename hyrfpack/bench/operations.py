@@ -60,7 +60,7 @@ DEFAULT_VARIANT = "cpu"
 
 def rasterize_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
     """Measure the rasterisation of one view, with and without antialiasing, forward and with all gradients."""
-    model, camera, pose = _one_view(subject)
+    model, camera, pose = _middle_view(subject)
     inputs = splat_inputs(model, camera_center(pose))
     for antialiased in (False, True):
         call = rasterize_call(inputs, pose, camera.intrinsics, camera.width, camera.height, antialiased=antialiased)
@@ -79,13 +79,13 @@ def hash_encode_rows(subject: Subject, repeats: int, note: Callable[[str], None]
 
 def mlp_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
     """Measure both fields' decoders on the features of all Gaussians, seen from one camera."""
-    model, _, pose = _one_view(subject)
+    model, _, pose = _middle_view(subject)
     for name, part, features in decoder_inputs(model, camera_center(pose)):
         call = mlp_call(features, list(part.weights), list(part.biases))
         yield from _compare("mlp", f"{name}, ", call, MLP_VARIANTS, measure_relative_error, repeats)
 
 
-def _one_view(subject: Subject) -> tuple[HybridModel, Camera, Tensor]:
+def _middle_view(subject: Subject) -> tuple[HybridModel, Camera, Tensor]:
     """Return the model, the middle camera, and its (4, 4) float64 pose camera_from_local."""
     camera = subject.cameras[len(subject.cameras) // 2]
     return subject.model, camera, torch.as_tensor(subject.model.config.frame.local_pose(camera))

@@ -20,13 +20,13 @@ from hyrfpack.render import RenderSettings, render
 # Values that are measured for each setting, the exact value first. `near` is left out, because it decides what belongs
 # to the picture. The exact `cull_tolerance` is not infinity: EWA projection is linearised about a centre and smears
 # Gaussians far outside the picture all over it. Training culls these Gaussians and never optimises them for such views.
-SWEEPS: dict[str, tuple[Any, ...]] = {
+RENDER_SETTING_VALUES: dict[str, tuple[Any, ...]] = {
     "background_threshold": (0.0, 1 / 512, 1 / 255, 0.01, 0.03, 0.1, 0.2, 0.3),
     "background_stride": (1, 2, 3, 4),
     "cull_tolerance": (1.0, 0.0, 0.1, 0.2, 0.3, 0.5, math.inf),
     "transmittance_min": (0.0, 1e-5, 1e-4, 1e-3, 1 / 255, 0.01, 0.03),
 }
-EXACT_SETTINGS = RenderSettings(**{name: values[0] for name, values in SWEEPS.items()})
+EXACT_SETTINGS = RenderSettings(**{name: values[0] for name, values in RENDER_SETTING_VALUES.items()})
 BACKGROUND_SETTINGS = ("background_threshold", "background_stride")
 
 RenderTask = Callable[[], list[Tensor]]
@@ -47,7 +47,7 @@ def render_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> 
         return lambda: [render(model, camera, settings, decoded=reused).rgb for camera in subject.cameras]
 
     render_task(defaults)()  # compiles kernels that are not cached, which must not count as a slow first run
-    for name, values in SWEEPS.items():
+    for name, values in RENDER_SETTING_VALUES.items():
         if name in BACKGROUND_SETTINGS and not model.config.background:
             note(f"the model has no background sphere, so {name} is left out")
             continue

@@ -44,9 +44,9 @@ def scene_provenance(scene: Scene) -> dict:
     """
     cameras = [view.camera for view in scene.train]
     kept: dict = {"viewpoint": Viewpoint.from_cameras(cameras).to_json(), "cameras": provenance_cameras(cameras)}
-    small = all(max(view.camera.width, view.camera.height) < DEFAULT_MAX_SIZE for view in scene.views)
-    needless = scene.max_size is None or (small and scene.max_size == DEFAULT_MAX_SIZE)
-    if not needless:
+    is_small = all(max(view.camera.width, view.camera.height) < DEFAULT_MAX_SIZE for view in scene.views)
+    is_redundant = scene.max_size is None or (is_small and scene.max_size == DEFAULT_MAX_SIZE)
+    if not is_redundant:
         kept["max_size"] = scene.max_size
     return kept
 

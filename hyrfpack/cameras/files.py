@@ -35,7 +35,7 @@ def camera_from_json(item: Mapping[str, Any]) -> Camera:
     """
     width, height, fx = _side_length(item["width"]), _side_length(item["height"]), _focal_length(item["fx"])
     fy = _focal_length(item.get("fy", fx))
-    cx, cy = _finite(item.get("cx", width / 2)), _finite(item.get("cy", height / 2))
+    cx, cy = _finite_float(item.get("cx", width / 2)), _finite_float(item.get("cy", height / 2))
     return Camera(width, height, fx, fy, cx, cy, item["camera_from_world"])
 
 
@@ -128,6 +128,7 @@ def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
 
 
 def _parse_camera(item: dict[str, Any], name: str) -> tuple[str, Camera]:
+    """Parse a camera as `camera_to_json` writes it, or as 3DGS training does, by position and rotation."""
     if "camera_from_world" in item or "rotation" not in item:
         return str(item.get("name", name)), camera_from_json(item)
     rotation = np.asarray(item["rotation"], np.float64).reshape(3, 3)
@@ -137,15 +138,17 @@ def _parse_camera(item: dict[str, Any], name: str) -> tuple[str, Camera]:
 
 
 def _parse_transforms_frame(item: dict[str, Any], name: str) -> tuple[str, Camera]:
+    """Parse a frame of a transforms.json, whose camera has OpenGL axes."""
     width, height = item["w"], item["h"]
-    fx = item["fl_x"] if "fl_x" in item else width / (2 * math.tan(_finite(item["camera_angle_x"]) / 2))
+    fx = item["fl_x"] if "fl_x" in item else width / (2 * math.tan(_finite_float(item["camera_angle_x"]) / 2))
     world_from_camera = rigid_pose(item["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
     size = {"width": width, "height": height, "fx": fx, "fy": item.get("fl_y", fx)}
     camera = camera_from_json({**item, **size, "camera_from_world": np.linalg.inv(world_from_camera)})
     return str(item.get("file_path", name)), camera
 
 
-def _finite(value: Any) -> float:
+def _finite_float(value: Any) -> float:
+    """Convert a value to a float and check that it is finite."""
     value = float(value)
     if not math.isfinite(value):
         raise ValueError(f"the number {value}")
@@ -160,7 +163,8 @@ def _side_length(value: Any) -> int:
 
 
 def _focal_length(value: Any) -> float:
-    value = _finite(value)
+    """Check that a focal length is finite and positive."""
+    value = _finite_float(value)
     if not value > 0:
         raise ValueError(f"a focal length of {value} pixels")
     return value

@@ -228,6 +228,7 @@ def _covered_arc(offsets: np.ndarray, up: np.ndarray, typical: int) -> tuple[flo
 
 
 def _nearest_to_median(rows: np.ndarray) -> int:
+    """Return the index of the row nearest to the median row."""
     return int(np.argmin(np.linalg.norm(rows - np.median(rows, axis=0), axis=1)))
 
 

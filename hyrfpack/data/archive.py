@@ -21,8 +21,8 @@ from hyrfpack.errors import HyrfDataError, HyrfError, short_reason
 from hyrfpack.outputs import ARCHIVE_SUFFIXES
 
 _MAX_FILES = 200_000
-# Limit of the unpacked size: this ratio to the archive's size, plus the slack. Photos hardly shrink in an archive, and
-# text shrinks to a tenth, so that a larger ratio is not a dataset.
+# The unpacked size may be at most the archive's size times the ratio, plus the slack. Photos hardly shrink in an
+# archive and text shrinks to a tenth, so that no dataset has a larger ratio.
 _MAX_UNPACKED_RATIO = 100
 _UNPACKED_SLACK_BYTES = 1 << 26
 _COPY_CHUNK_BYTES = 1 << 20

@@ -13,7 +13,7 @@ import numpy as np
 from hyrfpack.data.equirectangular import FACES, Face, FaceFile, face_lens, face_size
 from hyrfpack.data.folder import is_raw_name, list_pictures
 from hyrfpack.data.masks import find_masks
-from hyrfpack.data.names import find_similar_name
+from hyrfpack.data.names import find_similar_file
 from hyrfpack.data.pictures import (
     PhotoFile,
     PictureHeader,
@@ -28,7 +28,7 @@ from hyrfpack.data.unusable import raw_photos_notes
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced, rigid_pose
 
-_MAX_ALPHA_SAMPLES = 4
+_MAX_PHOTOS_CHECKED_FOR_ALPHA = 4
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ def missing_photos_notes(
 def _describe_folder(path: Path, name: str) -> str:
     """Describe the content of the folder where a photo was expected, for an error message."""
     folder = PurePosixPath(name).parent
-    similar = find_similar_name(name, list_pictures(path))
+    similar = find_similar_file(name, list_pictures(path))
     near = f"; the nearest by name is {similar.relative_to(path)}" if similar else ""
     try:
         endings = Counter(entry.suffix or "other" for entry in (path / folder).iterdir() if entry.is_file())
@@ -347,7 +347,7 @@ def _has_transparency(photos: list[Photo], max_size: int) -> bool:
         return pixels
 
     candidates = [photo for photo in photos if photo.header.has_alpha]
-    return any(alpha(photo).min() < 255 for photo in evenly_spaced(candidates, _MAX_ALPHA_SAMPLES))
+    return any(alpha(photo).min() < 255 for photo in evenly_spaced(candidates, _MAX_PHOTOS_CHECKED_FOR_ALPHA))
 
 
 def _drop_nonfinite_points(

@@ -96,11 +96,13 @@ def _check_full_size(folder: Path) -> Path:
 
 
 def _lens(focal: float, k1: float, k2: float, _: Path, header: PictureHeader) -> Lens:
+    """Return the lens of a photo, whose size only its file states."""
     width, height = header.size
     return Lens(width, height, focal, focal, width / 2, height / 2, "brown", brown_coefficients(k1, k2))
 
 
 def _is_bundle(file: Path) -> bool:
+    """Whether a file starts with the signature of a bundle file."""
     try:
         with file.open("rb") as stream:
             return stream.read(len(_FILE_SIGNATURE)) == _FILE_SIGNATURE
@@ -117,7 +119,7 @@ def _read_list(path: Path, bundle: Path) -> tuple[list[str], Path]:
         raise HyrfDataError(
             f"{bundle}: the list of its photos is missing (looked for list.txt and *.lst beside it); export it, too"
         )
-    lines = _text(listing).splitlines()
+    lines = _read_text(listing).splitlines()
     # Lists that Bundler itself writes have 0 and the focal length from EXIF after each name.
     names = [re.sub(r"\s+0\s+[\d.eE+-]+$", "", line.strip()) for line in lines]
     return [name for name in names if name and not name.startswith("#")], listing
@@ -125,7 +127,7 @@ def _read_list(path: Path, bundle: Path) -> tuple[list[str], Path]:
 
 def _read_bundle(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Read the (N, 5, 3) rows of the cameras, (P, 3) points and (P, 3) colours in [0, 1]."""
-    lines = [line for line in _text(file).splitlines() if line.strip() and not line.startswith("#")]
+    lines = [line for line in _read_text(file).splitlines() if line.strip() and not line.startswith("#")]
     try:
         cameras, points = map(int, lines[0].split()[:2])
     except (IndexError, ValueError) as error:
@@ -137,14 +139,14 @@ def _read_bundle(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             "is truncated, export it again"
         )
     first = 1 + 5 * cameras
-    table = _numbers(lines[1:first], file).reshape(cameras, 5, 3)
+    table = _parse_numbers(lines[1:first], file).reshape(cameras, 5, 3)
     if not np.isfinite(table).all():
         raise HyrfDataError(f"{file}: a camera in it has numbers that are not finite; export it again")
-    colors = np.clip(_numbers(lines[first + 1 : needed : 3], file) / 255, 0, 1)
-    return table, _numbers(lines[first:needed:3], file), np.nan_to_num(colors, nan=0.5)
+    colors = np.clip(_parse_numbers(lines[first + 1 : needed : 3], file) / 255, 0, 1)
+    return table, _parse_numbers(lines[first:needed:3], file), np.nan_to_num(colors, nan=0.5)
 
 
-def _numbers(lines: list[str], file: Path) -> np.ndarray:
+def _parse_numbers(lines: list[str], file: Path) -> np.ndarray:
     """Parse lines of three numbers each to (N, 3) float64."""
     try:
         rows = [tuple(map(float, line.split())) for line in lines]
@@ -155,7 +157,7 @@ def _numbers(lines: list[str], file: Path) -> np.ndarray:
     return np.array(rows, np.float64).reshape(-1, 3)
 
 
-def _text(file: Path) -> str:
+def _read_text(file: Path) -> str:
     try:
         return file.read_bytes().decode("utf-8-sig", errors="replace")
     except OSError as error:

@@ -117,7 +117,7 @@ def _photo_folder(path: Path, base: Path, images: str | None, names: Sequence[st
 
 
 def _choose_model(path: Path, models: Sequence[Path], name: str | None) -> tuple[Path, list[str]]:
-    """The model of a name, or the one with the most photos, and a note where there was a choice."""
+    """Select the model of this name, or the one with the most photos; also return a note if there are several."""
     if not models:
         raise HyrfDataError(f"{path}: no COLMAP model in sparse or colmap/sparse; run the reconstruction first")
     if name is None and len(models) == 1:

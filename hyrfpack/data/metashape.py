@@ -95,7 +95,7 @@ def read_metashape(path: Path, *, test_every: int, images: str | None, max_size:
             raise HyrfDataError(f"{where} is of a sensor that the file does not describe; export the cameras again")
         if key not in lenses:
             lenses[key] = _lens(sensors[key], f"{table}: sensor {key}")
-        matrix = _numbers(transform, 16, where).reshape(4, 4)
+        matrix = _parse_numbers(transform, 16, where).reshape(4, 4)
         with np.errstate(all="ignore"):
             axes = frame.rotation @ matrix[:3, :3]
             position = frame.scale * (frame.rotation @ matrix[:3, 3]) + frame.translation
@@ -161,7 +161,7 @@ def _choose_chunk(document: Element, table: Path) -> tuple[Element, list[str]]:
 
 
 def _is_in_component(camera: Element, component: str | None) -> bool:
-    """Whether a camera belongs to a component, or the chunk has no components."""
+    """Whether a camera belongs to a component. Without components, or without an id of its own, it belongs to any."""
     return component is None or camera.get("component_id") in (None, component)
 
 
@@ -181,9 +181,9 @@ def _choose_frame(chunk: Element, table: Path) -> tuple[_Frame, str | None, list
         return _IDENTITY_FRAME, component, notes
     where = f"{table}: the transform of the {'component' if elements else 'chunk'}"
     frame = _Frame(
-        _numbers(transform.findtext("rotation"), 9, where).reshape(3, 3),
-        _numbers(transform.findtext("translation") or "0 0 0", 3, where),
-        float(_numbers(transform.findtext("scale") or "1", 1, where)[0]),
+        _parse_numbers(transform.findtext("rotation"), 9, where).reshape(3, 3),
+        _parse_numbers(transform.findtext("translation") or "0 0 0", 3, where),
+        float(_parse_numbers(transform.findtext("scale") or "1", 1, where)[0]),
     )
     if not frame.scale > 0 or np.abs(frame.rotation @ frame.rotation.T - np.eye(3)).max() > 1e-3:
         raise HyrfDataError(f"{where} is no rotation with a positive scale; export the cameras again")
@@ -206,7 +206,7 @@ def _lens(sensor: Element, where: str) -> Lens | Callable[[Path, PictureHeader],
     for name in _CALIBRATION_KEYS:
         text = calibration.findtext(name)
         if text is not None:
-            values[name] = float(_numbers(text, 1, where)[0])
+            values[name] = float(_parse_numbers(text, 1, where)[0])
     size = calibration.find("resolution")
     if size is None:
         size = sensor.find("resolution")
@@ -225,11 +225,11 @@ def _lens(sensor: Element, where: str) -> Lens | Callable[[Path, PictureHeader],
 
 def _pixels(size: Element | None, side: str, where: str) -> int:
     """Read a side of a resolution in whole pixels."""
-    value = float(_numbers(None if size is None else size.get(side), 1, where)[0])
+    value = float(_parse_numbers(None if size is None else size.get(side), 1, where)[0])
     return round(value)
 
 
-def _numbers(text: str | None, count: int, where: str) -> np.ndarray:
+def _parse_numbers(text: str | None, count: int, where: str) -> np.ndarray:
     """Parse a text of `count` finite numbers to float64."""
     try:
         values = [float(word) for word in (text or "").split()]

@@ -167,7 +167,7 @@ def path_parts(name: str) -> tuple[str, ...]:
     return tuple(parts[1:] if parts and _DRIVE_PATTERN.fullmatch(parts[0]) else parts)
 
 
-def find_similar_name(name: str, files: Iterable[Path]) -> Path | None:
+def find_similar_file(name: str, files: Iterable[Path]) -> Path | None:
     """Find the file whose name is most similar to a photo's, None if there are no files."""
     by_name = {_fold_case(file.name): file for file in files}
     key = _key(name)
@@ -186,6 +186,7 @@ def _fold_case(text: str) -> str:
 
 
 def _normalize_unicode(text: str) -> str:
+    """Convert a text to Unicode form NFC."""
     return unicodedata.normalize("NFC", text)
 
 

@@ -26,7 +26,7 @@ _SIXTEEN_BIT_MODES = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 _ORIENTATION_TAG = 0x0112
 _TRANSPOSITIONS = {2: 0, 3: 3, 4: 1, 5: 5, 6: 4, 7: 6, 8: 2}  # EXIF orientation -> Image.Transpose of Pillow
 _INVERSE_ORIENTATIONS = {6: 8, 8: 6}  # every other orientation is its own inverse
-HEIC_NEEDS = "reading HEIC photos needs pillow-heif"
+HEIC_REQUIREMENT = "reading HEIC photos needs pillow-heif"
 HEIC_REMEDY = "run 'pip install \"hyrfpack[heic]\"', or convert them to JPEG"
 RAW_REMEDY = "export them as JPEG and name the folder that holds the exported photos"
 
@@ -90,6 +90,7 @@ class PhotoFile:
         return undistort(picture, self.lens) if self.lens.is_distorted else picture
 
     def _size_changed_error(self) -> HyrfDataError:
+        """Return the exception for a file whose size differs from that of the scene."""
         return HyrfDataError(
             f"{display_path(self.path)}: the picture changed its size since the scene was read; read it again"
         )
@@ -297,6 +298,7 @@ def _orientation_applied_by_pillow(image) -> int:
 
 
 def _has_alpha(image) -> bool:
+    """Whether a picture opened with Pillow has an alpha channel or a transparent colour."""
     # The grey level that means "transparent" in a 16-bit picture is ignored: conversion to 8 bits would lose it.
     transparent = "transparency" in image.info and image.mode not in _SIXTEEN_BIT_MODES
     return transparent or image.mode in ("RGBA", "LA", "PA", "La", "RGBa")
@@ -310,5 +312,5 @@ def _register_heic(path: Path) -> None:
         try:
             import pillow_heif
         except ModuleNotFoundError as error:
-            raise HyrfDataError(f"{display_path(path)}: {HEIC_NEEDS}; {HEIC_REMEDY}") from error
+            raise HyrfDataError(f"{display_path(path)}: {HEIC_REQUIREMENT}; {HEIC_REMEDY}") from error
         pillow_heif.register_heif_opener()

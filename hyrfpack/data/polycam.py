@@ -18,6 +18,7 @@ from hyrfpack.data.undistort import Lens
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Scene
 
+# The folders of the cameras and of the photos.
 CORRECTED_FOLDERS = ("keyframes/corrected_cameras", "keyframes/corrected_images")
 UNCORRECTED_FOLDERS = ("keyframes/cameras", "keyframes/images")
 

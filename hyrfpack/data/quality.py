@@ -69,7 +69,9 @@ def read_gray(path: StrPath, size: int = MEASURED_SIDE_PIXELS) -> np.ndarray:
 
 
 def measure_sharpness(gray: np.ndarray) -> float:
-    """Measure the sharpness of a picture: about 1 if it is sharp to the pixel, 0.25 if it is blurred over 4 pixels.
+    """Measure the sharpness of a picture, from 0 to about 1.
+
+    It is about 1 if the picture is sharp to the pixel, and 0.25 if it is blurred over 4 pixels or more.
 
     With D(r) the mean squared difference of pixels r apart, in one of four directions (rows, columns, diagonals):
 

@@ -76,7 +76,7 @@ def find_photo_folder(path: Path) -> Path | None:
     for folder in named:
         if _holds_photos(folder):
             return folder
-    if any(is_picture_name(name) and not name.lower().startswith("mask.") for name in _names(path)):
+    if any(is_picture_name(name) and not name.lower().startswith("mask.") for name in _list_names(path)):
         return path
     if named:
         return named[0]  # it is empty or has unreadable pictures, which reading it reports
@@ -136,7 +136,9 @@ def _models_in(base: Path) -> list[Path]:
 
 def _holds_photos(folder: Path) -> bool:
     """Whether a folder or one of its subfolders holds photos."""
-    if any(is_picture_name(name) for name in _names(folder)):  # the usual case, which needs no search of subfolders
+    if any(
+        is_picture_name(name) for name in _list_names(folder)
+    ):  # the usual case, which needs no search of subfolders
         return True
     try:
         return bool(list_photos(folder))
@@ -146,11 +148,11 @@ def _holds_photos(folder: Path) -> bool:
 
 def _subfolders(folder: Path) -> list[Path]:
     """List the subfolders by name, without hidden ones; the list is empty if the folder cannot be read."""
-    names = (name for name in sorted(_names(folder)) if not name.startswith((".", "__")))
+    names = (name for name in sorted(_list_names(folder)) if not name.startswith((".", "__")))
     return [folder / name for name in names if os.path.isdir(folder / name)]
 
 
-def _names(folder: Path) -> list[str]:
+def _list_names(folder: Path) -> list[str]:
     """List the names in a folder; the list is empty if it cannot be read."""
     try:
         return os.listdir(folder)

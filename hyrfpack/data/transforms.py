@@ -123,6 +123,7 @@ def pose_from_camera_axes(axes: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def _is_finite(value: float) -> bool:
+    """Whether a number is finite as a float64."""
     try:
         return math.isfinite(value)
     except OverflowError:  # an integer beyond float64

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from hyrfpack.data.folder import list_raw_photos
-from hyrfpack.data.pictures import HEIC_NEEDS, HEIC_REMEDY, RAW_REMEDY
+from hyrfpack.data.pictures import HEIC_REMEDY, HEIC_REQUIREMENT, RAW_REMEDY
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.outputs import RAW_PHOTO_SUFFIXES, READABLE_PICTURE_SUFFIXES, VIDEO_SUFFIXES
 
@@ -60,11 +60,11 @@ def unreadable_sentences(reasons: Mapping[str, str], count: int) -> list[str]:
         >>> unreadable_sentences({"a.jpg": "the picture file is empty"}, 40)
         ['1 of 40 photos cannot be read: a.jpg (the picture file is empty); copy it again, or remove it']
     """
-    heic = [name for name, reason in reasons.items() if reason.startswith(HEIC_NEEDS)]
+    heic = [name for name, reason in reasons.items() if reason.startswith(HEIC_REQUIREMENT)]
     other = [name for name in reasons if name not in heic]
     sentences = []
     if heic:
-        sentences.append(f"{_cannot_be_read(heic, count)} ({HEIC_NEEDS}); {HEIC_REMEDY}")
+        sentences.append(f"{_cannot_be_read(heic, count)} ({HEIC_REQUIREMENT}); {HEIC_REMEDY}")
     if other:
         first, it = reasons[other[0]], "it" if len(other) == 1 else "them"
         reason = first if len({reasons[name] for name in other}) == 1 else f"{other[0]}: {first}"

@@ -42,6 +42,7 @@ def format_machine(facts: dict[str, object]) -> str:
 
 
 def _processor_name() -> str:
+    """Return the model name of the processor, or its architecture if the name is unknown."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

@@ -96,12 +96,14 @@ def time_alternately(
 
 
 def _measure(task: Callable[[], Any]) -> tuple[Any, float, float]:
+    """Run a task; return its result, and its wall time and processor time in seconds."""
     wall, work = perf_counter(), process_time()
     result = task()
     return result, perf_counter() - wall, process_time() - work
 
 
 def _summarise(seconds: list[tuple[float, float]]) -> Timing:
+    """Summarise (wall, processor) times of the repeats."""
     wall, work = 1e3 * np.array(seconds).T
     low, high = np.percentile(wall, (25, 75))
     return Timing(

@@ -14,7 +14,7 @@ import hyrfpack
 from hyrfpack.bench import GROUPS, bench, rendering, subject
 from hyrfpack.bench.codec import PROFILE_SETTING_VALUES, codec_rows, parameter_errors
 from hyrfpack.bench.operations import hash_encode_rows, mlp_rows, rasterize_rows
-from hyrfpack.bench.rendering import EXACT_SETTINGS, SWEEPS, render_rows
+from hyrfpack.bench.rendering import EXACT_SETTINGS, RENDER_SETTING_VALUES, render_rows
 from hyrfpack.bench.subject import Subject
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import encode_model, save
@@ -121,7 +121,10 @@ def test_half_precision_errors_of_the_fields_are_relative_to_float64():
 
 
 def test_every_accuracy_setting_of_rendering_is_swept_but_near():
-    assert set(SWEEPS) == {field.name for field in dataclasses.fields(RenderSettings)} - {"near", "exposure"}
+    assert set(RENDER_SETTING_VALUES) == {field.name for field in dataclasses.fields(RenderSettings)} - {
+        "near",
+        "exposure",
+    }
     assert (
         EXACT_SETTINGS.background_stride == 1
         and EXACT_SETTINGS.background_threshold == EXACT_SETTINGS.transmittance_min == 0
@@ -130,7 +133,7 @@ def test_every_accuracy_setting_of_rendering_is_swept_but_near():
 
 def test_the_default_is_among_what_is_tried_of_each_setting():
     rows = by_setting(render_rows(subject_of(model_of()), 1, ignore))
-    for name, values in SWEEPS.items():
+    for name, values in RENDER_SETTING_VALUES.items():
         assert len(rows[name]) == len({*values, getattr(RenderSettings(), name)})
 
 

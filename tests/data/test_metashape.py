@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hyrfpack.data import load_scene
-from hyrfpack.data.metashape import _numbers
+from hyrfpack.data.metashape import _parse_numbers
 from hyrfpack.data.undistort import distort
 from hyrfpack.errors import HyrfDataError
 
@@ -81,7 +81,7 @@ def test_cameras_of_a_real_flight_stand_and_look_as_the_aircraft_noted(tmp_path,
     scene = load_scene(tmp_path, test_every=0)
 
     assert any("placed on the Earth" in note for note in scene.notes)
-    rotation, shift = _numbers(ROTATION, 9, "").reshape(3, 3), _numbers(TRANSLATION, 3, "")
+    rotation, shift = _parse_numbers(ROTATION, 9, "").reshape(3, 3), _parse_numbers(TRANSLATION, 3, "")
     for view, (longitude, latitude, height, tilt, heading) in zip(scene.views, NOTED.values(), strict=True):
         place, axes = geocentric(longitude, latitude, height)
         offset = axes @ (SCALE * rotation @ view.camera.position + shift - place)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hyrfpack.data.names import PictureIndex, find_similar_name, path_parts
+from hyrfpack.data.names import PictureIndex, find_similar_file, path_parts
 
 
 def folder_of(root: Path, *names: str) -> Path:
@@ -108,8 +108,8 @@ def test_notes_say_how_many_are_called_otherwise_with_an_example(tmp_path):
 def test_the_nearest_by_name_is_named():
     files = [Path("photos/IMG_0412.jpg"), Path("photos/DSC_0001.jpg")]
 
-    assert find_similar_name("images/IMG_412.jpeg", files) == files[0]
-    assert find_similar_name("IMG_412.jpeg", []) is None
+    assert find_similar_file("images/IMG_412.jpeg", files) == files[0]
+    assert find_similar_file("IMG_412.jpeg", []) is None
 
 
 @given(name=st.text())
