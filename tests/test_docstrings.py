@@ -21,7 +21,9 @@ OPERATIONS = (
     "activate", "adam", "background", "composite", "contraction", "hash_encode", "mlp", "rasterize", "shade", "ssim",
 )  # fmt: skip
 # Not for users: `background_grid` and `shade` take a whole decoder, which no short example makes.
-WITHOUT = {"background_colors", "background_grid", "check", "check_shading", "choose_shading_implementation", "shade"}
+WITHOUT = {
+    "background_colors", "background_grid", "check_inputs", "check_shading", "choose_shading_implementation", "shade",
+}  # fmt: skip
 
 
 def public_functions() -> Iterator[tuple[str, object]]:

@@ -98,7 +98,14 @@ def test_a_step_waits_four_times(asked: Asked) -> None:
 
 def test_all_parts_of_a_step_are_counted(asked: Asked) -> None:
     names = {name for kind, name, _ in asked if kind == "launch"}
-    kernels = {"look", "activate_backward", "encode_views_kernel", "project", "blend_backward", "encode_nodes_kernel"}
+    kernels = {
+        "frustum_kernel",
+        "activate_backward",
+        "encode_views_kernel",
+        "project",
+        "blend_backward",
+        "encode_nodes_kernel",
+    }
     kernels |= {"composite_kernel", "grad_grid_kernel", "adam_step_kernel"}
     assert names >= kernels | {"index_add_", "searchsorted", "zeros", "arange"}
     assert {name for kind, name, _ in asked if kind == "wait"} == {"tolist", "nonzero"}

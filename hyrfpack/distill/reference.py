@@ -13,8 +13,8 @@ from torch import Tensor
 from hyrfpack.device import make_current
 from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.model import HybridModel
+from hyrfpack.ops.rasterize.blend_weights import sum_blend_weights
 from hyrfpack.ops.rasterize.cull import frustum_cull
-from hyrfpack.ops.rasterize.light import sent_light
 from hyrfpack.parallel.pool import parallel_map, torch_on_one_thread
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Camera, Picture, Scene, View
@@ -61,7 +61,7 @@ def mean_sent_light(drawable: Drawable, cameras: Sequence[Camera]) -> Tensor:
         index = frustum_cull(drawable.positions, pose, *size, settings.near, settings.cull_tolerance)
         gaussians = (drawable.positions, drawable.quats, drawable.scales, drawable.opacities)
         means, quats, scales, opacities = (part[index] for part in gaussians)
-        light, _ = sent_light(
+        light, _ = sum_blend_weights(
             means, quats, scales, opacities, pose, *size, near=settings.near, antialiased=drawable.antialiased
         )
         return index, light

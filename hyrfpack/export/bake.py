@@ -18,8 +18,8 @@ from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.ops.least_squares import least_squares
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.poses import camera_center
+from hyrfpack.ops.rasterize.blend_weights import sum_blend_weights
 from hyrfpack.ops.rasterize.cull import frustum_cull
-from hyrfpack.ops.rasterize.light import sent_light
 from hyrfpack.ops.rasterize.reference import ALPHA_MIN
 from hyrfpack.ops.shade import Shading, encode_directions
 from hyrfpack.parallel.pool import parallel_map, run_tasks, torch_on_one_thread
@@ -173,7 +173,7 @@ def _compute_camera_visibility(model: HybridModel, geometry: Geometry, camera: C
     drawn = frustum_cull(positions, *viewport, settings.near, settings.cull_tolerance)
 
     def compute_light(means: Tensor, shapes: Geometry) -> tuple[Tensor, Tensor]:
-        return sent_light(means, shapes.quats, shapes.scales, shapes.opacities, *viewport, **settings_of_light)
+        return sum_blend_weights(means, shapes.quats, shapes.scales, shapes.opacities, *viewport, **settings_of_light)
 
     culled_light, transmittance = compute_light(positions, geometry)
     light = culled_light[drawn]

@@ -477,7 +477,7 @@ def test_tiles_counted_otherwise_than_listed_change_nothing_else(monkeypatch: py
 def test_more_pairs_than_can_be_numbered_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     from hyrfpack.ops.rasterize import gpu_bin
 
-    monkeypatch.setattr(gpu_bin, "PAIRS_MAX", 3)
+    monkeypatch.setattr(gpu_bin, "MAX_PAIRS", 3)
     with pytest.raises(MemoryError, match="pairs"):
         _picture(Case(_gaussians(8)), "gpu")
 
@@ -536,7 +536,7 @@ def test_depth_and_visible_are_not_differentiable(implementation: str) -> None:
 @needs_triton
 @pytest.mark.parametrize("tolerance", [0.0, 0.3])
 def test_frustum_of_the_gpu_is_the_picture_and_a_band_around_it(tolerance: float) -> None:
-    from hyrfpack.ops.rasterize.gpu_project import camera_numbers
+    from hyrfpack.ops.rasterize.gpu_project import pack_camera
 
     positions = _gaussians(400, spread=3.0)["means"]
     camera, intrinsics = _camera(2.0), (30.0, 50.0, 20.0, 24.0)
@@ -544,7 +544,7 @@ def test_frustum_of_the_gpu_is_the_picture_and_a_band_around_it(tolerance: float
     across, down = (30 * x / z + 20) / 24 - 1, (50 * y / z + 24) / 20 - 1  # -1 to 1 in the picture
     expected = (z > 0.5) & (across.abs() < 1 + tolerance) & (down.abs() < 1 + tolerance)
 
-    numbers = camera_numbers(camera, intrinsics, 48, 40, 0.5, torch.device(DEVICE), tolerance)
+    numbers = pack_camera(camera, intrinsics, 48, 40, 0.5, torch.device(DEVICE), tolerance)
     inside = gpu(torch.zeros(512, dtype=torch.int32))
     _frustum_kernel[(4,)](gpu(positions), numbers, 400, inside, num_warps=4, enable_fp_fusion=True)
 

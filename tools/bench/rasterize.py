@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hyrfpack.measure.error import largest_error, measure_error, measure_relative_error
 from hyrfpack.model.operation_calls import random_cotangent, rasterize_call
-from hyrfpack.ops.rasterize import SHAPES, rasterize
+from hyrfpack.ops.rasterize import INPUT_SHAPES, rasterize
 from hyrfpack.parallel.pool import thread_count
 
 WORKLOADS = {"A": (50_000, 320, 240, 1.75), "B": (200_000, 800, 800, 2.6)}  # Gaussians, width, height, sigma in px
@@ -40,7 +40,7 @@ def workload(name: str) -> tuple[dict[str, Tensor], tuple]:
     opacities = torch.sigmoid(1.5 * torch.randn(count, generator=generator) - 1)
     colors = torch.rand(count, 3, generator=generator)
     camera = torch.eye(4, dtype=torch.float64), (focal, focal, width / 2, height / 2), width, height
-    return dict(zip(SHAPES, (means, quats, scales, opacities, colors), strict=True)), camera
+    return dict(zip(INPUT_SHAPES, (means, quats, scales, opacities, colors), strict=True)), camera
 
 
 def run(inputs: dict[str, Tensor], camera: tuple, implementation: str) -> dict[str, float]:

@@ -20,7 +20,7 @@ from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.operation_calls import splat_inputs
 from hyrfpack.ops.poses import camera_center
-from hyrfpack.ops.rasterize.reference import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, project
+from hyrfpack.ops.rasterize.reference import ALPHA_MAX, ALPHA_MIN, TILE_SIZE, TRANSMITTANCE_MIN, project
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, Picture, Scene, View
 
@@ -141,12 +141,14 @@ def count_blended(splats: Splats, tiles: int = 48, near: float = 0.01) -> tuple[
     seen = seen.select(torch.argsort(seen.depths))
     reach = (2 * torch.log(255 * seen.opacities).clamp_min(0))[:, None] * seen.covs2d[:, [0, 2]]
     lower, upper = seen.means2d - reach.sqrt(), seen.means2d + reach.sqrt()
-    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
+    columns, rows = -(-camera.width // TILE_SIZE), -(-camera.height // TILE_SIZE)
     places = torch.linspace(0, columns * rows - 1, min(tiles, columns * rows)).long().tolist()
-    corners = torch.stack(torch.meshgrid(torch.arange(TILE), torch.arange(TILE), indexing="xy"), -1).view(-1, 2)
+    corners = torch.stack(torch.meshgrid(torch.arange(TILE_SIZE), torch.arange(TILE_SIZE), indexing="xy"), -1).view(
+        -1, 2
+    )
     added = reached = pairs = 0.0
     for place in places:
-        corner = torch.tensor([TILE * (place % columns), TILE * (place // columns)])
+        corner = torch.tensor([TILE_SIZE * (place % columns), TILE_SIZE * (place // columns)])
         pixels = (corner + corners + 0.5).to(lower)
         inside = (lower <= pixels[-1]).all(-1) & (upper >= pixels[0]).all(-1) & (seen.opacities >= ALPHA_MIN)
         here = seen.select(torch.nonzero(inside)[:, 0])

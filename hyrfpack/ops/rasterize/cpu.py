@@ -1,4 +1,4 @@
-"""Rasterising on the CPU: Numba kernels on the shared thread pool, behind one autograd.Function."""
+"""Rasterises on the CPU with Numba kernels on the shared thread pool, behind one autograd.Function."""
 
 from __future__ import annotations
 
@@ -11,19 +11,28 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hyrfpack.ops.rasterize import cpu_bin, cpu_blend, cpu_project
-from hyrfpack.ops.rasterize.reference import TILE, jacobian_limits
+from hyrfpack.ops.rasterize.reference import TILE_SIZE, jacobian_limits
 from hyrfpack.parallel.pool import run_ranges, run_tasks, thread_count
 
-LEAST_RUN = 128  # pairs, about, that a thread blends while another wakes
+# A thread blends about this many pairs while another one starts; shorter runs are not worth a task.
+_MIN_PAIRS_PER_RUN = 128
 
 
 @dataclass(frozen=True)
 class _View:
-    """What of the call is not a tensor to differentiate. Numbers of one type each: kernels are compiled for types."""
+    """The arguments of a call without gradients. Each has one fixed type, since kernels are compiled per type.
 
-    axes: tuple[tuple[float, ...], ...]  # rows of the camera's rotation
+    Attributes:
+        axes: the rows of the camera's rotation.
+        shift: the camera's translation.
+        lens: fx, fy, cx, cy, then the limits of x/z (low, high) and of y/z in the Jacobian.
+        width, height, near, antialiased, transmittance_min, depth: as in `rasterize`.
+        absgrad: as in `rasterize`, or None.
+    """
+
+    axes: tuple[tuple[float, ...], ...]
     shift: tuple[float, ...]
-    lens: tuple[float, ...]  # fx, fy, cx, cy and the limits of x/z and y/z in the Jacobian
+    lens: tuple[float, ...]
     width: int
     height: int
     near: float
@@ -35,17 +44,17 @@ class _View:
 
 @dataclass(frozen=True)
 class _Tiles:
-    """The pairs of a picture, tile by tile and in depth order within each.
+    """The (Gaussian, tile) pairs of an image, ordered by tile and, within a tile, by depth.
 
     Attributes:
-        records: (V, 16) the projections of what is drawn, in depth order, see cpu_project.
-        first: (N + 1,) where each Gaussian's slots begin, its places in the list of pairs Gaussian by Gaussian.
-        starts: (tiles + 1,) where each tile's pairs begin.
+        records: (V, 16) the projections of the V drawn Gaussians in depth order, see cpu_project.
+        slot_starts: (N + 1,) the first slot of each Gaussian. Slots number the pairs Gaussian by Gaussian.
+        starts: (tiles + 1,) the first pair of each tile.
         pairs: (P,) uint64, packed as in cpu_bin.
     """
 
     records: np.ndarray
-    first: np.ndarray
+    slot_starts: np.ndarray
     starts: np.ndarray
     pairs: np.ndarray
 
@@ -67,7 +76,7 @@ def rasterize(
     depth: bool,
     absgrad: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, int, dict[str, float]]:
-    """Arguments and results (a tuple in the order of the fields) as in `hyrfpack.ops.rasterize.rasterize`."""
+    """Compute `hyrfpack.ops.rasterize.rasterize`; the result is a tuple of the fields of `Rasterization` in order."""
     where = camera_from_world, intrinsics, width, height
     view = _view(*where, near, antialiased, transmittance_min, depth, None if absgrad is None else absgrad.detach())
     report: dict = {}
@@ -76,7 +85,7 @@ def rasterize(
 
 
 @torch.no_grad()
-def sent_light(
+def sum_blend_weights(
     means: Tensor,
     quats: Tensor,
     scales: Tensor,
@@ -90,15 +99,18 @@ def sent_light(
     antialiased: bool,
     transmittance_min: float,
 ) -> tuple[Tensor, Tensor]:
-    """Arguments and results as in `hyrfpack.ops.rasterize.light.sent_light`."""
+    """Compute `hyrfpack.ops.rasterize.blend_weights.sum_blend_weights`."""
     view = _view(camera_from_world, intrinsics, width, height, near, antialiased, transmittance_min)
-    inputs = (means, quats, scales, opacities, means)  # no one looks at colours
-    records, keys, boxes = _project(tuple(tensor.detach().contiguous().numpy() for tensor in inputs), view)
-    tiles = _bin(cpu_bin.sort_by_depth(keys), records, boxes, view)
-    of_pairs, transmittance = np.zeros(len(tiles.pairs), np.float32), np.empty((view.height, view.width), np.float32)
-    _blend_into(tiles, view, None, transmittance, None, of_pairs)
+    inputs = (means, quats, scales, opacities, means)  # Colours are not used; `means` stands in for them.
+    records, keys, tile_count_bounds = _project(tuple(tensor.detach().contiguous().numpy() for tensor in inputs), view)
+    tiles = _bin_pairs(cpu_bin.sort_by_depth(keys), records, tile_count_bounds, view)
+    pair_weights, transmittance = (
+        np.zeros(len(tiles.pairs), np.float32),
+        np.empty((view.height, view.width), np.float32),
+    )
+    _blend_into(tiles, view, None, transmittance, None, pair_weights)
     sums = np.empty(len(means), np.float32)
-    run_ranges(lambda start, stop: cpu_blend.sum_slots(start, stop, tiles.first, of_pairs, sums), len(means))
+    run_ranges(lambda start, stop: cpu_blend.sum_slots(start, stop, tiles.slot_starts, pair_weights, sums), len(means))
     return torch.from_numpy(sums), torch.from_numpy(transmittance)
 
 
@@ -113,6 +125,7 @@ def _view(
     depth: bool = False,
     absgrad: Tensor | None = None,
 ) -> _View:
+    """Convert the arguments of `rasterize` without gradients for the kernels."""
     camera = camera_from_world.detach().double().tolist()[:3]
     return _View(
         axes=tuple(tuple(row[:3]) for row in camera),
@@ -129,16 +142,18 @@ def _view(
 
 
 class _Rasterize(torch.autograd.Function):
+    """Autograd function of `rasterize`."""
+
     @staticmethod
     def forward(ctx, means, quats, scales, opacities, colors, view, report):
         inputs = tuple(tensor.contiguous() for tensor in (means, quats, scales, opacities, colors))
         arrays = tuple(tensor.detach().numpy() for tensor in inputs)
         clock = [perf_counter()]
-        records, keys, boxes = _project(arrays, view)
+        records, keys, tile_count_bounds = _project(arrays, view)
         clock.append(perf_counter())
         order = cpu_bin.sort_by_depth(keys)
         clock.append(perf_counter())
-        tiles = _bin(order, records, boxes, view)
+        tiles = _bin_pairs(order, records, tile_count_bounds, view)
         clock.append(perf_counter())
         rgb, transmittance, depths, blended = _blend(tiles, view)
         clock.append(perf_counter())
@@ -147,7 +162,7 @@ class _Rasterize(torch.autograd.Function):
         report["seconds"] = {
             stage: clock[i + 1] - clock[i] for i, stage in enumerate(("project", "sort", "bin", "blend"))
         }
-        visible = torch.from_numpy(tiles.first[1:] > tiles.first[:-1])
+        visible = torch.from_numpy(tiles.slot_starts[1:] > tiles.slot_starts[:-1])
         rgb, transmittance = torch.from_numpy(rgb), torch.from_numpy(transmittance)
         depths = None if depths is None else torch.from_numpy(depths)
         ctx.save_for_backward(*inputs[:4], rgb, transmittance)
@@ -165,67 +180,78 @@ class _Rasterize(torch.autograd.Function):
         return *(torch.from_numpy(grad) for grad in grads), None, None
 
 
-def _lines(count: int) -> np.ndarray:
-    """(count, 16) float32, not initialised, each row one cache line."""
+def _cache_line_rows(count: int) -> np.ndarray:
+    """Allocate an uninitialised array (count, 16) of float32 with each row on one cache line."""
     numbers = np.empty(16 * count + 16, np.float32)
     skip = -numbers.ctypes.data // 4 % 16
     return numbers[skip : skip + 16 * count].reshape(count, 16)
 
 
 def _project(arrays: tuple[np.ndarray, ...], view: _View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Project all Gaussians; returns records, sort keys and bounds of the tile counts, see `cpu_project.project`."""
     count = len(arrays[0])
-    records = _lines(count)
-    keys, boxes = np.empty(count, np.uint32), np.empty(count, np.uint32)
+    records = _cache_line_rows(count)
+    keys, tile_count_bounds = np.empty(count, np.uint32), np.empty(count, np.uint32)
     where = view.axes, view.shift, view.lens, view.width, view.height, view.near, view.antialiased
 
     def task(start: int, stop: int) -> None:
-        cpu_project.project(start, stop, *arrays, *where, records, keys, boxes)
+        cpu_project.project(start, stop, *arrays, *where, records, keys, tile_count_bounds)
 
     run_ranges(task, count)
-    return records, keys, boxes
+    return records, keys, tile_count_bounds
 
 
-def _bin(order: np.ndarray, records: np.ndarray, boxes: np.ndarray, view: _View) -> _Tiles:
+def _bin_pairs(order: np.ndarray, records: np.ndarray, tile_count_bounds: np.ndarray, view: _View) -> _Tiles:
+    """List the pairs of each tile in depth order.
+
+    Raises:
+        MemoryError: there are cpu_bin.MAX_PAIRS pairs or more.
+    """
     count = len(order)
-    tile_total = -(-view.width // TILE) * -(-view.height // TILE)
+    tile_total = -(-view.width // TILE_SIZE) * -(-view.height // TILE_SIZE)
     chunks = max(1, min(4 * thread_count(), count // 256))
     edges = [count * i // chunks for i in range(chunks + 1)]
     tile_counts = np.zeros((chunks, tile_total), np.int64)
-    first = np.zeros(len(records) + 1, np.int64)
-    sorted_records = _lines(count)
-    found: list = [None] * chunks
+    slot_starts = np.zeros(len(records) + 1, np.int64)
+    sorted_records = _cache_line_rows(count)
+    chunk_pairs: list = [None] * chunks
 
     def find(chunk: int) -> None:
-        found[chunk] = cpu_bin.find_pairs(
-            edges[chunk], edges[chunk + 1], order, boxes, records, view.width, view.height,
-            tile_counts[chunk], first[1:], sorted_records,
+        chunk_pairs[chunk] = cpu_bin.find_pairs(
+            edges[chunk], edges[chunk + 1], order, tile_count_bounds, records, view.width, view.height,
+            tile_counts[chunk], slot_starts[1:], sorted_records,
         )  # fmt: skip
 
     run_tasks(find, chunks)
-    np.cumsum(first, out=first)
+    np.cumsum(slot_starts, out=slot_starts)
     starts = np.empty(tile_total + 1, np.int64)
-    cpu_bin.place_chunks(tile_counts, starts)
-    if first[-1] >= cpu_bin.PAIRS_MAX:
-        raise MemoryError(f"{first[-1]} pairs of a Gaussian and a tile; at most {cpu_bin.PAIRS_MAX - 1} can be drawn")
-    pairs = np.empty(first[-1], np.uint64)
+    cpu_bin.assign_chunk_offsets(tile_counts, starts)
+    if slot_starts[-1] >= cpu_bin.MAX_PAIRS:
+        raise MemoryError(
+            f"{slot_starts[-1]} pairs of a Gaussian and a tile; at most {cpu_bin.MAX_PAIRS - 1} can be drawn"
+        )
+    pairs = np.empty(slot_starts[-1], np.uint64)
 
     def fill(chunk: int) -> None:
-        cpu_bin.fill_tiles(edges[chunk], edges[chunk + 1], order, first, *found[chunk], tile_counts[chunk], pairs)
+        cpu_bin.fill_tiles(
+            edges[chunk], edges[chunk + 1], order, slot_starts, *chunk_pairs[chunk], tile_counts[chunk], pairs
+        )
 
     run_tasks(fill, chunks)
-    return _Tiles(sorted_records, first, starts, pairs)
+    return _Tiles(sorted_records, slot_starts, starts, pairs)
 
 
 def _tile_runs(starts: np.ndarray) -> list[tuple[int, int]]:
-    """Contiguous runs of tiles of about equal work, 16 for each thread where that is enough."""
-    work = starts + 4 * np.arange(len(starts))  # an empty tile costs about as much as four pairs
-    count = max(1, min(16 * thread_count(), len(starts) - 1, work[-1] // LEAST_RUN))
+    """Split the tiles into contiguous runs of about equal work, 16 per thread if there is enough work."""
+    work = starts + 4 * np.arange(len(starts))  # An empty tile costs about as much as four pairs.
+    count = max(1, min(16 * thread_count(), len(starts) - 1, work[-1] // _MIN_PAIRS_PER_RUN))
     edges = np.searchsorted(work, work[-1] * np.arange(1, count) // count)
     edges = np.unique(np.concatenate([[0], edges, [len(starts) - 1]])).tolist()
     return list(zip(edges[:-1], edges[1:], strict=True))
 
 
 def _blend(tiles: _Tiles, view: _View) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray]:
+    """Blend all tiles; returns rgb, transmittance, depth if requested, and the pairs blended in each tile."""
     size = view.height, view.width
     rgb, transmittance = np.empty((*size, 3), np.float32), np.empty(size, np.float32)
     depths = np.empty(size, np.float32) if view.depth else None
@@ -238,16 +264,16 @@ def _blend_into(
     rgb: np.ndarray | None,
     transmittance: np.ndarray,
     depths: np.ndarray | None,
-    light: np.ndarray | None,
+    pair_weights: np.ndarray | None,
 ) -> np.ndarray:
-    """Blend all tiles into these arrays; after how many pairs each was finished."""
+    """Blend all tiles into the given arrays; returns the number of pairs blended in each tile, (tiles,)."""
     blended = np.empty(len(tiles.starts) - 1, np.uint32)
     runs = _tile_runs(tiles.starts)
 
     def task(run: int) -> None:
         cpu_blend.blend_tiles(
             *runs[run], tiles.starts, tiles.pairs, tiles.records, view.width, view.height, view.transmittance_min,
-            rgb, transmittance, depths, light, blended,
+            rgb, transmittance, depths, pair_weights, blended,
         )  # fmt: skip
 
     run_tasks(task, len(runs))
@@ -263,7 +289,8 @@ def _blend_backward(
     grad_rgb: np.ndarray,
     grad_transmittance: np.ndarray,
 ) -> np.ndarray:
-    gradient_rows = _lines(len(tiles.pairs))
+    """Return the gradient row of each pair, (P, 16), at its slot."""
+    gradient_rows = _cache_line_rows(len(tiles.pairs))
     runs = _tile_runs(tiles.starts)
 
     def task(run: int) -> None:
@@ -277,12 +304,13 @@ def _blend_backward(
 
 
 def _project_backward(tiles: _Tiles, view: _View, rows: np.ndarray, inputs: list[np.ndarray]) -> tuple[np.ndarray, ...]:
+    """Return the gradients by means, quats, scales, opacities and colors."""
     means, quats, scales, opacities = inputs
     grads = tuple(np.empty_like(array) for array in (means, quats, scales, opacities, means))
 
     def task(start: int, stop: int) -> None:
         cpu_project.project_backward(
-            start, stop, tiles.first, rows, means, quats, scales, opacities,
+            start, stop, tiles.slot_starts, rows, means, quats, scales, opacities,
             view.axes, view.shift, view.lens, view.antialiased, *grads, view.absgrad,
         )  # fmt: skip
 

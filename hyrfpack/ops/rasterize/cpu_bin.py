@@ -1,7 +1,8 @@
-"""Compiled sorting and binning: which Gaussians each tile blends, in depth order.
+"""Sorts Gaussians by depth and bins them into tiles, in compiled code.
 
-A pair is one Gaussian in one tile, packed in a uint64: its position in the depth order, its slot in the list of all
-pairs Gaussian by Gaussian (where its gradient goes), and the tile's first and last pixel row that it touches.
+A pair is one Gaussian in one tile, packed into a uint64. It consists of the Gaussian's position in the depth order, the
+pair's slot, and the first and last pixel row of the tile that the Gaussian touches. Slots number all pairs Gaussian by
+Gaussian; backward writes a pair's gradient to its slot.
 """
 
 from __future__ import annotations
@@ -10,38 +11,50 @@ import math
 
 import numpy as np
 
-from hyrfpack.ops.rasterize.cpu_project import COV_XX, COV_YY, HIDDEN, MEAN_X, MEAN_Y, REACH, RECORD, U_X, U_Y
-from hyrfpack.ops.rasterize.reference import TILE
+from hyrfpack.ops.rasterize.cpu_project import (
+    COV_XX,
+    COV_YY,
+    HIDDEN_KEY,
+    MEAN_X,
+    MEAN_Y,
+    REACH,
+    RECORD_FLOATS,
+    U_X,
+    U_Y,
+)
+from hyrfpack.ops.rasterize.reference import TILE_SIZE
 from hyrfpack.parallel.compiled import compiled
 
-# From the low end: 4 bits first row, 4 bits last row, 28 bits slot, 28 bits position.
-PAIRS_MAX = 1 << 28
-SLOT_SHIFT, POSITION_SHIFT = np.uint64(8), np.uint64(36)
-SLOT_MASK = np.uint64(PAIRS_MAX - 1)
+# Layout of a pair from the lowest bit: 4 bits first row, 4 bits last row, 28 bits slot, 28 bits position.
+MAX_PAIRS = 1 << 28
+SLOT_SHIFT_BITS = np.uint64(8)
+POSITION_SHIFT_BITS = np.uint64(36)
+SLOT_MASK = np.uint64(MAX_PAIRS - 1)
 
-_DIGIT_BITS = 11
-_BLOCK = 64
-_PAD = 0.01  # pixels by which spans are widened against rounding; blending decides pixel by pixel
+_MAX_RADIX_BITS = 11
+_POSITIONS_PER_BLOCK = 64
+# Spans are widened by this margin against rounding errors; blending tests alpha at each pixel anyway.
+_SPAN_MARGIN_PIXELS = 0.01
 _kernel = compiled(fastmath={"contract", "nsz", "nnan"}, error_model="numpy")
 
 
 @_kernel
 def sort_by_depth(keys):
-    """Positions of the keys that are not HIDDEN, in ascending order of key and then of position (radix sort)."""
-    low, high, count = HIDDEN, np.uint32(0), 0
+    """Return the positions of the keys other than HIDDEN_KEY, sorted by key and then by position (radix sort)."""
+    low, high, count = HIDDEN_KEY, np.uint32(0), 0
     for key in keys:
-        if key != HIDDEN:
+        if key != HIDDEN_KEY:
             low, high, count = min(low, key), max(high, key), count + 1
     items, other = np.empty(count, np.uint64), np.empty(count, np.uint64)
     at = 0
     for i in range(len(keys)):
-        if keys[i] != HIDDEN:
+        if keys[i] != HIDDEN_KEY:
             items[at] = (np.uint64(keys[i] - low) << np.uint64(32)) | np.uint64(i)
             at += 1
     bits = 0
     while count > 0 and (np.uint64(high - low) >> np.uint64(bits)) > 0:
         bits += 1
-    passes = (bits + _DIGIT_BITS - 1) // _DIGIT_BITS
+    passes = (bits + _MAX_RADIX_BITS - 1) // _MAX_RADIX_BITS
     width = (bits + passes - 1) // max(passes, 1)
     mask = np.uint64((1 << width) - 1)
     for turn in range(passes):
@@ -64,53 +77,54 @@ def sort_by_depth(keys):
 
 @_kernel
 def _span(center, slope, rest, reach, inv_var, turn, low, high):
-    """The extent along one axis of an ellipse cut to a slab of the other axis.
+    """Compute the extent along one axis of an ellipse that is cut to a slab of the other axis.
 
-    The points at offset t along the slab's axis span slope t +- sqrt(rest (reach - t^2 inv_var)); the ellipse is
-    widest at t = +-turn.
+    The points at offset t along the slab's axis span slope t +- sqrt(rest (reach - t^2 inv_var)). The extremes of the
+    whole ellipse lie at t = +-turn.
 
     Returns:
-        Lowest and highest coordinate, slightly padded.
+        The lowest and highest coordinate, widened by a small margin.
     """
     t = min(max(turn, low), high)
     up = slope * t + math.sqrt(rest * max(reach - t * t * inv_var, 0.0))
     t = min(max(-turn, low), high)
     down = slope * t - math.sqrt(rest * max(reach - t * t * inv_var, 0.0))
-    return center + down - _PAD, center + up + _PAD
+    return center + down - _SPAN_MARGIN_PIXELS, center + up + _SPAN_MARGIN_PIXELS
 
 
 @_kernel
-def _pixels(low, high, last):
-    """The pixels 0 to last, as integers, whose centres lie in [low, high] (given less half a pixel)."""
+def _pixel_range(low, high, last):
+    """Return the first and last pixel in 0 to last whose centre, minus half a pixel, lies in [low, high]."""
     return np.int64(math.ceil(max(low, 0.0))), np.int64(math.floor(min(high, np.float64(last))))
 
 
 @_kernel
-def find_pairs(start, stop, order, boxes, records, width, height, tile_counts, pair_counts, sorted_records):
+def find_pairs(start, stop, order, tile_count_bounds, records, width, height, tile_counts, pair_counts, sorted_records):
     """List the tiles that each Gaussian touches, for positions start to stop of the depth order.
 
-    A pair is kept where the ellipse alpha >= 1/255 meets the rectangle spanned by the tile's pixel centres.
+    A pair is listed if the ellipse alpha >= 1/255 meets the rectangle spanned by the tile's pixel centres.
 
     Args:
-        tile_counts: (tiles,) pairs in each tile, added to.
-        pair_counts: (N,) pairs of each Gaussian, written where it is in `order`.
-        sorted_records: (V, 16) the records in depth order, written.
+        tile_counts: (tiles,) number of pairs in each tile; incremented.
+        pair_counts: (N,) number of pairs of each Gaussian; written for Gaussians in `order`.
+        sorted_records: (V, 16) the records in depth order; written.
 
     Returns:
-        (pairs,) tiles and (pairs,) rows, position by position; rows = first + 16 last, the tile's pixel rows touched.
+        (pairs,) tiles and (pairs,) rows, ordered by position. rows = first + 16 last are the pixel rows of the tile
+        that the Gaussian touches.
     """
     capacity = 0
     for position in range(np.uint64(start), np.uint64(stop)):
-        capacity += np.int64(boxes[order[position]])
+        capacity += np.int64(tile_count_bounds[order[position]])
     tiles, rows = np.empty(capacity, np.uint32), np.empty(capacity, np.uint8)
-    tiles_x = (width + TILE - 1) // TILE
+    tiles_x = (width + TILE_SIZE - 1) // TILE_SIZE
     at = 0
-    for block in range(start, stop, _BLOCK):
-        # In blocks, because fetching several records at once hides the latency of memory.
-        block_stop = min(block + _BLOCK, stop)
+    for block in range(start, stop, _POSITIONS_PER_BLOCK):
+        # Records are copied in blocks, because loading several at once hides the latency of memory.
+        block_stop = min(block + _POSITIONS_PER_BLOCK, stop)
         for position in range(np.uint64(block), np.uint64(block_stop)):
             source = np.uint64(order[position])
-            for field in range(np.uint64(RECORD)):
+            for field in range(np.uint64(RECORD_FLOATS)):
                 sorted_records[position, field] = records[source, field]
         for position in range(np.uint64(block), np.uint64(block_stop)):
             begin = at
@@ -119,29 +133,33 @@ def find_pairs(start, stop, order, boxes, records, width, height, tile_counts, p
             xx, yy, u_x = np.float64(record[COV_XX]), np.float64(record[COV_YY]), np.float64(record[U_X])
             inv_xx, inv_yy = 1 / xx, 1 / yy
             extent_x, extent_y = math.sqrt(reach * xx), math.sqrt(reach * yy)
-            top, bottom = _pixels(y - extent_y - _PAD, y + extent_y + _PAD, height - 1)
-            # Not from xx yy - xy^2, which cancels on needles: slope = xy / yy, rest = det / yy; likewise for y.
+            top, bottom = _pixel_range(
+                y - extent_y - _SPAN_MARGIN_PIXELS, y + extent_y + _SPAN_MARGIN_PIXELS, height - 1
+            )
+            # slope = xy / yy and rest = det / yy (likewise for y) are not computed from xx yy - xy^2, which cancels on
+            # needles.
             slope_x, rest_x = -np.float64(record[U_Y]) / u_x, 0.0625 / (u_x * u_x)
             slope_y, rest_y = slope_x * yy * inv_xx, rest_x * yy * inv_xx
-            turn_x, turn_y = slope_x * extent_y, slope_y * extent_x  # dx at the largest dy, dy at the largest dx
-            for tile_y in range(top // TILE, bottom // TILE + 1):
-                high_row, low_row = max(top, tile_y * TILE), min(bottom, tile_y * TILE + TILE - 1)
+            # turn_x is dx at the largest dy; turn_y is dy at the largest dx.
+            turn_x, turn_y = slope_x * extent_y, slope_y * extent_x
+            for tile_y in range(top // TILE_SIZE, bottom // TILE_SIZE + 1):
+                high_row, low_row = max(top, tile_y * TILE_SIZE), min(bottom, tile_y * TILE_SIZE + TILE_SIZE - 1)
                 near, far = max(high_row - y, -extent_y), min(low_row - y, extent_y)
                 low, high = _span(x, slope_x, rest_x, reach, inv_yy, turn_y, near, far)
-                left, right = _pixels(low, high, width - 1)
+                left, right = _pixel_range(low, high, width - 1)
                 if left > right:
                     continue
-                for tile_x in range(left // TILE, right // TILE + 1):
-                    near = max(max(left, tile_x * TILE) - x, -extent_x)
-                    far = min(min(right, tile_x * TILE + TILE - 1) - x, extent_x)
+                for tile_x in range(left // TILE_SIZE, right // TILE_SIZE + 1):
+                    near = max(max(left, tile_x * TILE_SIZE) - x, -extent_x)
+                    far = min(min(right, tile_x * TILE_SIZE + TILE_SIZE - 1) - x, extent_x)
                     low, high = _span(y, slope_y, rest_y, reach, inv_xx, turn_x, near, far)
-                    first, last = _pixels(low, high, low_row)
+                    first, last = _pixel_range(low, high, low_row)
                     first = max(first, high_row)
                     if first > last or at >= capacity:
                         continue
                     tile = np.uint64(tile_y * tiles_x + tile_x)
                     tiles[at] = tile
-                    rows[at] = (first - tile_y * TILE) + 16 * (last - tile_y * TILE)
+                    rows[at] = (first - tile_y * TILE_SIZE) + 16 * (last - tile_y * TILE_SIZE)
                     tile_counts[tile] += 1
                     at += 1
             pair_counts[order[position]] = at - begin
@@ -149,8 +167,11 @@ def find_pairs(start, stop, order, boxes, records, width, height, tile_counts, p
 
 
 @_kernel
-def place_chunks(tile_counts, tile_starts):
-    """Turn (chunks, tiles) counts into where each chunk's pairs of each tile go; fill tile_starts (tiles + 1,)."""
+def assign_chunk_offsets(tile_counts, tile_starts):
+    """Replace the counts (chunks, tiles) by the offset of each chunk's pairs of each tile.
+
+    Writes the first pair of each tile to tile_starts (tiles + 1,).
+    """
     at = 0
     for tile in range(tile_counts.shape[1]):
         tile_starts[tile] = at
@@ -162,19 +183,21 @@ def place_chunks(tile_counts, tile_starts):
 
 
 @_kernel
-def fill_tiles(start, stop, order, first, tiles, rows, offsets, pairs):
-    """Put one chunk's pairs into their tiles, keeping their order.
+def fill_tiles(start, stop, order, slot_starts, tiles, rows, offsets, pairs):
+    """Write one chunk's pairs to their tiles, keeping their order.
 
-    first: (N + 1,) where each Gaussian's slots begin; offsets: (tiles,) where the chunk's next pair of each tile goes,
-    advanced; pairs: (P,) uint64, written.
+    Args:
+        slot_starts: (N + 1,) the first slot of each Gaussian.
+        offsets: (tiles,) the offset of the chunk's next pair of each tile; incremented.
+        pairs: (P,) uint64, written.
     """
     source = np.uint64(0)
     for position in range(np.uint64(start), np.uint64(stop)):
         i = np.uint64(order[position])
-        head = position << POSITION_SHIFT
-        for slot in range(np.uint64(first[i]), np.uint64(first[i + np.uint64(1)])):
+        head = position << POSITION_SHIFT_BITS
+        for slot in range(np.uint64(slot_starts[i]), np.uint64(slot_starts[i + np.uint64(1)])):
             tile = np.uint64(tiles[source])
             at = np.uint64(offsets[tile])
             offsets[tile] += 1
-            pairs[at] = head | (slot << SLOT_SHIFT) | np.uint64(rows[source])
+            pairs[at] = head | (slot << SLOT_SHIFT_BITS) | np.uint64(rows[source])
             source += np.uint64(1)

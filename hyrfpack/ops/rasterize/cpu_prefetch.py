@@ -1,4 +1,4 @@
-"""Asking the CPU for memory before it is needed: what compiled kernels read or write out of order."""
+"""Provides prefetch instructions for compiled kernels that read or write memory out of order."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from numba.extending import intrinsic
 
 
 def _prefetch(for_write: int):
+    """Make a Numba intrinsic that prefetches the first cache line of an array's row."""
+
     def typed(typingctx, array, row):
         def codegen(context, builder, signature, args):
             layout = signature.args[0]
@@ -28,7 +30,7 @@ def _prefetch(for_write: int):
 
 
 prefetch_row = _prefetch(for_write=0)
-"""prefetch_row(array, i): row i (uint64) of a 2-D array will be read soon. Reads nothing, so that any i is safe."""
+"""prefetch_row(array, i) prefetches row i (uint64) of a 2-D array for reading. It reads nothing, so any i is safe."""
 
 prefetch_row_for_write = _prefetch(for_write=1)
-"""Likewise: the row will be written soon."""
+"""prefetch_row_for_write(array, i) prefetches row i for writing, and is otherwise like `prefetch_row`."""

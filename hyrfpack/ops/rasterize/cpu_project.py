@@ -1,7 +1,7 @@
-"""Compiled projection: 3D Gaussians to the records that binning and blending read, and the way back for gradients.
+"""Projects 3D Gaussians to the records that binning and blending read, and backpropagates, in compiled code.
 
-Everything is in float64, which costs little here and keeps far-away scenes, needles and huge Gaussians exact; the
-records are float32. A Gaussian whose numbers overflow is left out like one behind the camera.
+All computation is in float64, which costs little here and keeps far-away scenes, needles and huge Gaussians exact. The
+records are float32. A Gaussian whose numbers overflow is skipped, like one behind the camera.
 """
 
 from __future__ import annotations
@@ -10,26 +10,34 @@ import math
 
 import numpy as np
 
-from hyrfpack.ops.rasterize.reference import ALPHA_MIN, COMPENSATION_MIN, LOW_PASS, QUAT_NORM_MIN, TILE
+from hyrfpack.ops.rasterize.reference import (
+    ALPHA_MIN,
+    DETERMINANT_RATIO_MIN,
+    LOW_PASS_VARIANCE,
+    QUAT_NORM_MIN,
+    TILE_SIZE,
+)
 from hyrfpack.parallel.compiled import compiled
 
-# One record of a projected Gaussian: 16 float32, one cache line. With Sigma = its 2D covariance,
+# Columns of a record, which holds one projected Gaussian in 16 float32, one cache line. With Sigma = its 2D covariance,
 #     u = U_X dx + U_Y dy,  v = V_Y dy,  u^2 + v^2 = 1/16 d^T Sigma^-1 d   (so the exponent is -8 (u^2 + v^2)).
-# Squares of a triangular form lose nothing to cancellation on long needles, and are never negative.
-MEAN_X, MEAN_Y, U_X, U_Y, V_Y, CUT, OPACITY, RED, GREEN, BLUE, DEPTH, COV_XX, COV_YY, REACH = range(14)
-RECORD = 16
-# CUT: the largest u^2 + v^2 with alpha >= 1/255.  REACH: the largest d^T Sigma^-1 d to bin, slightly more.
+# Squares of a triangular form do not cancel on long needles, and are never negative.
+MEAN_X, MEAN_Y, U_X, U_Y, V_Y, CUTOFF, OPACITY, RED, GREEN, BLUE, DEPTH, COV_XX, COV_YY, REACH = range(14)
+RECORD_FLOATS = 16
+# CUTOFF: the largest u^2 + v^2 with alpha >= 1/255. REACH: the largest d^T Sigma^-1 d to bin, slightly more than that.
 
-# One gradient row of a (Gaussian, tile) pair: sums over pixels of p = dL/d(exponent) times u, v, uu, uv, vv and 1;
-# dL/d(color); sums of |p u| and |p (U_Y u + V_Y v)|. Padded to a cache line.
+# Columns of the gradient row of a (Gaussian, tile) pair: sums over pixels of p = dL/d(exponent) times u, v, uu, uv, vv
+# and 1; dL/d(color); sums of |p u| and |p (U_Y u + V_Y v)|. The row is padded to a cache line.
 SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_P, SUM_RED, SUM_GREEN, SUM_BLUE, SUM_ABS_U, SUM_ABS_V = range(11)
-ROW = 16
+GRADIENT_ROW_FLOATS = 16
 
-HIDDEN = np.uint32(0xFFFFFFFF)  # the sort key of a Gaussian that is not drawn
-_OVERFLOW = 1e30
-_OPTIONS = {"fastmath": {"contract", "nsz"}, "error_model": "numpy"}
-_kernel = compiled(**_OPTIONS)
-_inlined = compiled(**_OPTIONS, inline="always")  # what LLVM finds too large to inline by itself
+# Sort key of a Gaussian that is not drawn.
+HIDDEN_KEY = np.uint32(0xFFFFFFFF)
+# Gaussians with a larger depth, opacity, covariance or mean are not drawn.
+_MAX_MAGNITUDE = 1e30
+_COMPILE_OPTIONS = {"fastmath": {"contract", "nsz"}, "error_model": "numpy"}
+_kernel = compiled(**_COMPILE_OPTIONS)
+_inlined = compiled(**_COMPILE_OPTIONS, inline="always")  # LLVM does not inline functions of this size by itself.
 
 
 @_kernel
@@ -44,12 +52,12 @@ def _cross(a, b):
 
 @_kernel
 def _combine(s, a, t, b):
-    """s a + t b."""
+    """Return s a + t b."""
     return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
 
 
 @_kernel
-def _times(a, b):
+def _multiply(a, b):
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
@@ -59,13 +67,13 @@ def _clamp(value, low, high):
 
 
 @_kernel
-def _double(x, y, z):
+def _to_float64(x, y, z):
     return np.float64(x), np.float64(y), np.float64(z)
 
 
 @_kernel
-def _columns(q0, q1, q2, q3):
-    """The rotation matrix of a unit quaternion wxyz, column by column."""
+def _rotation_columns(q0, q1, q2, q3):
+    """Return the columns of the rotation matrix of a unit quaternion wxyz."""
     return (
         (1 - 2 * (q2 * q2 + q3 * q3), 2 * (q1 * q2 + q0 * q3), 2 * (q1 * q3 - q0 * q2)),
         (2 * (q1 * q2 - q0 * q3), 1 - 2 * (q1 * q1 + q3 * q3), 2 * (q2 * q3 + q0 * q1)),
@@ -74,25 +82,25 @@ def _columns(q0, q1, q2, q3):
 
 
 @_inlined
-def _locate(mean, axes, shift):
-    """x / z, y / z and z of a mean in the camera with rotation rows `axes`."""
+def _project_mean(mean, axes, shift):
+    """Return x / z, y / z and z of a mean in the camera's frame; `axes` are the rows of the rotation."""
     z = _dot(axes[2], mean) + shift[2]
     inv_z = 1 / z
     return (_dot(axes[0], mean) + shift[0]) * inv_z, (_dot(axes[1], mean) + shift[1]) * inv_z, z
 
 
 @_inlined
-def _spread(x_z, y_z, z, quat, axes, lens):
-    """The factors of the covariance.
+def _covariance_factors(x_z, y_z, z, quat, axes, lens):
+    """Compute the factors of the covariance.
 
     Returns:
-        a, b: the rows of J R; e, f: the rows of J R Q; q: the unit quaternion; norm: its length before.
+        a, b: the rows of J R; e, f: the rows of J R Q; q: the unit quaternion; norm: its length before normalisation.
     """
     q0, q1, q2, q3 = quat
     norm = math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
     scale = 1 / max(norm, QUAT_NORM_MIN)
     q0, q1, q2, q3 = q0 * scale, q1 * scale, q2 * scale, q3 * scale
-    axis_0, axis_1, axis_2 = _columns(q0, q1, q2, q3)
+    axis_0, axis_1, axis_2 = _rotation_columns(q0, q1, q2, q3)
     inv_z = 1 / z
     j_x, j_y = lens[0] * inv_z, lens[1] * inv_z
     a = _combine(j_x, axes[0], -j_x * _clamp(x_z, lens[4], lens[5]), axes[2])
@@ -104,18 +112,22 @@ def _spread(x_z, y_z, z, quat, axes, lens):
 
 @_inlined
 def _covariance(g, h):
-    """xx, xy, yy of the filtered covariance whose root has rows g and h; determinants before and after the filter."""
+    """Compute the low-pass filtered covariance from its square root with rows g and h.
+
+    Returns:
+        xx, xy, yy of the filtered covariance; its determinant before and after the filter.
+    """
     xx, xy, yy = _dot(g, g), _dot(g, h), _dot(h, h)
-    # |g x h|^2 = xx yy - xy^2 without the cancellation that needles suffer from.
+    # |g x h|^2 equals xx yy - xy^2, but does not cancel on needles.
     normal = _cross(g, h)
     raw = _dot(normal, normal)
-    det = raw + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS
-    return xx + LOW_PASS, xy, yy + LOW_PASS, raw, det
+    det = raw + LOW_PASS_VARIANCE * (xx + yy) + LOW_PASS_VARIANCE * LOW_PASS_VARIANCE
+    return xx + LOW_PASS_VARIANCE, xy, yy + LOW_PASS_VARIANCE, raw, det
 
 
 @_kernel
-def _triangle(xx, xy, yy, det):
-    """U_X, U_Y and V_Y of a record."""
+def _triangular_form(xx, xy, yy, det):
+    """Return U_X, U_Y and V_Y of a record."""
     inv_yy = 1 / yy
     u_x = 0.25 * math.sqrt(yy / det)
     return u_x, -u_x * xy * inv_yy, 0.25 * math.sqrt(inv_yy)
@@ -124,32 +136,37 @@ def _triangle(xx, xy, yy, det):
 @_kernel
 def project(
     start, stop, means, quats, scales, opacities, colors, axes, shift, lens, width, height, near, antialiased,
-    records, keys, boxes,
+    records, keys, tile_count_bounds,
 ):  # fmt: skip
-    """Fill records (N, 16), keys (N,) uint32 that sort by depth, boxes (N,) how many tiles the bounding box meets.
+    """Project Gaussians start to stop. A record is written only for a Gaussian that is drawn.
 
-    axes: the rows of the camera's rotation; shift: its translation; lens: fx, fy, cx, cy, then the limits of x/z (low,
-    high) and of y/z in the Jacobian. All tuples of float64, for loads from arrays would stay in the loop.
-    Only Gaussians start to stop are handled. A record is written only for what is drawn.
+    Args:
+        axes: the rows of the camera's rotation. All camera arguments are tuples of float64, because loads from arrays
+            would stay in the loop.
+        shift: the camera's translation.
+        lens: fx, fy, cx, cy, then the limits of x/z (low, high) and of y/z in the Jacobian.
+        records: (N, 16), written.
+        keys: (N,) uint32, written: sort keys by depth.
+        tile_count_bounds: (N,), written: the number of tiles that the bounding box meets.
     """
     for i in range(np.uint64(start), np.uint64(stop)):
-        keys[i] = HIDDEN
-        boxes[i] = 0
-        x_z, y_z, z = _locate(_double(means[i, 0], means[i, 1], means[i, 2]), axes, shift)
+        keys[i] = HIDDEN_KEY
+        tile_count_bounds[i] = 0
+        x_z, y_z, z = _project_mean(_to_float64(means[i, 0], means[i, 1], means[i, 2]), axes, shift)
         opacity = np.float64(opacities[i])
-        # Written so that NaN fails every test and is not drawn.
-        if not (z > near and z < _OVERFLOW and opacity >= ALPHA_MIN and opacity < _OVERFLOW):
+        # The comparisons are written so that they fail for NaN, which is then not drawn.
+        if not (z > near and z < _MAX_MAGNITUDE and opacity >= ALPHA_MIN and opacity < _MAX_MAGNITUDE):
             continue
         quat = np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
-        _, _, e, f, _, _ = _spread(x_z, y_z, z, quat, axes, lens)
-        scale = _double(scales[i, 0], scales[i, 1], scales[i, 2])
-        xx, xy, yy, raw, det = _covariance(_times(e, scale), _times(f, scale))
+        _, _, e, f, _, _ = _covariance_factors(x_z, y_z, z, quat, axes, lens)
+        scale = _to_float64(scales[i, 0], scales[i, 1], scales[i, 2])
+        xx, xy, yy, raw, det = _covariance(_multiply(e, scale), _multiply(f, scale))
         if antialiased:
-            opacity *= math.sqrt(max(raw / det, COMPENSATION_MIN))
+            opacity *= math.sqrt(max(raw / det, DETERMINANT_RATIO_MIN))
         mean_x, mean_y = lens[0] * x_z + lens[2], lens[1] * y_z + lens[3]
-        if not (opacity >= ALPHA_MIN and xx < _OVERFLOW and yy < _OVERFLOW):
+        if not (opacity >= ALPHA_MIN and xx < _MAX_MAGNITUDE and yy < _MAX_MAGNITUDE):
             continue
-        if not (abs(mean_x) < _OVERFLOW and abs(mean_y) < _OVERFLOW):
+        if not (abs(mean_x) < _MAX_MAGNITUDE and abs(mean_y) < _MAX_MAGNITUDE):
             continue
 
         cut = 2 * math.log(255 * opacity)
@@ -159,14 +176,14 @@ def project(
         top, bottom = max(mean_y - extent_y - 0.5, 0.0), min(mean_y + extent_y - 0.5, height - 1.0)
         if not (math.ceil(left) <= math.floor(right) and math.ceil(top) <= math.floor(bottom)):
             continue
-        columns = np.int64(right) // TILE - np.int64(math.ceil(left)) // TILE + 1
-        rows = np.int64(bottom) // TILE - np.int64(math.ceil(top)) // TILE + 1
+        columns = np.int64(right) // TILE_SIZE - np.int64(math.ceil(left)) // TILE_SIZE + 1
+        rows = np.int64(bottom) // TILE_SIZE - np.int64(math.ceil(top)) // TILE_SIZE + 1
 
         keys[i] = np.float32(z).view(np.uint32)
-        boxes[i] = columns * rows
+        tile_count_bounds[i] = columns * rows
         records[i, MEAN_X], records[i, MEAN_Y] = mean_x, mean_y
-        records[i, U_X], records[i, U_Y], records[i, V_Y] = _triangle(xx, xy, yy, det)
-        records[i, CUT], records[i, REACH] = cut / 16, reach
+        records[i, U_X], records[i, U_Y], records[i, V_Y] = _triangular_form(xx, xy, yy, det)
+        records[i, CUTOFF], records[i, REACH] = cut / 16, reach
         records[i, OPACITY], records[i, DEPTH] = opacity, z
         records[i, RED], records[i, GREEN], records[i, BLUE] = colors[i, 0], colors[i, 1], colors[i, 2]
         records[i, COV_XX], records[i, COV_YY] = xx, yy
@@ -174,17 +191,20 @@ def project(
 
 @_kernel
 def project_backward(
-    start, stop, first, rows, means, quats, scales, opacities, axes, shift, lens, antialiased,
+    start, stop, slot_starts, rows, means, quats, scales, opacities, axes, shift, lens, antialiased,
     grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, absgrad,
 ):  # fmt: skip
-    """Sum the gradient rows of each Gaussian and pull them back through the projection.
+    """Sum the gradient rows of Gaussians start to stop and backpropagate them through the projection.
 
-    first: (N + 1,) where each one's rows (P, 16) begin. The gradients are written, absgrad ((N, 2) or None) is added
-    to. Only Gaussians start to stop are handled.
+    Args:
+        slot_starts: (N + 1,) the first slot of each Gaussian.
+        rows: (P, 16) the gradient rows, by slot.
+        grad_means, grad_quats, grad_scales, grad_opacities, grad_colors: the gradients, written.
+        absgrad: (N, 2), added to, or None.
     """
-    sums = np.empty(ROW, np.float32)
+    sums = np.empty(GRADIENT_ROW_FLOATS, np.float32)
     for i in range(np.uint64(start), np.uint64(stop)):
-        begin, end = np.uint64(first[i]), np.uint64(first[i + np.uint64(1)])
+        begin, end = np.uint64(slot_starts[i]), np.uint64(slot_starts[i + np.uint64(1)])
         if begin == end:
             grad_means[i] = 0
             grad_quats[i] = 0
@@ -194,20 +214,20 @@ def project_backward(
             continue
         sums[:] = 0
         for row in range(begin, end):
-            for k in range(np.uint64(ROW)):
+            for k in range(np.uint64(GRADIENT_ROW_FLOATS)):
                 sums[k] += rows[row, k]
         grad_colors[i, 0], grad_colors[i, 1], grad_colors[i, 2] = sums[SUM_RED], sums[SUM_GREEN], sums[SUM_BLUE]
         sum_p = np.float64(sums[SUM_P])
         grad_opacities[i] = sum_p / opacities[i]
 
-        x_z, y_z, z = _locate(_double(means[i, 0], means[i, 1], means[i, 2]), axes, shift)
+        x_z, y_z, z = _project_mean(_to_float64(means[i, 0], means[i, 1], means[i, 2]), axes, shift)
         inv_z = 1 / z
         quat = np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
-        a, b, e, f, q, norm = _spread(x_z, y_z, z, quat, axes, lens)
-        scale = _double(scales[i, 0], scales[i, 1], scales[i, 2])
-        g, h = _times(e, scale), _times(f, scale)
+        a, b, e, f, q, norm = _covariance_factors(x_z, y_z, z, quat, axes, lens)
+        scale = _to_float64(scales[i, 0], scales[i, 1], scales[i, 2])
+        g, h = _multiply(e, scale), _multiply(f, scale)
         xx, xy, yy, raw, det = _covariance(g, h)
-        u_x, u_y, v_y = _triangle(xx, xy, yy, det)
+        u_x, u_y, v_y = _triangular_form(xx, xy, yy, det)
 
         # Sigma^-1 d = 16 (U_X u, U_Y u + V_Y v), and dL/dSigma = 1/2 sum p (Sigma^-1 d)(Sigma^-1 d)^T.
         su, sv = np.float64(sums[SUM_U]), np.float64(sums[SUM_V])
@@ -219,19 +239,19 @@ def project_backward(
         if absgrad is not None:
             absgrad[i, 0] += np.float32(16 * u_x * sums[SUM_ABS_U])
             absgrad[i, 1] += np.float32(16 * sums[SUM_ABS_V])
-        if antialiased and raw / det >= COMPENSATION_MIN:
-            # The exponent gains 1/2 log(raw / det).
-            grad_xx += 0.5 * sum_p * ((yy - LOW_PASS) / raw - yy / det)
-            grad_yy += 0.5 * sum_p * ((xx - LOW_PASS) / raw - xx / det)
+        if antialiased and raw / det >= DETERMINANT_RATIO_MIN:
+            # The compensated opacity adds 1/2 log(raw / det) to the exponent.
+            grad_xx += 0.5 * sum_p * ((yy - LOW_PASS_VARIANCE) / raw - yy / det)
+            grad_yy += 0.5 * sum_p * ((xx - LOW_PASS_VARIANCE) / raw - xx / det)
             grad_xy -= sum_p * xy * (1 / raw - 1 / det)
 
         grad_g, grad_h = _combine(2 * grad_xx, g, grad_xy, h), _combine(2 * grad_yy, h, grad_xy, g)
-        by_e, by_f = _times(grad_g, e), _times(grad_h, f)
+        by_e, by_f = _multiply(grad_g, e), _multiply(grad_h, f)
         for k in range(3):
             grad_scales[i, k] = by_e[k] + by_f[k]
-        grad_e, grad_f = _times(grad_g, scale), _times(grad_h, scale)
+        grad_e, grad_f = _multiply(grad_g, scale), _multiply(grad_h, scale)
 
-        # Through e = a Q and f = b Q: the rotation's matrix, then its unit quaternion, then the length.
+        # Backpropagate through e = a Q and f = b Q to the rotation matrix, the unit quaternion, and its length.
         d0 = _combine(a[0], grad_e, b[0], grad_f)
         d1 = _combine(a[1], grad_e, b[1], grad_f)
         d2 = _combine(a[2], grad_e, b[2], grad_f)
@@ -245,8 +265,8 @@ def project_backward(
         grad_quats[i, 0], grad_quats[i, 1] = (w0 - along * q0) * inv_norm, (w1 - along * q1) * inv_norm
         grad_quats[i, 2], grad_quats[i, 3] = (w2 - along * q2) * inv_norm, (w3 - along * q3) * inv_norm
 
-        # Through a = j_x R_x - j_x clamp(x/z) R_z and likewise b: the Jacobian, then the mean.
-        axis_0, axis_1, axis_2 = _columns(q0, q1, q2, q3)
+        # Backpropagate through a = j_x R_x - j_x clamp(x/z) R_z, and likewise b, to the Jacobian and then the mean.
+        axis_0, axis_1, axis_2 = _rotation_columns(q0, q1, q2, q3)
         grad_a = _combine(1.0, _combine(grad_e[0], axis_0, grad_e[1], axis_1), grad_e[2], axis_2)
         grad_b = _combine(1.0, _combine(grad_f[0], axis_0, grad_f[1], axis_1), grad_f[2], axis_2)
         right, down, forward = axes

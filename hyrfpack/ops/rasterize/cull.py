@@ -1,4 +1,4 @@
-"""Which Gaussians are worth decoding for a viewpoint (HyRF's visibility pre-culling)."""
+"""Selects the Gaussians to decode for a viewpoint (HyRF's visibility pre-culling)."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ def frustum_cull(
     *,
     implementation: str = "auto",
 ) -> Tensor:
-    """Indices of the points in front of the near plane that project into the picture or a band around it.
+    """Return the indices of points in front of the near plane that project into the image or a band around it.
 
     Args:
         positions: (N, 3) local units.
-        pose: (4, 4) camera_from_local, best on the CPU: "gpu" reads it there.
+        pose: (4, 4) camera_from_local, preferably on the CPU, where "gpu" reads it.
         intrinsics: (fx, fy, cx, cy) in pixels.
         near: smallest depth kept (exclusive), local units.
-        tolerance: width of the band as a fraction of half the picture's width and height (NDC units).
-        implementation: "auto", "reference" or "gpu" (float32 positions; works in float64).
+        tolerance: width of the band as a fraction of half the image's width and height (NDC units).
+        implementation: "auto", "reference" or "gpu" (float32 positions; computes in float64).
 
     Returns:
         (n,) int64, ascending.
 
     Raises:
-        FloatingPointError: a position is NaN or infinite; by comparisons alone it would be left out without a word.
-        ValueError: the implementation cannot take these positions.
+        FloatingPointError: a position is NaN or infinite; comparisons alone would drop it silently.
+        ValueError: the implementation does not support these positions.
     """
     if choose_implementation(implementation, ("reference", "gpu"), positions) == "gpu":
         from hyrfpack.ops.rasterize import gpu_cull
@@ -47,7 +47,7 @@ def frustum_cull(
     fx, fy, cx, cy = intrinsics
     x, y, z = (positions @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
     margin_x, margin_y = tolerance * width / 2, tolerance * height / 2
-    u, v = fx * x, fy * y  # compared after multiplying by z > 0: no division, nothing to guard
+    u, v = fx * x, fy * y  # Limits are multiplied by z > 0 instead of dividing by z, which needs no guard.
     inside = (
         (z > near)
         & (u > (-margin_x - cx) * z)

@@ -1,8 +1,8 @@
-"""Binning on the GPU: which Gaussians each tile blends, in depth order.
+"""Bins Gaussians into tiles on the GPU: lists the Gaussians that each tile blends, in depth order.
 
-A pair is one Gaussian in one tile. Pairs are listed Gaussian by Gaussian, nearest first, and then sorted stably by
-tile, so that each tile's pairs stay in depth order. A pair's place in the first list is its slot, where its gradient
-goes.
+A pair is one Gaussian in one tile. Pairs are first listed Gaussian by Gaussian, nearest first. They are then sorted
+stably by tile, so that each tile's pairs stay in depth order. The index of a pair in the first list is its slot, to
+which backward writes the pair's gradient.
 """
 
 from __future__ import annotations
@@ -15,51 +15,66 @@ import triton.language as tl
 from torch import Tensor
 
 from hyrfpack.ops.gpu_pairs import unpack_pair
-from hyrfpack.ops.rasterize.gpu_ellipse import TILE, ellipse, tile_columns, tile_rows
+from hyrfpack.ops.rasterize.gpu_ellipse import TILE_SIZE, make_ellipse, touched_pixel_rows, touched_tile_columns
 from hyrfpack.ops.rasterize.gpu_project import (
     COVARIANCE,
+    FLAGGED_INPUTS,
     MEAN,
-    NAMES,
+    RECORD_WORDS,
     U_SLOPES,
     V_SLOPE_OPACITY,
-    WORDS,
     Projection,
 )
 
-PAIRS_MAX = 2**31 - 64  # 32 bits number them, and a little past the end
-# A program lists as long as its largest Gaussian takes: few Gaussians a program, in one warp, waste the least.
-_BLOCK, _WARPS = 32, 1
-_COLUMNS = 8  # tiles of a row listed at once: one Gaussian over thousands of tiles holds nobody up
+MAX_PAIRS = 2**31 - 64  # Indices of pairs are int32, and loops may count slightly past the end.
+# A program runs as long as its largest Gaussian takes, so that few Gaussians per program, in one warp, waste least.
+_GAUSSIANS_PER_PROGRAM = 32
+_WARPS_PER_PROGRAM = 1
+# Tiles of a row are stored in groups of this size, so that one Gaussian over thousands of tiles does not delay others.
+_TILES_PER_STORE = 8
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """The pairs of a picture, tile by tile and in depth order within each. P pairs, tiles row by row.
+    """The P pairs of an image, ordered by tile (row by row) and, within a tile, by depth.
 
     Attributes:
-        starts: (tiles + 2,) int32 where each tile's pairs begin. One tile more than the picture has holds pairs of no
-            tile: what rounding took from a count between counting and listing.
-        owners: (P,) int32 the Gaussian of each pair.
-        slots: (P,) int64 where each pair stood in the list Gaussian by Gaussian.
-        begins: (N,) int32 where each Gaussian's slots begin; not set for what is not drawn.
-        nonfinite: names of inputs that are not finite somewhere.
+        tile_starts: (tiles + 2,) int32, the first pair of each tile. An extra tile after the last holds pairs of no
+            tile: those that were counted but not listed, because the two kernels rounded differently.
+        owners: (P,) int32, the Gaussian of each pair.
+        slots: (P,) int64, the slot of each pair.
+        slot_starts: (N,) int32, the first slot of each Gaussian; undefined for Gaussians that are not drawn.
+        nonfinite: names of the inputs that contain NaN or infinity.
     """
 
-    starts: Tensor
+    tile_starts: Tensor
     owners: Tensor
     slots: Tensor
-    begins: Tensor
+    slot_starts: Tensor
     nonfinite: tuple[str, ...]
 
 
 @triton.jit(do_not_specialize=["total", "width", "height"])
-def _list(
-    order, ends, records, total, width, height, tiles, owners, begins, BLOCK: tl.constexpr, COLUMNS: tl.constexpr
+def _list_pairs_kernel(
+    order,
+    ends,
+    records,
+    total,
+    width,
+    height,
+    tiles,
+    owners,
+    slot_starts,
+    BLOCK: tl.constexpr,
+    TILES_PER_STORE: tl.constexpr,
 ):
     """List the pairs Gaussian by Gaussian, in depth order.
 
-    order: (N,) int64 which Gaussian is at which place of the depth order; ends: (N,) int64 where its pairs end.
-    tiles (P,), owners (P,) and begins (N,) are written.
+    Args:
+        order: (N,) int64, the Gaussian at each position of the depth order.
+        ends: (N,) int64, the end of its slots.
+        tiles, owners: (P,), written: the tile and the Gaussian of each slot.
+        slot_starts: (N,), written: the first slot of each Gaussian.
     """
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = place < total
@@ -68,24 +83,24 @@ def _list(
     at = tl.where(live, at, end)
     drawn = at < end
     owner = tl.load(order + place, mask=drawn, other=0)
-    tl.store(begins + owner, at.to(tl.int32), mask=drawn)
-    record = records + owner * WORDS
+    tl.store(slot_starts + owner, at.to(tl.int32), mask=drawn)
+    record = records + owner * RECORD_WORDS
     u_x, u_y = unpack_pair(tl.load(record + U_SLOPES, mask=drawn, other=0))
     _, log_opacity = unpack_pair(tl.load(record + V_SLOPE_OPACITY, mask=drawn, other=0))
     x, y = unpack_pair(tl.load(record + MEAN, mask=drawn, other=0))
     xx, yy = unpack_pair(tl.load(record + COVARIANCE, mask=drawn, other=0))
-    # Any ellipse in place of none, so that none divides by zero.
+    # Gaussians that are not drawn get some valid ellipse, so that nothing divides by zero.
     u_y, xx, yy = tl.where(drawn, u_y, 1.0), tl.where(drawn, xx, 1.0), tl.where(drawn, yy, 1.0)
-    shape = ellipse(x, y, xx, yy, u_x, u_y, log_opacity)
-    top, bottom = tile_rows(shape, height)
+    shape = make_ellipse(x, y, xx, yy, u_x, u_y, log_opacity)
+    top, bottom = touched_pixel_rows(shape, height)
     owner = owner.to(tl.int32)
-    tiles_x = tl.cdiv(width, TILE)
+    tiles_x = tl.cdiv(width, TILE_SIZE)
 
-    row, last = top // TILE, tl.where(drawn, bottom // TILE, -1)
-    column = tl.arange(0, COLUMNS)[None, :]
-    going = tl.max(last - row, 0) >= 0
-    while going:
-        first, touched = tile_columns(shape, row, top, bottom, width)
+    row, last = top // TILE_SIZE, tl.where(drawn, bottom // TILE_SIZE, -1)
+    column = tl.arange(0, TILES_PER_STORE)[None, :]
+    unfinished = tl.max(last - row, 0) >= 0
+    while unfinished:
+        first, touched = touched_tile_columns(shape, row, top, bottom, width)
         touched = tl.where(row <= last, touched, 0)
         widest = tl.max(touched, 0)
         start = 0
@@ -95,15 +110,16 @@ def _list(
             tile = (row * tiles_x + first)[:, None] + (start + column)
             tl.store(tiles + slot, tile.to(tiles.dtype.element_ty), mask=write)
             tl.store(owners + slot, tl.broadcast_to(owner[:, None], tile.shape), mask=write)
-            start += COLUMNS
+            start += TILES_PER_STORE
         at += touched
         row += 1
-        going = tl.max(last - row, 0) >= 0
+        unfinished = tl.max(last - row, 0) >= 0
 
-    # Two kernels may round differently. A tile too many was left out above; one too few is a pair of no tile.
+    # Counting and listing may round differently. A surplus tile was skipped above; a missing one becomes a pair of no
+    # tile.
     missing = tl.max(end - at, 0)
     while missing > 0:
-        no_tile = tiles_x * tl.cdiv(height, TILE) + tl.zeros_like(row)
+        no_tile = tiles_x * tl.cdiv(height, TILE_SIZE) + tl.zeros_like(row)
         tl.store(tiles + at, no_tile.to(tiles.dtype.element_ty), mask=at < end)
         tl.store(owners + at, owner, mask=at < end)
         at += 1
@@ -111,32 +127,35 @@ def _list(
 
 
 def bin_pairs(projection: Projection, width: int, height: int) -> Pairs:
-    """Sort Gaussians by depth and list the pairs of each tile. Waits for the device once, to learn how many.
+    """Sort Gaussians by depth and list the pairs of each tile.
+
+    Synchronises with the device once, to read the number of pairs.
 
     Raises:
-        MemoryError: more than PAIRS_MAX pairs.
+        MemoryError: there are more than MAX_PAIRS pairs.
     """
     total, device = len(projection.keys), projection.keys.device
-    tile_total = -(-width // TILE.value) * -(-height // TILE.value)
+    tile_total = -(-width // TILE_SIZE.value) * -(-height // TILE_SIZE.value)
     order = torch.sort(projection.keys, stable=True)[1]
-    ends = projection.numbers[1:]
+    ends = projection.flags_and_ends[1:]
     torch.cumsum(projection.counts[order], 0, dtype=torch.int64, out=ends)
-    bits, count = projection.numbers[::total].tolist() if total else (0, 0)
-    if count > PAIRS_MAX:
-        raise MemoryError(f"{count} pairs of a Gaussian and a tile; at most {PAIRS_MAX} can be drawn")
+    bits, count = projection.flags_and_ends[::total].tolist() if total else (0, 0)
+    if count > MAX_PAIRS:
+        raise MemoryError(f"{count} pairs of a Gaussian and a tile; at most {MAX_PAIRS} can be drawn")
 
-    begins = torch.empty(total, dtype=torch.int32, device=device)
+    slot_starts = torch.empty(total, dtype=torch.int32, device=device)
     owners = torch.empty(count, dtype=torch.int32, device=device)
-    # 16 bits where they do: a radix sort then takes half the passes.
+    # Tiles are int16 if that is enough, so that the radix sort needs half the passes.
     kind = torch.int16 if tile_total + 1 < 2**15 else torch.int32
     tiles = torch.empty(count, dtype=kind, device=device)
     if count:
-        _list[(triton.cdiv(total, _BLOCK),)](
-            order, ends, projection.records, total, width, height, tiles, owners, begins,
-            BLOCK=_BLOCK, COLUMNS=_COLUMNS, num_warps=_WARPS, enable_fp_fusion=True,
+        _list_pairs_kernel[(triton.cdiv(total, _GAUSSIANS_PER_PROGRAM),)](
+            order, ends, projection.records, total, width, height, tiles, owners, slot_starts,
+            BLOCK=_GAUSSIANS_PER_PROGRAM, TILES_PER_STORE=_TILES_PER_STORE,
+            num_warps=_WARPS_PER_PROGRAM, enable_fp_fusion=True,
         )  # fmt: skip
     tiles, slots = torch.sort(tiles, stable=True)
     edges = torch.arange(tile_total + 2, dtype=kind, device=device)
-    starts = torch.searchsorted(tiles, edges, out_int32=True)
-    nonfinite = tuple(name for bit, name in enumerate(NAMES) if bits >> bit & 1)
-    return Pairs(starts, owners[slots], slots, begins, nonfinite)
+    tile_starts = torch.searchsorted(tiles, edges, out_int32=True)
+    nonfinite = tuple(name for bit, name in enumerate(FLAGGED_INPUTS) if bits >> bit & 1)
+    return Pairs(tile_starts, owners[slots], slots, slot_starts, nonfinite)

@@ -1,8 +1,8 @@
-"""Blending on the GPU, forward and backward: one program for each tile.
+"""Blends on the GPU, forward and backward, with one program per tile.
 
-A tile's 256 pixels are a block (ROWS, LANES): a thread owns one column of it, pixels of the same x, so that v, which
-depends on x alone, and all that is the same for a Gaussian are worked out once for the thread's pixels. Records are
-loaded as scalars, the same for all threads, a chunk of Gaussians at once so that their latencies overlap.
+A tile's 256 pixels are a block (ROWS, LANES). A thread owns one column of it, whose pixels have the same x, so that it
+computes v, which depends on x alone, and everything that depends on the Gaussian alone once for all its pixels. Records
+are loaded as scalars, the same for all threads, for a chunk of Gaussians at once, so that the loads' latencies overlap.
 """
 
 from __future__ import annotations
@@ -14,68 +14,71 @@ import triton.language as tl
 
 from hyrfpack.ops.gpu_pairs import pack_pair
 from hyrfpack.ops.rasterize import reference
-from hyrfpack.ops.rasterize.gpu_ellipse import EXPONENT_MIN, TILE
+from hyrfpack.ops.rasterize.gpu_ellipse import LOG2_ALPHA_MIN, TILE_SIZE
 from hyrfpack.ops.rasterize.gpu_project import (
     BLUE_DEPTH,
+    GRADIENT_ROW_FLOATS,
     OFFSET,
+    RECORD_WORDS,
     RED_GREEN,
     REFERENCE,
-    ROW,
     SUM_ABS_Y,
     SUM_BLUE,
     U_SLOPES,
     V_SLOPE_OPACITY,
-    WORDS,
 )
 
-_LANES = tl.constexpr(32)
-_ROWS = tl.constexpr(reference.TILE**2 // 32)
+_LANES_PER_BLOCK = tl.constexpr(32)
+_ROWS_PER_BLOCK = tl.constexpr(reference.TILE_SIZE**2 // 32)
 _ALPHA_MAX = tl.constexpr(reference.ALPHA_MAX)
-_EXPONENT_MAX = tl.constexpr(math.log2(reference.ALPHA_MAX))
-_NOTHING = tl.constexpr(-1e30)  # the logarithm of the opacity of no Gaussian
-_AT_ONCE = tl.constexpr(32)  # gradient rows cleared at once
-# One warp for a tile, 8 pixels a thread. Forward takes 131 instructions for a pair on sm_90 (169 in two warps, which
-# load everything twice), backward 417 (672 in two, and 18 barriers, for each of its 9 sums crosses the warps). At 80 to
-# 100 registers 20 to 25 tiles share a multiprocessor, enough to hide the latency of a chunk's loads.
-WARPS = 1
+_LOG2_ALPHA_MAX = tl.constexpr(math.log2(reference.ALPHA_MAX))
+# Stands for the logarithm of opacity 0.
+_LOG2_ZERO_OPACITY = tl.constexpr(-1e30)
+_ROWS_CLEARED_PER_STORE = tl.constexpr(32)
+# A tile has one warp with 8 pixels per thread. On sm_90 forward then takes 131 instructions per pair; two warps would
+# take 169, since both load everything. Backward takes 417; two warps would take 672 and 18 barriers, since each of its
+# 9 sums crosses the warps. At 80 to 100 registers per thread, 20 to 25 tiles share a multiprocessor, which is enough to
+# hide the latency of a chunk's loads.
+WARPS_PER_TILE = 1
 
 
 @triton.jit
-def _pixels(tile, width, height):
-    """The pixels of a tile.
+def _tile_pixels(tile, width, height):
+    """Compute the pixels of a tile.
 
     Returns:
         x, y: (LANES,) centres of the pixels in the first row of the block.
-        row: (ROWS, 1) what the further rows add to y.
-        place, inside: (256,) their places in the picture, and whether they lie in it. Flat: memory is read and written
-            so, or the compiler would choose another layout for the loop.
+        row: (ROWS, 1) the offsets in y of all rows of the block.
+        place, inside: (256,) their indices in the image, and whether they lie inside it. These are flat, because with
+            2-D loads and stores the compiler would choose another layout for the loop.
     """
-    left, top = (tile % tl.cdiv(width, TILE)) * TILE, (tile // tl.cdiv(width, TILE)) * TILE
-    pixel = tl.arange(0, TILE * TILE)
-    x, y = left + pixel % TILE, top + pixel // TILE
+    left, top = (tile % tl.cdiv(width, TILE_SIZE)) * TILE_SIZE, (tile // tl.cdiv(width, TILE_SIZE)) * TILE_SIZE
+    pixel = tl.arange(0, TILE_SIZE * TILE_SIZE)
+    x, y = left + pixel % TILE_SIZE, top + pixel // TILE_SIZE
     inside = (x < width) & (y < height)
     place = y.to(tl.int64) * width + x
-    lane = tl.arange(0, _LANES)
-    first_x, first_y = (left + lane % TILE).to(tl.float32) + 0.5, (top + lane // TILE).to(tl.float32) + 0.5
-    row = (tl.arange(0, _ROWS) * (_LANES // TILE)).to(tl.float32)[:, None]
+    lane = tl.arange(0, _LANES_PER_BLOCK)
+    first_x, first_y = (left + lane % TILE_SIZE).to(tl.float32) + 0.5, (top + lane // TILE_SIZE).to(tl.float32) + 0.5
+    row = (tl.arange(0, _ROWS_PER_BLOCK) * (_LANES_PER_BLOCK // TILE_SIZE)).to(tl.float32)[:, None]
     return first_x, first_y, row, place, inside
 
 
 @triton.jit
 def _load_pixels(pointer, inside):
-    """(ROWS, LANES) from flat pointers, 0 outside of the picture."""
-    return tl.reshape(tl.load(pointer, mask=inside, other=0.0), [_ROWS, _LANES])
+    """Load a block (ROWS, LANES) from flat pointers, 0 outside the image."""
+    return tl.reshape(tl.load(pointer, mask=inside, other=0.0), [_ROWS_PER_BLOCK, _LANES_PER_BLOCK])
 
 
 @triton.jit
 def _store_pixels(pointer, values, inside):
-    tl.store(pointer, tl.reshape(values, [_ROWS * _LANES]), mask=inside)
+    """Store a block (ROWS, LANES) to flat pointers where inside the image."""
+    tl.store(pointer, tl.reshape(values, [_ROWS_PER_BLOCK * _LANES_PER_BLOCK]), mask=inside)
 
 
 @triton.jit
-def _fetch(records, owner, live):
-    """A record's numbers; the opacity is nothing where not live."""
-    at = records + owner.to(tl.int64) * WORDS
+def _load_record(records, owner, live):
+    """Load the numbers of a record; the opacity is zero where not live."""
+    at = records + owner.to(tl.int64) * RECORD_WORDS
     # All words are loaded before the first is used, so that their latencies overlap. They are unpacked inline, since
     # calls of `unpack_pair` are slow in Triton's interpreter.
     ref, offset, slopes = tl.load(at + REFERENCE), tl.load(at + OFFSET), tl.load(at + U_SLOPES)
@@ -89,7 +92,7 @@ def _fetch(records, owner, live):
         slopes.to(tl.int32).to(tl.float32, bitcast=True),
         (slopes >> 32).to(tl.int32).to(tl.float32, bitcast=True),
         opacity.to(tl.int32).to(tl.float32, bitcast=True),
-        tl.where(live, log_opacity, _NOTHING),
+        tl.where(live, log_opacity, _LOG2_ZERO_OPACITY),
         color.to(tl.int32).to(tl.float32, bitcast=True),
         (color >> 32).to(tl.int32).to(tl.float32, bitcast=True),
         depth.to(tl.int32).to(tl.float32, bitcast=True),
@@ -98,8 +101,8 @@ def _fetch(records, owner, live):
 
 
 @triton.jit
-def _exponent(record, x, y, row):
-    """u (ROWS, LANES), v (LANES,) and log2 of alpha, before it is cut (ROWS, LANES)."""
+def _log2_alpha(record, x, y, row):
+    """Return u (ROWS, LANES), v (LANES,) and log2 of the unclamped alpha (ROWS, LANES)."""
     ref_x, ref_y, u_0, v_0, u_x, u_y, v_x, log_opacity, _, _, _, _ = record
     dx = x - ref_x
     v = v_x * dx + v_0
@@ -108,16 +111,17 @@ def _exponent(record, x, y, row):
 
 
 @triton.jit
-def _blend_one(record, x, y, row, transmittance_min, light, red, green, blue, depth, DEPTH: tl.constexpr):
-    _, _, exponent = _exponent(record, x, y, row)
-    alpha = tl.minimum(tl.exp2(exponent), _ALPHA_MAX)
-    weight = tl.where((exponent >= EXPONENT_MIN) & (light > transmittance_min), alpha * light, 0.0)
+def _blend_pair(record, x, y, row, transmittance_min, remaining, red, green, blue, depth, DEPTH: tl.constexpr):
+    """Blend one pair; returns the remaining transmittance and the accumulated values."""
+    _, _, log2_alpha = _log2_alpha(record, x, y, row)
+    alpha = tl.minimum(tl.exp2(log2_alpha), _ALPHA_MAX)
+    weight = tl.where((log2_alpha >= LOG2_ALPHA_MIN) & (remaining > transmittance_min), alpha * remaining, 0.0)
     red += weight * record[8]
     green += weight * record[9]
     blue += weight * record[10]
     if DEPTH:
         depth += weight * record[11]
-    return light - weight, red, green, blue, depth
+    return remaining - weight, red, green, blue, depth
 
 
 @triton.jit(do_not_specialize=["width", "height"])
@@ -126,79 +130,82 @@ def blend(
 ):
     """Blend one tile into rgb (H, W, 3), transmittance (H, W) and, if DEPTH, depths (H, W).
 
-    blended: (tiles,) int32 after how many pairs each tile was finished. Other arguments as in `gpu_bin.Pairs`.
+    Args:
+        starts, owners: `tile_starts` and `owners` of `gpu_bin.Pairs`.
+        blended: (tiles,) int32, written: the number of pairs after which each tile was finished.
     """
     tile = tl.program_id(0)
-    x, y, row, place, inside = _pixels(tile, width, height)
-    # T < 0 marks a pixel outside of the picture; it takes as little as one that is finished.
-    light = tl.reshape(tl.where(inside, 1.0, -1.0), [_ROWS, _LANES])
-    red, green, blue = tl.zeros_like(light), tl.zeros_like(light), tl.zeros_like(light)
-    depth = tl.zeros_like(light)
+    x, y, row, place, inside = _tile_pixels(tile, width, height)
+    # T < 0 marks a pixel outside the image; nothing is blended there, as in a finished pixel.
+    remaining = tl.reshape(tl.where(inside, 1.0, -1.0), [_ROWS_PER_BLOCK, _LANES_PER_BLOCK])
+    red, green, blue = tl.zeros_like(remaining), tl.zeros_like(remaining), tl.zeros_like(remaining)
+    depth = tl.zeros_like(remaining)
     begin, end = tl.load(starts + tile), tl.load(starts + tile + 1)
     at = begin
-    going = at < end
-    # The owners of the next chunk are loaded before this one is worked on. Past the end they are the last one again,
-    # for records of what is not drawn hold anything.
-    owner_0 = tl.load(owners + at, mask=going, other=0)
-    owner_1 = tl.load(owners + tl.minimum(at + 1, end - 1), mask=going, other=0)
-    owner_2 = tl.load(owners + tl.minimum(at + 2, end - 1), mask=going, other=0)
-    owner_3 = tl.load(owners + tl.minimum(at + 3, end - 1), mask=going, other=0)
-    while going:
-        record_0, record_1 = _fetch(records, owner_0, True), _fetch(records, owner_1, at + 1 < end)
-        record_2, record_3 = _fetch(records, owner_2, at + 2 < end), _fetch(records, owner_3, at + 3 < end)
+    unfinished = at < end
+    # The owners of the next chunk are loaded before this one is processed. Past the end the last owner is repeated,
+    # because the records of Gaussians that are not drawn are undefined.
+    owner_0 = tl.load(owners + at, mask=unfinished, other=0)
+    owner_1 = tl.load(owners + tl.minimum(at + 1, end - 1), mask=unfinished, other=0)
+    owner_2 = tl.load(owners + tl.minimum(at + 2, end - 1), mask=unfinished, other=0)
+    owner_3 = tl.load(owners + tl.minimum(at + 3, end - 1), mask=unfinished, other=0)
+    while unfinished:
+        record_0, record_1 = _load_record(records, owner_0, True), _load_record(records, owner_1, at + 1 < end)
+        record_2, record_3 = _load_record(records, owner_2, at + 2 < end), _load_record(records, owner_3, at + 3 < end)
         at += 4
         owner_0 = tl.load(owners + tl.minimum(at, end - 1))
         owner_1 = tl.load(owners + tl.minimum(at + 1, end - 1))
         owner_2 = tl.load(owners + tl.minimum(at + 2, end - 1))
         owner_3 = tl.load(owners + tl.minimum(at + 3, end - 1))
-        light, red, green, blue, depth = _blend_one(
-            record_0, x, y, row, transmittance_min, light, red, green, blue, depth, DEPTH
+        remaining, red, green, blue, depth = _blend_pair(
+            record_0, x, y, row, transmittance_min, remaining, red, green, blue, depth, DEPTH
         )
-        light, red, green, blue, depth = _blend_one(
-            record_1, x, y, row, transmittance_min, light, red, green, blue, depth, DEPTH
+        remaining, red, green, blue, depth = _blend_pair(
+            record_1, x, y, row, transmittance_min, remaining, red, green, blue, depth, DEPTH
         )
-        light, red, green, blue, depth = _blend_one(
-            record_2, x, y, row, transmittance_min, light, red, green, blue, depth, DEPTH
+        remaining, red, green, blue, depth = _blend_pair(
+            record_2, x, y, row, transmittance_min, remaining, red, green, blue, depth, DEPTH
         )
-        light, red, green, blue, depth = _blend_one(
-            record_3, x, y, row, transmittance_min, light, red, green, blue, depth, DEPTH
+        remaining, red, green, blue, depth = _blend_pair(
+            record_3, x, y, row, transmittance_min, remaining, red, green, blue, depth, DEPTH
         )
-        going = (at < end) & (tl.max(light) > transmittance_min)
+        unfinished = (at < end) & (tl.max(remaining) > transmittance_min)
     tl.store(blended + tile, tl.minimum(at, end) - begin)
-    _store_pixels(transmittance + place, light, inside)
+    _store_pixels(transmittance + place, remaining, inside)
     to = rgb + place * 3
     _store_pixels(to, red, inside)
     _store_pixels(to + 1, green, inside)
     _store_pixels(to + 2, blue, inside)
     if DEPTH:
-        _store_pixels(depths + place, depth / tl.where(light < 1, 1 - light, 1.0), inside)  # 0 where nothing is hit
+        # The depth is 0 where nothing is hit.
+        _store_pixels(depths + place, depth / tl.where(remaining < 1, 1 - remaining, 1.0), inside)
 
 
 @triton.jit
-def _backward_one(
-    record, x, y, row, transmittance_min, light, rest, g_red, g_green, g_blue, to, live, ABSGRAD: tl.constexpr
+def _backpropagate_pair(
+    record, x, y, row, transmittance_min, remaining, rest, g_red, g_green, g_blue, to, live, ABSGRAD: tl.constexpr
 ):
-    """Write the gradient row of one pair to `to`; returns the transmittance and the rest behind it.
+    """Write the gradient row of one pair to `to`; returns the transmittance and the rest R behind the pair.
 
-    With R the rest, what lies behind: dL/d(alpha) = T (color . g) - R / (1 - alpha).
+    R is the contribution of all that lies behind to g . rgb: dL/d(alpha) = T (color . g) - R / (1 - alpha).
     """
-    u, v, exponent = _exponent(record, x, y, row)
-    alpha = tl.minimum(tl.exp2(exponent), _ALPHA_MAX)
-    alpha = tl.where((exponent >= EXPONENT_MIN) & (light > transmittance_min), alpha, 0.0)
-    weight = alpha * light
-    here = weight * (record[8] * g_red + record[9] * g_green + record[10] * g_blue)
-    rest -= here
-    p = here - rest * (alpha / (1 - alpha))
-    p = tl.where(exponent <= _EXPONENT_MAX, p, 0.0)  # no gradient where alpha is cut
+    u, v, log2_alpha = _log2_alpha(record, x, y, row)
+    alpha = tl.minimum(tl.exp2(log2_alpha), _ALPHA_MAX)
+    alpha = tl.where((log2_alpha >= LOG2_ALPHA_MIN) & (remaining > transmittance_min), alpha, 0.0)
+    weight = alpha * remaining
+    contribution = weight * (record[8] * g_red + record[9] * g_green + record[10] * g_blue)
+    rest -= contribution
+    p = contribution - rest * (alpha / (1 - alpha))
+    p = tl.where(log2_alpha <= _LOG2_ALPHA_MAX, p, 0.0)  # A clamped alpha passes no gradient.
     pu = p * u
-    # Over a thread's pixels first, for which v is one number.
+    # Sums run over a thread's pixels first, for which v is one number.
     by_p, by_u, by_uu = tl.sum(p, 0), tl.sum(pu, 0), tl.sum(pu * u, 0)
     sum_u, sum_v, sum_uu, sum_uv = tl.sum(by_u, 0), tl.sum(by_p * v, 0), tl.sum(by_uu, 0), tl.sum(by_u * v, 0)
     sum_vv, sum_p = tl.sum(by_p * v * v, 0), tl.sum(by_p, 0)
     sum_red = tl.sum(weight * g_red)
     sum_green = tl.sum(weight * g_green)
     sum_blue = tl.sum(weight * g_blue)
-    # Two at a time, in the order of gpu_project's SUM_U to SUM_ABS_Y.
+    # Sums are stored in pairs, in the order of gpu_project's SUM_U to SUM_ABS_Y.
     tl.store(to, pack_pair(sum_u, sum_v), mask=live)
     tl.store(to + 1, pack_pair(sum_uu, sum_uv), mask=live)
     tl.store(to + 2, pack_pair(sum_vv, sum_p), mask=live)
@@ -210,7 +217,7 @@ def _backward_one(
         tl.store(to + 5, pack_pair(abs_y, 0.0 * abs_y), mask=live)
     else:
         tl.store(to + 4, pack_pair(sum_blue, 0.0 * sum_blue), mask=live)
-    return light - weight, rest
+    return remaining - weight, rest
 
 
 @triton.jit(do_not_specialize=["width", "height"])
@@ -218,11 +225,14 @@ def blend_backward(
     starts, owners, slots, blended, records, width, height, transmittance_min,
     rgb, transmittance, grad_rgb, grad_transmittance, gradient_rows, ABSGRAD: tl.constexpr,
 ):  # fmt: skip
-    """Write the gradient row of each pair of one tile to its slot in gradient_rows (P, 6) int64, zeros after the
-    tile's finish. Replays the blending front to back, so that it needs nothing stored but the picture."""
+    """Write the gradient row of each pair of one tile to its slot in gradient_rows (P, 6) int64.
+
+    Pairs after the tile was finished get zeros. Blending is replayed front to back, so that forward stores only the
+    image.
+    """
     tile = tl.program_id(0)
-    x, y, row, place, inside = _pixels(tile, width, height)
-    light = tl.reshape(tl.where(inside, 1.0, -1.0), [_ROWS, _LANES])
+    x, y, row, place, inside = _tile_pixels(tile, width, height)
+    remaining = tl.reshape(tl.where(inside, 1.0, -1.0), [_ROWS_PER_BLOCK, _LANES_PER_BLOCK])
     from_rgb = place * 3
     g_red = _load_pixels(grad_rgb + from_rgb, inside)
     g_green = _load_pixels(grad_rgb + from_rgb + 1, inside)
@@ -234,53 +244,59 @@ def blend_backward(
 
     at, end = tl.load(starts + tile), tl.load(starts + tile + 1)
     finish = at + tl.load(blended + tile)
-    going = at < finish
-    owner_0 = tl.load(owners + at, mask=going, other=0)
-    owner_1 = tl.load(owners + tl.minimum(at + 1, finish - 1), mask=going, other=0)
-    while going:
+    unfinished = at < finish
+    owner_0 = tl.load(owners + at, mask=unfinished, other=0)
+    owner_1 = tl.load(owners + tl.minimum(at + 1, finish - 1), mask=unfinished, other=0)
+    while unfinished:
         more = at + 1 < finish
-        record_0, record_1 = _fetch(records, owner_0, True), _fetch(records, owner_1, more)
-        to_0 = gradient_rows + tl.load(slots + at) * (ROW // 2)
-        to_1 = gradient_rows + tl.load(slots + tl.minimum(at + 1, finish - 1)) * (ROW // 2)
+        record_0, record_1 = _load_record(records, owner_0, True), _load_record(records, owner_1, more)
+        to_0 = gradient_rows + tl.load(slots + at) * (GRADIENT_ROW_FLOATS // 2)
+        to_1 = gradient_rows + tl.load(slots + tl.minimum(at + 1, finish - 1)) * (GRADIENT_ROW_FLOATS // 2)
         at += 2
-        going = at < finish
+        unfinished = at < finish
         owner_0 = tl.load(owners + tl.minimum(at, finish - 1))
         owner_1 = tl.load(owners + tl.minimum(at + 1, finish - 1))
-        light, rest = _backward_one(
-            record_0, x, y, row, transmittance_min, light, rest, g_red, g_green, g_blue, to_0, True, ABSGRAD
+        remaining, rest = _backpropagate_pair(
+            record_0, x, y, row, transmittance_min, remaining, rest, g_red, g_green, g_blue, to_0, True, ABSGRAD
         )
-        light, rest = _backward_one(
-            record_1, x, y, row, transmittance_min, light, rest, g_red, g_green, g_blue, to_1, more, ABSGRAD
+        remaining, rest = _backpropagate_pair(
+            record_1, x, y, row, transmittance_min, remaining, rest, g_red, g_green, g_blue, to_1, more, ABSGRAD
         )
 
     word = tl.arange(0, 8)[None, :]
-    pair = finish + tl.arange(0, _AT_ONCE)
-    going = finish < end
-    while going:
-        to = gradient_rows + tl.load(slots + pair, mask=pair < end, other=0)[:, None] * (ROW // 2) + word
-        nothing = tl.zeros([_AT_ONCE, 8], tl.int64)
-        tl.store(to, nothing, mask=(pair < end)[:, None] & (word < ROW // 2))
-        pair += _AT_ONCE
-        going = tl.min(pair, 0) < end
+    pair = finish + tl.arange(0, _ROWS_CLEARED_PER_STORE)
+    unfinished = finish < end
+    while unfinished:
+        to = (
+            gradient_rows + tl.load(slots + pair, mask=pair < end, other=0)[:, None] * (GRADIENT_ROW_FLOATS // 2) + word
+        )
+        zero_rows = tl.zeros([_ROWS_CLEARED_PER_STORE, 8], tl.int64)
+        tl.store(to, zero_rows, mask=(pair < end)[:, None] & (word < GRADIENT_ROW_FLOATS // 2))
+        pair += _ROWS_CLEARED_PER_STORE
+        unfinished = tl.min(pair, 0) < end
 
 
 @triton.jit(do_not_specialize=["total"])
-def sum_rows(gradient_rows, begins, counts, total, ABSGRAD: tl.constexpr, BLOCK: tl.constexpr, SLOTS: tl.constexpr):
-    """Put the sum of each Gaussian's gradient rows (P, 12) in place of its first. Many rows a turn: a Gaussian may lie
-    in thousands of tiles."""
+def sum_rows(
+    gradient_rows, slot_starts, counts, total, ABSGRAD: tl.constexpr, BLOCK: tl.constexpr, SLOTS: tl.constexpr
+):
+    """Replace the first of each Gaussian's gradient rows (P, 12) by their sum.
+
+    Many rows are loaded per iteration, because a Gaussian may lie in thousands of tiles.
+    """
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     count = tl.load(counts + index, mask=index < total, other=0)
-    begin = tl.load(begins + index, mask=count > 0, other=0).to(tl.int64)
+    begin = tl.load(slot_starts + index, mask=count > 0, other=0).to(tl.int64)
     most = tl.max(count, 0)
     if most > 1:
         column = tl.arange(0, 16)
         used = column <= (SUM_ABS_Y if ABSGRAD else SUM_BLUE)
         slot = tl.arange(0, SLOTS)
         sums = tl.zeros([BLOCK, 16], tl.float32)
-        first = gradient_rows + begin[:, None] * ROW + column[None, :]
+        first = gradient_rows + begin[:, None] * GRADIENT_ROW_FLOATS + column[None, :]
         done = 0
         while done < most:
-            at = first[:, None, :] + ((done + slot) * ROW)[None, :, None]
+            at = first[:, None, :] + ((done + slot) * GRADIENT_ROW_FLOATS)[None, :, None]
             there = ((done + slot)[None, :] < count[:, None])[:, :, None] & used[None, None, :]
             sums += tl.sum(tl.load(at, mask=there, other=0.0), 1)
             done += SLOTS

@@ -1,9 +1,9 @@
-"""Projection on the GPU: 3D Gaussians to the records that binning and blending read, and the way back for gradients.
+"""Projects 3D Gaussians on the GPU to the records that binning and blending read, and backpropagates.
 
-In float64, which costs little for something done once for a Gaussian and keeps far-away scenes, needles and huge
-Gaussians exact; the records are float32. A Gaussian whose numbers overflow is left out like one behind the camera.
-`project_block` and `store_records` are functions of their own, so that a kernel that makes its Gaussians itself can
-project them before they reach memory.
+All computation is in float64, which costs little once per Gaussian and keeps far-away scenes, needles and huge
+Gaussians exact. The records are float32. A Gaussian whose numbers overflow is skipped, like one behind the camera.
+`project_block` and `store_records` are separate functions, so that another kernel can project Gaussians without
+storing them first.
 """
 
 from __future__ import annotations
@@ -19,72 +19,84 @@ from torch import Tensor
 from hyrfpack.ops.gpu_pairs import pack_pair
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import reference
-from hyrfpack.ops.rasterize.gpu_ellipse import TILE, UNIT, ellipse, tile_columns, tile_rows
+from hyrfpack.ops.rasterize.gpu_ellipse import (
+    TILE_SIZE,
+    UV_SCALE,
+    make_ellipse,
+    touched_pixel_rows,
+    touched_tile_columns,
+)
 
-# One record of a projected Gaussian: 16 float32, read and written in pairs, see gpu_pairs. With Sigma = its 2D
-# covariance and d = pixel - mean,
+# Words of a record, which holds one projected Gaussian in 16 float32, read and written in pairs (see gpu_pairs). With
+# Sigma = its 2D covariance and d = pixel - mean,
 #     u = U_X (x - REF_X) + U_Y (y - REF_Y) + U_0,  v = V_X (x - REF_X) + V_0,  d^T Sigma^-1 d = 2 ln 2 (u^2 + v^2)
-# so that alpha = 2^(LOG_OPACITY - u^2 - v^2). Squares of a triangular form lose nothing to cancellation on long
-# needles, and are never negative. REF is the mean, or the picture's point next to it: the form of a needle whose mean
-# is far outside is exact where it is seen. Pair by pair:
+# so that alpha = 2^(LOG_OPACITY - u^2 - v^2). Squares of a triangular form do not cancel on long needles, and are never
+# negative. REF is the mean, clamped to the image, so that the form of a needle whose mean is far outside is exact where
+# the needle is visible. The pairs are:
 #     REF_X REF_Y | U_0 V_0 | U_X U_Y | V_X LOG_OPACITY | RED GREEN | BLUE DEPTH | MEAN_X MEAN_Y | COV_XX COV_YY
 REFERENCE, OFFSET, U_SLOPES, V_SLOPE_OPACITY, RED_GREEN, BLUE_DEPTH, MEAN, COVARIANCE = map(tl.constexpr, range(8))
-WORDS = tl.constexpr(8)
+RECORD_WORDS = tl.constexpr(8)
 
-# One gradient row of a (Gaussian, tile) pair: sums over pixels of p = dL/d(ln alpha) times u, v, uu, uv, vv and 1;
-# dL/d(color); sums of |p (U_X u + V_X v)| and |p u|, where they are asked for.
+# Columns of the gradient row of a (Gaussian, tile) pair: sums over pixels of p = dL/d(ln alpha) times u, v, uu, uv, vv
+# and 1; dL/d(color); and, if absgrad is requested, sums of |p (U_X u + V_X v)| and |p u|.
 SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_P, SUM_RED, SUM_GREEN, SUM_BLUE, SUM_ABS_X, SUM_ABS_Y = map(
     tl.constexpr, range(11)
 )
-ROW = tl.constexpr(12)  # floats: 48 bytes
+GRADIENT_ROW_FLOATS = tl.constexpr(12)
 
-VIEWPOINT = tl.constexpr(25)  # in `camera_numbers`
-HIDDEN = tl.constexpr(2**31 - 1)  # the sort key of a Gaussian that is not drawn
-NAMES = "means", "quats", "scales", "opacities", "colors"  # the bits of the flag of numbers that are not finite
-BLOCK = 128  # Gaussians a program: float64 takes many registers, so that small programs fill a processor best
-WARPS = 4
+# Index of the camera's centre in the result of `pack_camera`.
+VIEWPOINT_OFFSET = tl.constexpr(25)
+# Sort key of a Gaussian that is not drawn.
+HIDDEN_KEY = tl.constexpr(2**31 - 1)
+# Inputs in the order of their bits in the flags of non-finite inputs.
+FLAGGED_INPUTS = "means", "quats", "scales", "opacities", "colors"
+GAUSSIANS_PER_PROGRAM = 128  # float64 takes many registers; small programs then give the best occupancy.
+WARPS_PER_PROGRAM = 4
 
-_LOW_PASS = tl.constexpr(reference.LOW_PASS)
+_LOW_PASS_VARIANCE = tl.constexpr(reference.LOW_PASS_VARIANCE)
 _ALPHA_MIN = tl.constexpr(reference.ALPHA_MIN)
-_COMPENSATION_MIN = tl.constexpr(reference.COMPENSATION_MIN)
+_DETERMINANT_RATIO_MIN = tl.constexpr(reference.DETERMINANT_RATIO_MIN)
 _QUAT_NORM_MIN = tl.constexpr(reference.QUAT_NORM_MIN)
-_ROOT = tl.constexpr(math.sqrt(0.5 / math.log(2)))  # sqrt(1 / UNIT)
-_OVERFLOW = tl.constexpr(1e30)
-_FLOAT_MAX = tl.constexpr(3.4028234663852886e38)
+_INV_SQRT_UV_SCALE = tl.constexpr(math.sqrt(0.5 / math.log(2)))
+# Gaussians with a larger depth, opacity, covariance or mean are not drawn.
+_MAX_MAGNITUDE = tl.constexpr(1e30)
+_FLOAT32_MAX = tl.constexpr(3.4028234663852886e38)
 
 
 @dataclass(frozen=True)
 class Projection:
-    """What a kernel that projects writes of N Gaussians.
+    """The outputs of a projection kernel for N Gaussians.
 
     Attributes:
-        records: (N, 8) int64, set for what is drawn.
-        keys: (N,) int32 that sort by depth, HIDDEN for what is not drawn.
-        counts: (N,) int32 tiles touched.
-        visible: (N,) uint8 whether any.
-        numbers: (1 + N,) int64, first the flag of inputs that are not finite (zero before), the rest for binning.
+        records: (N, 8) int64, set for Gaussians that are drawn.
+        keys: (N,) int32 sort keys by depth, HIDDEN_KEY for Gaussians that are not drawn.
+        counts: (N,) int32, the number of tiles touched.
+        visible: (N,) uint8, whether any tile is touched.
+        flags_and_ends: (1 + N,) int64. The first element holds the flags of non-finite inputs and is zero before the
+            launch. Binning writes the others.
     """
 
     records: Tensor
     keys: Tensor
     counts: Tensor
     visible: Tensor
-    numbers: Tensor
+    flags_and_ends: Tensor
 
     @classmethod
     def empty(cls, total: int, device: torch.device) -> Projection:
-        """To be filled."""
+        """Allocate the outputs; only the flags are initialised."""
 
         def new(*shape: int, dtype: torch.dtype) -> Tensor:
             return torch.empty(shape, dtype=dtype, device=device)
 
-        numbers = new(1 + total, dtype=torch.int64)
-        numbers[:1].zero_()  # numbers[0] = 0 would copy from the host, and wait
+        flags_and_ends = new(1 + total, dtype=torch.int64)
+        flags_and_ends[:1].zero_()  # An assignment of 0 would copy it from the host and block.
         keys, counts = new(total, dtype=torch.int32), new(total, dtype=torch.int32)
-        return cls(new(total, WORDS.value, dtype=torch.int64), keys, counts, new(total, dtype=torch.uint8), numbers)
+        records, visible = new(total, RECORD_WORDS.value, dtype=torch.int64), new(total, dtype=torch.uint8)
+        return cls(records, keys, counts, visible, flags_and_ends)
 
 
-def camera_numbers(
+def pack_camera(
     camera_from_world: Tensor,
     intrinsics: tuple[float, float, float, float],
     width: int,
@@ -93,18 +105,18 @@ def camera_numbers(
     device: torch.device,
     tolerance: float = 0.0,
 ) -> Tensor:
-    """What the kernels need of a camera, as one small float64 tensor on the device.
+    """Pack the camera's parameters for the kernels into one small float64 tensor on the device.
 
     Args:
-        camera_from_world: (4, 4), best on the CPU: reading it from the device waits for all that is under way there.
+        camera_from_world: (4, 4), preferably on the CPU; reading it from the device synchronises.
         intrinsics: (fx, fy, cx, cy) in pixels.
-        near: in world units.
-        tolerance: of `in_frustum`, as a fraction of half the picture's size.
+        near: distance of the near plane in world units.
+        tolerance: width of the band of `in_frustum`, as a fraction of half the image's size.
 
     Returns:
         (28,): the rows of the rotation and the translation (12), fx, fy, cx, cy, near, the limits of x/z (low, high)
         and of y/z in the Jacobian, the limits of fx x/z (low, high) and of fy y/z in the frustum,
-        and, from VIEWPOINT on, where the camera stands.
+        and, from VIEWPOINT_OFFSET on, the camera's centre.
     """
     fx, fy, cx, cy = (float(number) for number in intrinsics)
     pose = camera_from_world.detach().to("cpu", torch.float64)
@@ -115,7 +127,7 @@ def camera_numbers(
         -margin_x - cx, width + margin_x - cx, -margin_y - cy, height + margin_y - cy,
         *camera_center(pose).tolist(),
     ]  # fmt: skip
-    # Not blocking: so small a copy is taken over at once, and a blocking one would wait for the device.
+    # The copy does not block, because a blocking one would wait for the device. Its source is staged at once.
     return torch.tensor(numbers, dtype=torch.float64).to(device, non_blocking=True)
 
 
@@ -131,8 +143,12 @@ def _load_4(pointer):
 
 @triton.jit
 def load_camera(camera):
-    """The numbers of `camera_numbers`: axes (three rows of the rotation), shift, lens (fx, fy, cx, cy), near, the
-    limits in the Jacobian (4) and those of the frustum (4)."""
+    """Load the result of `pack_camera`.
+
+    Returns:
+        axes (three rows of the rotation), shift (the translation), lens (fx, fy, cx, cy), near, the limits in the
+        Jacobian (4) and those of the frustum (4).
+    """
     axes = _load_3(camera), _load_3(camera + 3), _load_3(camera + 6)
     shift, lens, near = _load_3(camera + 9), _load_4(camera + 12), tl.load(camera + 16)
     return axes, shift, lens, near, _load_4(camera + 17), _load_4(camera + 21)
@@ -140,7 +156,7 @@ def load_camera(camera):
 
 @triton.jit
 def load_rows_3(pointer, index, live):
-    """Rows of an (N, 3) tensor, column by column; 0 where not live."""
+    """Load rows of an (N, 3) tensor as one block per column; 0 where not live."""
     at = pointer + index.to(tl.int64) * 3
     first, second = tl.load(at, mask=live, other=0.0), tl.load(at + 1, mask=live, other=0.0)
     return first, second, tl.load(at + 2, mask=live, other=0.0)
@@ -148,7 +164,7 @@ def load_rows_3(pointer, index, live):
 
 @triton.jit
 def load_rows_4(pointer, index, live):
-    """Rows of an (N, 4) tensor, column by column; 0 where not live."""
+    """Load rows of an (N, 4) tensor as one block per column; 0 where not live."""
     at = pointer + index.to(tl.int64) * 4
     first, second = tl.load(at, mask=live, other=0.0), tl.load(at + 1, mask=live, other=0.0)
     return first, second, tl.load(at + 2, mask=live, other=0.0), tl.load(at + 3, mask=live, other=0.0)
@@ -166,12 +182,12 @@ def _cross(a, b):
 
 @triton.jit
 def _combine(s, a, t, b):
-    """s a + t b."""
+    """Return s a + t b."""
     return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
 
 
 @triton.jit
-def _times(a, b):
+def _multiply(a, b):
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
@@ -181,18 +197,18 @@ def _clamp(value, low, high):
 
 
 @triton.jit
-def _double_3(a):
+def _to_float64_3(a):
     return a[0].to(tl.float64), a[1].to(tl.float64), a[2].to(tl.float64)
 
 
 @triton.jit
-def _double_4(a):
+def _to_float64_4(a):
     return a[0].to(tl.float64), a[1].to(tl.float64), a[2].to(tl.float64), a[3].to(tl.float64)
 
 
 @triton.jit
-def _columns(q):
-    """The rotation matrix of a unit quaternion wxyz, column by column."""
+def _rotation_columns(q):
+    """Return the columns of the rotation matrix of a unit quaternion wxyz."""
     return (
         (1 - 2 * (q[2] * q[2] + q[3] * q[3]), 2 * (q[1] * q[2] + q[0] * q[3]), 2 * (q[1] * q[3] - q[0] * q[2])),
         (2 * (q[1] * q[2] - q[0] * q[3]), 1 - 2 * (q[1] * q[1] + q[3] * q[3]), 2 * (q[2] * q[3] + q[0] * q[1])),
@@ -201,36 +217,38 @@ def _columns(q):
 
 
 @triton.jit
-def _locate(mean, axes, shift):
-    """The mean in the camera's frame."""
-    mean = _double_3(mean)
+def _to_camera(mean, axes, shift):
+    """Return the mean in the camera's frame."""
+    mean = _to_float64_3(mean)
     return _dot(axes[0], mean) + shift[0], _dot(axes[1], mean) + shift[1], _dot(axes[2], mean) + shift[2]
 
 
 @triton.jit
 def in_frustum(mean, camera):
-    """Which means lie in front of the near plane and in the picture or the band around it that `camera_numbers` was
-    given as tolerance."""
+    """Return whether means lie in front of the near plane and project into the image or the band around it.
+
+    The `tolerance` of `pack_camera` sets the width of the band.
+    """
     axes, shift, lens, near, _, limits = camera
-    x, y, z = _locate(mean, axes, shift)
-    u, v = lens[0] * x, lens[1] * y  # compared after multiplying by z > 0: no division, nothing to guard
+    x, y, z = _to_camera(mean, axes, shift)
+    u, v = lens[0] * x, lens[1] * y  # Limits are multiplied by z > 0 instead of dividing by z, which needs no guard.
     inside = (u > limits[0] * z) & (u < limits[1] * z) & (v > limits[2] * z) & (v < limits[3] * z)
     return inside & (z > near)
 
 
 @triton.jit
-def _spread(x_z, y_z, inv_z, quat, axes, lens, limits):
-    """The factors of the covariance.
+def _covariance_factors(x_z, y_z, inv_z, quat, axes, lens, limits):
+    """Compute the factors of the covariance.
 
     Returns:
         a, b: the rows of J R; e, f: the rows of J R Q; the columns of Q; q: the unit quaternion; norm: its length
-        before.
+        before normalisation.
     """
-    quat = _double_4(quat)
+    quat = _to_float64_4(quat)
     norm = tl.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
     scale = 1 / tl.maximum(norm, _QUAT_NORM_MIN)
     q = quat[0] * scale, quat[1] * scale, quat[2] * scale, quat[3] * scale
-    columns = _columns(q)
+    columns = _rotation_columns(q)
     j_x, j_y = lens[0] * inv_z, lens[1] * inv_z
     a = _combine(j_x, axes[0], -j_x * _clamp(x_z, limits[0], limits[1]), axes[2])
     b = _combine(j_y, axes[1], -j_y * _clamp(y_z, limits[2], limits[3]), axes[2])
@@ -241,21 +259,25 @@ def _spread(x_z, y_z, inv_z, quat, axes, lens, limits):
 
 @triton.jit
 def _covariance(g, h):
-    """xx, xy, yy of the filtered covariance whose root has rows g and h; determinants before and after the filter."""
+    """Compute the low-pass filtered covariance from its square root with rows g and h.
+
+    Returns:
+        xx, xy, yy of the filtered covariance; its determinant before and after the filter.
+    """
     xx, xy, yy = _dot(g, g), _dot(g, h), _dot(h, h)
-    # |g x h|^2 = xx yy - xy^2 without the cancellation that needles suffer from.
+    # |g x h|^2 equals xx yy - xy^2, but does not cancel on needles.
     normal = _cross(g, h)
     raw = _dot(normal, normal)
-    det = raw + (xx + yy) * _LOW_PASS + _LOW_PASS * _LOW_PASS
-    return xx + _LOW_PASS, xy, yy + _LOW_PASS, raw, det
+    det = raw + (xx + yy) * _LOW_PASS_VARIANCE + _LOW_PASS_VARIANCE * _LOW_PASS_VARIANCE
+    return xx + _LOW_PASS_VARIANCE, xy, yy + _LOW_PASS_VARIANCE, raw, det
 
 
 @triton.jit
-def _triangle(xx, xy, det):
-    """U_X, U_Y and V_X of a record."""
+def _triangular_form(xx, xy, det):
+    """Return U_X, U_Y and V_X of a record."""
     inv_xx = 1 / xx
-    u_y = tl.sqrt(xx / det) * _ROOT
-    return -u_y * xy * inv_xx, u_y, tl.sqrt(inv_xx) * _ROOT
+    u_y = tl.sqrt(xx / det) * _INV_SQRT_UV_SCALE
+    return -u_y * xy * inv_xx, u_y, tl.sqrt(inv_xx) * _INV_SQRT_UV_SCALE
 
 
 @triton.jit
@@ -263,36 +285,37 @@ def project_block(mean, quat, scale, opacity, camera, width, height, ANTIALIASED
     """Project a block of Gaussians.
 
     Args:
-        mean, quat, scale: tuples of 3, 4 and 3 blocks of float32; opacity: one. Opacity 0 hides.
-        camera: of `load_camera`.
+        mean, quat, scale: tuples of 3, 4 and 3 blocks of float32.
+        opacity: a block of float32; a Gaussian with opacity 0 is not drawn.
+        camera: the result of `load_camera`.
         width, height: int32.
 
     Returns:
-        The float32 pairs of a record, without the colours, for `store_records`; int32 keys that sort by
-        depth, HIDDEN for what is not drawn; int32 counts of tiles that the ellipse alpha >= 1/255 touches.
+        The float32 pairs of a record, without the colours, for `store_records`; int32 sort keys by depth, HIDDEN_KEY
+        for Gaussians that are not drawn; int32 counts of tiles that the ellipse alpha >= 1/255 touches.
     """
     axes, shift, lens, near, limits, _ = camera
-    x, y, z = _locate(mean, axes, shift)
+    x, y, z = _to_camera(mean, axes, shift)
     opacity = opacity.to(tl.float64)
-    # Written so that NaN fails every test and is not drawn.
-    drawn = (z > near) & (z < _OVERFLOW) & (opacity >= _ALPHA_MIN) & (opacity < _OVERFLOW)
+    # The comparisons are written so that they fail for NaN, which is then not drawn.
+    drawn = (z > near) & (z < _MAX_MAGNITUDE) & (opacity >= _ALPHA_MIN) & (opacity < _MAX_MAGNITUDE)
     z = tl.where(drawn, z, 1.0)
     inv_z = 1 / z
     x_z, y_z = x * inv_z, y * inv_z
-    _, _, e, f, _, _, _ = _spread(x_z, y_z, inv_z, quat, axes, lens, limits)
-    scale = _double_3(scale)
-    xx, xy, yy, raw, det = _covariance(_times(e, scale), _times(f, scale))
+    _, _, e, f, _, _, _ = _covariance_factors(x_z, y_z, inv_z, quat, axes, lens, limits)
+    scale = _to_float64_3(scale)
+    xx, xy, yy, raw, det = _covariance(_multiply(e, scale), _multiply(f, scale))
     if ANTIALIASED:
-        opacity *= tl.sqrt(tl.maximum(raw / det, _COMPENSATION_MIN))
+        opacity *= tl.sqrt(tl.maximum(raw / det, _DETERMINANT_RATIO_MIN))
     mean_x, mean_y = lens[0] * x_z + lens[2], lens[1] * y_z + lens[3]
-    drawn &= (opacity >= _ALPHA_MIN) & (xx < _OVERFLOW) & (yy < _OVERFLOW)
-    drawn &= (tl.abs(mean_x) < _OVERFLOW) & (tl.abs(mean_y) < _OVERFLOW)
-    # Any numbers in place of those that overflow.
+    drawn &= (opacity >= _ALPHA_MIN) & (xx < _MAX_MAGNITUDE) & (yy < _MAX_MAGNITUDE)
+    drawn &= (tl.abs(mean_x) < _MAX_MAGNITUDE) & (tl.abs(mean_y) < _MAX_MAGNITUDE)
+    # Numbers that overflow are replaced by arbitrary finite ones.
     xx, xy, yy = tl.where(drawn, xx, 1.0), tl.where(drawn, xy, 0.0), tl.where(drawn, yy, 1.0)
     det = tl.where(drawn, det, 1.0)
     mean_x, mean_y = tl.where(drawn, mean_x, 0.0), tl.where(drawn, mean_y, 0.0)
 
-    u_x, u_y, v_x = _triangle(xx, xy, det)
+    u_x, u_y, v_x = _triangular_form(xx, xy, det)
     ref_x = _clamp(mean_x, 0.0, width.to(tl.float64)).to(tl.float32)
     ref_y = _clamp(mean_y, 0.0, height.to(tl.float64)).to(tl.float32)
     from_x, from_y = ref_x.to(tl.float64) - mean_x, ref_y.to(tl.float64) - mean_y
@@ -302,30 +325,30 @@ def project_block(mean, quat, scale, opacity, camera, width, height, ANTIALIASED
     mean_x, mean_y = mean_x.to(tl.float32), mean_y.to(tl.float32)
     xx, yy, depth = xx.to(tl.float32), yy.to(tl.float32), z.to(tl.float32)
 
-    shape = ellipse(mean_x, mean_y, xx, yy, u_x, u_y, log_opacity)
-    top, bottom = tile_rows(shape, height)
+    shape = make_ellipse(mean_x, mean_y, xx, yy, u_x, u_y, log_opacity)
+    top, bottom = touched_pixel_rows(shape, height)
     bottom = tl.where(drawn, bottom, -1)
-    row, last = top // TILE, tl.where(top <= bottom, bottom // TILE, -1)
+    row, last = top // TILE_SIZE, tl.where(top <= bottom, bottom // TILE_SIZE, -1)
     count = tl.zeros_like(row)
-    going = tl.max(last - row, 0) >= 0
-    while going:
-        _column, touched = tile_columns(shape, row, top, bottom, width)
+    unfinished = tl.max(last - row, 0) >= 0
+    while unfinished:
+        _column, touched = touched_tile_columns(shape, row, top, bottom, width)
         count += tl.where(row <= last, touched, 0)
         row += 1
-        going = tl.max(last - row, 0) >= 0
-    key = tl.where(count > 0, depth.to(tl.int32, bitcast=True), HIDDEN)
+        unfinished = tl.max(last - row, 0) >= 0
+    key = tl.where(count > 0, depth.to(tl.int32, bitcast=True), HIDDEN_KEY)
     words = ((ref_x, ref_y), (u_0, v_0), (u_x, u_y), (v_x, log_opacity), depth, (mean_x, mean_y), (xx, yy))
     return words, key, count
 
 
 @triton.jit
 def store_records(records, index, drawn, words):
-    """Write records (N, 8) int64 of Gaussians `index` where drawn, all but what `store_colors` writes.
+    """Write the records (N, 8) int64 of Gaussians `index` where drawn, without the words that `store_colors` writes.
 
-    words: of `project_block`.
+    words: the result of `project_block`.
     """
     reference, offset, u_slopes, v_slope_opacity, depth, mean, covariance = words
-    at = records + index.to(tl.int64) * WORDS
+    at = records + index.to(tl.int64) * RECORD_WORDS
     tl.store(at + REFERENCE, pack_pair(reference[0], reference[1]), mask=drawn)
     tl.store(at + OFFSET, pack_pair(offset[0], offset[1]), mask=drawn)
     tl.store(at + U_SLOPES, pack_pair(u_slopes[0], u_slopes[1]), mask=drawn)
@@ -336,37 +359,39 @@ def store_records(records, index, drawn, words):
 
 @triton.jit
 def store_colors(records, index, drawn, color, depth):
-    """Write what of records depends on colours, a tuple of 3 blocks, and the depth that shares a word with one."""
-    at = records + index.to(tl.int64) * WORDS
+    """Write the colours, a tuple of 3 blocks, to records, and the depth that shares a word with blue."""
+    at = records + index.to(tl.int64) * RECORD_WORDS
     tl.store(at + RED_GREEN, pack_pair(color[0], color[1]), mask=drawn)
     tl.store(at + BLUE_DEPTH, pack_pair(color[2], depth), mask=drawn)
 
 
 @triton.jit
 def is_finite(a):
-    return tl.abs(a) <= _FLOAT_MAX
+    """Return whether numbers are neither NaN nor infinite."""
+    return tl.abs(a) <= _FLOAT32_MAX
 
 
 @triton.jit
-def _flag(flags, bits):
+def _set_flags(flags, bits):
+    """Set the bits of all Gaussians of the block in `flags`."""
     if tl.max(bits, 0) > 0:
         tl.atomic_or(flags + tl.zeros_like(bits), bits.to(tl.int64), mask=bits > 0)
 
 
 @triton.jit
 def flag_geometry(flags, mean, quat, scale, opacity):
-    """Set a bit, in the order of NAMES, of the one int64 `flags` for each input that is not finite somewhere."""
+    """Set a bit of the int64 `flags` for each input with NaN or infinity, in the order of FLAGGED_INPUTS."""
     means = is_finite(mean[0]) & is_finite(mean[1]) & is_finite(mean[2])
     quats = is_finite(quat[0]) & is_finite(quat[1]) & is_finite(quat[2]) & is_finite(quat[3])
     scales = is_finite(scale[0]) & is_finite(scale[1]) & is_finite(scale[2])
     bits = tl.where(means, 0, 1) | tl.where(quats, 0, 2) | tl.where(scales, 0, 4)
-    _flag(flags, bits | tl.where(is_finite(opacity), 0, 8))
+    _set_flags(flags, bits | tl.where(is_finite(opacity), 0, 8))
 
 
 @triton.jit
 def flag_colors(flags, color):
-    """As `flag_geometry`, the last bit, for colours."""
-    _flag(flags, tl.where(is_finite(color[0]) & is_finite(color[1]) & is_finite(color[2]), 0, 16))
+    """Set the last bit of `flags` if a colour is not finite, see `flag_geometry`."""
+    _set_flags(flags, tl.where(is_finite(color[0]) & is_finite(color[1]) & is_finite(color[2]), 0, 16))
 
 
 @triton.jit(do_not_specialize=["total", "width", "height"])
@@ -374,10 +399,10 @@ def project(
     means, quats, scales, opacities, colors, camera, total, width, height, records, keys, counts, visible, flags,
     ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Fill records (N, 8) int64, keys (N,) int32 that sort by depth, counts (N,) int32 of tiles touched and visible
-    (N,) uint8; flags int64, zero before, gets a bit for each input that is not finite somewhere.
+    """Project a block of Gaussians. A record is written only for a Gaussian that is drawn.
 
-    A record is written only for what is drawn.
+    The outputs are the fields of `Projection`: records (N, 8) int64, keys (N,) int32, counts (N,) int32 and visible
+    (N,) uint8. `flags`, int64 and zero before the launch, gets a bit for each input with NaN or infinity.
     """
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = index < total
@@ -396,6 +421,7 @@ def project(
 
 @triton.jit
 def _store_rows_3(pointer, index, live, a):
+    """Store blocks, one per column, as rows of an (N, 3) float32 tensor where live."""
     at = pointer + index.to(tl.int64) * 3
     tl.store(at, a[0].to(tl.float32), mask=live)
     tl.store(at + 1, a[1].to(tl.float32), mask=live)
@@ -404,19 +430,22 @@ def _store_rows_3(pointer, index, live, a):
 
 @triton.jit(do_not_specialize=["total", "absgrad_row", "absgrad_column"])
 def project_backward(
-    rows, begins, counts, means, quats, scales, opacities, camera, total,
+    rows, slot_starts, counts, means, quats, scales, opacities, camera, total,
     grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, absgrad, absgrad_row, absgrad_column,
     ANTIALIASED: tl.constexpr, ABSGRAD: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Pull the gradient row of each Gaussian, its sum over tiles, back through the projection.
+    """Backpropagate the gradient row of each Gaussian, its sum over tiles, through the projection.
 
-    rows: (P, 12), a Gaussian's at begins[i]; begins, counts: (N,) int32. The gradients are written, absgrad ((N, 2)
-    with these strides) is added to.
+    Args:
+        rows: (P, 12) gradient rows; that of Gaussian i is rows[slot_starts[i]].
+        slot_starts, counts: (N,) int32.
+        grad_means, grad_quats, grad_scales, grad_opacities, grad_colors: the gradients, written.
+        absgrad: (N, 2) with the strides absgrad_row and absgrad_column, added to.
     """
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = index < total
     drawn = live & (tl.load(counts + index, mask=live, other=0) > 0)
-    at = rows + tl.load(begins + index, mask=drawn, other=0).to(tl.int64) * ROW
+    at = rows + tl.load(slot_starts + index, mask=drawn, other=0).to(tl.int64) * GRADIENT_ROW_FLOATS
     sum_u, sum_v = tl.load(at + SUM_U, mask=drawn, other=0.0), tl.load(at + SUM_V, mask=drawn, other=0.0)
     sum_uu, sum_uv = tl.load(at + SUM_UU, mask=drawn, other=0.0), tl.load(at + SUM_UV, mask=drawn, other=0.0)
     sum_vv, sum_p = tl.load(at + SUM_VV, mask=drawn, other=0.0), tl.load(at + SUM_P, mask=drawn, other=0.0)
@@ -427,46 +456,46 @@ def project_backward(
     tl.store(grad_opacities + index, sum_p / opacity, mask=live)
 
     axes, shift, lens, _, limits, _ = load_camera(camera)
-    # What is not drawn may hold any numbers: it is replaced by zeros in front of the camera, its gradients by zeros.
-    x, y, z = _locate(load_rows_3(means, index, drawn), axes, shift)
+    # Gaussians that are not drawn may hold any numbers. They are replaced by zeros at z = 1 and get zero gradients.
+    x, y, z = _to_camera(load_rows_3(means, index, drawn), axes, shift)
     inv_z = 1 / tl.where(drawn, z, 1.0)
     x_z, y_z = x * inv_z, y * inv_z
     quat = load_rows_4(quats, index, drawn)
-    a, b, e, f, columns, q, norm = _spread(x_z, y_z, inv_z, quat, axes, lens, limits)
-    scale = _double_3(load_rows_3(scales, index, drawn))
-    g, h = _times(e, scale), _times(f, scale)
+    a, b, e, f, columns, q, norm = _covariance_factors(x_z, y_z, inv_z, quat, axes, lens, limits)
+    scale = _to_float64_3(load_rows_3(scales, index, drawn))
+    g, h = _multiply(e, scale), _multiply(f, scale)
     xx, xy, yy, raw, det = _covariance(g, h)
-    u_x, u_y, v_x = _triangle(xx, xy, det)
+    u_x, u_y, v_x = _triangular_form(xx, xy, det)
     if ABSGRAD:
         to = absgrad + index.to(tl.int64) * absgrad_row
         abs_x, abs_y = tl.load(at + SUM_ABS_X, mask=drawn, other=0.0), tl.load(at + SUM_ABS_Y, mask=drawn, other=0.0)
         before_x = tl.load(to, mask=drawn, other=0.0)
         before_y = tl.load(to + absgrad_column, mask=drawn, other=0.0)
-        tl.store(to, before_x + abs_x * UNIT, mask=drawn)
-        tl.store(to + absgrad_column, before_y + (u_y * UNIT).to(tl.float32) * abs_y, mask=drawn)
+        tl.store(to, before_x + abs_x * UV_SCALE, mask=drawn)
+        tl.store(to + absgrad_column, before_y + (u_y * UV_SCALE).to(tl.float32) * abs_y, mask=drawn)
 
-    # Sigma^-1 d = UNIT (U_X u + V_X v, U_Y u), and dL/dSigma = 1/2 sum p (Sigma^-1 d)(Sigma^-1 d)^T.
+    # Sigma^-1 d = UV_SCALE (U_X u + V_X v, U_Y u), and dL/dSigma = 1/2 sum p (Sigma^-1 d)(Sigma^-1 d)^T.
     su, sv, sum_p = sum_u.to(tl.float64), sum_v.to(tl.float64), sum_p.to(tl.float64)
     suu, suv, svv = sum_uu.to(tl.float64), sum_uv.to(tl.float64), sum_vv.to(tl.float64)
-    grad_x, grad_y = (u_x * su + v_x * sv) * UNIT, u_y * su * UNIT
-    grad_xx = (u_x * u_x * suu + 2 * u_x * v_x * suv + v_x * v_x * svv) * (0.5 * UNIT * UNIT)
-    grad_xy = u_y * (u_x * suu + v_x * suv) * (UNIT * UNIT)
-    grad_yy = u_y * u_y * suu * (0.5 * UNIT * UNIT)
+    grad_x, grad_y = (u_x * su + v_x * sv) * UV_SCALE, u_y * su * UV_SCALE
+    grad_xx = (u_x * u_x * suu + 2 * u_x * v_x * suv + v_x * v_x * svv) * (0.5 * UV_SCALE * UV_SCALE)
+    grad_xy = u_y * (u_x * suu + v_x * suv) * (UV_SCALE * UV_SCALE)
+    grad_yy = u_y * u_y * suu * (0.5 * UV_SCALE * UV_SCALE)
     if ANTIALIASED:
-        # The exponent gains 1/2 log(raw / det).
-        compensated = raw >= det * _COMPENSATION_MIN
+        # The compensated opacity adds 1/2 log(raw / det) to the exponent.
+        compensated = raw >= det * _DETERMINANT_RATIO_MIN
         by_p = tl.where(compensated, sum_p, 0.0)
         inv_raw, inv_det = 1 / tl.where(compensated, raw, 1.0), 1 / det
-        grad_xx += 0.5 * by_p * ((yy - _LOW_PASS) * inv_raw - yy * inv_det)
-        grad_yy += 0.5 * by_p * ((xx - _LOW_PASS) * inv_raw - xx * inv_det)
+        grad_xx += 0.5 * by_p * ((yy - _LOW_PASS_VARIANCE) * inv_raw - yy * inv_det)
+        grad_yy += 0.5 * by_p * ((xx - _LOW_PASS_VARIANCE) * inv_raw - xx * inv_det)
         grad_xy -= by_p * xy * (inv_raw - inv_det)
 
     grad_g, grad_h = _combine(2 * grad_xx, g, grad_xy, h), _combine(2 * grad_yy, h, grad_xy, g)
-    by_e, by_f = _times(grad_g, e), _times(grad_h, f)
+    by_e, by_f = _multiply(grad_g, e), _multiply(grad_h, f)
     _store_rows_3(grad_scales, index, live, (by_e[0] + by_f[0], by_e[1] + by_f[1], by_e[2] + by_f[2]))
-    grad_e, grad_f = _times(grad_g, scale), _times(grad_h, scale)
+    grad_e, grad_f = _multiply(grad_g, scale), _multiply(grad_h, scale)
 
-    # Through e = a Q and f = b Q: the rotation's matrix, then its unit quaternion, then the length.
+    # Backpropagate through e = a Q and f = b Q to the rotation matrix, the unit quaternion, and its length.
     d0 = _combine(a[0], grad_e, b[0], grad_f)
     d1 = _combine(a[1], grad_e, b[1], grad_f)
     d2 = _combine(a[2], grad_e, b[2], grad_f)
@@ -483,7 +512,7 @@ def project_backward(
     tl.store(to + 2, ((w2 - along * q[2]) * inv_norm).to(tl.float32), mask=live)
     tl.store(to + 3, ((w3 - along * q[3]) * inv_norm).to(tl.float32), mask=live)
 
-    # Through a = j_x R_x - j_x clamp(x/z) R_z and likewise b: the Jacobian, then the mean.
+    # Backpropagate through a = j_x R_x - j_x clamp(x/z) R_z, and likewise b, to the Jacobian and then the mean.
     grad_a = _combine(1.0, _combine(grad_e[0], columns[0], grad_e[1], columns[1]), grad_e[2], columns[2])
     grad_b = _combine(1.0, _combine(grad_f[0], columns[0], grad_f[1], columns[1]), grad_f[2], columns[2])
     right, down, forward = axes

@@ -1,4 +1,4 @@
-"""Projecting and shading in one kernel: of a Gaussian that is not drawn, not even the colour's inputs are read."""
+"""Projects and shades Gaussians in one kernel, which reads the inputs of colours only for Gaussians that are drawn."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import triton.language as tl
 from torch import Tensor
 
 from hyrfpack.ops.rasterize import Rasterization
-from hyrfpack.ops.rasterize.gpu import draw
+from hyrfpack.ops.rasterize.gpu import bin_and_blend
 from hyrfpack.ops.rasterize.gpu_project import (
-    VIEWPOINT,
+    VIEWPOINT_OFFSET,
     Projection,
-    camera_numbers,
     flag_colors,
     flag_geometry,
     in_frustum,
     load_camera,
     load_rows_3,
     load_rows_4,
+    pack_camera,
     project_block,
     store_colors,
     store_records,
@@ -28,23 +28,23 @@ from hyrfpack.ops.shade.gpu import launch_size, shade_block
 
 
 @triton.jit(do_not_specialize=["total", "width", "height"])
-def project_shaded(
+def project_shaded_kernel(
     means, quats, scales, opacities, first_layer, packed, b2, b3, color_logits, camera, total, width, height,
     records, keys, counts, visible, flags,
     IN: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, OUT: tl.constexpr,
     IN_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, OUT_P: tl.constexpr,
     FREQUENCY: tl.constexpr, PRECISION: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """As `gpu_project.project`, of means in the frustum alone, with colours as of `shade_block`."""
+    """Do what `gpu_project.project` does for means in the frustum, with colours from `shade_block`."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = index < total
     mean, quat = load_rows_3(means, index, live), load_rows_4(quats, index, live)
     scale, opacity = load_rows_3(scales, index, live), tl.load(opacities + index, mask=live, other=0.0)
-    numbers = load_camera(camera)
-    shown = tl.where(in_frustum(mean, numbers), opacity, 0.0)
-    words, key, count = project_block(mean, quat, scale, shown, numbers, width, height, ANTIALIASED)
+    loaded_camera = load_camera(camera)
+    opacity_in_frustum = tl.where(in_frustum(mean, loaded_camera), opacity, 0.0)
+    words, key, count = project_block(mean, quat, scale, opacity_in_frustum, loaded_camera, width, height, ANTIALIASED)
     drawn = count > 0
-    # Stored before the colours are worked out, which takes all registers.
+    # Records are stored before colours are computed, which takes all registers.
     store_records(records, index, drawn, words)
     flag_geometry(flags, mean, quat, scale, opacity)
     tl.store(keys + index, key, mask=live)
@@ -52,9 +52,9 @@ def project_shaded(
     tl.store(visible + index, drawn.to(tl.uint8), mask=live)
     if tl.max(count, 0) > 0:
         viewpoint = (
-            tl.load(camera + VIEWPOINT).to(tl.float32),
-            tl.load(camera + VIEWPOINT + 1).to(tl.float32),
-            tl.load(camera + VIEWPOINT + 2).to(tl.float32),
+            tl.load(camera + VIEWPOINT_OFFSET).to(tl.float32),
+            tl.load(camera + VIEWPOINT_OFFSET + 1).to(tl.float32),
+            tl.load(camera + VIEWPOINT_OFFSET + 2).to(tl.float32),
         )
         color = shade_block(
             mean, index, drawn, viewpoint, first_layer, packed, b2, b3, color_logits,
@@ -82,20 +82,20 @@ def rasterize_shaded(
     transmittance_min: float,
     depth: bool,
 ) -> Rasterization:
-    """As `hyrfpack.ops.rasterize.shaded.rasterize_shaded`."""
+    """Compute `hyrfpack.ops.rasterize.shaded.rasterize_shaded`."""
     total, device = len(means), means.device
     inputs = (tensor.detach().contiguous() for tensor in (means, quats, scales, opacities))
-    camera = camera_numbers(camera_from_world, intrinsics, width, height, near, device, cull_tolerance)
+    camera = pack_camera(camera_from_world, intrinsics, width, height, near, device, cull_tolerance)
     tensors, constants = shading.kernel_arguments
     projection = Projection.empty(total, device)
     if total:
         block, warps = launch_size(shading.mixed)
-        project_shaded[(triton.cdiv(total, block),)](
+        project_shaded_kernel[(triton.cdiv(total, block),)](
             *inputs, *tensors, camera, total, int(width), int(height),
-            projection.records, projection.keys, projection.counts, projection.visible, projection.numbers,
+            projection.records, projection.keys, projection.counts, projection.visible, projection.flags_and_ends,
             **constants, ANTIALIASED=bool(antialiased), BLOCK=block, num_warps=warps, enable_fp_fusion=True,
         )  # fmt: skip
-    drawn = draw(projection, int(width), int(height), float(transmittance_min), bool(depth))
-    pairs = drawn.pairs
+    image = bin_and_blend(projection, int(width), int(height), float(transmittance_min), bool(depth))
+    pairs = image.pairs
     visible = projection.visible.view(torch.bool)
-    return Rasterization(drawn.rgb, drawn.transmittance, drawn.depth, visible, len(pairs.owners), {}, pairs.nonfinite)
+    return Rasterization(image.rgb, image.transmittance, image.depth, visible, len(pairs.owners), {}, pairs.nonfinite)

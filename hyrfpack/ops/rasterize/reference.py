@@ -1,8 +1,8 @@
-"""The definition of right for rasterising: plain torch, any device, float32 or float64, differentiable by autograd.
+"""Implements rasterisation in plain torch for any device, in float32 or float64, differentiable by autograd.
 
-`project` and `blend` say what every faster implementation must compute. `rasterize` puts them together tile by tile,
-so that memory stays bounded, and never lets a tile decide anything: a Gaussian is left out of a tile only where its
-alpha is below 1/255 on all of the tile.
+This reference defines the correct result: every faster implementation must compute what `project` and `blend` compute.
+`rasterize` applies them tile by tile to bound memory. Tiles never affect the result, since a Gaussian is skipped in a
+tile only if its alpha is below 1/255 on the whole tile.
 """
 
 from __future__ import annotations
@@ -15,25 +15,27 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-TILE = 16
-LOW_PASS = 0.3  # px^2 added to the diagonal of every 2D covariance
+TILE_SIZE = 16  # Tiles are squares with sides of 16 pixels.
+# Variance in px^2 that is added to the diagonal of every 2D covariance.
+LOW_PASS_VARIANCE = 0.3
 ALPHA_MAX = 0.99
 ALPHA_MIN = 1 / 255
-TRANSMITTANCE_MIN = 1 / 512  # half a step of 8 bits
-COMPENSATION_MIN = 2.5e-5  # of the determinant ratio under `antialiased`
+TRANSMITTANCE_MIN = 1 / 512  # This is half a quantisation step of 8-bit images.
+# Lower bound of det(Sigma) / det(Sigma + 0.3 I) in the compensation of opacities for the low-pass.
+DETERMINANT_RATIO_MIN = 2.5e-5
 QUAT_NORM_MIN = 1e-12
-_PIXEL_PAIRS_AT_ONCE = 1 << 21
+_MAX_PIXEL_PAIRS_PER_CHUNK = 1 << 21
 
 
 @dataclass(frozen=True)
 class Projected:
-    """Gaussians in front of the camera, as seen in the picture. M of them, in the order of the input.
+    """The M Gaussians in front of the camera, projected to the image, in the order of the input.
 
     Attributes:
-        index: (M,) which input Gaussian each one is.
+        index: (M,) the index of each one in the input.
         means2d: (M, 2) pixels.
         covs2d: (M, 3) xx, xy, yy in px^2, low-pass included.
-        conics: (M, 3) the inverse covariance, likewise.
+        conics: (M, 3) xx, xy, yy of the inverse covariance in 1/px^2.
         depths: (M,) camera z in world units.
         opacities: (M,) compensated for the low-pass when antialiased.
     """
@@ -46,16 +48,16 @@ class Projected:
     opacities: Tensor
 
     def select(self, which: Tensor) -> Projected:
-        """Those of the given positions, in the given order."""
+        """Return the Gaussians at the given positions, in the given order."""
         return Projected(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
 
 def jacobian_limits(
     intrinsics: tuple[float, float, float, float], width: int, height: int
 ) -> tuple[float, float, float, float]:
-    """The x/z (least, most) and y/z (least, most) that the projection's Jacobian is taken at, at most.
+    """Return the ranges of x/z (min, max) and y/z (min, max) to which the projection's Jacobian is clamped.
 
-    It is the field of view widened by 0.15 of its size on each side (the 3DGS rule, about the principal point).
+    They are the field of view, widened by 0.15 of its size on each side (the 3DGS rule, about the principal point).
     """
     fx, fy, cx, cy = intrinsics
     slack_x, slack_y = 0.15 * width / fx, 0.15 * height / fy
@@ -76,12 +78,12 @@ def project(
 ) -> Projected:
     """Project 3D Gaussians to 2D Gaussians (EWA splatting).
 
-    With p = R m + t the mean in the camera and J the Jacobian of the pinhole projection at p, the picture's
-    covariance is J R Q diag(s^2) Q^T R^T J^T + 0.3 I. J is taken with x/z and y/z clamped to `jacobian_limits`.
-    Gaussians at z <= near are dropped. Arguments as in `hyrfpack.ops.rasterize.rasterize`.
+    With p = R m + t the mean in the camera's frame and J the Jacobian of the pinhole projection at p, the 2D covariance
+    is J R Q diag(s^2) Q^T R^T J^T + 0.3 I. J is evaluated with x/z and y/z clamped to `jacobian_limits`. Gaussians at
+    z <= near are dropped. The arguments are those of `hyrfpack.ops.rasterize.rasterize`.
     """
     fx, fy, cx, cy = intrinsics
-    # In float64 where there is one (Apple's GPUs have none): far from the origin, R m and t are large and cancel.
+    # Far from the origin R m and t are large and cancel, so float64 is used where it exists (Apple's GPUs have none).
     exact = torch.float32 if means.device.type == "mps" else torch.float64
     camera = camera_from_world.to(exact).to(means.device)
     seen = means.to(exact) @ camera[:3, :3].T + camera[:3, 3]
@@ -98,11 +100,11 @@ def project(
     xx, xy, yy = (half[:, 0] ** 2).sum(-1), (half[:, 0] * half[:, 1]).sum(-1), (half[:, 1] ** 2).sum(-1)
     # |a x b|^2 = |a|^2 |b|^2 - (a . b)^2 without the cancellation that needles suffer from.
     determinant = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(-1)
-    filtered = determinant + LOW_PASS * (xx + yy) + LOW_PASS**2
+    filtered = determinant + LOW_PASS_VARIANCE * (xx + yy) + LOW_PASS_VARIANCE**2
     opacities = opacities[index]
     if antialiased:
-        opacities = opacities * (determinant / filtered).clamp_min(COMPENSATION_MIN).sqrt()
-    xx, yy = xx + LOW_PASS, yy + LOW_PASS
+        opacities = opacities * (determinant / filtered).clamp_min(DETERMINANT_RATIO_MIN).sqrt()
+    xx, yy = xx + LOW_PASS_VARIANCE, yy + LOW_PASS_VARIANCE
     return Projected(
         index=index,
         means2d=torch.stack([fx * x_z + cx, fy * y_z + cy], -1),
@@ -122,22 +124,22 @@ def blend(
     on_grad: Callable[[Tensor], None] | None = None,
     transmittance_min: float = TRANSMITTANCE_MIN,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Blend 2D Gaussians, nearest first, at some pixels.
+    """Blend 2D Gaussians front to back at the given pixels.
 
-        alpha_i = min(0.99, opacity_i exp(-1/2 d^T conic_i d)), left out below 1/255
+        alpha_i = min(0.99, opacity_i exp(-1/2 d^T conic_i d)), skipped below 1/255
         T_i = product over j < i of (1 - alpha_j);  a pixel is finished once T_i <= transmittance_min
 
-    No gradient passes through an alpha that is cut at 0.99.
+    No gradient passes through an alpha that is clamped to 0.99.
 
     Args:
         means2d, conics, opacities: (M, 2), (M, 3), (M,) in depth order.
-        values: (M, C) what to blend.
+        values: (M, C) the values to blend.
         pixels: (P, 2) pixel centres.
-        on_grad: called in backward with dL/d means2d apart for each pixel, (P, M, 2).
-        transmittance_min: in [0, 1).
+        on_grad: called in backward with dL/d means2d of each pixel separately, (P, M, 2).
+        transmittance_min: T at which a pixel is finished, in [0, 1).
 
     Returns:
-        (P, C) sum of T_i alpha_i values_i; (P,) transmittance left; (P, M) whether alpha_i >= 1/255.
+        (P, C) sum of T_i alpha_i values_i; (P,) remaining transmittance; (P, M) whether alpha_i >= 1/255.
     """
     centers = means2d.expand(len(pixels), -1, -1)
     if on_grad is not None and centers.requires_grad:
@@ -155,7 +157,7 @@ def blend(
 
 
 def _transmittances(alphas: Tensor) -> Tensor:
-    """(P, M + 1) what light is left before each of the Gaussians (P, M), and after the last."""
+    """Return the transmittances (P, M + 1) before each of the Gaussians' alphas (P, M) and after the last."""
     return torch.cat([alphas.new_ones(len(alphas), 1), (1 - alphas).cumprod(-1)], -1)
 
 
@@ -176,37 +178,37 @@ def rasterize(
     depth: bool,
     absgrad: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, int, dict[str, float]]:
-    """Arguments and results (a tuple in the order of the fields) as in `hyrfpack.ops.rasterize.rasterize`."""
+    """Compute `hyrfpack.ops.rasterize.rasterize`; the result is a tuple of the fields of `Rasterization` in order."""
     started = perf_counter()
     projected = project(
         means, quats, scales, opacities, camera_from_world, intrinsics, width, height, near, antialiased
     )
     ended_project = perf_counter()
-    # float32 depths decide the order, so that it is one and the same in every precision; ties keep the input's order.
+    # Depths are sorted in float32, so that the order is the same in every precision; ties keep the input's order.
     projected = projected.select(torch.argsort(projected.depths.detach().float(), stable=True))
     with torch.no_grad():
-        # Where opacity exp(-r^2 / 2) = 1/255, along each axis, with a little to spare.
+        # The extent along each axis is that of the ellipse opacity exp(-r^2 / 2) = 1/255, plus a safety margin.
         reach = 2 * torch.log(255 * projected.opacities).clamp_min(0) + 1e-3
         extent = (reach[:, None] * projected.covs2d[:, [0, 2]]).sqrt() + 0.01
         lower, upper = projected.means2d - extent, projected.means2d + extent
-        possible = projected.opacities >= ALPHA_MIN
+        above_alpha_min = projected.opacities >= ALPHA_MIN
     values = torch.cat([colors[projected.index], projected.depths.detach()[:, None]], -1)
     ended_sort = perf_counter()
 
     visible = torch.zeros(len(means), dtype=torch.bool, device=means.device)
     pairs = 0
     strips = []
-    for top in range(0, height, TILE):
+    for top in range(0, height, TILE_SIZE):
         tiles = []
-        for left in range(0, width, TILE):
-            right, bottom = min(left + TILE, width), min(top + TILE, height)
+        for left in range(0, width, TILE_SIZE):
+            right, bottom = min(left + TILE_SIZE, width), min(top + TILE_SIZE, height)
             first, last = means.new_tensor([left, top]), means.new_tensor([right, bottom])
-            reaches = torch.nonzero(possible & (lower <= last).all(-1) & (upper >= first).all(-1))[:, 0]
+            candidates = torch.nonzero(above_alpha_min & (lower <= last).all(-1) & (upper >= first).all(-1))[:, 0]
             tile, touched = _blend_tile(
-                projected.select(reaches), values[reaches], left, top, right, bottom, absgrad, transmittance_min
+                projected.select(candidates), values[candidates], left, top, right, bottom, absgrad, transmittance_min
             )
             tiles.append(tile)
-            visible[projected.index[reaches[touched]]] = True
+            visible[projected.index[candidates[touched]]] = True
             pairs += int(touched.sum())
         strips.append(torch.cat(tiles, 1))
     picture = torch.cat(strips)
@@ -229,7 +231,11 @@ def _blend_tile(
     absgrad: Tensor | None,
     transmittance_min: float,
 ) -> tuple[Tensor, Tensor]:
-    """(h, w, C + 1) blended values and transmittance of one tile; (M,) which Gaussians reach alpha 1/255 in it."""
+    """Blend one tile.
+
+    Returns:
+        (h, w, C + 1) blended values and transmittance; (M,) whether each Gaussian reaches alpha 1/255 in the tile.
+    """
     columns = torch.arange(left, right, device=values.device, dtype=values.dtype) + 0.5
     rows = torch.arange(top, bottom, device=values.device, dtype=values.dtype) + 0.5
     pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).view(-1, 2)
@@ -241,15 +247,15 @@ def _blend_tile(
     on_grad = None if absgrad is None else add_absgrad
     parts = []
     touched = torch.zeros(len(values), dtype=torch.bool, device=values.device)
-    for some in pixels.split(max(1, _PIXEL_PAIRS_AT_ONCE // max(1, len(values)))):
-        # Recomputed in backward, so that the whole picture's pairs never lie in memory at once.
+    for chunk in pixels.split(max(1, _MAX_PIXEL_PAIRS_PER_CHUNK // max(1, len(values)))):
+        # Blending is recomputed in backward, so that memory never holds the pixel pairs of the whole image.
         blended, transmittance, hits = checkpoint(
             blend,
             splats.means2d,
             splats.conics,
             splats.opacities,
             values,
-            some,
+            chunk,
             on_grad,
             transmittance_min,
             use_reentrant=False,
@@ -260,7 +266,7 @@ def _blend_tile(
 
 
 def _rotations(quats: Tensor) -> Tensor:
-    """(M, 3, 3) rotation matrices of quaternions (M, 4) wxyz of any length; the identity for a length of zero."""
+    """Return rotation matrices (M, 3, 3) of quaternions (M, 4) wxyz of any length; the identity for length zero."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1, eps=QUAT_NORM_MIN).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z),

@@ -1,4 +1,4 @@
-"""Rasterising with colours that are made on the way: what inference does with a model that does not change."""
+"""Rasterises Gaussians whose colours are decoded during projection, for inference with a fixed model."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.ops.poses import camera_center
-from hyrfpack.ops.rasterize import Rasterization, check, rasterize
+from hyrfpack.ops.rasterize import Rasterization, check_inputs, rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
 from hyrfpack.ops.shade import Shading, check_shading, choose_shading_implementation, shade
@@ -33,27 +33,27 @@ def rasterize_shaded(
     depth: bool = False,
     implementation: str = "auto",
 ) -> Rasterization:
-    """Draw the Gaussians whose centres a camera sees, in the colours they have from there.
+    """Render the Gaussians whose centres a camera sees, with their view-dependent colours.
 
-    As `frustum_cull`, then `shade` from the camera's place, then `rasterize`, with one kernel for what goes before
-    binning: a colour is decoded while its Gaussian is projected, and only where it is drawn.
+    The result is that of `frustum_cull`, `shade` from the camera's centre and `rasterize`. "gpu" runs all steps before
+    binning in one kernel, which decodes a colour while it projects the Gaussian, and only if the Gaussian is drawn.
 
     Args:
         means, quats, scales, opacities: (N, 3), (N, 4), (N, 3), (N,) as in `rasterize`, of all Gaussians.
-        shading: of these N.
-        camera_from_world: (4, 4), best on the CPU.
+        shading: the colour decoder of these N Gaussians.
+        camera_from_world: (4, 4), preferably on the CPU.
         intrinsics, width, height, near, antialiased, transmittance_min, depth: as in `rasterize`.
-        cull_tolerance: how far outside the picture a centre may project, as a fraction of half its size.
-        implementation: "auto", "reference" or "gpu"; "reference" takes the best there is for each part.
+        cull_tolerance: how far outside the image a centre may project, as a fraction of half the image's size.
+        implementation: "auto", "reference" or "gpu"; "reference" runs each step in its fastest implementation.
 
     Returns:
-        The picture; `visible` is (N,). Not differentiable.
+        The image, not differentiable; its field `visible` is (N,).
 
     Raises:
         ValueError, MemoryError: as `rasterize` and `shade`.
     """
     geometry = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
-    check(geometry, camera_from_world, width, height, near, transmittance_min)
+    check_inputs(geometry, camera_from_world, width, height, near, transmittance_min)
     check_shading(shading, len(means))
     if choose_shading_implementation(shading, implementation, *geometry.values()) == "gpu":
         from hyrfpack.ops.rasterize.gpu_shaded import rasterize_shaded as run
@@ -77,7 +77,7 @@ def rasterize_shaded(
     pose = camera_from_world.to(means)
     index = frustum_cull(means, pose, intrinsics, width, height, near, cull_tolerance)
     colors = shade(means, camera_center(pose), shading, index)
-    drawn = rasterize(
+    image = rasterize(
         means[index],
         quats[index],
         scales[index],
@@ -93,5 +93,5 @@ def rasterize_shaded(
         depth=depth,
     )
     visible = torch.zeros(len(means), dtype=torch.bool, device=means.device)
-    visible[index] = drawn.visible
-    return dataclasses.replace(drawn, visible=visible)
+    visible[index] = image.visible
+    return dataclasses.replace(image, visible=visible)

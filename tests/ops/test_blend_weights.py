@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.ops.rasterize import rasterize
-from hyrfpack.ops.rasterize.light import sent_light
+from hyrfpack.ops.rasterize.blend_weights import sum_blend_weights
 
 SIZE = ((50.0, 50.0, 24.0, 20.0), 48, 40)
 
@@ -46,8 +46,8 @@ KINDS = [
 @pytest.mark.parametrize("kind", KINDS)
 def test_one_pass_finds_the_derivative_that_float64_finds(kind: str, antialiased: bool) -> None:
     gaussians, camera = scene(kind), torch.eye(4, dtype=torch.float64)
-    expected = sent_light(*(part.double() for part in gaussians), camera, *SIZE, antialiased=antialiased)
-    found = sent_light(*gaussians, camera, *SIZE, antialiased=antialiased, implementation="cpu")
+    expected = sum_blend_weights(*(part.double() for part in gaussians), camera, *SIZE, antialiased=antialiased)
+    found = sum_blend_weights(*gaussians, camera, *SIZE, antialiased=antialiased, implementation="cpu")
     assert expected[0].max() > 1 > expected[1].min()
     for tensor, wanted in zip(found, expected, strict=True):
         torch.testing.assert_close(tensor, wanted.float(), atol=2e-4, rtol=2e-4)
@@ -56,7 +56,7 @@ def test_one_pass_finds_the_derivative_that_float64_finds(kind: str, antialiased
 def test_all_light_is_what_does_not_pass() -> None:
     gaussians, camera = scene("a cloud"), torch.eye(4)
     picture = rasterize(*gaussians, torch.ones(300, 3), camera, *SIZE)
-    light, passed = sent_light(*gaussians, camera, *SIZE)
+    light, passed = sum_blend_weights(*gaussians, camera, *SIZE)
     assert torch.equal(passed, picture.transmittance)
     assert float(light.sum()) == pytest.approx(float((1 - picture.transmittance).sum()), rel=1e-5)
     assert not light.requires_grad and not light[~picture.visible].any()
@@ -65,11 +65,13 @@ def test_all_light_is_what_does_not_pass() -> None:
 @pytest.mark.parametrize("implementation", ["cpu", "reference"])
 def test_where_nothing_is_drawn_there_is_no_light(implementation: str) -> None:
     means, *rest = scene("a cloud")
-    nothing, passed = sent_light(
+    nothing, passed = sum_blend_weights(
         means - torch.tensor([0.0, 0.0, 99.0]), *rest, torch.eye(4), *SIZE, implementation=implementation
     )
     assert nothing.shape == (300,) and not nothing.any() and bool((passed == 1).all())
-    none, _ = sent_light(*(part[:0] for part in scene("a cloud")), torch.eye(4), *SIZE, implementation=implementation)
+    none, _ = sum_blend_weights(
+        *(part[:0] for part in scene("a cloud")), torch.eye(4), *SIZE, implementation=implementation
+    )
     assert none.shape == (0,)
 
 
@@ -77,11 +79,11 @@ def test_same_bytes_with_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) 
     gaussians, found = scene("a cloud", 3000), set()
     for threads in (1, 2, 5):
         monkeypatch.setenv("HYRFPACK_THREADS", str(threads))
-        found.add(sent_light(*gaussians, torch.eye(4), *SIZE)[0].numpy().tobytes())
+        found.add(sum_blend_weights(*gaussians, torch.eye(4), *SIZE)[0].numpy().tobytes())
     assert len(found) == 1
 
 
 def test_shapes_that_do_not_fit_are_refused() -> None:
     means, quats, scales, opacities = scene("a cloud")
     with pytest.raises(ValueError, match="scales"):
-        sent_light(means, quats, scales[:9], opacities, torch.eye(4), *SIZE)
+        sum_blend_weights(means, quats, scales[:9], opacities, torch.eye(4), *SIZE)
