@@ -127,7 +127,7 @@ CASES = {
 
 def rested(browser: Browser) -> Browser:
     """Once nothing moves the eye any more."""
-    look = "const look = () => (hyrfpack.player.held ? requestAnimationFrame(look) : done())"
+    look = "const look = () => (hyrfpack.player.driven ? requestAnimationFrame(look) : done())"
     browser.evaluate(f"new Promise((done) => {{ {look}; look(); }})")
     return browser
 

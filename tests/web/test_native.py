@@ -205,7 +205,7 @@ def test_a_lost_device_comes_back_with_the_same_view(browser: Browser, tmp_path:
     browser.drag((120, 90), (160, 100))
     settled(browser)
     before = browser.evaluate("JSON.stringify(hyrfpack.camera())")
-    run(browser, "window.said = []; hyrfpack.player.addEventListener('said', ({detail}) => said.push(detail));")
+    run(browser, "window.said = []; hyrfpack.player.addEventListener('remark', ({detail}) => said.push(detail));")
     made = []
     for _ in range(8):
         browser.evaluate(
@@ -277,7 +277,7 @@ REFUSED = PATCHED + (
 )
 SAYING = (
     "; { const tell = EventTarget.prototype.dispatchEvent; EventTarget.prototype.dispatchEvent = function (event) {"
-    "  if (event.type === 'said') window.said = event.detail; return tell.call(this, event); }; }"
+    "  if (event.type === 'remark') window.said = event.detail; return tell.call(this, event); }; }"
 )
 
 
@@ -312,7 +312,7 @@ def test_the_first_layer_is_seen_while_the_rest_comes(browser: Browser, tmp_path
         "window.seen = []; window.rest = null; const { player } = hyrfpack;"
         "player.addEventListener('loaded', () => { seen.push(player.renderer.content.count);"
         " rest?.(); rest = null; });"
-        "player.addEventListener('counted', ({ detail }) => (window.counted = detail.count));",
+        "player.addEventListener('count', ({ detail }) => (window.counted = detail.count));",
     )
     browser.evaluate(
         "hyrfpack.player.open({ name: 'x.hyrf', stream: (async function* () {"

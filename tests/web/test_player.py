@@ -205,13 +205,13 @@ def test_damping_takes_frames_and_then_there_are_none(browser: Browser, tmp_path
     assert frames - before > 3
     time.sleep(0.5)
     assert browser.evaluate("hyrfpack.frames()") == frames
-    assert not browser.evaluate("hyrfpack.player.held")
+    assert not browser.evaluate("hyrfpack.player.driven")
 
 
 def test_the_eye_glides_to_another_camera_and_stops_for_a_person(browser: Browser, tmp_path: Path):
     opened(browser, tmp_path, page_of(cloud(50)))
     far, near = camera(2.5).position, camera(1.5).position
-    browser.evaluate("(window.way = [], hyrfpack.player.addEventListener('drawn', () => way.push(hyrfpack.camera())))")
+    browser.evaluate("(window.way = [], hyrfpack.player.addEventListener('frame', () => way.push(hyrfpack.camera())))")
     browser.press("n")
     np.testing.assert_allclose(eye(browser).camera_from_world, camera(1.5).camera_from_world, atol=1e-9)
     on_its_way = [np.linalg.norm(np.array(at["camera_from_world"])[:3, 3]) for at in browser.evaluate("way")]
@@ -236,7 +236,7 @@ def test_glides_pass_between_their_ends_and_less_motion_jumps(browser: Browser, 
     # Half-way by the mover itself: about the target they share, at a distance between theirs.
     browser.prefer()
     script = """(() => {
-        const { player } = hyrfpack, glide = player.movers.find((mover) => "way" in mover);
+        const { player } = hyrfpack, glide = player.movers.find((mover) => "path" in mover);
         player.choose(0);
         glide.to(() => player.choose(1));
         glide.advance(0.4);

@@ -1,67 +1,74 @@
-// What the page's address asks for: ?content=URL&camera=...&poster=URL&title=...&exposure=consistent&noui&autorotate,
-// and #camera=...
+// Parses the parameters of the page's address, ?content=URL&camera=...&poster=URL&title=...&exposure=consistent&noui
+// &autorotate and #camera=..., and formats cameras for links.
 
 import { cameraOf, viewOf } from "./camera.js";
 import { EXPOSURES } from "./exposure.js";
 import { normalizedQuat, quatOf, rowsOf } from "./rotation.js";
 
-const SIDE = 1000; // pixels of the picture of a camera that is told without one
-const LEAST_FOCAL = 0.05, MOST_FOCAL = 50; // of the square root of the picture's area
-const LONGEST = 200; // letters of a title
+const LINK_SIDE_PIXELS = 1000; // links do not store a picture's size
+// Limits of the focal length divided by the square root of the picture's area.
+const MIN_FOCAL_RATIO = 0.05;
+const MAX_FOCAL_RATIO = 50;
+const MAX_TITLE_LETTERS = 200;
 
-// Throws an Error with a sentence where a web address is not one that can be fetched.
-export function webAddress(text, what) {
+// Resolves an address against the page's. Throws an Error with a sentence for an address that cannot be fetched.
+export function resolveAddress(text, what) {
   let address;
   try {
     address = new URL(text, document.baseURI);
   } catch {
-    throw new Error(`The ${what} in the address, ${shortened(text)}, is no address of a file.`);
+    throw new Error(`The ${what} in the address, ${shortenForMessage(text)}, is no address of a file.`);
   }
   if (!["http:", "https:", location.protocol].includes(address.protocol) || address.username || address.password) {
-    throw new Error(`The ${what} in the address must be an http or https address without a password, not ${shortened(text)}.`);
+    const found = shortenForMessage(text);
+    throw new Error(`The ${what} in the address must be an http or https address without a password, not ${found}.`);
   }
   return address.href;
 }
 
-const shortened = (text) => (text.length > 60 ? `${text.slice(0, 60)}…` : text || "an empty one");
+// Shortens a text from the address for a message.
+const shortenForMessage = (text) => (text.length > 60 ? `${text.slice(0, 60)}…` : text || "an empty one");
 
-// {content, poster, title, camera, exposure, noui, autorotate}, null where nothing is said, and `wrong`: sentences
-// about what cannot be used; addresses are "" then, the exposure is null.
-export function readSearch(search) {
-  const asked = new URLSearchParams(search), wrong = [];
-  const web = (name, what) => {
-    if (!asked.has(name)) return null;
+// Parses what follows "?": {content, poster, title, camera, exposure, noui, autorotate}, null where a parameter is
+// absent. `wrong` has a sentence for each invalid parameter; invalid addresses become "", an invalid exposure null.
+export function parseSearch(search) {
+  const parameters = new URLSearchParams(search), wrong = [];
+  const readAddress = (name, what) => {
+    if (!parameters.has(name)) return null;
     try {
-      return webAddress(asked.get(name), what);
+      return resolveAddress(parameters.get(name), what);
     } catch ({ message }) {
       wrong.push(message);
       return "";
     }
   };
-  const exposure = asked.get("exposure");
+  const exposure = parameters.get("exposure");
   if (exposure !== null && !EXPOSURES.includes(exposure)) {
-    wrong.push(`The exposure in the address must be ${EXPOSURES.join(" or ")}, not ${shortened(exposure)}.`);
+    wrong.push(`The exposure in the address must be ${EXPOSURES.join(" or ")}, not ${shortenForMessage(exposure)}.`);
   }
-  const flag = (name) => asked.has(name) && !["0", "false", "no", "off"].includes(asked.get(name).toLowerCase());
+  const readFlag = (name) => {
+    return parameters.has(name) && !["0", "false", "no", "off"].includes(parameters.get(name).toLowerCase());
+  };
   return {
-    content: web("content", "content"),
-    poster: web("poster", "poster"),
-    title: asked.get("title")?.trim().slice(0, LONGEST) || null,
-    camera: asked.get("camera"),
+    content: readAddress("content", "content"),
+    poster: readAddress("poster", "poster"),
+    title: parameters.get("title")?.trim().slice(0, MAX_TITLE_LETTERS) || null,
+    camera: parameters.get("camera"),
     exposure: EXPOSURES.includes(exposure) ? exposure : null,
-    noui: flag("noui"),
-    autorotate: flag("autorotate"),
+    noui: readFlag("noui"),
+    autorotate: readFlag("autorotate"),
     wrong,
   };
 }
 
-// The camera in #camera=..., null without.
-export function readHash(hash) {
+// Returns the text of the camera in #camera=..., or null.
+export function parseHash(hash) {
   const [name, ...values] = hash.slice(1).split("=");
   return name === "camera" ? values.join("=") : null;
 }
 
-// What a camera's text stands for: {number} of the list, {view} or {view, depth} of the point to orbit about.
+// Parses the text of a camera: {number} is an index into the scene's cameras; {view} is a camera of its own, with the
+// {depth} of the point to orbit about where the text has it.
 export function parseCamera(text, scene) {
   try {
     text = decodeURIComponent(text).trim();
@@ -71,33 +78,39 @@ export function parseCamera(text, scene) {
       return { number: text - 1 };
     }
     if (text.startsWith("{")) return { view: viewOf(JSON.parse(text), scene) };
-    return compactView(text, scene);
+    return parseCompactCamera(text, scene);
   } catch ({ message }) {
     throw new Error(`The address names no camera that can be used: ${message}.`);
   }
 }
 
-// Position (world), rotation (camera from world: w, x, y, z), focal length by the root of the picture's area, depth of
-// the target: short, and within 1e-4 of the truth.
-export function compactCamera(eye, scene) {
-  const { fy, camera_from_world: pose } = cameraOf(eye.view(SIDE, SIDE), scene);
+// Formats the eye as nine numbers for a link: position (world), rotation (camera from world: w, x, y, z), focal length
+// divided by the square root of the picture's area, and depth of the target. Lengths are rounded to 1e-4 of the viewing
+// distance or finer.
+export function formatCamera(eye, scene) {
+  const { fy, camera_from_world: pose } = cameraOf(eye.view(LINK_SIDE_PIXELS, LINK_SIDE_PIXELS), scene);
   const position = eye.position.map((value, axis) => scene.center[axis] + scene.unit * value);
   const digits = Math.min(15, Math.max(0, 5 - Math.floor(Math.log10(scene.unit * Math.max(eye.pace, 1e-9)))));
   const lengths = [...position, scene.unit * eye.depth].map((value) => Number(value.toFixed(digits)));
   const quat = quatOf(pose.slice(0, 3).map((row) => row.slice(0, 3))).map((value) => Number(value.toFixed(6)));
-  return [...lengths.slice(0, 3), ...quat, Number((fy / SIDE).toPrecision(6)), lengths[3]].join(",");
+  return [...lengths.slice(0, 3), ...quat, Number((fy / LINK_SIDE_PIXELS).toPrecision(6)), lengths[3]].join(",");
 }
 
-function compactView(text, scene) {
+// Parses the numbers that formatCamera writes.
+function parseCompactCamera(text, scene) {
   const numbers = text.split(",").map((part) => (part.trim() ? Number(part) : NaN));
   if (![8, 9].includes(numbers.length) || !numbers.every(Number.isFinite)) {
     throw new Error("it is a camera's number, JSON, or 9 numbers as the share link writes them");
   }
   const position = numbers.slice(0, 3), quat = numbers.slice(3, 7), [focal, depth = 0] = numbers.slice(7);
   if (!(Math.hypot(...quat) > 0.5)) throw new Error("its rotation is no unit quaternion");
-  if (!(focal >= LEAST_FOCAL && focal <= MOST_FOCAL)) throw new Error(`its focal length must be ${LEAST_FOCAL} to ${MOST_FOCAL}`);
+  if (!(focal >= MIN_FOCAL_RATIO && focal <= MAX_FOCAL_RATIO)) {
+    throw new Error(`its focal length must be ${MIN_FOCAL_RATIO} to ${MAX_FOCAL_RATIO}`);
+  }
   const rows = rowsOf(normalizedQuat(quat));
   const pose = rows.map((row) => [...row, -row.reduce((sum, value, k) => sum + value * position[k], 0)]);
-  const size = { width: SIDE, height: SIDE, fx: SIDE * focal, fy: SIDE * focal, cx: SIDE / 2, cy: SIDE / 2 };
-  return { view: viewOf({ ...size, camera_from_world: [...pose, [0, 0, 0, 1]] }, scene), depth: Math.max(0, depth) / scene.unit };
+  const side = LINK_SIDE_PIXELS, fx = side * focal;
+  const intrinsics = { width: side, height: side, fx, fy: fx, cx: side / 2, cy: side / 2 };
+  const view = viewOf({ ...intrinsics, camera_from_world: [...pose, [0, 0, 0, 1]] }, scene);
+  return { view, depth: Math.max(0, depth) / scene.unit };
 }

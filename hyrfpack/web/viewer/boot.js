@@ -1,14 +1,16 @@
-// Unpacks the player: its texts go to where scripts find them by name, its script runs. The page's policy names both
-// scripts. Until it runs, `hyrfpack.ready` is the promise of its own.
+// Unpacks the player's texts into script elements, which are found by their ids, and runs its script. The page's policy
+// names both scripts. Until the player runs, `hyrfpack.ready` is a promise that follows the player's own.
 
 {
-  const unpacked = async (text) => {
+  // Decompresses a JSON text in base64.
+  const unpack = async (text) => {
     if (!window.DecompressionStream) throw new Error("This browser is too old for this page; take a newer one.");
     const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
     const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
     return JSON.parse(await new Response(stream).text());
   };
 
+  // Adds a script element to the page.
   const put = (type, id, text) => {
     const script = Object.assign(document.createElement("script"), { type, id });
     script.append(text);
@@ -16,14 +18,14 @@
   };
 
   const boot = async () => {
-    const { "main.js": main, ...texts } = await unpacked(document.getElementById("player").textContent);
+    const { "main.js": main, ...texts } = await unpack(document.getElementById("player").textContent);
     for (const [name, text] of Object.entries(texts)) put("text/plain", name, text);
     put("text/javascript", "main.js", main);
   };
 
-  const booted = boot(), before = { ready: booted.then(() => window.hyrfpack !== before && window.hyrfpack.ready) };
-  window.hyrfpack = before;
-  before.ready.catch(() => {}); // the page says it
+  const booted = boot(), loading = { ready: booted.then(() => window.hyrfpack !== loading && window.hyrfpack.ready) };
+  window.hyrfpack = loading;
+  loading.ready.catch(() => {}); // the page shows the error
   booted.catch(({ message }) => {
     document.getElementById("sentence").textContent = message;
     document.getElementById("message").hidden = false;

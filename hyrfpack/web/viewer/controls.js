@@ -1,28 +1,32 @@
-// Mouse, fingers and keys move the eye.
+// Moves the eye by mouse, touch and keys.
 
 import { mul } from "./camera.js";
 
-const TAP = { pixels: 8, apart: 30, ms: 350 }; // a finger's second tap lies near the first, not on it
-const ORBIT = 3.6; // radians across a window of the focal length's size
-const FLY = { W: [0, 0, 1], S: [0, 0, -1], A: [-1, 0, 0], D: [1, 0, 0], Q: [0, 1, 0], E: [0, -1, 0] };
-const LOOK = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }; // yaw, pitch
-const NEARER = { "+": -1, "-": 1 }; // sign of the change of depth
-const SPEED = 0.5, FASTER = 4, LOOK_SPEED = 1.0; // of the way to the scene's middle a second; radians a second
-const ZOOM_SPEED = 1.2; // e-folds a second
-const TOUCH = 1 / 60; // s that a key moves at once, however short it is pressed and however slow frames are
-const TYPED = { "=": "+", _: "-", Add: "+", Subtract: "-" }; // the same keys
+const MAX_TAP_MOVE_PIXELS = 8;
+const MAX_DOUBLE_TAP_DISTANCE_PIXELS = 30; // the second tap of a finger is less precise than one tap
+const MAX_TAP_MS = 350;
+const ORBIT_RADIANS = 3.6; // for a drag of two focal lengths
+const FLY_AXES = { W: [0, 0, 1], S: [0, 0, -1], A: [-1, 0, 0], D: [1, 0, 0], Q: [0, 1, 0], E: [0, -1, 0] };
+const LOOK_SIGNS = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }; // yaw, pitch
+const ZOOM_SIGNS = { "+": -1, "-": 1 }; // the sign of the change of depth
+const FLY_SPEED = 0.5; // in units of the eye's `pace` per second
+const SHIFT_FACTOR = 4;
+const LOOK_RADIANS_PER_SECOND = 1.0;
+const ZOOM_EFOLDS_PER_SECOND = 1.2;
+const KEY_PRESS_SECONDS = 1 / 60; // a key moves the eye at once for this time, even if it is released before a frame
+const KEY_ALIASES = { "=": "+", _: "-", Add: "+", Subtract: "-" }; // keys with the same function
 
 export class Controls {
-  // `acted` is told of everything that a person does, `pick(x, y)` of a double-click, `press(key)` of the keys that do
-  // not move, `ignored(kind)` of a wheel or a finger that is left to the page around.
+  // Callbacks: `acted()` after any input, `pick(x, y)` after a double-click, `press(key)` for keys that do not move the
+  // eye, `ignored(kind)` when a wheel or a finger is left to the surrounding page.
   constructor(player, damper, { acted, pick, press, ignored }) {
     const { canvas } = player;
     Object.assign(this, { player, canvas, damper, acted, pick, press, ignored });
     this.pointers = new Map();
-    this.held = new Map(); // place on the keyboard -> name
+    this.held = new Map(); // code of each key that is down -> its name
     this.tapped = null;
     this.framed = window.parent !== window;
-    this.engage(!this.framed); // until then a page around keeps its wheel, and a finger scrolls it
+    this.engage(!this.framed); // in a frame, wheel and fingers scroll the surrounding page until the canvas is clicked
     canvas.addEventListener("pointerdown", (event) => this.down(event));
     canvas.addEventListener("pointermove", (event) => this.drag(event));
     for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => this.lift(event));
@@ -38,46 +42,49 @@ export class Controls {
   }
 
   get eye() {
-    return this.player.eye; // null while there is no scene
+    return this.player.eye; // null before a scene is loaded
   }
 
+  // Sets whether the canvas uses wheel and fingers, or leaves them to the surrounding page.
   engage(engaged) {
     this.engaged = engaged;
     this.canvas.classList.toggle("engaged", engaged);
   }
 
-  // Whether a key that moves or a finger is down.
+  // Whether a key that moves the eye, a button or a finger is down.
   get active() {
     return this.pointers.size > 0 || [...this.held.values()].some((key) => key !== "Shift");
   }
 
-  // Move for so many seconds as the held keys say.
+  // Moves the eye by the keys that are down. Returns whether it moved.
   advance(seconds) {
     const keys = [...this.held.values()];
     return keys.map((key) => this.step(key, seconds, keys.includes("Shift"))).some(Boolean);
   }
 
+  // Moves the eye by one key. Returns whether it is a key that moves the eye.
   step(key, seconds, shift) {
-    if (FLY[key]) {
-      this.eye.move(...mul(FLY[key], seconds * (shift ? FASTER : 1) * SPEED * this.eye.pace));
-    } else if (LOOK[key]) {
-      const [yaw, pitch] = LOOK[key].map((way) => way * seconds * LOOK_SPEED);
+    if (FLY_AXES[key]) {
+      this.eye.move(...mul(FLY_AXES[key], seconds * (shift ? SHIFT_FACTOR : 1) * FLY_SPEED * this.eye.pace));
+    } else if (LOOK_SIGNS[key]) {
+      const [yaw, pitch] = LOOK_SIGNS[key].map((direction) => direction * seconds * LOOK_RADIANS_PER_SECOND);
       if (shift) this.eye.orbit(-yaw, -pitch);
       else this.eye.look(yaw, pitch);
-    } else if (NEARER[key]) {
-      this.eye.zoom(Math.exp(NEARER[key] * seconds * ZOOM_SPEED), 0, 0);
+    } else if (ZOOM_SIGNS[key]) {
+      this.eye.zoom(Math.exp(ZOOM_SIGNS[key] * seconds * ZOOM_EFOLDS_PER_SECOND), 0, 0);
     } else {
       return false;
     }
     return true;
   }
 
-  // Pixels of the page to units of the focal length.
+  // The size of a CSS pixel in units of the focal length.
   get pixel() {
     const { clientWidth, clientHeight } = this.canvas;
     return 1 / (this.eye.focal * Math.sqrt(clientWidth * clientHeight));
   }
 
+  // Converts a position in CSS pixels to units of the focal length, from the canvas' centre.
   fromMiddle(x, y) {
     const { clientWidth, clientHeight } = this.canvas;
     return [(x - clientWidth / 2) * this.pixel, (y - clientHeight / 2) * this.pixel];
@@ -95,9 +102,9 @@ export class Controls {
   drag(event) {
     const pointer = this.pointers.get(event.pointerId);
     if (!pointer || !this.engaged || !this.eye) return;
-    const before = gesture(this.pointers);
+    const before = measureGesture(this.pointers);
     [pointer.x, pointer.y] = [event.clientX, event.clientY];
-    const after = gesture(this.pointers);
+    const after = measureGesture(this.pointers);
     const dx = (after.x - before.x) * this.pixel, dy = (after.y - before.y) * this.pixel;
     this.acted();
     if (this.pointers.size > 1) {
@@ -107,19 +114,19 @@ export class Controls {
     } else if (event.buttons & 6 || event.shiftKey) {
       this.damper.pan(dx, dy);
     } else {
-      this.damper.orbit((-ORBIT * dx) / 2, (-ORBIT * dy) / 2);
+      this.damper.orbit((-ORBIT_RADIANS * dx) / 2, (-ORBIT_RADIANS * dy) / 2);
     }
   }
 
   lift(event) {
     this.pointers.delete(event.pointerId);
     const { clientX: x, clientY: y, timeStamp: time } = event;
-    const near = (to, pixels) => to && Math.hypot(x - to.x, y - to.y) < pixels && time - to.time < TAP.ms;
-    const tap = event.type === "pointerup" && near(this.start, TAP.pixels);
+    const near = (to, pixels) => to && Math.hypot(x - to.x, y - to.y) < pixels && time - to.time < MAX_TAP_MS;
+    const tap = event.type === "pointerup" && near(this.start, MAX_TAP_MOVE_PIXELS);
     if (!tap) {
       this.tapped = null;
       if (!this.engaged) this.ignored("finger");
-    } else if (near(this.tapped, TAP.apart)) {
+    } else if (near(this.tapped, MAX_DOUBLE_TAP_DISTANCE_PIXELS)) {
       this.tapped = null;
       this.pick(x, y);
     } else {
@@ -133,43 +140,45 @@ export class Controls {
   wheel(event) {
     if (!this.engaged) return this.ignored("wheel");
     const lines = event.deltaMode === 1 ? 33 : event.deltaMode === 2 ? 400 : 1;
-    const much = event.ctrlKey ? 0.01 : 0.0012; // a trackpad's pinch comes as Ctrl and a wheel of small steps
-    const step = Math.max(-0.5, Math.min(0.5, event.deltaY * lines * much));
+    const speed = event.ctrlKey ? 0.01 : 0.0012; // browsers report a pinch on a trackpad as Ctrl and small wheel steps
+    const step = Math.max(-0.5, Math.min(0.5, event.deltaY * lines * speed));
     event.preventDefault();
     this.acted();
     if (this.eye) this.damper.zoom(step, ...this.fromMiddle(event.clientX, event.clientY));
   }
 
   release(event) {
-    if (event.key === "Meta") this.held.clear(); // macOS tells of no letter that was let go meanwhile
+    if (event.key === "Meta") this.held.clear(); // macOS sends no keyup events for keys released while Meta is down
     else if (this.held.delete(event.code)) this.acted();
   }
 
   key(event) {
-    const key = keyName(event), moves = FLY[key] || LOOK[key] || NEARER[key];
+    const key = keyName(event), moves = FLY_AXES[key] || LOOK_SIGNS[key] || ZOOM_SIGNS[key];
     const typing = "select, dialog, input:not([type='range'], [type='checkbox'])";
-    const theirs = event.target.closest?.(LOOK[key] ? "input, select, dialog" : typing); // not ours
-    if (event.ctrlKey || event.metaKey || event.altKey || (theirs && key !== "Escape")) return;
+    const isForInput = event.target.closest?.(LOOK_SIGNS[key] ? "input, select, dialog" : typing);
+    if (event.ctrlKey || event.metaKey || event.altKey || (isForInput && key !== "Escape")) return;
     if (moves || key === "Shift") {
       this.held.set(event.code, key);
-      if (LOOK[key]) event.preventDefault();
+      if (LOOK_SIGNS[key]) event.preventDefault();
       if (moves) this.acted();
-      if (moves && this.eye && !event.repeat) this.step(key, TOUCH, event.shiftKey);
+      if (moves && this.eye && !event.repeat) this.step(key, KEY_PRESS_SECONDS, event.shiftKey);
     } else if (!event.repeat) {
       this.press(key);
     }
   }
 }
 
-// Letters by their place on the keyboard where they fly, or are not Latin, so that other layouts work as well.
+// Returns the name of a key. Keys that fly, and letters that are not Latin, are named by their position on a US
+// keyboard, so that other layouts work.
 function keyName(event) {
   const place = event.code.startsWith("Key") ? event.code.slice(3) : "";
-  const name = FLY[place] || event.key > "~" ? place : event.key.length === 1 ? event.key.toUpperCase() : event.key;
-  return TYPED[name] ?? name;
+  const typed = event.key.length === 1 ? event.key.toUpperCase() : event.key;
+  const name = FLY_AXES[place] || event.key > "~" ? place : typed;
+  return KEY_ALIASES[name] ?? name;
 }
 
-// The middle of all pointers and how far they are from it.
-function gesture(pointers) {
+// Returns the mean position of all pointers and their mean distance from it.
+function measureGesture(pointers) {
   const all = [...pointers.values()];
   const mean = (name) => all.reduce((sum, pointer) => sum + pointer[name], 0) / all.length;
   const x = mean("x"), y = mean("y");

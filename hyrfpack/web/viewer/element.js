@@ -1,12 +1,13 @@
-// <hyrf-viewer src="scene.hyrf" camera="2" poster="scene.jpg" exposure="consistent" autorotate noui>: the player beside
-// this script, in a frame.
-// `src` and `poster` are relative to the page that the element is on. Events: "load", "error" (detail: a sentence).
+// <hyrf-viewer src="scene.hyrf" camera="2" poster="scene.jpg" exposure="consistent" autorotate noui>: shows the player
+// that lies next to this script in a frame. `src` and `poster` are relative to the page of the element. Events: "load",
+// "error" (detail: a sentence).
 
-const PLAYER = new URL("index.html", document.currentScript?.src ?? scriptAddress());
-const LOOK = ":host { display: block; aspect-ratio: 4 / 3; } :host([hidden]) { display: none; } iframe { display: block; width: 100%; height: 100%; border: 0; }";
+const PLAYER_URL = new URL("index.html", document.currentScript?.src ?? findScriptAddress());
+const ELEMENT_CSS = ":host { display: block; aspect-ratio: 4 / 3; } :host([hidden]) { display: none; } " +
+  "iframe { display: block; width: 100%; height: 100%; border: 0; }";
 
-// A module is told by no one where it lies.
-function scriptAddress() {
+// Finds this script's address among the page's scripts, for modules have no document.currentScript.
+function findScriptAddress() {
   const scripts = [...document.querySelectorAll("script[src]")].map(({ src }) => src);
   return scripts.find((address) => new URL(address).pathname.endsWith("/hyrf-viewer.js")) ?? document.baseURI;
 }
@@ -16,8 +17,8 @@ class HyrfViewer extends HTMLElement {
 
   constructor() {
     super();
-    const style = new CSSStyleSheet(); // a page's policy may forbid style elements
-    style.replaceSync(LOOK);
+    const style = new CSSStyleSheet(); // unlike a style element, allowed by every policy of a page
+    style.replaceSync(ELEMENT_CSS);
     this.frame = document.createElement("iframe");
     this.frame.allow = "fullscreen; clipboard-write";
     this.frame.sandbox = "allow-scripts allow-same-origin allow-downloads";
@@ -40,19 +41,19 @@ class HyrfViewer extends HTMLElement {
     if (this.isConnected) this.follow();
   }
 
-  // Once for all attributes that change together. Another camera only changes what follows #, so that nothing is loaded
-  // anew.
+  // Updates the frame's address, once for all attributes that change together. A new camera changes only what follows
+  // "#", so that the frame is not reloaded.
   async follow() {
     if (this.following) return;
     this.following = true;
     await null;
     this.following = false;
-    const address = new URL(PLAYER);
-    for (const [name, asked] of [["src", "content"], ["poster", "poster"]]) {
+    const address = new URL(PLAYER_URL);
+    for (const [name, parameter] of [["src", "content"], ["poster", "poster"]]) {
       const value = this.getAttribute(name);
       if (!value) continue;
       try {
-        address.searchParams.set(asked, new URL(value, document.baseURI));
+        address.searchParams.set(parameter, new URL(value, document.baseURI));
       } catch {
         this.tell("error", `${name} is no address of a file: ${value}`);
       }
@@ -67,6 +68,7 @@ class HyrfViewer extends HTMLElement {
     if (this.frame.src !== address.href) this.frame.src = address;
   }
 
+  // Passes on the events of the player in the frame.
   hear({ source, data }) {
     if (source !== this.frame.contentWindow || !["load", "error"].includes(data?.hyrf)) return;
     this.tell(data.hyrf, String(data.message ?? ""));

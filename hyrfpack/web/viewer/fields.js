@@ -1,29 +1,30 @@
-// A model on the graphics device: what no view changes is worked out once, colours as the view moves.
+// Evaluates a model on the graphics device: view-independent numbers once, colours again when the view moves.
 
-import { sidesOf } from "./frustum.js";
-import { ContextLost, Graphics, Pace } from "./graphics.js";
-import { TEXTURE_WIDTH } from "./layout.js";
+import { frustumPlanes } from "./frustum.js";
+import { ContextLostError, Graphics, WorkPacer } from "./graphics.js";
+import { TEXTURE_WIDTH } from "./constants.js";
 import { Panorama } from "./panorama.js";
-import { textOf } from "./parts.js";
-import { Rows } from "./rows.js";
+import { elementText } from "./dom.js";
+import { RowStates } from "./row_states.js";
 
-const WIDEST = 32; // cells of 8 hidden units that a shader can hold
-const WEIGHTS_WIDTH = 1024; // of the texture with a decoder's numbers, where no block of uniforms holds them
-const UNIT = 6; // that this texture is bound to
-const TABLE_SLICE = 1 << 21; // numbers of a table that are sent at a time
-const EVEN = 2e-3; // radians that a row of Gaussians may be turned before its colours count as stale
-const SHARE = 8; // of the visible rows, one in so many is coloured in a frame while moving
+const MAX_CELLS = 32; // a cell is 8 hidden units; the shaders hold all cells in variables
+const WEIGHTS_TEXTURE_WIDTH = 1024; // the texture holds a decoder's numbers where no block of uniforms does
+const WEIGHTS_TEXTURE_UNIT = 6;
+const TABLE_NUMBERS_PER_UPLOAD = 1 << 21;
+const MAX_FRESH_TURN_RADIANS = 2e-3; // the colours of a row are stale when the viewing direction turned by more
+const MOVING_ROWS_DIVISOR = 8; // while moving, a frame colours at most this fraction of the visible rows
 
-// What keeps a device from working fields out, to end a sentence with; its splats can be drawn all the same.
-export class Unfit extends Error {}
+// The device cannot evaluate fields, for the reason in the message, which is the end of a sentence. It can draw splats.
+export class UnsupportedDeviceError extends Error {}
+export const MEMORY_REASON = "this device's memory does not hold the fields.";
 
 export class Fields {
-  // Whether a device can hold a model (pack.js) at all; throws Unfit where not.
+  // Throws UnsupportedDeviceError for a device that cannot hold a model of pack.js.
   static check(gl, { cells, height, geometry, radiance }) {
     const side = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     const rows = Math.max(height, ...[geometry, radiance].map(({ table }) => table.length / 2 / TEXTURE_WIDTH));
-    if (cells > WIDEST) throw new Unfit("the decoders are too wide for this device.");
-    if (rows > side) throw new Unfit("the model is larger than this device's textures.");
+    if (cells > MAX_CELLS) throw new UnsupportedDeviceError("the decoders are too wide for this device.");
+    if (rows > side) throw new UnsupportedDeviceError("the model is larger than this device's textures.");
   }
 
   constructor(gl, model) {
@@ -31,11 +32,11 @@ export class Fields {
     this.gl = gl;
     this.graphics = new Graphics(gl);
     Object.assign(this, { model, count, height, antialiased, cells });
-    this.rows = new Rows(balls);
-    this.pace = new Pace();
+    this.rows = new RowStates(balls);
+    this.pace = new WorkPacer();
   }
 
-  // Work out what no view changes. `report` is told the part done, and may throw to end it.
+  // Evaluates all that does not depend on the view. `report` is called with the fraction done, and may throw to stop.
   async prepare(report) {
     const { gl, graphics, model, height } = this, size = [TEXTURE_WIDTH, height];
     Fields.check(gl, model);
@@ -47,13 +48,14 @@ export class Fields {
     const floats = [gl.RGBA32F, gl.RGBA, gl.FLOAT, 4];
     const explicit = graphics.table(floats, TEXTURE_WIDTH, model.explicit);
     this.logits = graphics.table(floats, TEXTURE_WIDTH, model.logits);
-    model.explicit = model.logits = null; // of no more use: the worker can make them again
+    model.explicit = model.logits = null; // frees memory; the worker can make them again
     const geometry = await this.field(model.geometry), radiance = await this.field(model.radiance);
-    this.demand();
+    this.checkMemory();
 
-    const forms = this.forms(), programs = {};
-    for (const name of Object.keys(forms)) programs[name] = graphics.compile(textOf("whole.vert"), forms[name]);
-    for (const name of Object.keys(forms)) await graphics.compiled(programs[name], `${name}.frag`);
+    const shaders = this.shaders(), programs = {};
+    const vertexText = elementText("whole.vert");
+    for (const name of Object.keys(shaders)) programs[name] = graphics.compile(vertexText, shaders[name]);
+    for (const name of Object.keys(shaders)) await graphics.compiled(programs[name], `${name}.frag`);
     this.programs = programs;
 
     await this.shape(geometry, explicit, (part) => report(0.5 * part));
@@ -65,35 +67,37 @@ export class Fields {
     this.target = graphics.framebuffer(this.colors);
     this.radiance = radiance;
     if (model.background) {
-      this.panorama = new Panorama(graphics, model.finest, (target, area, picture) => this.sky(target, area, picture));
+      this.panorama = new Panorama(graphics, model.finest, (...area) => this.drawSky(...area));
       await this.panorama.begin();
     } else {
       radiance.freeTable();
     }
   }
 
-  // Throws unless what was asked for so far fits into the device's memory.
-  demand() {
+  // Throws an error unless everything so far fits into the device's memory.
+  checkMemory() {
     const { gl } = this, error = gl.getError();
-    if (this.graphics.lost) throw new ContextLost();
-    if (error !== gl.NO_ERROR) throw new Unfit("this device's memory does not hold the fields.");
+    if (this.graphics.lost) throw new ContextLostError();
+    if (error !== gl.NO_ERROR) throw new UnsupportedDeviceError(MEMORY_REASON);
   }
 
-  // A field's table and decoder on the device.
+  // Uploads a field's table and decoder.
   async field({ table, levels, decoder: { numbers, places } }) {
     const { gl, graphics } = this, wide = 2 * TEXTURE_WIDTH, rows = Math.ceil(table.length / wide);
     const texture = graphics.texture(gl.TEXTURE_2D, gl.RG32F, TEXTURE_WIDTH, rows);
     for (let at = 0; at < table.length;) {
-      const left = table.length - at, high = Math.floor(Math.min(left, TABLE_SLICE) / wide);
-      const size = high ? [TEXTURE_WIDTH, high] : [left / 2, 1]; // the last row may be short
+      const rest = table.length - at, high = Math.floor(Math.min(rest, TABLE_NUMBERS_PER_UPLOAD) / wide);
+      const size = high ? [TEXTURE_WIDTH, high] : [rest / 2, 1]; // the last row may be short
       gl.bindTexture(gl.TEXTURE_2D, texture);
       const part = table.subarray(at, at + 2 * size[0] * size[1]);
       gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, at / wide, ...size, gl.RG, gl.FLOAT, part);
       at += part.length;
-      if (at < table.length) await graphics.finished();
+      if (at < table.length) await graphics.whenDone();
     }
     const block = this.fitsBlock(numbers), floats = [gl.RGBA32F, gl.RGBA, gl.FLOAT, 4];
-    const weights = block ? graphics.keep(gl.createBuffer(), "Buffer") : graphics.table(floats, WEIGHTS_WIDTH, numbers);
+    const weights = block
+      ? graphics.track(gl.createBuffer(), "Buffer")
+      : graphics.table(floats, WEIGHTS_TEXTURE_WIDTH, numbers);
     if (block) {
       gl.bindBuffer(gl.UNIFORM_BUFFER, weights);
       gl.bufferData(gl.UNIFORM_BUFFER, numbers, gl.STATIC_DRAW);
@@ -103,21 +107,22 @@ export class Fields {
     return { table: texture, levels: new Uint32Array(levels.flat()), block, weights, places, freeTable, free };
   }
 
-  // Whether shaders shall find a decoder's numbers in a block of uniforms: a device reads that far faster than a
-  // texture, a processor that stands in for one the other way round.
+  // Returns whether shaders read a decoder's numbers from a block of uniforms. Graphics devices read it far faster than
+  // a texture; for software renderers it is the other way round.
   fitsBlock({ byteLength }) {
-    const { gl } = this, said = gl.getParameter(gl.RENDERER);
-    const names = said === "WebKit WebGL" ? gl.getExtension("WEBGL_debug_renderer_info") : null; // it says no more there
-    const name = names ? gl.getParameter(names.UNMASKED_RENDERER_WEBGL) : said;
+    const { gl } = this, rendererName = gl.getParameter(gl.RENDERER);
+    // WebKit hides the device's name.
+    const debugInfo = rendererName === "WebKit WebGL" ? gl.getExtension("WEBGL_debug_renderer_info") : null;
+    const name = debugInfo ? gl.getParameter(debugInfo.UNMASKED_RENDERER_WEBGL) : rendererName;
     return byteLength <= gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE) && !/swiftshader|llvmpipe|software/i.test(name);
   }
 
-  // The texts of the passes.
-  forms() {
+  // Builds the fragment shaders of the passes.
+  shaders() {
     const { gl, cells, model: { geometry, radiance, sh, background } } = this;
-    // Some devices hold fewer bytes a pixel than they offer targets.
+    // Some devices cannot draw to as many targets as they offer, for lack of bytes per pixel.
     this.targets = Math.min(cells, gl.getParameter(gl.MAX_DRAW_BUFFERS), gl.getParameter(gl.MAX_COLOR_ATTACHMENTS));
-    while (this.targets > 1 && !this.bears(this.targets)) this.targets >>= 1;
+    while (this.targets > 1 && !this.supports(this.targets)) this.targets >>= 1;
     const common = ({ decoder: { numbers, places } }) => ({
       CELLS: cells,
       BIAS_1: places.BIAS_1, INPUTS: places.INPUTS, WEIGHTS: places.WEIGHTS,
@@ -131,17 +136,18 @@ export class Fields {
     const directions = radiance.decoder.places.INPUTS + 4 * cells * radiance.levels.length;
     const turned = { DIRECTIONS: directions, ...(sh ? { HARMONICS: 1 } : {}) };
     const parted = { CELLS: this.targets, ALL_CELLS: cells };
-    const forms = {
-      geometry: fieldShader("geometry.frag", { ...deep(geometry), ...placed(geometry) }),
-      first: fieldShader("first.frag", { ...common(radiance), ...placed(radiance), ...parted }),
-      colors: fieldShader("colors.frag", { ...deep(radiance), ...turned }),
+    const shaders = {
+      geometry: buildFieldShader("geometry.frag", { ...deep(geometry), ...placed(geometry) }),
+      first: buildFieldShader("first.frag", { ...common(radiance), ...placed(radiance), ...parted }),
+      colors: buildFieldShader("colors.frag", { ...deep(radiance), ...turned }),
     };
-    if (!background) return forms;
-    return { ...forms, panorama: fieldShader("panorama.frag", { ...deep(radiance), ...placed(radiance), ...turned }) };
+    if (!background) return shaders;
+    const constants = { ...deep(radiance), ...placed(radiance), ...turned };
+    return { ...shaders, panorama: buildFieldShader("panorama.frag", constants) };
   }
 
-  // Whether so many layers can be drawn to at once.
-  bears(count) {
+  // Returns whether `count` layers can be drawn to at once.
+  supports(count) {
     const { gl, graphics } = this;
     const framebuffer = graphics.framebuffer(...Array.from({ length: count }, (_, k) => [this.cached, k]));
     const whole = gl.checkFramebufferStatus(gl.FRAMEBUFFER) === gl.FRAMEBUFFER_COMPLETE;
@@ -149,12 +155,12 @@ export class Fields {
     return whole;
   }
 
-  // Take a pass into use.
+  // Selects the program of a pass and binds the field's buffers.
   use(name, field) {
     const { gl, graphics, model } = this, p = this.programs[name];
     gl.useProgram(p.program);
     if (field.block) gl.bindBufferBase(gl.UNIFORM_BUFFER, 0, field.weights);
-    else graphics.bind(p, { u_weights: field.weights }, gl.TEXTURE_2D, UNIT);
+    else graphics.bind(p, { u_weights: field.weights }, gl.TEXTURE_2D, WEIGHTS_TEXTURE_UNIT);
     if (p.u_levels) {
       graphics.bind(p, { u_table: field.table });
       gl.uniform4uiv(p.u_levels, field.levels);
@@ -163,13 +169,13 @@ export class Fields {
     return p;
   }
 
-  // Draw a pass to rows of its target.
+  // Draws a pass to rows of its target.
   pass(target, first, last) {
     const wide = this.height === 1 ? this.count : TEXTURE_WIDTH;
     this.area(target, [TEXTURE_WIDTH, this.height], [0, first, wide, last - first]);
   }
 
-  // Draw a pass to a part of its target: x, y, width, height.
+  // Draws a pass to a part (x, y, width, height) of its target.
   area(target, size, part) {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
@@ -180,9 +186,10 @@ export class Fields {
     gl.disable(gl.SCISSOR_TEST);
   }
 
+  // Evaluates the positions, opacities, scales and rotations of all Gaussians.
   async shape(field, explicit, report) {
     const { gl, graphics, model } = this, target = graphics.framebuffer(this.places, this.shapes);
-    await new Pace().run(graphics, this.count ? this.height : 0, (first, last) => {
+    await new WorkPacer().run(graphics, this.count ? this.height : 0, (first, last) => {
       const p = this.use("geometry", field);
       graphics.bind(p, { u_explicit: explicit, u_logits: this.logits }, gl.TEXTURE_2D, 1);
       gl.uniform1i(p.u_product, model.product);
@@ -192,8 +199,9 @@ export class Fields {
     graphics.free(target);
   }
 
+  // Evaluates the view-independent part of the colour decoder's first layer for all Gaussians.
   async cache(field, report) {
-    const { gl, graphics, cells, targets } = this, pace = new Pace(), passes = Math.ceil(cells / targets);
+    const { gl, graphics, cells, targets } = this, pace = new WorkPacer(), passes = Math.ceil(cells / targets);
     for (let number = 0; number < passes; number++) {
       const start = number * targets, layers = Math.min(targets, cells - start);
       const target = graphics.framebuffer(...Array.from({ length: layers }, (_, k) => [this.cached, start + k]));
@@ -207,14 +215,14 @@ export class Fields {
     }
   }
 
-  // A part of a picture of the background.
-  sky(target, size, part) {
+  // Draws a part of a picture of the background.
+  drawSky(target, size, part) {
     const { gl } = this, p = this.use("panorama", this.radiance);
     gl.uniform2f(p.u_size, ...size);
     this.area(target, size, part);
   }
 
-  // Colour rows, runs of them at once.
+  // Evaluates the colours of rows; adjacent rows are drawn at once.
   color(rows, eye) {
     const { gl, graphics } = this, p = this.use("colors", this.radiance);
     graphics.bind(p, { u_places: this.places, u_logits: this.logits });
@@ -229,36 +237,39 @@ export class Fields {
     }
   }
 
-  // While moving: colour the rows that need it most, for about so many ms; all that never were.
+  // While moving, colours the stalest rows for about `ms`, and all rows without colours.
   recolor(view, margin, ms) {
-    const { visible, rows, fresh } = this.rows.stale(sidesOf(view, margin), view.eye, EVEN);
-    const most = Math.max(fresh, Math.min(this.pace.within(ms), Math.ceil(visible / SHARE)));
+    const { visible, rows, fresh } = this.rows.stale(frustumPlanes(view, margin), view.eye, MAX_FRESH_TURN_RADIANS);
+    const most = Math.max(fresh, Math.min(this.pace.within(ms), Math.ceil(visible / MOVING_ROWS_DIVISOR)));
     if (rows.length) this.color(rows.slice(0, most), view.eye);
   }
 
-  // Colour all that is in view, while `goOn()`. `exact`: for this very viewpoint. {rows: how many, done: whether all}.
+  // Colours all stale rows in view, while `goOn()` is true. `exact`: no colour may be stale. Returns {rows: their
+  // number, done: whether all were coloured}.
   async coloured(view, margin, { goOn, exact = false } = {}) {
-    const { rows } = this.rows.stale(sidesOf(view, margin), view.eye, exact ? 0 : EVEN);
+    const { rows } = this.rows.stale(frustumPlanes(view, margin), view.eye, exact ? 0 : MAX_FRESH_TURN_RADIANS);
     return { rows: rows.length, done: await this.coloring(rows, view.eye, goOn) };
   }
 
+  // Colours rows in slices. Returns whether all were coloured.
   coloring(rows, eye, goOn) {
     const work = (first, last) => this.color(rows.slice(first, last), eye);
     return this.pace.run(this.graphics, rows.length, work, { goOn });
   }
 
-  // Standing still: all that is in view, and then what never was coloured, while `goOn()`; `changed` is called when
-  // there is more to see. Whether it is complete.
+  // Standing still, colours all rows in view, completes the background, then colours the rows without colours, while
+  // `goOn()` is true. `changed` is called when there is more to see. Returns whether the picture is complete.
   async complete(view, margin, { goOn, changed = () => {}, exact = false }) {
     const { rows, done } = await this.coloured(view, margin, { goOn, exact });
     if (rows) changed();
     if (!done) return false;
-    const how = { goOn, changed, done: () => this.finishSky() };
-    if (this.panorama && !(await this.panorama.complete(view, how))) return false;
+    const options = { goOn, changed, done: () => this.freeSky() };
+    if (this.panorama && !(await this.panorama.complete(view, options))) return false;
     return this.coloring(this.rows.fresh(), view.eye, goOn);
   }
 
-  finishSky() {
+  // Frees what only the background needs.
+  freeSky() {
     this.radiance.freeTable();
     this.graphics.free(this.programs.panorama.program);
   }
@@ -268,11 +279,12 @@ export class Fields {
   }
 }
 
-// The text of a pass: constants, field.glsl with its lines repeated for each cell, and the pass itself.
-function fieldShader(name, constants) {
+// Builds the shader of a pass from constants, field.glsl and the pass' own text. Lines that begin with EACH are
+// repeated for each cell.
+function buildFieldShader(name, constants) {
   const lines = Object.entries(constants).map(([key, value]) => `#define ${key} ${value}`);
   const cells = Array.from({ length: constants.CELLS }, (_, cell) => cell);
-  const text = `${textOf("field.glsl")}\n${textOf(name)}`;
+  const text = `${elementText("field.glsl")}\n${elementText(name)}`;
   const whole = text.replace(/^EACH (.*)$/gm, (_, line) => cells.map((cell) => line.replaceAll("$", cell)).join("\n"));
   return ["#version 300 es", ...lines, whole].join("\n");
 }

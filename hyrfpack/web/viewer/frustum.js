@@ -1,10 +1,10 @@
-// What a view sees, roughly.
+// Tests whether a view may see a sphere.
 
 import { add, mul } from "./camera.js";
 
-// The four sides of a view's picture and a band around it, `margin` as a fraction of half its size: planes through the
-// eye, 4 numbers each, unit normals inwards.
-export function sidesOf({ rows, translation, fx, fy, cx, cy, width, height }, margin) {
+// Returns the four planes through the eye and the sides of a view's picture, 4 numbers each, with unit normals inwards.
+// The picture is enlarged on each side by `margin` halves of its size.
+export function frustumPlanes({ rows, translation, fx, fy, cx, cy, width, height }, margin) {
   const side = (axis, sign, focal, reach) => {
     const length = Math.hypot(focal, reach);
     const [across, ahead] = [(sign * focal) / length, reach / length];
@@ -17,8 +17,8 @@ export function sidesOf({ rows, translation, fx, fy, cx, cy, width, height }, ma
   ].flat();
 }
 
-// Whether a ball is not wholly outside of one of the sides.
-export function touches(sides, x, y, z, radius) {
+// Returns whether a ball is not wholly outside one of these planes.
+export function intersectsFrustum(sides, x, y, z, radius) {
   for (let s = 0; s < 16; s += 4) {
     if (!(sides[s] * x + sides[s + 1] * y + sides[s + 2] * z + sides[s + 3] > -radius)) return false;
   }

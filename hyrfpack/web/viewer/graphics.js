@@ -1,50 +1,53 @@
-// WebGL 2 in the words that the player needs. What one Graphics has made is freed together.
+// A thin layer over WebGL 2. All objects that a Graphics creates are freed together.
 
-import { textOf } from "./parts.js";
+import { elementText } from "./dom.js";
 
-const POLL = 4; // ms between questions whether the device is done
+const POLL_INTERVAL_MS = 4;
 
-// The device was taken away in the middle of something; the page is told when it comes back.
-export class ContextLost extends Error {}
+// The graphics context was lost during an operation. An event of the canvas tells when it is restored.
+export class ContextLostError extends Error {}
 
-const losses = new WeakMap(); // context -> how often it was lost or came back
-const lossesOf = (gl) => losses.get(gl) ?? 0;
+const contextChanges = new WeakMap(); // context -> how often it was lost or restored
+const contextChangesOf = (gl) => contextChanges.get(gl) ?? 0;
 
-// Nothing that was made on a context until now is of use any more.
-export function countLoss(gl) {
-  losses.set(gl, lossesOf(gl) + 1);
+// Counts that a context was lost or restored, so that all earlier objects are invalid.
+export function countContextChange(gl) {
+  contextChanges.set(gl, contextChangesOf(gl) + 1);
 }
 
 export class Graphics {
   constructor(gl) {
     this.gl = gl;
-    this.made = new Map(); // object -> what deletes it
-    this.losses = lossesOf(gl);
+    this.made = new Map(); // object -> the kind in the name of the function that deletes it
+    this.losses = contextChangesOf(gl);
   }
 
-  // Whether the device was taken away since, even if it is back.
+  // Whether the context was lost since, even if it is restored.
   get lost() {
-    return this.gl.isContextLost() || this.losses !== lossesOf(this.gl);
+    return this.gl.isContextLost() || this.losses !== contextChangesOf(this.gl);
   }
 
-  keep(object, kind) {
+  // Registers an object to be freed.
+  track(object, kind) {
     this.made.set(object, kind);
     return object;
   }
 
-  // Delete something, or all.
+  // Deletes an object.
   free(object) {
     if (!object) return;
     if (!this.lost) this.gl[`delete${this.made.get(object)}`](object);
     this.made.delete(object);
   }
 
+  // Deletes all objects.
   dispose() {
     for (const object of [...this.made.keys()]) this.free(object);
   }
 
+  // Creates a texture without filtering; with a depth, an array of textures.
   texture(kind, format, width, height, depth) {
-    const { gl } = this, texture = this.keep(gl.createTexture(), "Texture");
+    const { gl } = this, texture = this.track(gl.createTexture(), "Texture");
     gl.bindTexture(kind, texture);
     if (depth) gl.texStorage3D(kind, 1, format, width, height, depth);
     else gl.texStorage2D(kind, 1, format, width, height);
@@ -53,50 +56,51 @@ export class Graphics {
     return texture;
   }
 
-  // For the texture that is bound.
-  smooth() {
+  // Sets linear filtering for the bound texture.
+  setLinear() {
     const { gl } = this;
     for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
   }
 
-  // A texture for an array of numbers, row after row; the last row may be short. `type`: internal format, format, type,
-  // and how many numbers a texel has.
-  table([internal, format, type, wide], width, numbers) {
-    const { gl } = this, texels = numbers.length / wide, rows = Math.floor(texels / width);
+  // Creates a texture of an array of numbers, row after row; the last row may be short. The first argument has the
+  // internal format, the format, the type and the number of components of a texel.
+  table([internal, format, type, size], width, numbers) {
+    const { gl } = this, texels = numbers.length / size, rows = Math.floor(texels / width);
     const texture = this.texture(gl.TEXTURE_2D, internal, width, Math.max(1, Math.ceil(texels / width)));
     if (rows) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, rows, format, type, numbers);
     const rest = texels - rows * width;
-    if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, rows, rest, 1, format, type, numbers.subarray(rows * width * wide));
+    if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, rows, rest, 1, format, type, numbers.subarray(rows * width * size));
     return texture;
   }
 
-  // Targets are textures, or [texture array, layer].
+  // Creates a framebuffer. Targets are textures, or [texture array, layer].
   framebuffer(...targets) {
-    const { gl } = this, framebuffer = this.keep(gl.createFramebuffer(), "Framebuffer");
+    const { gl } = this, framebuffer = this.track(gl.createFramebuffer(), "Framebuffer");
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-    const places = targets.map((_, number) => gl.COLOR_ATTACHMENT0 + number);
-    targets.forEach((target, number) => {
-      if (Array.isArray(target)) gl.framebufferTextureLayer(gl.FRAMEBUFFER, places[number], target[0], 0, target[1]);
-      else gl.framebufferTexture2D(gl.FRAMEBUFFER, places[number], gl.TEXTURE_2D, target, 0);
+    const attachments = targets.map((_, index) => gl.COLOR_ATTACHMENT0 + index);
+    targets.forEach((target, index) => {
+      const place = attachments[index];
+      if (Array.isArray(target)) gl.framebufferTextureLayer(gl.FRAMEBUFFER, place, target[0], 0, target[1]);
+      else gl.framebufferTexture2D(gl.FRAMEBUFFER, place, gl.TEXTURE_2D, target, 0);
     });
-    gl.drawBuffers(places);
+    gl.drawBuffers(attachments);
     return framebuffer;
   }
 
-  // Textures by the names of a program's uniforms, from a unit on.
+  // Binds textures, given by the names of a program's uniforms, to texture units from `first` on.
   bind(program, textures, kind = this.gl.TEXTURE_2D, first = 0) {
     const { gl } = this;
-    Object.entries(textures).forEach(([name, texture], number) => {
-      gl.activeTexture(gl.TEXTURE0 + first + number);
+    Object.entries(textures).forEach(([name, texture], index) => {
+      gl.activeTexture(gl.TEXTURE0 + first + index);
       gl.bindTexture(kind, texture);
-      gl.uniform1i(program[name], first + number);
+      gl.uniform1i(program[name], first + index);
     });
-    gl.activeTexture(gl.TEXTURE7); // nothing is bound here by others
+    gl.activeTexture(gl.TEXTURE7); // a unit that no program reads, so that later bindings do no harm
   }
 
-  // A program of two texts, and its uniforms by name. It may still be compiling, see `compiled`.
+  // Starts to compile a program of two texts. `link` or `compiled` finish it.
   compile(vertex, fragment) {
-    const { gl } = this, program = this.keep(gl.createProgram(), "Program");
+    const { gl } = this, program = this.track(gl.createProgram(), "Program");
     for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
       const shader = gl.createShader(kind);
       gl.shaderSource(shader, text);
@@ -107,8 +111,8 @@ export class Graphics {
     return { program };
   }
 
-  // The uniforms of a program by their names, once it is linked.
-  linked(found, what) {
+  // Adds the locations of a program's uniforms by their names. Throws an error if the program does not link.
+  link(found, what) {
     const { gl } = this, { program } = found, shaders = gl.getAttachedShaders(program) ?? [];
     if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !this.lost) {
       const logs = shaders.map((shader) => gl.getShaderInfoLog(shader)).join(" ");
@@ -122,59 +126,59 @@ export class Graphics {
     return found;
   }
 
-  // A program of files.
+  // Compiles a program of two shader files.
   program(vertex, fragment) {
-    return this.linked(this.compile(textOf(vertex), textOf(fragment)), `${vertex} and ${fragment}`);
+    return this.link(this.compile(elementText(vertex), elementText(fragment)), `${vertex} and ${fragment}`);
   }
 
-  // As `linked`, without keeping the page waiting where drivers compile aside.
+  // As `link`, but does not block the page where the driver compiles in parallel.
   async compiled(found, what) {
-    const { gl } = this, aside = gl.getExtension("KHR_parallel_shader_compile");
-    const pending = () => aside && !gl.getProgramParameter(found.program, aside.COMPLETION_STATUS_KHR);
-    while (!this.lost && pending()) await pause();
-    if (this.lost) throw new ContextLost();
-    return this.linked(found, what);
+    const { gl } = this, parallel = gl.getExtension("KHR_parallel_shader_compile");
+    const pending = () => parallel && !gl.getProgramParameter(found.program, parallel.COMPLETION_STATUS_KHR);
+    while (!this.lost && pending()) await waitForPoll();
+    if (this.lost) throw new ContextLostError();
+    return this.link(found, what);
   }
 
-  // Once the device has done all it was asked for so far.
-  async finished() {
+  // Waits until the device has done all work so far.
+  async whenDone() {
     const { gl } = this, fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
     for (let status = gl.UNSIGNALED; status !== gl.SIGNALED;) {
-      await pause();
-      if (this.lost || !fence) throw new ContextLost();
+      await waitForPoll();
+      if (this.lost || !fence) throw new ContextLostError();
       status = gl.getSyncParameter(fence, gl.SYNC_STATUS);
-      if (status === null) throw new ContextLost();
+      if (status === null) throw new ContextLostError();
     }
     gl.deleteSync(fence);
   }
 }
 
-const pause = () => new Promise((resolve) => setTimeout(resolve, POLL));
+const waitForPoll = () => new Promise((resolve) => setTimeout(resolve, POLL_INTERVAL_MS));
 
-// Work in slices that take the device about SLICE ms each, so that it can do other things between.
-export class Pace {
-  static SLICE = 100;
+// Divides work into slices of about SLICE_MS of device time, so that the device can draw frames between them.
+export class WorkPacer {
+  static SLICE_MS = 100;
 
   constructor() {
-    this.unit = null; // ms that a unit of the work took lately
+    this.unit = null; // ms that a unit of the work took lately; null before the first slice
   }
 
-  // How many units may be done in so many ms.
+  // Returns how many units of the work take about `ms`, at least one.
   within(ms) {
     return this.unit === null ? 1 : Math.max(1, Math.floor(ms / this.unit));
   }
 
-  // Calls `work(first, last)` for ranges that together are 0 to `count`, each awaited, while `goOn()`; tells `report`
-  // the part done. Whether all was done.
+  // Calls `work(first, last)` for consecutive ranges of 0 to `count`, and waits for the device after each, while
+  // `goOn()` is true. `report` is called with the fraction done. Returns whether all was done.
   async run(graphics, count, work, { goOn = () => true, report = () => {} } = {}) {
     for (let first = 0; first < count;) {
       if (!goOn()) return false;
-      const last = Math.min(count, first + this.within(Pace.SLICE)), began = performance.now();
+      const last = Math.min(count, first + this.within(WorkPacer.SLICE_MS)), began = performance.now();
       work(first, last);
-      await graphics.finished();
+      await graphics.whenDone();
       const unit = (performance.now() - began) / (last - first);
-      this.unit = this.unit === null ? unit : Math.max(unit, this.unit / 4); // at most four times as many next time
+      this.unit = this.unit === null ? unit : Math.max(unit, this.unit / 4); // so that a slice grows at most fourfold
       first = last;
       report(first / count);
     }

@@ -1,24 +1,24 @@
-// Help for what a person has at hand: mouse, fingers or keys; and a first hint.
+// Shows help for the input devices in use (mouse, touch, keys), and a hint on the first visit.
 
-import { element } from "./parts.js";
+import { element } from "./dom.js";
 
-const SEEN = "hyrfpack.hinted";
+const HINT_SEEN_KEY = "hyrfpack.hinted";
 const HINTS = { touch: "One finger turns, two move and zoom", mouse: "Drag to turn, wheel to zoom, ? for help" };
 
-// Storage may be forbidden, as in frames.
-const remembered = () => {
+// Returns whether the hint was seen before. Access to the storage may be forbidden, as in frames.
+const wasHintSeen = () => {
   try {
-    return localStorage.getItem(SEEN) !== null;
+    return localStorage.getItem(HINT_SEEN_KEY) !== null;
   } catch {
     return false;
   }
 };
 
-const remember = () => {
+const markHintSeen = () => {
   try {
-    localStorage.setItem(SEEN, "1");
+    localStorage.setItem(HINT_SEEN_KEY, "1");
   } catch {
-    // then it is shown again
+    // without storage the hint is shown again
   }
 };
 
@@ -32,21 +32,22 @@ export class Help {
     this.hint.textContent = HINTS[coarse ? "touch" : "mouse"];
   }
 
+  // Opens the help, with the sections for devices that were used.
   show() {
     for (const part of document.querySelectorAll("#help [data-with]")) part.hidden = !this.used.has(part.dataset.with);
     element("help").showModal();
   }
 
-  // To whom has not been here.
+  // Shows the hint on the first visit.
   greet() {
-    this.hint.hidden = this.hint.classList.contains("gone") || remembered();
+    this.hint.hidden = this.hint.classList.contains("gone") || wasHintSeen();
   }
 
-  // The person has found out.
+  // Hides the hint after the first input.
   acted() {
     if (this.hint.hidden || this.hint.classList.contains("gone")) return;
     this.hint.classList.add("gone");
     setTimeout(() => (this.hint.hidden = true), 500);
-    remember();
+    markHintSeen();
   }
 }

@@ -1,61 +1,65 @@
-// The worker that reads files and sorts, seen from the page.
+// The page's side of the worker that reads files and sorts splats.
 
-import { sidesOf } from "./frustum.js";
-import { textOf } from "./parts.js";
+import { frustumPlanes } from "./frustum.js";
+import { elementText } from "./dom.js";
 
-// Another file took this one's place.
-export class Superseded extends Error {}
+// The file is not wanted any more, because another one was opened.
+export class SupersededError extends Error {}
 
 export class Loader {
-  // `content(message)` takes each content that was read (see worker.js), one after the other, and is a promise whether
-  // it is shown now; `progress({what, part})`.
+  // `content(message)` is called with each content that was read (see worker_tasks.js), one after the other; its
+  // promise tells whether the content is shown. `progress({what, part})` is called with the fraction `part` of the step
+  // `what`.
   constructor({ content, progress }) {
     if (!window.DecompressionStream) throw new Error("This browser is too old to unpack the scene; take a newer one.");
     Object.assign(this, { content, progress });
     this.ticket = 0;
-    this.waiting = new Map(); // ticket -> what to do with the order
-    this.spare = null; // an order's array to be used again
-    const address = URL.createObjectURL(new Blob([textOf("worker.js")], { type: "text/javascript" }));
+    this.waiting = new Map(); // ticket -> the function that resolves the promise of its order
+    this.spare = null; // the array of an old order, for reuse
+    const address = URL.createObjectURL(new Blob([elementText("worker.js")], { type: "text/javascript" }));
     this.worker = new Worker(address);
     URL.revokeObjectURL(address);
     this.worker.onmessage = ({ data }) => {
       if (data.progress) this.progress(data.progress);
-      if (data.content) this.hand(data.content);
+      if (data.content) this.deliver(data.content);
       if (data.order) this.sorted(data.order);
       if (data.error) this.fail(new Error(data.error));
     };
     this.worker.onerror = ({ message }) => this.fail(new Error(message));
-    this.handed = Promise.resolve();
-    this.broken = false; // not all of the file can be had; what of it was shown can be had again
-    this.expecting = []; // {resolve, reject} of promises that all that can be had is shown
+    this.delivered = Promise.resolve();
+    this.broken = false; // no more of the file will come; what was shown can be decoded again
+    this.pending = []; // {resolve, reject} of the promises of `expect`
   }
 
-  hand(content) {
-    this.handed = this.handed.then(() => this.content(content)).then(
+  // Passes a content on after the one before it.
+  deliver(content) {
+    this.delivered = this.delivered.then(() => this.content(content)).then(
       (shown) => {
-        if (shown && (content.whole || this.broken)) this.expecting.splice(0).forEach(({ resolve }) => resolve());
+        if (shown && (content.whole || this.broken)) this.pending.splice(0).forEach(({ resolve }) => resolve());
       },
       (error) => this.fail(error),
     );
   }
 
-  // A promise that all that can be had is shown.
+  // Returns a promise that all available content is shown.
   expect() {
-    return new Promise((resolve, reject) => this.expecting.push({ resolve, reject }));
+    return new Promise((resolve, reject) => this.pending.push({ resolve, reject }));
   }
 
+  // Rejects the promises of `expect`.
   fail(error) {
     this.broken = true;
-    this.expecting.splice(0).forEach(({ reject }) => reject(error));
+    this.pending.splice(0).forEach(({ reject }) => reject(error));
   }
 
-  // Read a file: an async iterable of its bytes, which are taken away, and which may know their `length`.
+  // Reads a file: an async iterable of its bytes, which are transferred to the worker. `length` is 0 where it is
+  // unknown.
   async read({ name, scene, stage, plain = false, stream, length = stream.length }) {
     const shown = this.expect(), source = stream[Symbol.asyncIterator]();
     this.worker.postMessage({ start: { name, scene, stage, plain } });
     try {
       for (let part = 0;;) {
-        const { done, value: bytes } = await Promise.race([source.next(), shown]); // that may fail before the end
+        const { done, value: bytes } = await Promise.race([source.next(), shown]); // `shown` may fail before the end
         if (done) break;
         part += bytes.length;
         if (length) this.progress({ what: "loading", part: Math.min(1, part / length) });
@@ -63,7 +67,7 @@ export class Loader {
         this.worker.postMessage({ bytes: own }, [own.buffer]);
       }
     } catch (error) {
-      source.return?.().catch(() => {}); // nobody waits for it: it may be in the middle of something
+      source.return?.().catch(() => {}); // not awaited, because the source may be busy
       this.worker.postMessage({ broken: true });
       this.fail(error);
       throw error;
@@ -73,14 +77,14 @@ export class Loader {
     return shown;
   }
 
-  // Read the same bytes once more; `plain`: as splats.
+  // Decodes the same bytes again; `plain`: as splats.
   again(plain) {
     this.worker.postMessage({ again: { plain } });
   }
 
-  // Orders are wanted of this content from now on.
+  // Selects the content that is sorted from now on.
   use(number) {
-    this.used = number;
+    this.current = number;
     this.worker.postMessage({ use: number });
   }
 
@@ -88,11 +92,11 @@ export class Loader {
     return this.waiting.size > 0;
   }
 
-  // {order, drawn} for a view of a scene, or null if that is of a content no longer used; give the order back with
-  // `reuse` when it has been copied.
+  // Sorts the splats for a view of a scene. Returns a promise of {order, drawn}, or of null if another content is used
+  // by then. The caller returns the order by `reuse` after copying it.
   sort(view, { near, tolerance }) {
-    // Generous, so that nothing is missing at the edges until the next order comes.
-    const sides = sidesOf(view, 1 + tolerance), row = [...view.rows[2], view.translation[2]];
+    // The frustum is enlarged, so that no splats are missing at the edges until the next order comes.
+    const sides = frustumPlanes(view, 1 + tolerance), row = [...view.rows[2], view.translation[2]];
     const ticket = ++this.ticket, order = this.spare;
     this.spare = null;
     this.worker.postMessage({ sort: { ticket, row, sides, near, order } }, order ? [order.buffer] : []);
@@ -100,17 +104,18 @@ export class Loader {
   }
 
   sorted(answer) {
-    this.waiting.get(answer.ticket)(answer.number === this.used ? answer : null);
+    this.waiting.get(answer.ticket)(answer.number === this.current ? answer : null);
     this.waiting.delete(answer.ticket);
   }
 
+  // Takes back the array of an order.
   reuse(order) {
     this.spare = order;
   }
 
   dispose() {
     this.worker.terminate();
-    this.fail(new Superseded("another file was opened instead"));
+    this.fail(new SupersededError("another file was opened instead"));
     for (const answer of this.waiting.values()) answer(null);
     this.waiting.clear();
   }

@@ -1,28 +1,33 @@
-// The page: puts player, controls, panel and the place where the scene comes from together.
+// The page: connects the player, the controls, the panel and the source of the scene.
 
-import { compactCamera, parseCamera, readHash, readSearch, webAddress } from "./address.js";
+import { formatCamera, parseCamera, parseHash, parseSearch, resolveAddress } from "./address.js";
 import { Controls } from "./controls.js";
 import { AS_PHOTOGRAPHED, CONSISTENT } from "./exposure.js";
 import { Help } from "./help.js";
-import { Damper, Glide, Turntable, calm } from "./motion.js";
-import { announce, dismiss, fail, progress, remark, toast } from "./notes.js";
+import { Damper, Glide, Turntable, prefersReducedMotion } from "./motion.js";
+import { announce, dismiss, fail, progress, remark, toast } from "./notifications.js";
 import { Panel } from "./panel.js";
-import { element, textOf } from "./parts.js";
-import { payload } from "./payload.js";
+import { element, elementText } from "./dom.js";
+import { readPayload } from "./payload.js";
 import { Player } from "./player.js";
 import { savePicture, shareView } from "./share.js";
 import { chosenFile, fetchedFile } from "./source.js";
 import { followTraining, trainingTitle } from "./training.js";
 
-const FADE = 600; // ms, see style.css
-const NOT_BEGUN = "The training has not taken its first step yet.";
-const ENDED = "The training does not answer any more; this is its last snapshot.";
-const IGNORED = { wheel: "Click the scene, then the wheel zooms.", finger: "Tap the scene, then fingers move it." };
+const FADE_MS = 600; // the duration in style.css
+const NOT_STARTED_TEXT = "The training has not taken its first step yet.";
+const TRAINING_ENDED_TEXT = "The training does not answer any more; this is its last snapshot.";
+const IGNORED_TEXTS = {
+  wheel: "Click the scene, then the wheel zooms.",
+  finger: "Tap the scene, then fingers move it.",
+};
 
-// A page around this one that has put it into a <hyrf-viewer> is told of loads and errors.
-const tellFrame = (hyrf, message = "") => window.parent !== window && window.parent.postMessage({ hyrf, message }, "*");
+// Reports a load or an error to the <hyrf-viewer> that this page may be in.
+const postToParent = (hyrf, message = "") => {
+  if (window.parent !== window) window.parent.postMessage({ hyrf, message }, "*");
+};
 
-// A picture until there is something to see.
+// Shows a picture until the scene is drawn.
 function showPoster(address) {
   if (!address) return;
   const poster = element("poster") ?? Object.assign(document.createElement("img"), { id: "poster", alt: "" });
@@ -30,35 +35,38 @@ function showPoster(address) {
   document.body.append(poster);
 }
 
-// Once there is, it comes up over the picture.
-function appear(player) {
-  if (player.times.first === null && !player.calm) return requestAnimationFrame(() => appear(player));
+// Fades in the canvas over the poster after the first frame.
+function revealCanvas(player) {
+  if (player.times.first === null && !player.idle) return requestAnimationFrame(() => revealCanvas(player));
   document.body.classList.add("there");
-  setTimeout(() => element("poster")?.remove(), FADE);
+  setTimeout(() => element("poster")?.remove(), FADE_MS);
 }
 
+// Marks the picked point for a moment.
 function showRing(x, y) {
   const ring = element("ring");
   Object.assign(ring.style, { left: `${x}px`, top: `${y}px` });
   ring.hidden = true;
-  ring.getBoundingClientRect(); // so that its animation begins anew
+  ring.getBoundingClientRect(); // forces a layout, which restarts the animation
   ring.hidden = false;
   ring.onanimationend = () => (ring.hidden = true);
 }
 
 function start() {
-  const asked = readSearch(location.search);
-  document.body.classList.toggle("bare", asked.noui);
-  showPoster(asked.poster);
-  const inside = element("scene") ? JSON.parse(textOf("scene")) : null;
-  const beside = element("content") ? JSON.parse(textOf("content")) : null;
+  const parameters = parseSearch(location.search);
+  document.body.classList.toggle("bare", parameters.noui);
+  showPoster(parameters.poster);
+  const embedded = element("scene") ? JSON.parse(elementText("scene")) : null;
+  const served = element("content") ? JSON.parse(elementText("content")) : null;
 
-  const player = new Player(element("view"), inside);
+  const player = new Player(element("view"), embedded);
   const damper = new Damper(player), glide = new Glide(player), turntable = new Turntable(player), help = new Help();
-  let own = true, nextOwn = true; // what is shown, what is opened is the page's or the address's, not a person's
-  let title = inside ? (asked.title ?? inside.title) : document.title, next = title; // that of what is shown, is opened
-  let number = 0; // of what was opened
-  let picture = null;
+  // Whether the scene that is shown, and the one that is loading, come from the page or its address, not from a person.
+  let isOwn = true, isNextOwn = true;
+  let title = embedded ? (parameters.title ?? embedded.title) : document.title;
+  let nextTitle = title; // of the scene that is loading
+  let openCount = 0; // identifies what was opened last
+  let lastPicture = null;
 
   // ---- moving
 
@@ -70,32 +78,33 @@ function start() {
     if (player.pick(x, y)) showRing(x, y);
   };
 
-  // Stand where a text from the address says.
-  const stand = (text, glides) => {
+  // Moves the eye to the camera of a text from the address.
+  const moveTo = (text, smoothly) => {
     const { number: camera, view, depth } = parseCamera(text, player.scene);
     const move = () => {
       if (camera !== undefined) return player.choose(camera);
-      player.eye.stand(view);
+      player.eye.setView(view);
       if (depth) player.eye.target = player.eye.point(0, 0, depth);
       player.changed();
     };
-    if (glides) glide.to(move);
+    if (smoothly) glide.to(move);
     else move();
   };
 
-  const follow = (text, glides) => {
+  // Moves the eye to the camera of a text, null for none, and shows what is wrong with it.
+  const followCamera = (text, smoothly) => {
     if (text === null || !player.scene) return;
     try {
-      stand(text, glides);
-      if (glides) dismiss();
+      moveTo(text, smoothly);
+      if (smoothly) dismiss();
     } catch (error) {
       fail(error);
     }
   };
 
-  const turn = (on) => {
-    turntable.turn(on);
-    element("turn").setAttribute("aria-pressed", String(on));
+  const setTurning = (isOn) => {
+    turntable.turn(isOn);
+    element("turn").setAttribute("aria-pressed", String(isOn));
   };
 
   const switchExposure = () => {
@@ -106,21 +115,21 @@ function start() {
 
   const share = () => {
     const exposure = player.hasExposureMap && player.exposure === CONSISTENT ? CONSISTENT : null;
-    return shareView(compactCamera(player.eye, player.scene), exposure, own);
+    return shareView(formatCamera(player.eye, player.scene), exposure, isOwn);
   };
 
-  const whenThere = (action) => () => player.loaded && action();
+  const ifLoaded = (action) => () => player.loaded && action();
   const panel = new Panel(player, {
     choose,
     N: () => choose((player.camera + 1) % player.cameras.length),
     P: () => choose((player.camera + player.cameras.length - 1) % player.cameras.length),
     R: () => choose(player.camera),
     O: () => pick(player.canvas.clientWidth / 2, player.canvas.clientHeight / 2),
-    T: () => turn(!turntable.on),
+    T: () => setTurning(!turntable.on),
     F: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.())?.catch(() => {}),
-    X: whenThere(switchExposure),
-    L: whenThere(share),
-    C: whenThere(async () => savePicture(await player.capture(), title)),
+    X: ifLoaded(switchExposure),
+    L: ifLoaded(share),
+    C: ifLoaded(async () => savePicture(await player.capture(), title)),
     H: () => panel.toggle(),
     "?": () => help.show(),
     Escape: dismiss,
@@ -129,53 +138,55 @@ function start() {
     glide.stop();
     turntable.pause();
     help.acted();
-    player.wake();
+    player.schedule();
   };
   const controls = new Controls(player, damper, {
-    acted, pick, press: (key) => panel.press(key), ignored: (kind) => toast(IGNORED[kind]),
+    acted, pick, press: (key) => panel.press(key), ignored: (kind) => toast(IGNORED_TEXTS[kind]),
   });
   player.movers.push(controls, damper, glide, turntable);
-  if (asked.exposure) player.exposure = asked.exposure;
+  if (parameters.exposure) player.exposure = parameters.exposure;
 
-  // ---- what the player tells
+  // ---- events of the player
 
   player.addEventListener("progress", ({ detail }) => progress(detail));
-  player.addEventListener("said", ({ detail }) => remark(detail));
+  player.addEventListener("remark", ({ detail }) => remark(detail));
   player.addEventListener("failed", ({ detail }) => fail(detail));
-  player.addEventListener("stood", ({ detail }) => player.loaded && announce(`Camera ${detail + 1} of ${player.cameras.length}`));
+  player.addEventListener("camera", ({ detail }) => {
+    if (player.loaded) announce(`Camera ${detail + 1} of ${player.cameras.length}`);
+  });
   player.addEventListener("opened", ({ detail }) => {
     for (const mover of [damper, glide]) mover.stop();
-    [title, own] = [next, nextOwn];
+    [title, isOwn] = [nextTitle, isNextOwn];
     panel.describe(detail, title);
-    if (own) follow(readHash(location.hash) ?? asked.camera, false);
+    if (isOwn) followCamera(parseHash(location.hash) ?? parameters.camera, false);
   });
-  player.addEventListener("counted", ({ detail }) => panel.describe(detail, title)); // all layers of a file are here
+  player.addEventListener("count", ({ detail }) => panel.describe(detail, title)); // more layers were loaded
   player.addEventListener("loaded", () => {
-    document.body.classList.remove("empty"); // the page's own scene may come after a file that failed
-    appear(player);
+    document.body.classList.remove("empty"); // the page's own scene may be loaded after a file failed
+    revealCanvas(player);
     help.greet();
     if (!player.whole) return;
     element("loading").hidden = true;
     announce(`${title} is shown.`);
   });
 
-  // ---- where the scene comes from
+  // ---- opening scenes
 
-  // `bring`: a promise of {name, stream}. `called`: what the scene is called, if not as the file.
-  // `given`: by the page or its address.
-  const open = async (bring, called = null, given = true) => {
-    const mine = ++number;
+  // Opens a scene. `fetchFile` returns a promise of {name, stream}; `name` is the scene's title, if not the file's
+  // name; `isGiven`: the page or its address names it.
+  const open = async (fetchFile, name = null, isGiven = true) => {
+    const thisOpen = ++openCount;
     dismiss();
     document.body.classList.remove("empty");
     try {
       progress({ what: "loading", part: 0 });
-      const file = await bring();
-      if (mine !== number) return;
-      [next, nextOwn] = [called ?? file.name.replace(/\.\w+$/, ""), given];
+      const file = await fetchFile();
+      if (thisOpen !== openCount) return;
+      [nextTitle, isNextOwn] = [name ?? file.name.replace(/\.\w+$/, ""), isGiven];
       await player.open(file);
-      tellFrame("load");
+      postToParent("load");
     } catch (error) {
-      if (mine !== number) return; // another file was chosen meanwhile
+      if (thisOpen !== openCount) return; // another file was opened meanwhile
       document.body.classList.toggle("empty", !player.loaded);
       throw error;
     }
@@ -186,55 +197,59 @@ function start() {
     open(async () => chosenFile(file), null, false).catch(fail);
   };
 
-  // From where to look at a file beside the page, {cameras, up, target}, where the page says so.
-  const stageOf = (address) => {
-    const stages = Object.entries(beside?.stages ?? {});
+  // Returns the cameras of a file next to the page, {cameras, up, target}, or null where the page has none.
+  const findStage = (address) => {
+    const stages = Object.entries(served?.stages ?? {});
     return stages.find(([name]) => new URL(encodeURI(name), document.baseURI).href === address)?.[1] ?? null;
   };
 
-  // Show a model that is being trained, and each newer snapshot of it from where one stands.
+  // Shows a model that is being trained. Newer snapshots replace it, and the eye stays.
   const watchTraining = (address, updates) => new Promise((shown, failed) => {
-    let mine = number, begun = false; // what is opened by a person meanwhile has another number
-    const wanted = () => mine === number;
+    let thisOpen = openCount, isShown = false; // a person who opens a file changes `openCount`
+    const isWanted = () => thisOpen === openCount;
     const show = async (progress) => {
-      const called = trainingTitle(beside.title, progress);
-      if (!begun) {
+      const name = trainingTitle(served.title, progress);
+      if (!isShown) {
         remark("");
-        const opening = open(() => fetchedFile(address), called);
-        mine = number;
+        const opening = open(() => fetchedFile(address), name);
+        thisOpen = openCount;
         await opening;
-        begun = true;
+        isShown = true;
         return shown();
       }
       const file = await fetchedFile(address);
-      if (!wanted()) return;
+      if (!isWanted()) return;
       await player.open({ ...file, update: true });
-      if (!wanted()) return;
-      title = next = called;
-      panel.entitle(player.scene, title);
+      if (!isWanted()) return;
+      title = nextTitle = name;
+      panel.setTitle(player.scene, title);
     };
-    followTraining(updates, { show, waiting: () => remark(NOT_BEGUN), wanted }).then(() => wanted() && remark(ENDED), failed);
+    const ended = followTraining(updates, { show, waiting: () => remark(NOT_STARTED_TEXT), isWanted });
+    ended.then(() => isWanted() && remark(TRAINING_ENDED_TEXT), failed);
   });
 
-  const first = async () => {
-    if (inside) {
-      panel.describe(inside, title);
-      follow(readHash(location.hash) ?? asked.camera, false);
-      await player.load(payload(), element("background"));
-      tellFrame("load");
+  const openFirst = async () => {
+    if (embedded) {
+      panel.describe(embedded, title);
+      followCamera(parseHash(location.hash) ?? parameters.camera, false);
+      await player.load(readPayload(), element("background"));
+      postToParent("load");
       return;
     }
-    const address = asked.content ?? (beside?.content ? webAddress(beside.content, "content") : null);
-    const updates = asked.content || !beside?.updates ? null : webAddress(beside.updates, "content");
+    const address = parameters.content ?? (served?.content ? resolveAddress(served.content, "content") : null);
+    const updates = parameters.content || !served?.updates ? null : resolveAddress(served.updates, "content");
     if (updates) return watchTraining(address, updates);
-    if (address) return open(async () => ({ ...(await fetchedFile(address)), stage: stageOf(address) }), asked.title ?? (asked.content ? null : beside.title));
+    if (address) {
+      const name = parameters.title ?? (parameters.content ? null : served.title);
+      return open(async () => ({ ...(await fetchedFile(address)), stage: findStage(address) }), name);
+    }
     element("loading").hidden = true;
     document.body.classList.add("empty");
   };
 
   element("file").onchange = ({ target }) => {
     openFile(target.files[0]);
-    target.value = ""; // the same file may be chosen again
+    target.value = ""; // so that the same file can be chosen again
   };
   for (const button of document.querySelectorAll(".choose")) button.onclick = () => element("file").click();
   addEventListener("dragover", (event) => {
@@ -248,27 +263,28 @@ function start() {
     document.body.classList.remove("dropping");
     openFile(event.dataTransfer.files[0]);
   });
-  addEventListener("hashchange", () => follow(readHash(location.hash), true));
+  addEventListener("hashchange", () => followCamera(parseHash(location.hash), true));
   element("dismiss").onclick = element("enough").onclick = dismiss;
-  if (asked.autorotate && !calm()) turn(true);
+  if (parameters.autorotate && !prefersReducedMotion()) setTurning(true);
 
-  const ready = first();
+  const ready = openFirst();
   ready.catch((error) => {
     fail(error);
-    tellFrame("error", error.message);
+    postToParent("error", error.message);
   });
-  if (asked.wrong.length) fail(new Error(asked.wrong.join(" ")));
+  if (parameters.wrong.length) fail(new Error(parameters.wrong.join(" ")));
 
-  // For scripts. Cameras are {width, height, fx, fy, cx, cy, camera_from_world: 4 x 4}, OpenCV axes, the world's units.
+  // The interface for scripts. Cameras are {width, height, fx, fy, cx, cy, camera_from_world: 4 x 4}, with OpenCV axes,
+  // in world units.
   window.hyrfpack = {
-    ready, // a promise of the scene
-    show: async (camera) => { // stands there and draws; a promise
+    ready, // a promise that the scene is loaded
+    show: async (camera) => { // moves the eye to a camera and draws its picture
       await ready;
-      picture = await player.show(camera);
+      lastPicture = await player.show(camera);
     },
-    pixels: () => picture, // RGB bytes of what `show` drew last, top row first
-    camera: () => player.viewed, // of the window
-    frames: () => player.frames, // how many the window has been given
+    pixels: () => lastPicture, // the RGB bytes of the last picture of `show`, top row first
+    camera: () => player.viewed, // the camera of the window's picture
+    frames: () => player.frames, // the number of frames drawn to the window
     player,
   };
 }
@@ -276,7 +292,7 @@ function start() {
 try {
   start();
 } catch (error) {
-  document.body.classList.add("bare"); // nothing can be moved
+  document.body.classList.add("bare"); // hides the controls, which would have no effect
   fail(error);
-  tellFrame("error", error.message);
+  postToParent("error", error.message);
 }

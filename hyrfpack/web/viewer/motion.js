@@ -1,18 +1,18 @@
-// What moves the eye from frame to frame, see Player.movers: soft ends of movements, glides, and a slow turn.
+// Movers of the eye (see Player.movers): damped movements, glides between cameras, and a slow turn.
 
 import { dot, mul, sub } from "./camera.js";
 import { quatOf, rowsOf, slerp } from "./rotation.js";
 
-const DAMPING = 0.07; // s after which e^-1 of a movement is still to come
-const REST = 1e-4; // radians and parts of the focal length: no one sees what is left
-const GLIDE = 0.8; // s
-const TURN = 0.25; // radians a second
-const RESUME = 4000; // ms after a person's last act
+const DAMPING_SECONDS = 0.07; // the remaining movement falls to 1/e in this time
+const REST_THRESHOLD = 1e-4; // radians, or focal lengths; smaller movements are invisible
+const GLIDE_SECONDS = 0.8;
+const TURN_RADIANS_PER_SECOND = 0.25;
+const TURN_RESUME_MS = 4000; // after the last input
 
-const lessMotion = matchMedia("(prefers-reduced-motion: reduce)");
-export const calm = () => lessMotion.matches;
+const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)");
+export const prefersReducedMotion = () => reducedMotion.matches;
 
-// What a person asks for is done a little late and ends softly, but in the end exactly, however long the frames take.
+// Spreads movements over time with an exponential decay. Their sum is exact, whatever the frame rate.
 export class Damper {
   constructor(player) {
     this.player = player;
@@ -21,24 +21,25 @@ export class Damper {
 
   stop() {
     this.left = { yaw: 0, pitch: 0, x: 0, y: 0, depth: 0 };
-    this.place = [0, 0]; // to which it is zoomed
+    this.place = [0, 0]; // the point of the picture that keeps its place in a zoom
   }
 
-  // All as of Eye; of zooms the factor's logarithm.
+  // Movements have the units of Eye; a zoom is the logarithm of its factor.
   orbit(yaw, pitch) {
-    this.more({ yaw, pitch });
+    this.add({ yaw, pitch });
   }
 
   pan(x, y) {
-    this.more({ x, y });
+    this.add({ x, y });
   }
 
   zoom(depth, ...place) {
     this.place = place;
-    this.more({ depth });
+    this.add({ depth });
   }
 
-  more(movement) {
+  // Adds to the remaining movement.
+  add(movement) {
     for (const [name, value] of Object.entries(movement)) this.left[name] += value;
     this.player.changed();
   }
@@ -50,8 +51,8 @@ export class Damper {
   advance(seconds) {
     if (!this.active) return false;
     const { left } = this, { eye } = this.player;
-    const last = calm() || Object.values(left).every((value) => Math.abs(value) < REST);
-    const part = last ? 1 : 1 - Math.exp(-seconds / DAMPING);
+    const last = prefersReducedMotion() || Object.values(left).every((value) => Math.abs(value) < REST_THRESHOLD);
+    const part = last ? 1 : 1 - Math.exp(-seconds / DAMPING_SECONDS);
     if (left.yaw || left.pitch) eye.orbit(part * left.yaw, part * left.pitch);
     if (left.depth) eye.zoom(Math.exp(part * left.depth), ...this.place);
     if (left.x || left.y) eye.pan(part * left.x, part * left.y);
@@ -60,7 +61,7 @@ export class Damper {
   }
 }
 
-// From where the eye is to where it shall be.
+// Moves the eye smoothly from one pose to another.
 export class Glide {
   constructor(player) {
     this.player = player;
@@ -68,80 +69,81 @@ export class Glide {
   }
 
   get active() {
-    return this.way !== null;
+    return this.path !== null;
   }
 
   stop() {
-    this.way = null;
+    this.path = null;
   }
 
-  // `move` sets the eye elsewhere, to where it then glides.
+  // Glides to the pose that `move` sets.
   to(move) {
     const { eye } = this.player, from = eye.pose;
     move();
     this.stop();
-    if (calm()) return;
+    if (prefersReducedMotion()) return;
     const to = eye.pose;
     Object.assign(eye, from);
-    this.way = { from: wayPoint(from), to: wayPoint(to), end: to, time: 0 };
+    this.path = { from: blendablePose(from), to: blendablePose(to), end: to, time: 0 };
     this.player.changed();
   }
 
   advance(seconds) {
-    if (!this.way) return false;
-    const { from, to, end } = this.way, { eye } = this.player;
-    const time = (this.way.time += seconds) / GLIDE;
+    if (!this.path) return false;
+    const { from, to, end } = this.path, { eye } = this.player;
+    const time = (this.path.time += seconds) / GLIDE_SECONDS;
     if (time >= 1) {
       Object.assign(eye, end);
       this.stop();
       return true;
     }
-    const part = time * time * (3 - 2 * time), mix = (a, b) => a + part * (b - a);
-    const blend = (a, b) => a.map((value, k) => mix(value, b[k]));
+    const part = time * time * (3 - 2 * time), lerp = (a, b) => a + part * (b - a);
+    const lerpVector = (a, b) => a.map((value, k) => lerp(value, b[k]));
     const rows = rowsOf(slerp(from.quat, to.quat, part));
-    const away = mul(blend(from.away, to.away), Math.exp(mix(Math.log(from.distance), Math.log(to.distance))));
-    const target = blend(from.target, to.target);
+    const away = mul(lerpVector(from.away, to.away), Math.exp(lerp(Math.log(from.distance), Math.log(to.distance))));
+    const target = lerpVector(from.target, to.target);
     const position = [0, 1, 2].reduce((sum, row) => sub(sum, mul(rows[row], away[row])), target);
-    Object.assign(eye, { rows, target, position, focal: mix(from.focal, to.focal), pace: mix(from.pace, to.pace) });
+    Object.assign(eye, { rows, target, position, focal: lerp(from.focal, to.focal), pace: lerp(from.pace, to.pace) });
     return true;
   }
 }
 
-// A pose by what can be blended: its target, how far and (in the eye's axes) in which direction that is.
-function wayPoint({ position, rows, focal, pace, target }) {
+// Returns a pose in terms that can be interpolated: its target, and the distance and direction (in the eye's axes) to
+// it.
+function blendablePose({ position, rows, focal, pace, target }) {
   const away = sub(target, position), distance = Math.hypot(...away) || 1;
   return { quat: quatOf(rows), target, distance, away: rows.map((row) => dot(row, away) / distance), focal, pace };
 }
 
-// A slow turn about the target, while no one acts.
+// Turns the eye slowly about its target while there is no input.
 export class Turntable {
   constructor(player) {
     this.player = player;
     this.on = false;
-    this.resumes = 0; // when
+    this.resumesAt = 0; // the time from which it turns again
   }
 
   get active() {
-    return this.on && performance.now() >= this.resumes;
+    return this.on && performance.now() >= this.resumesAt;
   }
 
   turn(on) {
     this.on = on;
-    this.resumes = 0;
+    this.resumesAt = 0;
     this.player.changed();
   }
 
-  // A person acts.
+  // Pauses the turn after an input.
   pause() {
     if (!this.on) return;
-    this.resumes = performance.now() + RESUME;
+    this.resumesAt = performance.now() + TURN_RESUME_MS;
     clearTimeout(this.timer);
-    this.timer = setTimeout(() => this.player.changed(), RESUME + 1);
+    this.timer = setTimeout(() => this.player.changed(), TURN_RESUME_MS + 1);
   }
 
   advance(seconds) {
     if (!this.active) return false;
-    this.player.eye.orbit(TURN * seconds, 0);
+    this.player.eye.orbit(TURN_RADIANS_PER_SECOND * seconds, 0);
     return true;
   }
 }

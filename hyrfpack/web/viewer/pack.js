@@ -1,46 +1,47 @@
-// Splats and models as the shaders read them: texels of textures that are TEXTURE_WIDTH wide.
+// Packs splats and models into the textures that the shaders read. Textures are TEXTURE_WIDTH wide.
 
 import { decoderLayout, gridLevels } from "../hyrf/grids.js";
-import { TEXTURE_WIDTH } from "./layout.js";
+import { TEXTURE_WIDTH } from "./constants.js";
 
-const CELL = 8; // hidden units that are kept together
+const UNITS_PER_CELL = 8; // hidden units that the shaders process together
 
-const rowsOf = (count) => Math.max(1, Math.ceil(count / TEXTURE_WIDTH));
+const countRows = (count) => Math.max(1, Math.ceil(count / TEXTURE_WIDTH));
 
 const unorm16 = (value) => Math.round(65535 * Math.min(1, Math.max(0, value)));
 const snorm16 = (value) => Math.round(32767 * Math.min(1, Math.max(-1, value))) & 0xffff;
 const pair16 = (low, high) => (low | (high << 16)) >>> 0;
-const logScale = (scale) => unorm16((Math.log(scale) + 22) / 44);
-const step = (color, most) => Math.round((most * (Math.min(2, Math.max(-1, color)) + 1)) / 3);
+const quantizeScale = (scale) => unorm16((Math.log(scale) + 22) / 44);
+const quantizeColor = (color, levels) => Math.round((levels * (Math.min(2, Math.max(-1, color)) + 1)) / 3);
 
-// Textures of splats (see viewer/formats): places and shapes, 4 words a splat, harmonics, 4 words a splat and layer.
+// Packs splats (see viewer/formats): positions and shapes have 4 words a splat, harmonics 4 words a splat and layer.
 export function packSplats(splats) {
   const { count, degree, antialiased, positions, scales, quats, opacities, colors, harmonics, range } = splats;
-  const height = rowsOf(count), capacity = TEXTURE_WIDTH * height;
+  const height = countRows(count), capacity = TEXTURE_WIDTH * height;
   const floats = new Uint32Array(positions.buffer, positions.byteOffset, 3 * count);
   const places = new Uint32Array(4 * capacity), shapes = new Uint32Array(4 * capacity);
   for (let i = 0, p = 0, q = 0; i < count; i++, p += 3, q += 4) {
     places[q] = floats[p];
     places[q + 1] = floats[p + 1];
     places[q + 2] = floats[p + 2];
-    places[q + 3] = pair16(unorm16(opacities[i]), logScale(scales[p + 2]));
+    places[q + 3] = pair16(unorm16(opacities[i]), quantizeScale(scales[p + 2]));
     shapes[q] = pair16(snorm16(quats[q]), snorm16(quats[q + 1]));
     shapes[q + 1] = pair16(snorm16(quats[q + 2]), snorm16(quats[q + 3]));
-    shapes[q + 2] = pair16(logScale(scales[p]), logScale(scales[p + 1]));
-    const red = step(colors[p], 2047), green = step(colors[p + 1], 2047), blue = step(colors[p + 2], 1023);
+    shapes[q + 2] = pair16(quantizeScale(scales[p]), quantizeScale(scales[p + 1]));
+    const red = quantizeColor(colors[p], 2047), green = quantizeColor(colors[p + 1], 2047);
+    const blue = quantizeColor(colors[p + 2], 1023);
     shapes[q + 3] = red | (green << 11) | (blue << 22);
   }
-  const others = count ? harmonics.length / count : 0;
+  const higher = count ? harmonics.length / count : 0;
   const layered = new Uint8Array(16 * capacity * degree); // a layer holds 16 bytes of each splat
   for (let i = 0, at = 0; i < count; i++) {
-    for (let b = 0; b < others; b++) layered[16 * ((b >> 4) * capacity + i) + (b & 15)] = harmonics[at++];
+    for (let b = 0; b < higher; b++) layered[16 * ((b >> 4) * capacity + i) + (b & 15)] = harmonics[at++];
   }
   return { count, height, degree, range, antialiased, places, shapes, harmonics: new Uint32Array(layered.buffer) };
 }
 
-// A model of hyrf/index.js for fields.js.
+// Packs a model of hyrf/index.js for fields.js.
 export function packModel({ config, count, positions, colorLogits, scaleLogits, opacityLogits, geometry, radiance }) {
-  const height = rowsOf(count);
+  const height = countRows(count);
   const explicit = new Float32Array(4 * TEXTURE_WIDTH * height), logits = new Float32Array(4 * TEXTURE_WIDTH * height);
   for (let i = 0, p = 0, q = 0; i < count; i++, p += 3, q += 4) {
     explicit[q] = positions[p];
@@ -62,7 +63,7 @@ export function packModel({ config, count, positions, colorLogits, scaleLogits, 
     balls: rowBalls(positions, count),
     geometry: field("geometry", geometry),
     radiance: field("radiance", radiance),
-    cells: Math.ceil(config.hidden / CELL),
+    cells: Math.ceil(config.hidden / UNITS_PER_CELL),
     sh: config.direction_encoding === "sh",
     halfExtent: config.frame.half_extent,
     product: config.scale_rule === "product",
@@ -73,11 +74,11 @@ export function packModel({ config, count, positions, colorLogits, scaleLogits, 
   };
 }
 
-// A decoder's numbers by fours, hidden units filled up to whole cells: bias 1, the weights of each input, bias 2, for
-// each four units of the second hidden layer the weights of each of the first, bias 3, likewise. {numbers, and the
-// place of each part in fours}.
+// Packs a decoder's numbers by fours; hidden units are padded to whole cells. The order is: bias 1, the weights of each
+// input, bias 2, the weights of matrix 2 (for each four outputs those of each input), bias 3, matrix 3 likewise.
+// Returns {numbers, places: the offset of each part, in fours}.
 function packDecoder(decoder, [first, second, last]) {
-  const width = CELL * Math.ceil(first.outputs / CELL), ends = 4 * Math.ceil(last.outputs / 4);
+  const width = UNITS_PER_CELL * Math.ceil(first.outputs / UNITS_PER_CELL), ends = 4 * Math.ceil(last.outputs / 4);
   const places = { BIAS_1: 0, INPUTS: width / 4 };
   places.BIAS_2 = places.INPUTS + (first.inputs * width) / 4;
   places.MATRIX_2 = places.BIAS_2 + width / 4;
@@ -101,9 +102,9 @@ function packDecoder(decoder, [first, second, last]) {
   return { numbers, places: { ...places, WEIGHTS } };
 }
 
-// For each row of a texture a ball around its Gaussians' positions: x, y, z, radius.
+// Returns, for each row of a texture, a ball around its Gaussians' positions: x, y, z, radius.
 function rowBalls(positions, count) {
-  const balls = new Float32Array(4 * rowsOf(count));
+  const balls = new Float32Array(4 * countRows(count));
   for (let row = 0; row * TEXTURE_WIDTH < count; row++) {
     const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
     const end = 3 * Math.min(count, (row + 1) * TEXTURE_WIDTH);

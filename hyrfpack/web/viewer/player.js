@@ -1,103 +1,112 @@
-// What draws: scene, worker, renderer and eye put together on a canvas. It knows no other part of the page.
+// The player: draws a scene on a canvas with a worker, a renderer and an eye. It knows no other part of the page.
 //
-// Events: "progress" (detail: {part: 0 to 1, what: "loading" | "unpacking" | "preparing"}), "opened" (detail: the scene
-// of a file that came without one), "counted" (detail: the same, when more of the file is there), "loaded" (there is
-// something to see), "exposed" (the exposure was chosen, or may have got or lost its map), "said" (detail: a sentence
-// for the corner, "" for none), "drawn" (detail: ms a frame while moving), "stood" (detail: number of the camera),
-// "failed" (detail: Error). Movers, see `movers`, move the eye from frame to frame.
+// Events:
+//     "progress"   detail {part: fraction, what: "loading" | "unpacking" | "preparing"}
+//     "opened"     detail: the scene of a file that was opened without one
+//     "count"    detail: the scene, when more Gaussians of its file were loaded
+//     "loaded"     something can be drawn
+//     "exposure"    the exposure was chosen, or the scene has got or lost its exposure map
+//     "remark"       detail: a remark on the scene, "" for none
+//     "frame"      detail: ms a frame while moving
+//     "camera"      detail: the index of the camera that the eye was moved to
+//     "failed"     detail: an Error
 
 import { Eye, cameraOf, viewOf } from "./camera.js";
 import { AS_PHOTOGRAPHED, EXPOSURES, viewGains } from "./exposure.js";
-import { Fields, Unfit } from "./fields.js";
-import { ContextLost, countLoss } from "./graphics.js";
-import { Loader, Superseded } from "./loader.js";
+import { Fields, MEMORY_REASON, UnsupportedDeviceError } from "./fields.js";
+import { ContextLostError, countContextChange } from "./graphics.js";
+import { Loader, SupersededError } from "./loader.js";
 import { Renderer } from "./renderer.js";
 import { Splats } from "./splats.js";
 
-const SETTLED = 200; // ms after the last move until the picture is drawn at full resolution
-const FRAME = 33; // ms that a frame may take while moving before it is drawn coarser
-const COARSEST = 0.2;
-const DENSEST = 2; // device pixels a CSS pixel
-const FIRST_STEP = 1 / 60, LONGEST_STEP = 0.25; // s that a mover may move in one frame
-const COLORING = 0.25; // of a frame, for colours while moving
-const SHARES = { loading: [0, 0.3], unpacking: [0.3, 0.6], preparing: [0.6, 1] }; // of the progress bar
+const SETTLE_MS = 200; // after the last movement, the picture is drawn at full resolution
+const TARGET_FRAME_MS = 33; // slower frames lower the resolution while moving
+const MIN_SCALE = 0.2;
+const MAX_PIXEL_RATIO = 2; // device pixels a CSS pixel
+const FIRST_STEP_SECONDS = 1 / 60; // for the first frame of a movement, which has none before it
+const MAX_STEP_SECONDS = 0.25; // longer frames do not move the eye farther
+const COLORING_RATIO = 0.25; // the share of a frame that is used for colours while moving
+const PROGRESS_RANGES = { loading: [0, 0.3], unpacking: [0.3, 0.6], preparing: [0.6, 1] };
 
-const TAKEN = "The graphics device was taken away, or another scene opened, meanwhile; try again.";
+const DEVICE_LOST_TEXT = "The graphics device was taken away, or another scene opened, meanwhile; try again.";
 
 export class Player extends EventTarget {
-  // Without a scene, `open` brings one. Throws an Error with a sentence where the browser cannot draw.
+  // A player without a scene gets one by `open`. Throws an Error with a sentence where the browser cannot draw.
   constructor(canvas, scene = null) {
     super();
     this.canvas = canvas;
     this.renderer = new Renderer(canvas);
-    this.loader = null; // of what is drawn
-    this.next = null; // of what is being loaded
-    this.earlier = null; // of what was being loaded before, for the case that the next cannot be shown
-    this.waiters = []; // of the earlier one, called when it is so no more
+    this.loader = null; // of the file that is drawn
+    this.next = null; // of the file that is being loaded
+    this.previous = null; // of the file that was being loaded before, in case the next one cannot be shown
+    this.waiters = []; // called when `previous` changes
     this.scene = null;
     this.cameras = [];
     this.eye = null;
-    this.movers = []; // {active, advance(seconds)}: whether it holds the eye now; move it and tell whether it moved
-    this.resolution = 1; // of the canvas, chosen by a person
-    this.automatic = true; // coarser while moving, if slow
-    this.chosenExposure = AS_PHOTOGRAPHED;
-    this.frames = 0; // drawn so far
-    this.times = { first: null, complete: null }; // ms since the page was opened: something, everything was seen
-    this.moved = -Infinity; // when
-    this.moves = 0;
-    this.before = null; // when the last frame was that a mover held
-    this.began = null; // when the frame that is being drawn was begun
-    this.took = null; // ms a frame, lately
-    this.coarse = 1; // times the chosen resolution, while moving
+    this.movers = []; // {active: whether it moves the eye, advance(seconds): moves it and returns whether it moved}
+    this.resolution = 1; // a fraction of the canvas' size, chosen by a person
+    this.automatic = true; // lower the resolution while moving, if frames are slow
+    this.mode = AS_PHOTOGRAPHED; // of the exposure
+    this.frames = 0; // the number of frames drawn so far
+    // The times of the first picture and of the first complete one, in ms since the page was opened.
+    this.times = { first: null, complete: null };
+    this.movedAt = -Infinity; // the time of the last movement
+    this.moves = 0; // the number of changes of the view or the content
+    this.before = null; // the time of the last frame, if a mover was active then
+    this.began = null; // the start of the frame that is being drawn
+    this.took = null; // the running mean of ms a frame
+    this.coarse = 1; // the factor of the resolution while moving
     this.scheduled = false;
     this.loaded = false;
-    this.whole = false; // no more layers of the file will come
-    this.stale = true; // the canvas does not show the view
-    this.unsorted = true; // the order is not that of the view
-    this.calm = false; // there is nothing more to do
-    this.calmed = []; // who waits for that
-    this.turn = Promise.resolve(); // of those that complete the picture, one after the other
-    if (scene) this.enter(beginning(scene));
+    this.whole = false; // whether all layers of the file are loaded
+    this.stale = true; // whether the canvas must be drawn again
+    this.unsorted = true; // whether the splats must be sorted for the view
+    this.idle = false; // whether the picture is complete
+    this.onIdle = []; // functions that resolve the promises of `settled`
+    this.queue = Promise.resolve(); // the end of the queue of `enqueue`
+    if (scene) this.setScene(initialView(scene));
 
-    this.listening = new AbortController();
-    const { signal } = this.listening;
-    canvas.addEventListener("webglcontextlost", (event) => this.lose(event), { signal });
-    canvas.addEventListener("webglcontextrestored", () => this.restore(), { signal });
-    addEventListener("resize", () => this.wake(), { signal }); // also to a screen of other density
-    this.observer = new ResizeObserver(() => this.wake());
+    this.aborter = new AbortController();
+    const { signal } = this.aborter;
+    canvas.addEventListener("webglcontextlost", (event) => this.onLost(event), { signal });
+    canvas.addEventListener("webglcontextrestored", () => this.onRestored(), { signal });
+    addEventListener("resize", () => this.schedule(), { signal }); // comes with a new pixel ratio, too
+    this.observer = new ResizeObserver(() => this.schedule());
     this.observer.observe(canvas);
   }
 
-  tell(name, detail) {
+  // Dispatches an event.
+  emit(name, detail) {
     this.dispatchEvent(new CustomEvent(name, { detail }));
   }
 
-  // Free all that the device and the worker hold. The canvas shows nothing any more.
+  // Frees the worker and all objects of the graphics device. The canvas is blank from then on.
   dispose() {
-    this.listening.abort();
+    this.aborter.abort();
     this.observer.disconnect();
     this.loaded = false;
-    for (const loader of [this.loader, this.next, this.earlier]) loader?.dispose();
+    for (const loader of [this.loader, this.next, this.previous]) loader?.dispose();
     this.renderer.dispose();
     this.renderer.gl.getExtension("WEBGL_lose_context")?.loseContext();
   }
 
   // ---- loading
 
-  // The file of the scene that the player was made with: an async iterable of its bytes, which may know their `length`.
-  // `picture`: of its background, an <img>, or none. Another file may be shown instead, if one is opened meanwhile.
+  // Loads the file of the scene that the player was created with, from an async iterable of its bytes, which may have
+  // their `length`. `picture`: an <img> of the background, or null. If another file is opened meanwhile, that one is
+  // shown.
   async load(stream, picture = null) {
     try {
       await this.receive({ scene: this.scene, stream, picture });
     } catch (error) {
       const { message } = error;
-      if (error instanceof Superseded) return;
+      if (error instanceof SupersededError) return;
       throw new Error(`The scene cannot be unpacked; if this page is not whole, fetch it again (${message}).`);
     }
   }
 
-  // Any file: {name, stream}, and `stage` where it is known from where to look: {cameras, up, target}. `update`: it is
-  // the scene that is shown, as it is now; the eye stays where it is, and nothing is told of it but what is wrong.
+  // Opens a file, {name, stream}. `stage` has its {cameras, up, target} where they are known. `update`: the file is a
+  // newer version of the scene that is shown; the eye stays, and only errors are reported.
   async open({ name, stream, stage = null, update = false }) {
     try {
       await this.receive({ name, stream, stage, picture: null, update });
@@ -106,12 +115,13 @@ export class Player extends EventTarget {
     }
   }
 
+  // Loads a file and shows it.
   async receive({ name = "", scene = null, stage = null, stream, picture, update = false }) {
-    // What the page came with is shown after all if this cannot be.
-    if (this.loader || this.earlier) this.next?.dispose();
-    else this.earlier = this.next;
+    // The page's own file is kept, and shown if this one fails.
+    if (this.loader || this.previous) this.next?.dispose();
+    else this.previous = this.next;
     const loader = new Loader({
-      content: (content) => this.take(loader, content),
+      content: (content) => this.install(loader, content),
       progress: ({ what, part }) => this.progress(loader, what, part),
     });
     Object.assign(loader, { picture, part: 0, scene, remark: "", update });
@@ -119,224 +129,235 @@ export class Player extends EventTarget {
     try {
       await loader.read({ name, scene, stage, plain: scene?.plain ?? false, stream });
     } catch (error) {
-      if (this.loader === loader) this.rest();
-      else this.drop(loader);
+      if (this.loader === loader) {
+        this.whole = true; // no more of the file will come
+        this.redraw();
+      } else {
+        this.discard(loader);
+      }
       throw error;
     }
   }
 
-  // What is shown is all that comes of its file.
-  rest() {
-    this.whole = true;
-    this.redraw();
-  }
-
-  // A loader has nothing to show.
-  drop(loader) {
+  // Discards a loader that has nothing to show.
+  discard(loader) {
     loader.dispose();
-    if (loader === this.next) [this.next, this.earlier] = [this.earlier, null];
-    else if (loader === this.earlier) this.earlier = null;
-    for (const go of this.waiters.splice(0)) go();
+    if (loader === this.next) [this.next, this.previous] = [this.previous, null];
+    else if (loader === this.previous) this.previous = null;
+    for (const resolve of this.waiters.splice(0)) resolve();
   }
 
-  // Only of what was opened last.
+  // Reports progress, only of the file that was opened last.
   progress(loader, what, part) {
-    const [first, last] = SHARES[what];
+    const [first, last] = PROGRESS_RANGES[what];
     loader.part = Math.max(loader.part, first + (last - first) * part);
-    if (loader === (this.next ?? this.loader) && !loader.update) this.tell("progress", { what, part: loader.part });
+    if (loader === (this.next ?? this.loader) && !loader.update) this.emit("progress", { what, part: loader.part });
   }
 
+  // Returns whether a loader is in use.
   wanted(loader) {
-    return [this.loader, this.next, this.earlier].includes(loader);
+    return [this.loader, this.next, this.previous].includes(loader);
   }
 
-  // Once a loader may show what it has; throws Superseded if it may not any more.
-  async turnOf(loader) {
-    while (loader === this.earlier) await new Promise((resolve) => this.waiters.push(resolve));
-    if (!this.wanted(loader)) throw new Superseded();
+  // Waits until a loader may show its content. Throws SupersededError if it is not in use any more.
+  async waitFor(loader) {
+    while (loader === this.previous) await new Promise((resolve) => this.waiters.push(resolve));
+    if (!this.wanted(loader)) throw new SupersededError();
   }
 
-  // What the worker has read goes to the device. Whether it is shown now: until then all stays as it was.
-  async take(loader, { number, whole, scene, model, splats, picture }) {
-    const { gl } = this.renderer, begins = loader.scene ? null : beginning(scene);
+  // Uploads a content that the worker has read, and shows it. The old content stays until then. Returns whether the new
+  // one is shown.
+  async install(loader, { number, whole, scene, model, splats, picture }) {
+    const { gl } = this.renderer, initial = loader.scene ? null : initialView(scene);
     let content = null, staged = null;
     try {
-      await this.turnOf(loader);
+      await this.waitFor(loader);
       await loader.picture?.decode();
-      gl.getError(); // of anything before
+      gl.getError(); // clears earlier errors
       if (model) {
         content = new Fields(gl, model);
         await content.prepare((part) => {
-          if (!this.wanted(loader)) throw new Superseded();
+          if (!this.wanted(loader)) throw new SupersededError();
           this.progress(loader, "preparing", part);
         });
-        const view = this.view(loader.update && sameAxes(this.scene, scene) ? this.eye : begins?.eye);
+        const view = this.view(loader.update && sameAxes(this.scene, scene) ? this.eye : initial?.eye);
         await content.coloured(view, scene.tolerance, { goOn: () => this.wanted(loader) });
       } else {
         content = new Splats(gl, splats);
       }
-      await this.turnOf(loader);
-      if (content.graphics.lost) throw new ContextLost();
+      await this.waitFor(loader);
+      if (content.graphics.lost) throw new ContextLostError();
       staged = this.renderer.stage(content, scene, picture ?? loader.picture);
       const error = gl.getError();
-      if (content.graphics.lost) throw new ContextLost();
-      if (error !== gl.NO_ERROR && model) throw new Unfit("this device's memory does not hold the fields.");
+      if (content.graphics.lost) throw new ContextLostError();
+      if (error !== gl.NO_ERROR && model) throw new UnsupportedDeviceError(MEMORY_REASON);
       if (error !== gl.NO_ERROR) throw new Error("It does not fit into the memory of the graphics device.");
     } catch (error) {
       content?.dispose();
-      // All begins again when the device is back.
-      if (error instanceof ContextLost || error instanceof Superseded) return false;
+      // After a lost context, `onRestored` decodes the file again.
+      if (error instanceof ContextLostError || error instanceof SupersededError) return false;
       if (!model) throw error;
-      const unfit = error instanceof Unfit ? error.message : "this device's driver refuses the fields.";
-      loader.remark = `Drawn with harmonics: ${unfit}`;
+      const isUnsupported = error instanceof UnsupportedDeviceError;
+      const reason = isUnsupported ? error.message : "this device's driver refuses the fields.";
+      loader.remark = `Drawn with harmonics: ${reason}`;
       loader.again(true);
       return false;
     }
-    const stays = loader.update && sameAxes(this.scene, scene);
-    if (stays) Object.assign(this, { scene, cameras: begins?.cameras ?? this.cameras });
-    else if (begins) this.enter(begins);
+    const keepsEye = loader.update && sameAxes(this.scene, scene);
+    if (keepsEye) Object.assign(this, { scene, cameras: initial?.cameras ?? this.cameras });
+    else if (initial) this.setScene(initial);
     this.renderer.show(staged);
     loader.use(number);
     if (loader === this.next) {
-      for (const other of [this.loader, this.earlier]) other?.dispose();
+      for (const other of [this.loader, this.previous]) other?.dispose();
       this.loader = loader;
-      this.next = this.earlier = null;
-      for (const go of this.waiters.splice(0)) go();
+      this.next = this.previous = null;
+      for (const resolve of this.waiters.splice(0)) resolve();
     }
     this.scene = scene;
     this.whole = whole || loader.broken;
     this.loaded = true;
-    this.tell("exposed");
+    this.emit("exposure");
     this.moves++;
     this.stale = this.unsorted = true;
-    if (begins && !stays) this.tell("opened", scene);
-    else if (!begins && scene.count !== loader.scene.count) this.tell("counted", scene);
+    if (initial && !keepsEye) this.emit("opened", scene);
+    else if (!initial && scene.count !== loader.scene.count) this.emit("count", scene);
     loader.scene = scene;
-    this.tell("said", loader.remark);
+    this.emit("remark", loader.remark);
     this.progress(loader, "preparing", 1);
-    if (!stays) this.tell("loaded");
-    this.fit();
-    this.resort();
+    if (!keepsEye) this.emit("loaded");
+    this.resize();
+    this.sort();
     return true;
   }
 
-  // Stand before a scene.
-  enter({ scene, cameras, eye }) {
+  // Replaces the scene and moves the eye to its first camera.
+  setScene({ scene, cameras, eye }) {
     this.scene = scene;
     this.cameras = cameras;
-    this.eye = this.eye ? Object.assign(this.eye, eye) : eye; // others hold on to it
+    this.eye = this.eye ? Object.assign(this.eye, eye) : eye; // other objects refer to the eye
     this.choose(0);
   }
 
-  // The device was taken away: browsers do so in the background, or when a driver starts anew.
-  lose(event) {
-    event.preventDefault(); // else it is for ever
-    countLoss(this.renderer.gl);
+  // Handles a lost graphics context. Browsers drop contexts of pages in the background, or when a driver restarts.
+  onLost(event) {
+    event.preventDefault(); // otherwise the context is never restored
+    countContextChange(this.renderer.gl);
     this.loaded = false;
-    this.calm = false; // the picture is not complete until the device is restored
-    this.tell("said", "The graphics device was taken away; the picture comes back with it.");
+    this.idle = false; // the picture is not complete until the device is restored
+    this.emit("remark", "The graphics device was taken away; the picture comes back with it.");
   }
 
-  // It is back, with nothing of what it held.
-  async restore() {
+  // Handles the restored context, whose objects are all lost.
+  async onRestored() {
     try {
-      countLoss(this.renderer.gl);
+      countContextChange(this.renderer.gl);
       this.renderer = new Renderer(this.canvas);
       this.coarse = 1;
-      for (const loader of [this.loader, this.next, this.earlier]) loader?.again(false);
-      if (this.loader) await this.loader.expect(); // it says what there is to be said
-      else this.tell("said", "");
+      for (const loader of [this.loader, this.next, this.previous]) loader?.again(false);
+      if (this.loader) await this.loader.expect(); // showing the content updates the remark, too
+      else this.emit("remark", "");
     } catch (error) {
-      if (!(error instanceof Superseded)) this.tell("failed", error);
+      if (!(error instanceof SupersededError)) this.emit("failed", error);
     }
   }
 
   // ---- drawing
 
-  // "as-photographed" or "consistent", see exposure.js.
+  // The exposure, "as-photographed" or "consistent", see exposure.js.
   get exposure() {
-    return this.chosenExposure;
+    return this.mode;
   }
 
   set exposure(exposure) {
     if (!EXPOSURES.includes(exposure)) throw new Error(`The exposure must be ${EXPOSURES.join(" or ")}, not ${exposure}.`);
-    this.chosenExposure = exposure;
-    this.tell("exposed");
+    this.mode = exposure;
+    this.emit("exposure");
     this.redraw();
   }
 
-  // Whether the scene has an exposure map, without which both exposures are the same.
+  // Whether the scene has an exposure map. Without one, both exposures are the same.
   get hasExposureMap() {
     return Boolean(this.scene?.exposure);
   }
 
+  // Returns the exposure gains of a view.
   gains(view) {
     return viewGains(this.scene, view, this.exposure);
   }
 
+  // The factor of the resolution of the next frame.
   get scale() {
-    return this.moving && this.automatic ? Math.max(COARSEST, this.resolution * this.coarse) : this.resolution;
+    return this.moving && this.automatic ? Math.max(MIN_SCALE, this.resolution * this.coarse) : this.resolution;
   }
 
-  get held() {
+  // Whether a mover moves the eye.
+  get driven() {
     return this.movers.some((mover) => mover.active);
   }
 
+  // Whether the eye moves or moved just now.
   get moving() {
-    return this.held || performance.now() - this.moved < SETTLED;
+    return this.driven || performance.now() - this.movedAt < SETTLE_MS;
   }
 
-  // A promise that the picture is complete: full resolution, the order and colours of the view, the whole background.
+  // A promise that the picture is complete: at full resolution, with the order and colours of this view, and the
+  // background.
   get settled() {
-    return this.calm ? Promise.resolve() : new Promise((resolve) => this.calmed.push(resolve));
+    return this.idle ? Promise.resolve() : new Promise((resolve) => this.onIdle.push(resolve));
   }
 
-  // Give the canvas the window's size. That blanks it, so it is drawn to at once.
-  fit() {
+  // Sets the canvas to the window's size. A change blanks the canvas, so it must be drawn in the same frame.
+  resize() {
     const { clientWidth, clientHeight } = this.canvas, [wide, high] = this.renderer.largest;
-    const dense = Math.min(devicePixelRatio, DENSEST, wide / clientWidth, high / clientHeight);
+    const dense = Math.min(devicePixelRatio, MAX_PIXEL_RATIO, wide / clientWidth, high / clientHeight);
     const [width, height] = [clientWidth, clientHeight].map((side) => Math.max(1, Math.round(side * dense)));
     if (this.canvas.width === width && this.canvas.height === height) return;
     [this.canvas.width, this.canvas.height] = [width, height];
     this.moves++;
-    this.calm = false;
+    this.idle = false;
     this.stale = this.unsorted = true;
   }
 
+  // Requests a frame after the eye has moved.
   changed() {
-    this.moved = performance.now();
+    this.movedAt = performance.now();
     this.moves++;
     this.unsorted = true;
     this.redraw();
   }
 
+  // Requests a new picture of the same view.
   redraw() {
-    this.calm = false;
+    this.idle = false;
     this.stale = true;
-    this.wake();
+    this.schedule();
   }
 
-  wake() {
+  // Requests an animation frame.
+  schedule() {
     if (this.scheduled || !this.loaded) return;
     this.scheduled = true;
     requestAnimationFrame((now) => this.frame(now));
   }
 
+  // Moves the eye, and draws a frame if something has changed.
   frame(now) {
     this.scheduled = false;
     if (!this.loaded) return;
-    if (this.renderer.busy()) return this.wake();
-    this.fit();
+    if (this.renderer.busy()) return this.schedule();
+    this.resize();
     if (this.began !== null) this.measure(now - this.began);
     this.began = null;
-    const seconds = this.before === null ? FIRST_STEP : Math.min(LONGEST_STEP, (now - this.before) / 1000);
+    const seconds = this.before === null ? FIRST_STEP_SECONDS : Math.min(MAX_STEP_SECONDS, (now - this.before) / 1000);
     if (this.movers.map((mover) => mover.advance(seconds)).some(Boolean)) this.changed();
-    this.before = this.held ? now : null;
-    this.resort();
+    this.before = this.driven ? now : null;
+    this.sort();
     const moving = this.moving, scale = this.scale;
     if (this.stale || this.shown !== scale) {
       const view = this.view(), { content } = this.renderer;
-      if (moving) content.recolor(view, this.scene.tolerance, COLORING * Math.max(FRAME, this.took ?? 0));
+      const frameMs = Math.max(TARGET_FRAME_MS, this.took ?? 0);
+      if (moving) content.recolor(view, this.scene.tolerance, COLORING_RATIO * frameMs);
       this.renderer.draw(view, scale, this.gains(view));
       if (this.renderer.drawn) this.times.first ??= performance.now();
       this.frames++;
@@ -344,49 +365,52 @@ export class Player extends EventTarget {
       this.stale = false;
       this.shown = scale;
     }
-    if (moving || this.began !== null) return this.wake();
+    if (moving || this.began !== null) return this.schedule();
     this.took = null;
     this.finish();
   }
 
-  // A frame took so many ms, waiting for the screen included.
+  // Adapts the resolution to the time that a frame took, in ms, including the wait for the screen.
   measure(took) {
     this.took = 0.8 * (this.took ?? took) + 0.2 * took;
     if (!this.moving) return;
-    this.tell("drawn", this.took);
+    this.emit("frame", this.took);
     if (this.automatic) {
-      const wish = this.coarse * Math.min(1.15, Math.sqrt(FRAME / took));
-      // Small changes would only make the picture swim.
-      if (took > 1.3 * FRAME || took < 0.7 * FRAME) this.coarse = Math.min(1, Math.max(COARSEST, wish));
+      const wanted = this.coarse * Math.min(1.15, Math.sqrt(TARGET_FRAME_MS / took));
+      // Small changes of the resolution would be visible as jitter and save little.
+      const isOffTarget = took > 1.3 * TARGET_FRAME_MS || took < 0.7 * TARGET_FRAME_MS;
+      if (isOffTarget) this.coarse = Math.min(1, Math.max(MIN_SCALE, wanted));
     }
   }
 
-  // Standing still: complete the picture, then rest.
+  // Completes the picture while the eye stands still.
   async finish() {
-    if (this.finishing || this.calm) return;
+    if (this.finishing || this.idle) return;
     this.finishing = true;
     const { moves } = this, { content } = this.renderer;
     const goOn = () => this.loaded && this.moves === moves && this.renderer.content === content;
-    const how = { goOn, changed: () => this.redraw() };
-    const whole = await this.alone(() => content.complete(this.view(), this.scene.tolerance, how)).catch((error) => {
-      this.tell("failed", error);
+    const options = { goOn, changed: () => this.redraw() };
+    const work = () => content.complete(this.view(), this.scene.tolerance, options);
+    const whole = await this.enqueue(work).catch((error) => {
+      this.emit("failed", error);
       return true;
     });
     this.finishing = false;
-    if (!whole || !goOn() || this.stale || this.unsorted || this.loader.busy) return this.wake();
+    if (!whole || !goOn() || this.stale || this.unsorted || this.loader.busy) return this.schedule();
     if (!this.whole) return;
-    this.calm = true;
+    this.idle = true;
     this.times.complete ??= performance.now();
-    for (const resolve of this.calmed.splice(0)) resolve();
+    for (const resolve of this.onIdle.splice(0)) resolve();
   }
 
-  // Do something to the content after others have done with it. null where the device was taken away.
-  alone(work) {
-    const done = this.turn.then(work).catch((error) => {
-      if (!(error instanceof ContextLost)) throw error;
+  // Runs work on the content after all earlier work on it. Returns a promise of its result, null if the context was
+  // lost.
+  enqueue(work) {
+    const done = this.queue.then(work).catch((error) => {
+      if (!(error instanceof ContextLostError)) throw error;
       return null;
     });
-    this.turn = done.catch(() => {});
+    this.queue = done.catch(() => {});
     return done;
   }
 
@@ -394,36 +418,38 @@ export class Player extends EventTarget {
     return eye.view(this.canvas.width, this.canvas.height);
   }
 
-  // The camera of the world that the window shows.
+  // The camera, in world units, of the window's picture.
   get viewed() {
     return cameraOf(this.view(), this.scene);
   }
 
-  async resort() {
+  // Sorts the splats for the current view.
+  async sort() {
     if (!this.unsorted || this.loader.busy) return;
     this.unsorted = false;
     const { content } = this.renderer, sorted = await this.loader.sort(this.view(), this.scene);
-    if (sorted && content === this.renderer.content) this.order(sorted);
+    if (sorted && content === this.renderer.content) this.setOrder(sorted);
     else this.unsorted = true;
     this.redraw();
   }
 
-  order({ order, drawn }) {
+  // Uploads an order.
+  setOrder({ order, drawn }) {
     if (this.loaded) this.renderer.sorted(order, drawn);
     this.loader.reuse(order);
   }
 
-  // ---- standing somewhere
+  // ---- cameras
 
-  // Stand at one of the scene's cameras.
+  // Moves the eye to one of the scene's cameras.
   choose(number) {
     this.camera = (number + this.cameras.length) % this.cameras.length;
-    this.eye.stand(this.cameras[this.camera]);
-    this.tell("stood", this.camera);
+    this.eye.setView(this.cameras[this.camera]);
+    this.emit("camera", this.camera);
     this.changed();
   }
 
-  // Orbit about what is seen at a place of the canvas, CSS pixels. Whether there is something.
+  // Sets the target to the point that is seen at a position of the canvas, in CSS pixels. Returns whether there is one.
   pick(x, y) {
     if (!this.loaded) return false;
     const { width, height, clientWidth, clientHeight } = this.canvas, view = this.view();
@@ -435,43 +461,43 @@ export class Player extends EventTarget {
     return depth !== null;
   }
 
-  // PNG of what the window shows, at its full size.
+  // Returns a promise of a PNG of the window's picture at full size.
   capture() {
     const view = this.view();
     this.renderer.draw(view, this.resolution, this.gains(view));
     return new Promise((resolve) => this.canvas.toBlob(resolve, "image/png"));
   }
 
-  // Stand at a camera of the world and draw exactly its picture: RGB bytes, top row first. Throws an Error with a
-  // sentence, and stays, where that cannot be.
+  // Moves the eye to a camera in world units and draws its picture. Returns its RGB bytes, top row first. Throws an
+  // Error with a sentence where that is impossible; the eye does not move then.
   async show(camera) {
-    if (!this.loaded) throw new Error(TAKEN);
+    if (!this.loaded) throw new Error(DEVICE_LOST_TEXT);
     const view = viewOf(camera, this.scene), { content } = this.renderer;
     this.renderer.check(view);
-    this.eye.stand(view);
+    this.eye.setView(view);
     this.changed();
-    const picture = await this.alone(async () => {
+    const picture = await this.enqueue(async () => {
       await content.complete(view, this.scene.tolerance, { exact: true });
       const sorted = await this.loader.sort(view, this.scene);
-      if (!sorted || !this.loaded || content !== this.renderer.content) throw new ContextLost();
-      this.order(sorted);
+      if (!sorted || !this.loaded || content !== this.renderer.content) throw new ContextLostError();
+      this.setOrder(sorted);
       return this.renderer.read(view, this.gains(view));
     });
     this.unsorted = true;
     this.redraw();
-    if (!picture) throw new Error(TAKEN);
+    if (!picture) throw new Error(DEVICE_LOST_TEXT);
     return picture;
   }
 }
 
-// Whether two scenes have the same origin and unit, so that an eye of one can look at the other.
+// Returns whether two scenes have the same origin and unit, so that an eye of one scene fits the other.
 function sameAxes(before, after) {
   return before?.unit === after.unit && before.center.every((value, axis) => value === after.center[axis]);
 }
 
-// How one first stands before a scene. Throws where a camera makes no sense.
-function beginning(scene) {
+// Returns the views and the eye at the start of a scene. Throws an Error where a camera is invalid.
+function initialView(scene) {
   const cameras = scene.cameras.map((camera) => viewOf(camera, scene)), eye = new Eye(scene, cameras);
-  eye.stand(cameras[0]);
+  eye.setView(cameras[0]);
   return { scene, cameras, eye };
 }

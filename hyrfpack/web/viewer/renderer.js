@@ -1,66 +1,66 @@
-// Draws splats with WebGL 2: project (one fragment a splat), blend (one quad a splat, farthest first), resolve (over
-// the background, with the gains of the exposure).
+// Draws splats with WebGL 2 in three passes: project (one fragment a splat), blend (one quad a splat, farthest first)
+// and resolve (composite over the background, and apply the gains of the exposure).
 
 import { Graphics } from "./graphics.js";
-import { SPHERE_RADIUS, TEXTURE_WIDTH } from "./layout.js";
+import { BACKGROUND_RADIUS, TEXTURE_WIDTH } from "./constants.js";
 
-const LARGEST_PICTURE = 8192; // pixels a side that are read back
-const QUADS = 1024; // an instance: drivers are slow with many small instances
+const MAX_READ_SIDE_PIXELS = 8192; // of pictures that are read back
+const QUADS_PER_INSTANCE = 1024; // drivers are slow with many small instances
 
 export class Renderer {
-  // Throws an Error with a sentence where the browser cannot do it.
+  // Throws an Error with a sentence where the browser has no WebGL 2.
   constructor(canvas) {
-    const wishes = { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" };
-    const gl = canvas.getContext("webgl2", wishes);
+    const contextOptions = { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" };
+    const gl = canvas.getContext("webgl2", contextOptions);
     if (!gl) throw new Error("This browser offers no WebGL 2, which drawing needs; switch it on or take another one.");
-    gl.getError(); // of a context that was lost before
+    gl.getError(); // clears the error of a context that was lost before
     this.gl = gl;
     this.graphics = new Graphics(gl);
     const side = gl.getParameter(gl.MAX_TEXTURE_SIZE), sides = gl.getParameter(gl.MAX_VIEWPORT_DIMS) ?? [0, 0];
-    this.largest = [...sides].map((most) => Math.min(most, side)); // width and height of a picture
-    // Thousands of layers are blended: 8 bits would round away what faint ones add.
+    this.largest = [...sides].map((limit) => Math.min(limit, side)); // the maximum width and height of a picture
+    // Thousands of splats are blended, and 8 bits would round the faint ones to nothing.
     this.fine = Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
-    gl.getExtension("WEBGL_provoking_vertex")?.provokingVertexWEBGL(0x8e4d); // the first: free of cost everywhere
+    gl.getExtension("WEBGL_provoking_vertex")?.provokingVertexWEBGL(0x8e4d); // the first one: fast on all devices
     this.project = this.graphics.program("whole.vert", "project.frag");
     this.blend = this.graphics.program("blend.vert", "blend.frag");
     this.resolve = this.graphics.program("whole.vert", "resolve.frag");
 
     // Two triangles for each of the quads of one instance.
     const corner = (k) => 4 * Math.floor(k / 6) + [0, 1, 2, 2, 1, 3][k % 6];
-    const corners = Uint32Array.from({ length: 6 * QUADS }, (_, k) => corner(k));
-    this.quads = this.graphics.keep(gl.createVertexArray(), "VertexArray");
+    const corners = Uint32Array.from({ length: 6 * QUADS_PER_INSTANCE }, (_, k) => corner(k));
+    this.quads = this.graphics.track(gl.createVertexArray(), "VertexArray");
     gl.bindVertexArray(this.quads);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.graphics.keep(gl.createBuffer(), "Buffer"));
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.graphics.track(gl.createBuffer(), "Buffer"));
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
-    gl.bindVertexArray(null); // fragments are drawn without any
+    gl.bindVertexArray(null); // the other passes need no vertices
 
     this.unused = { u_colors: this.graphics.texture(gl.TEXTURE_2D, gl.RG32UI, 1, 1) };
-    this.unusedLayers = { u_harmonics: this.graphics.texture(gl.TEXTURE_2D_ARRAY, gl.RGBA32UI, 1, 1, 1) };
+    this.noLayers = { u_harmonics: this.graphics.texture(gl.TEXTURE_2D_ARRAY, gl.RGBA32UI, 1, 1, 1) };
     this.plain = this.graphics.texture(gl.TEXTURE_2D, gl.RGBA8, 1, 1);
     this.content = null;
     this.drawn = 0;
   }
 
-  // Make all that drawing splats (`Splats` or `Fields`) of a scene takes, for `show`; they are freed with the splats.
-  // `picture`: of the background, see `background`.
+  // Creates all objects for drawing a content (`Splats` or `Fields`), for `show`. They are freed with the content.
+  // `picture` is the background's, see `background`, or null.
   stage(content, scene, picture) {
     const { gl } = this, { graphics } = content, size = [TEXTURE_WIDTH, content.height];
     const order = graphics.texture(gl.TEXTURE_2D, gl.R32UI, ...size);
     const shapes = graphics.texture(gl.TEXTURE_2D, gl.RGBA32UI, ...size);
     const appearances = graphics.texture(gl.TEXTURE_2D, gl.RGBA32UI, ...size);
     const projection = graphics.framebuffer(shapes, appearances);
-    const behind = picture ? this.background(graphics, picture) : null;
-    return { content, scene, order, shapes, appearances, projection, projectionSize: size, picture: behind };
+    const background = picture ? this.background(graphics, picture) : null;
+    return { content, scene, order, shapes, appearances, projection, tableSize: size, picture: background };
   }
 
-  // Draw what was staged from now on. What was before is freed.
+  // Draws a staged content from now on, and frees the one before it.
   show(staged) {
     this.content?.dispose();
     Object.assign(this, staged);
     this.drawn = 0;
   }
 
-  // A texture of a picture of all directions: an image, or {width, height, rgba}.
+  // Creates the texture of an equirectangular picture: an image, or {width, height, rgba}.
   background(graphics, picture) {
     const { gl } = this;
     const size = [picture.naturalWidth ?? picture.width, picture.naturalHeight ?? picture.height];
@@ -69,11 +69,12 @@ export class Renderer {
     if (picture.rgba) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ...size, gl.RGBA, gl.UNSIGNED_BYTE, picture.rgba);
     else gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, gl.RGBA, gl.UNSIGNED_BYTE, picture);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.REPEAT);
-    graphics.smooth();
+    graphics.setLinear();
     return texture;
   }
 
-  // Take an order: indices of splats, farthest first, of which the first `drawn` count; whole rows of the texture.
+  // Uploads an order: indices of splats, farthest first, of which the first `drawn` are drawn. It fills whole rows of
+  // the texture.
   sorted(order, drawn) {
     const { gl } = this, rows = Math.ceil(drawn / TEXTURE_WIDTH);
     gl.bindTexture(gl.TEXTURE_2D, this.order);
@@ -81,18 +82,18 @@ export class Renderer {
     this.drawn = drawn;
   }
 
-  // Draw a view to the canvas, splats at `scale` times its resolution. `gains`: of the exposure, see exposure.js.
+  // Draws a view to the canvas, with splats at `scale` times its resolution. `gains`: of the exposure, see exposure.js.
   draw(view, scale, gains) {
     const size = [view.width, view.height].map((side) => Math.max(1, Math.round(side * scale)));
-    this.splats(resized(view, ...size));
+    this.splats(resizeView(view, ...size));
     this.over(view, size, null, gains);
   }
 
-  // Draw a view and read it: RGB, top row first. Throws an Error with a sentence where the device cannot.
+  // Draws a view and returns its RGB bytes, top row first. Throws an Error with a sentence where the device cannot.
   read(view, gains) {
     const { gl, graphics } = this, { width, height } = view;
     this.check(view);
-    gl.getError(); // of anything before
+    gl.getError(); // clears earlier errors
     const texture = graphics.texture(gl.TEXTURE_2D, gl.RGBA8, width, height);
     const target = graphics.framebuffer(texture);
     this.splats(view);
@@ -108,12 +109,13 @@ export class Renderer {
 
   // Throws an Error with a sentence where a view's picture is too large.
   check({ width, height }) {
-    const [wide, high] = this.largest.map((side) => Math.min(side, LARGEST_PICTURE));
+    const [wide, high] = this.largest.map((side) => Math.min(side, MAX_READ_SIDE_PIXELS));
     if (width <= wide && height <= high) return;
     throw new Error(`Pictures here are ${wide} x ${high} pixels at most; ask for a smaller one.`);
   }
 
-  // How deep what is seen at a pixel lies, null where there is nothing. `scale` of depths of interest.
+  // Returns the mean depth of the splats at a pixel, null where there are none. Depths z are blended as z / (z +
+  // scale), so `scale` should be of their magnitude.
   pick(view, x, y, scale) {
     const { gl } = this;
     const place = [Math.floor(x), Math.floor(y), 1, 1];
@@ -135,7 +137,8 @@ export class Renderer {
     return false;
   }
 
-  // Blend the splats of a view; with `pick`, depths instead of colours, at the pixels of `part` (x, y, width, height).
+  // Blends the splats of a view at the pixels of `part` (x, y, width, height). If `pick` is not 0, it blends depths
+  // instead of colours, see `pick`.
   splats(view, pick = 0, part = [0, 0, view.width, view.height]) {
     const { gl, graphics, blend } = this, { width, height } = view;
     this.projections(view, pick);
@@ -150,25 +153,26 @@ export class Renderer {
     graphics.bind(blend, { u_order: this.order, u_shapes: this.shapes, u_projected: this.appearances });
     gl.uniform2f(blend.u_size, width, height);
     gl.uniform1i(blend.u_drawn, this.drawn);
-    gl.uniform1i(blend.u_quads, QUADS);
+    gl.uniform1i(blend.u_quads, QUADS_PER_INSTANCE);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.quads);
-    const instances = Math.ceil(this.drawn / QUADS);
-    if (instances) gl.drawElementsInstanced(gl.TRIANGLES, 6 * QUADS, gl.UNSIGNED_INT, 0, instances);
+    const instances = Math.ceil(this.drawn / QUADS_PER_INSTANCE);
+    if (instances) gl.drawElementsInstanced(gl.TRIANGLES, 6 * QUADS_PER_INSTANCE, gl.UNSIGNED_INT, 0, instances);
     gl.bindVertexArray(null);
     gl.disable(gl.BLEND);
     gl.disable(gl.SCISSOR_TEST);
   }
 
+  // Projects all splats of a view.
   projections(view, pick) {
     const { gl, graphics, project: p, content, scene } = this, { colors, harmonics } = content;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.projection);
-    gl.viewport(0, 0, ...this.projectionSize);
+    gl.viewport(0, 0, ...this.tableSize);
     gl.useProgram(p.program);
     const colored = colors ? { u_colors: colors } : this.unused;
     graphics.bind(p, { u_places: content.places, u_shapes: content.shapes, ...colored });
-    graphics.bind(p, harmonics ? { u_harmonics: harmonics } : this.unusedLayers, gl.TEXTURE_2D_ARRAY, 3);
+    graphics.bind(p, harmonics ? { u_harmonics: harmonics } : this.noLayers, gl.TEXTURE_2D_ARRAY, 3);
     gl.uniform1i(p.u_colored, colors ? 1 : 0);
     gl.uniform1i(p.u_degree, content.degree ?? 0);
     gl.uniform1f(p.u_range, content.range ?? 1);
@@ -185,9 +189,10 @@ export class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
+  // Composites the blended splats, which fill the size `used`, over the background, to a target or the canvas.
   over(view, used, target, gains) {
     const { gl, graphics, resolve: r, scene, content } = this, picture = content.panorama?.texture ?? this.picture;
-    const { center, radius } = sphereOf(scene);
+    const { center, radius } = backgroundSphere(scene);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
     gl.viewport(0, 0, view.width, view.height);
     gl.useProgram(r.program);
@@ -208,17 +213,18 @@ export class Renderer {
     }
   }
 
-  // A target for the splats, at least so large.
+  // Provides a target for the splats of at least this size.
   reserve(width, height) {
     const { gl, graphics } = this, [w, h] = this.reserved ?? [0, 0];
     if (width <= w && height <= h) return;
     this.release();
     this.reserved = [Math.max(w, width), Math.max(h, height)];
     this.layered = graphics.texture(gl.TEXTURE_2D, this.fine ? gl.RGBA16F : gl.RGBA8, ...this.reserved);
-    graphics.smooth();
+    graphics.setLinear();
     this.layers = graphics.framebuffer(this.layered);
   }
 
+  // Frees that target.
   release() {
     for (const object of [this.layered, this.layers]) this.graphics.free(object);
     this.layered = this.layers = this.reserved = null;
@@ -232,15 +238,15 @@ export class Renderer {
   }
 }
 
-// The sphere that the background lies on, in the page's units; a radius of Infinity where nothing is said of it.
-function sphereOf({ kind, sphere, center, unit }) {
-  if (kind === "hyrf") return { center: [0, 0, 0], radius: SPHERE_RADIUS };
+// Returns the background sphere in the page's units. The radius is Infinity where the scene has none.
+function backgroundSphere({ kind, sphere, center, unit }) {
+  if (kind === "hyrf") return { center: [0, 0, 0], radius: BACKGROUND_RADIUS };
   if (!sphere) return { center: [0, 0, 0], radius: Infinity };
   return { center: sphere.center.map((value, axis) => (value - center[axis]) / unit), radius: sphere.radius / unit };
 }
 
-// A view in a picture of another resolution.
-function resized(view, width, height) {
+// Returns a view at another resolution.
+function resizeView(view, width, height) {
   const x = width / view.width, y = height / view.height;
   if (x === 1 && y === 1) return view;
   return { ...view, width, height, fx: view.fx * x, fy: view.fy * y, cx: view.cx * x, cy: view.cy * y };

@@ -1,8 +1,8 @@
-// Rotations as unit quaternions (w, x, y, z), for what lies between two of them and for short addresses.
+// Rotations as unit quaternions (w, x, y, z), for interpolation and for short addresses.
 
-// Of a matrix with these rows.
+// Returns the quaternion of a rotation matrix, given by its rows.
 export function quatOf([[a, b, c], [d, e, f], [g, h, i]]) {
-  // From the largest of four, so that nothing is divided by little.
+  // The formula of the largest component avoids divisions by small numbers.
   const squares = [1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i];
   const largest = squares.indexOf(Math.max(...squares));
   const quat = [
@@ -14,7 +14,7 @@ export function quatOf([[a, b, c], [d, e, f], [g, h, i]]) {
   return normalizedQuat(quat[0] < 0 ? quat.map((value) => -value) : quat);
 }
 
-// The rows of its matrix.
+// Returns the rows of a quaternion's rotation matrix.
 export function rowsOf([w, x, y, z]) {
   return [
     [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -28,7 +28,7 @@ export function normalizedQuat(quat) {
   return quat.map((value) => value / length);
 }
 
-// The rotation a part of the way from one to another, the shorter way round.
+// Interpolates between two rotations along the shorter arc; `part` is in [0, 1].
 export function slerp(from, to, part) {
   const cosine = from.reduce((sum, value, k) => sum + value * to[k], 0), sign = cosine < 0 ? -1 : 1;
   const angle = Math.acos(Math.min(1, Math.abs(cosine)));

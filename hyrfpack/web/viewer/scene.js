@@ -1,25 +1,27 @@
-// What a player has to know of a file that is opened by itself: the scene, as pages have it in JSON.
+// Describes the scene of a file that is opened without a page of its own, in the form of the JSON in pages.
 
 import { backgroundColors } from "../hyrf/fields.js";
 import { viewpointOf } from "../hyrf/viewpoint.js";
-import { SPHERE_RADIUS } from "./layout.js";
+import { BACKGROUND_RADIUS } from "./constants.js";
 
-const NEAR_PLANE = 0.01; // hyrfpack.render's defaults: local units; of half the picture's size
-const CULL_BAND = 0.3;
-const SAMPLED_SPLATS = 10000;
-const PICTURE_ROWS = 128;
+const NEAR_PLANE_LOCAL = 0.01; // in local units; the default of hyrfpack.render
+const CULL_MARGIN_RATIO = 0.3; // in halves of the picture's size; the default of hyrfpack.render
+const MIN_SAMPLED_SPLATS = 10000;
+const BACKGROUND_HEIGHT_PIXELS = 128;
 
+// Returns the scene of a model.
 export function modelScene({ metadata, config, count }, name) {
   const { cameras, up, target } = viewpointOf(metadata), { center, scale } = config.frame;
   return {
-    kind: "hyrf", title: name, count, center, unit: scale, near: NEAR_PLANE, tolerance: CULL_BAND, up, target,
-    solid: config.solid, cameras,
+    kind: "hyrf", title: name, count, center, unit: scale, near: NEAR_PLANE_LOCAL, tolerance: CULL_MARGIN_RATIO,
+    up, target, solid: config.solid, cameras,
   };
 }
 
-// Splats say nothing of cameras: one looks at their middle, from as far as befits most of them.
+// Returns the scene of splats. Their files have no cameras, so the camera looks at their median position, from a
+// distance that shows most of them.
 export function splatsScene({ count, center, unit, positions }, name) {
-  const step = Math.max(1, Math.floor(count / SAMPLED_SPLATS)), axes = [[], [], []];
+  const step = Math.max(1, Math.floor(count / MIN_SAMPLED_SPLATS)), axes = [[], [], []];
   for (let i = 0; i < count; i += step) axes.forEach((values, axis) => values.push(positions[3 * i + axis]));
   const middle = axes.map((values) => percentile(values, 0.5));
   const reach = axes.map((values, axis) => percentile(values.map((value) => Math.abs(value - middle[axis])), 0.9));
@@ -27,18 +29,18 @@ export function splatsScene({ count, center, unit, positions }, name) {
   const target = middle.map((value, axis) => center[axis] + unit * value);
   const viewpoint = viewpointOf({ config: { frame: { center: target, scale: size * unit } } });
   return {
-    kind: "splats", title: name, count, center, unit, near: NEAR_PLANE * size, tolerance: CULL_BAND,
+    kind: "splats", title: name, count, center, unit, near: NEAR_PLANE_LOCAL * size, tolerance: CULL_MARGIN_RATIO,
     up: viewpoint.up, target, solid: [0, 0, 0], cameras: viewpoint.cameras,
   };
 }
 
 const percentile = (values, part) => Float32Array.from(values).sort()[Math.floor(part * (values.length - 1))] ?? 0;
 
-// The background of a model as a picture of all directions from its middle, for devices that cannot make it themselves:
-// {width, height, rgba}, equirectangular; null where there is none.
+// Returns the background of a model as an equirectangular picture, {width, height, rgba}, seen from its centre; null
+// where there is none. It is for devices that cannot evaluate the background.
 export function backgroundPicture(model) {
   if (!model.config.background) return null;
-  const height = PICTURE_ROWS, width = 2 * height, directions = new Float32Array(3 * width * height);
+  const height = BACKGROUND_HEIGHT_PIXELS, width = 2 * height, directions = new Float32Array(3 * width * height);
   for (let v = 0, at = 0; v < height; v++) {
     const latitude = Math.PI * (0.5 - (v + 0.5) / height);
     for (let u = 0; u < width; u++) {
@@ -48,7 +50,7 @@ export function backgroundPicture(model) {
       directions[at++] = Math.cos(latitude) * Math.cos(longitude);
     }
   }
-  const colors = backgroundColors(model, directions.map((value) => SPHERE_RADIUS * value), directions);
+  const colors = backgroundColors(model, directions.map((value) => BACKGROUND_RADIUS * value), directions);
   const rgba = new Uint8Array(4 * width * height).fill(255);
   for (let k = 0; k < width * height; k++) {
     for (let c = 0; c < 3; c++) rgba[4 * k + c] = Math.round(255 * colors[3 * k + c]);

@@ -1,20 +1,21 @@
-// What a person takes along: the address of what is seen, and a picture of it.
+// Shares the view: copies its address, and saves a picture of it.
 
-import { toast } from "./notes.js";
+import { toast } from "./notifications.js";
 
-// The page's address with this camera and exposure (null for the usual one), copied. `holds`: whether it brings the
-// scene, too.
-export async function shareView(camera, exposure, holds) {
-  const address = new URL(location.href), { searchParams: asked } = address;
-  if (exposure) asked.set("exposure", exposure);
-  else if (asked.has("exposure")) asked.delete("exposure");
+// Copies the page's address with this camera and exposure (null for the default). `includesScene`: whether the address
+// opens the scene, too.
+export async function shareView(camera, exposure, includesScene) {
+  const address = new URL(location.href), { searchParams: parameters } = address;
+  if (exposure) parameters.set("exposure", exposure);
+  else if (parameters.has("exposure")) parameters.delete("exposure");
   address.hash = `camera=${camera}`;
   try {
     history.replaceState(null, "", address);
   } catch {
-    // a page without an address of its own, as in srcdoc
+    // pages without an address of their own, as in srcdoc, cannot change it
   }
-  const copied = "The link to this view is copied" + (holds ? "." : "; it does not hold the file that you opened.");
+  const ending = includesScene ? "." : "; it does not hold the file that you opened.";
+  const copied = `The link to this view is copied${ending}`;
   try {
     await navigator.clipboard.writeText(address.href);
     toast(copied);
@@ -23,6 +24,7 @@ export async function shareView(camera, exposure, holds) {
   }
 }
 
+// Downloads a picture.
 export function savePicture(blob, title) {
   const link = document.createElement("a"), address = URL.createObjectURL(blob);
   Object.assign(link, { href: address, download: `${fileName(title)}.png` });

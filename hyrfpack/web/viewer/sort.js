@@ -1,9 +1,9 @@
-// Splats by depth, farthest first.
+// Sorts splats by depth, farthest first.
 
-const RADIX = 1 << 16;
+const RADIX_BINS = 1 << 16;
 
 export class DepthSort {
-  // Of splats at positions (3 N). Orders fill whole rows of a texture of this width.
+  // `positions` are those of the splats (3 N). Orders fill whole rows of a texture of this `width`.
   constructor(positions, width) {
     this.positions = positions;
     this.count = positions.length / 3;
@@ -11,13 +11,13 @@ export class DepthSort {
     this.depths = new Float32Array(this.count);
     this.bits = new Uint32Array(this.depths.buffer);
     [this.indices, this.others] = [new Uint32Array(this.count), new Uint32Array(this.count)];
-    this.counts = new Uint32Array(RADIX);
+    this.counts = new Uint32Array(RADIX_BINS);
   }
 
-  // {order, drawn}: indices of which the first `drawn` count. A radix sort of the float32 depths in two passes of 16
-  // bits. `row`: the camera's third, and its translation. Splats behind the near plane, or outside of the sides (see
-  // frustum.js), are left out. At equal depth the later one comes first, as the rasteriser has it. `order` is written
-  // to where it fits.
+  // Returns {order, drawn}: indices of splats, of which the first `drawn` are valid. Uses a radix sort of the float32
+  // depths in two passes of 16 bits. `row` is the third row of the camera's pose. Splats before the near plane or
+  // outside the planes `sides` (see frustum.js) are left out. At equal depth the later splat comes first, as in the
+  // rasteriser. `order` is reused if its length fits.
   sort(row, sides, near, order) {
     const { positions, depths, bits, indices, others, counts } = this;
     const [a, b, c, d] = row;
@@ -45,6 +45,7 @@ export class DepthSort {
   }
 }
 
+// Distributes indices by their keys, in a stable order: one pass of the radix sort.
 function scatter(from, to, length, counts, key) {
   let start = 0;
   for (let k = 0; k < counts.length; k++) {

@@ -1,23 +1,25 @@
-// Where a scene's bytes come from: an address, or a file of the person's own. Each is {name, stream}: the stream is an
-// async iterable of Uint8Array, which knows its `length` where that is known.
+// Sources of a scene's bytes: an address, or a file that a person chose. Each is {name, stream}; the stream is an async
+// iterable of Uint8Array, with its `length` in bytes, or 0 where that is unknown.
 
-// Throws an Error with a sentence where it cannot be had.
+// Fetches a file. Throws an Error with a sentence where that fails.
 export async function fetchedFile(address) {
-  const name = nameOfAddress(address), answer = await ask(address, name);
+  const name = nameOfAddress(address), answer = await request(address, name);
   if (!answer.ok) {
     const status = [answer.status, answer.statusText].filter(Boolean).join(" ");
     await answer.body?.cancel();
     throw new Error(`${name} could not be fetched (${status}); check the address ${address}`);
   }
-  // What is sent packed has another length than what is read.
+  // For a compressed transfer, Content-Length is not the length of the file.
   const length = answer.headers.get("Content-Encoding") ? 0 : Number(answer.headers.get("Content-Length")) || 0;
   return { name, stream: Object.assign(downloaded(address, name, answer, length), { length }) };
 }
 
+// Returns a file that a person chose.
 export function chosenFile(file) {
   return { name: file.name, stream: Object.assign(pieces(file.stream()), { length: file.size }) };
 }
 
+// Returns the file name in an address.
 const nameOfAddress = (address) => {
   const last = new URL(address).pathname.split("/").pop();
   try {
@@ -27,24 +29,25 @@ const nameOfAddress = (address) => {
   }
 };
 
-async function ask(address, name, headers = {}) {
+// Sends a request. Throws an Error with a sentence where no answer comes.
+async function request(address, name, headers = {}) {
   try {
     return await fetch(address, { headers, credentials: "same-origin" });
   } catch {
-    const why = location.protocol === "file:"
+    const reason = location.protocol === "file:"
       ? "a page opened from the disk may not read files; drop the file on the page, or serve both"
       : new URL(address).origin === location.origin
         ? "its server does not answer"
         : `${new URL(address).host} does not answer, or does not let pages of other sites read it`;
-    throw new Error(`${name} could not be fetched: ${why}.`);
+    throw new Error(`${name} could not be fetched: ${reason}.`);
   }
 }
 
-// A connection that breaks is taken up again once, where it broke.
+// Yields the bytes of an answer. A connection that breaks is resumed once, by a range request.
 async function* downloaded(address, name, answer, length) {
-  const own = new URL(address).origin === location.origin, tag = answer.headers.get("ETag");
+  const isSameOrigin = new URL(address).origin === location.origin, tag = answer.headers.get("ETag");
   let done = 0;
-  for (let again = false; ; again = true) {
+  for (let isResumed = false; ; isResumed = true) {
     try {
       for await (const bytes of pieces(answer.body)) {
         done += bytes.length;
@@ -53,18 +56,20 @@ async function* downloaded(address, name, answer, length) {
       if (done >= length) return;
       throw new Error("it ends early");
     } catch (error) {
-      const broke = new Error(`the connection broke after ${done.toLocaleString("en")} bytes; reload the page to try again`);
-      if (again || !done) throw broke;
-      // Other sites' servers would have to allow If-Range.
-      const headers = { Range: `bytes=${done}-`, ...(own && tag && !tag.startsWith("W/") ? { "If-Range": tag } : {}) };
-      answer = await ask(address, name, headers);
+      const sentence = `the connection broke after ${done.toLocaleString("en")} bytes; reload the page to try again`;
+      const brokenError = new Error(sentence);
+      if (isResumed || !done) throw brokenError;
+      // If-Range is sent to the page's own server only, because other servers would have to allow it.
+      const condition = isSameOrigin && tag && !tag.startsWith("W/") ? { "If-Range": tag } : {};
+      const headers = { Range: `bytes=${done}-`, ...condition };
+      answer = await request(address, name, headers);
       const first = answer.headers.get("Content-Range");
-      if (answer.status !== 206 || (first && !first.startsWith(`bytes ${done}-`))) throw broke;
+      if (answer.status !== 206 || (first && !first.startsWith(`bytes ${done}-`))) throw brokenError;
     }
   }
 }
 
-// Not every browser can iterate over a ReadableStream itself.
+// Iterates over a ReadableStream, which not every browser can do itself.
 async function* pieces(stream) {
   const reader = stream.getReader();
   try {

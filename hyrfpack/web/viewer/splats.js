@@ -1,7 +1,7 @@
-// Splats with harmonics on the graphics device, as pack.js makes them.
+// Splats with harmonics on the graphics device, from the arrays of pack.js.
 
 import { Graphics } from "./graphics.js";
-import { TEXTURE_WIDTH } from "./layout.js";
+import { TEXTURE_WIDTH } from "./constants.js";
 
 export class Splats {
   constructor(gl, { count, height, degree, range, antialiased, places, shapes, harmonics }) {
@@ -14,7 +14,7 @@ export class Splats {
     if (degree) gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, 0, ...size, gl.RGBA_INTEGER, gl.UNSIGNED_INT, harmonics);
   }
 
-  // Nothing of them changes with the view, see Fields.
+  // Splats do not change with the view, unlike Fields.
   recolor() {}
 
   async complete() {

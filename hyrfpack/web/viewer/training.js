@@ -1,13 +1,14 @@
-// A model that is still being trained: its server tells how far the training is, and has the newest snapshot of it.
+// Follows a training through its server, which has the progress and the newest snapshot of the model.
 
-const ASK_INTERVAL = 2000; // ms between two requests
-const LOAD_RATIO = 3; // the next snapshot is asked for no sooner than so many times what the last one took to load
-const MOST_FAILURES = 3; // in a row, after which the training has ended
+const REQUEST_INTERVAL_MS = 2000;
+const WAIT_PER_LOAD_RATIO = 3; // after a snapshot, the wait is at least this many times its loading time
+const MAX_FAILURES = 3; // after as many failed requests in a row, the training counts as ended
 
 const wait = (duration) => new Promise((done) => setTimeout(done, duration));
 
-// {snapshot: number from 1, 0 while there is none, step, steps}, or null where the server does not answer.
-async function askProgress(address) {
+// Requests the progress {snapshot, step, steps}; `snapshot` counts from 1 and is 0 while there is none. Returns null
+// where the server does not answer.
+async function requestProgress(address) {
   try {
     const answer = await fetch(address, { cache: "no-store" });
     return answer.ok ? await answer.json() : null;
@@ -16,26 +17,26 @@ async function askProgress(address) {
   }
 }
 
-// Follow a training until its server answers no more or `wanted()` is false. `show(progress)`, a promise that a
-// snapshot is shown, is called for the first one and for each newer one; `waiting()` while there is none.
-export async function followTraining(address, { show, waiting, wanted }) {
+// Follows a training until its server stops answering or `isWanted()` is false. `show(progress)` is called for each new
+// snapshot, and its promise is awaited; `waiting()` is called while there is none.
+export async function followTraining(address, { show, waiting, isWanted }) {
   let shown = 0;
-  for (let failures = 0; wanted() && failures < MOST_FAILURES; ) {
-    const progress = document.hidden && shown ? { snapshot: shown } : await askProgress(address);
+  for (let failures = 0; isWanted() && failures < MAX_FAILURES; ) {
+    const progress = document.hidden && shown ? { snapshot: shown } : await requestProgress(address);
     failures = progress ? 0 : failures + 1;
-    let took = 0;
+    let loadMs = 0;
     if (progress?.snapshot === 0) waiting();
-    else if (progress && progress.snapshot !== shown && wanted()) {
+    else if (progress && progress.snapshot !== shown && isWanted()) {
       const began = performance.now();
       try {
         await show(progress);
         shown = progress.snapshot;
       } catch (error) {
-        if (!shown) throw error; // else the next one may be better
+        if (!shown) throw error; // after the first one, errors are ignored: the next snapshot may be valid
       }
-      took = performance.now() - began;
+      loadMs = performance.now() - began;
     }
-    await wait(Math.max(ASK_INTERVAL, LOAD_RATIO * took));
+    await wait(Math.max(REQUEST_INTERVAL_MS, WAIT_PER_LOAD_RATIO * loadMs));
   }
 }
 

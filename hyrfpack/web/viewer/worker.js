@@ -1,6 +1,6 @@
-// The worker of pages that take files of every kind.
+// The worker of pages that open files of all formats.
 
 import { decodeSplats } from "./formats/index.js";
-import { startWorker } from "./reading.js";
+import { startWorker } from "./worker_tasks.js";
 
 startWorker(decodeSplats);

@@ -1,7 +1,7 @@
-// The worker of pages with a model inside: smaller, for it reads no other kind of file.
+// The worker of pages with an embedded model. It is smaller, because it reads no other format.
 
 import { HyrfFormatError } from "../hyrf/errors.js";
-import { startWorker } from "./reading.js";
+import { startWorker } from "./worker_tasks.js";
 
 startWorker(() => {
   throw new HyrfFormatError("this page takes .hyrf files only; drop others on a player from 'hyrfpack export -o player/'.");

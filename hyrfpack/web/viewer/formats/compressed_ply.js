@@ -56,8 +56,8 @@ export function decodeCompressedPly(bytes, header) {
   const rows = readPlyRows(bytes, header, ["vertex", "chunk", ...(higher ? ["sh"] : [])]);
   const vertex = rows.get("vertex"), chunk = rows.get("chunk"), { count } = vertex;
   if (chunk.count !== Math.ceil(count / GAUSSIANS_PER_CHUNK) || (higher && rows.get("sh").count !== count)) {
-    const found = `${groupedDigits(chunk.count)} chunks do not fit ${groupedDigits(count)} Gaussians`;
-    rejectSplats(`${found}, ${GAUSSIANS_PER_CHUNK} each; it is damaged`);
+    const found = `${groupedDigits(chunk.count)} chunks do not fit ${groupedDigits(count)} Gaussians, 256 each`;
+    rejectSplats(`${found}; it is damaged`);
   }
   const [place, turn, size, tint] = PACKED_NAMES.map((name) => vertex.column(name));
   const positions = new Float64Array(3 * count), scales = new Float32Array(3 * count);

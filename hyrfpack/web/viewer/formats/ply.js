@@ -1,6 +1,6 @@
 // Reads the PLY files of 3D Gaussian Splatting: one element `vertex` of x y z, f_dc_0..2 (harmonics of degree 0, RGB),
 // f_rest_0.. (higher ones, channel after channel), opacity (its logit), scale_0..2 (natural logarithms) and rot_0..3
-// (wxyz). Rows may be binary or text, properties in any order and of any type.
+// (wxyz). RowStates may be binary or text, properties in any order and of any type.
 
 import { HIGHER_HARMONICS_BY_DEGREE, SH_BAND_0 } from "../../hyrf/harmonics.js";
 import { normalizeSplats, rejectSplats } from "./normalize.js";

@@ -62,8 +62,8 @@ export class ZipArchive {
     if ((method !== METHOD_STORED && method !== METHOD_DEFLATED) || flags & FLAG_ENCRYPTED) {
       rejectSplats(`${quotedText(name)} in it is encrypted or packed by method ${method}; zip it stored or deflated`);
     }
-    if (local + LOCAL_HEADER_BYTES > this.bytes.length) rejectDamagedZip();
-    if (view.getUint32(local, true) !== LOCAL_HEADER_SIGNATURE) rejectDamagedZip();
+    const isOutside = local + LOCAL_HEADER_BYTES > this.bytes.length;
+    if (isOutside || view.getUint32(local, true) !== LOCAL_HEADER_SIGNATURE) rejectDamagedZip();
     const start = local + LOCAL_HEADER_BYTES + view.getUint16(local + 26, true) + view.getUint16(local + 28, true);
     if (start + stored > this.bytes.length) rejectDamagedZip();
     const packed = this.bytes.subarray(start, start + stored);

@@ -1,0 +1,52 @@
+// Messages at the lower edge of the page: progress, errors, and confirmations.
+
+import { element } from "./dom.js";
+
+const TOAST_MS = 4000;
+const STEP_LABELS = { loading: "Loading", unpacking: "Unpacking", preparing: "Preparing" };
+let toastTimer = 0;
+
+// Shows the sentence of an error until it is dismissed.
+export function fail({ message }) {
+  element("loading").hidden = true;
+  element("sentence").textContent = message;
+  element("message").hidden = false;
+}
+
+// Hides the error and the confirmation.
+export function dismiss() {
+  element("message").hidden = true;
+  element("toast").hidden = true;
+}
+
+// Shows a confirmation for TOAST_MS; screen readers read it. With an address to copy, it stays until it is dismissed.
+export function toast(sentence, address = "") {
+  const link = element("link");
+  element("toast").hidden = false; // before its text changes, so that screen readers read it
+  element("done").textContent = sentence;
+  link.hidden = !address;
+  link.value = address;
+  clearTimeout(toastTimer);
+  if (address) link.select();
+  else toastTimer = setTimeout(() => (element("toast").hidden = true), TOAST_MS);
+}
+
+// Tells screen readers a sentence.
+export function announce(sentence) {
+  element("status").textContent = sentence;
+}
+
+// Shows a lasting remark about the scene; "" hides it.
+export function remark(sentence) {
+  element("remark").hidden = !sentence;
+  element("remark").textContent = sentence;
+}
+
+// Shows the fraction `part` of the step `what`.
+export function progress({ what, part }) {
+  element("loading").hidden = false;
+  element("bar").value = part;
+  element("step").textContent = `${STEP_LABELS[what]} ${Math.floor(100 * part)} %`;
+  const quarter = `${STEP_LABELS[what]}, ${25 * Math.floor(4 * part)} percent`;
+  if (element("status").textContent !== quarter) announce(quarter);
+}
