@@ -19,7 +19,7 @@ from hyrfpack.parallel.ranks import Ranks, join_processes
 from hyrfpack.scene import Picture, Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer, train
 from hyrfpack.train import trainer as trainers
-from hyrfpack.train.together import averaged, digest
+from hyrfpack.train.distributed import average_gradients, digest
 
 DENSITY = DensityConfig(start=0.05, stop=0.68, peak=0.4, excess=1.5, rounds=5, gradient=1e-5, resets=1)
 # Two processes take 60 steps, with rounds of density control after each 7th from 3 to 38, of which the last take away.
@@ -66,7 +66,7 @@ def talk(ranks: Ranks) -> dict:
 
     weight, idle = torch.nn.Parameter(torch.zeros(2, 3)), torch.nn.Parameter(torch.zeros(2))
     weight.grad = torch.full((2, 3), float(ranks.rank))
-    sums = averaged(ranks, [weight, idle], torch.tensor([1.0, ranks.rank]))
+    sums = average_gradients(ranks, [weight, idle], torch.tensor([1.0, ranks.rank]))
     with join_processes() as again:
         pass
     return {
@@ -79,8 +79,8 @@ def talk(ranks: Ranks) -> dict:
         "agreed": ranks.run_on_all(lambda: ranks.rank * 10),
         "refused by the last": sentence_of(lambda: ranks.run_on_all(refuse(ranks.size - 1))),
         "refused by all": sentence_of(lambda: ranks.run_on_all(refuse(0))),
-        "averaged": weight.grad.tolist(),
-        "averaged of idle": None if idle.grad is None else idle.grad.tolist(),
+        "average_gradients": weight.grad.tolist(),
+        "average_gradients of idle": None if idle.grad is None else idle.grad.tolist(),
         "sums": sums.tolist(),
         "threads": os.environ["HYRFPACK_THREADS"],
     }

@@ -78,8 +78,8 @@ def test_sub_packages_can_be_imported_from_in_every_way():
         "assert progress is again is sys.modules['hyrfpack.train.progress'] is hyrfpack.train.progress\n"
         "assert t is hyrfpack.train is sys.modules['hyrfpack.train'].train\n"
         "assert t.Trainer is Trainer and hyrfpack.cameras.paths.orbit\n"
-        "progress.LOG_EVERY = 7\n"
-        "assert hyrfpack.train.progress.LOG_EVERY == 7\n"
+        "progress.LOG_INTERVAL_SECONDS = 7\n"
+        "assert hyrfpack.train.progress.LOG_INTERVAL_SECONDS == 7\n"
         "try: hyrfpack.nothing\n"
         "except AttributeError: print('and nothing else')"
     )

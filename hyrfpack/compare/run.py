@@ -14,7 +14,7 @@ from hyrfpack.format import describe
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.outputs import StrPath
 from hyrfpack.render.files import unique_stems
-from hyrfpack.train.run import VIEWS
+from hyrfpack.train.run import VIEWS_FOLDER
 
 # Steps, counts, sizes and times of real runs are smaller; a larger number means that the metrics are damaged.
 MAX_NUMBER = 1e15
@@ -205,7 +205,7 @@ def _file_sizes(folder: Path) -> dict[str, int]:
 
 def _existing_pictures(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """Return the paths of those of `evaluate`'s pictures that exist, by the name of their photo."""
-    files = {name: folder / VIEWS / f"{file}.png" for name, file in zip(names, unique_stems(names), strict=True)}
+    files = {name: folder / VIEWS_FOLDER / f"{file}.png" for name, file in zip(names, unique_stems(names), strict=True)}
     return {name: path for name, path in files.items() if path.is_file()}
 
 

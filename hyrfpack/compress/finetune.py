@@ -31,8 +31,8 @@ from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
 from hyrfpack.render import render
 from hyrfpack.scene import Picture, View
 from hyrfpack.train.config import LearningRates
+from hyrfpack.train.distributed import average_gradients
 from hyrfpack.train.optimizer import Optimizer
-from hyrfpack.train.together import averaged
 from hyrfpack.train.trainer import shuffled
 
 FINETUNING_RATES = LearningRates(
@@ -118,7 +118,7 @@ def finetune(
                     raise
                 problem, loss = error, tuned.gaussians.positions.new_zeros(())
             if not ranks.is_single:
-                sums = averaged(ranks, list(tuned.parameters()), loss.new_tensor((loss, problem is not None)))
+                sums = average_gradients(ranks, list(tuned.parameters()), loss.new_tensor((loss, problem is not None)))
                 loss, problems = sums / ranks.size
                 if problems:
                     ranks.raise_if_any(problem)

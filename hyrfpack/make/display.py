@@ -12,7 +12,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.live import Live
 
 from hyrfpack.make.progress import OVERDUE_RATIO, Progress
-from hyrfpack.train.progress import LOG_EVERY, StatusLine, duration
+from hyrfpack.train.progress import LOG_INTERVAL_SECONDS, StatusLine, duration
 
 
 class Display:
@@ -87,6 +87,6 @@ class Display:
         return parts
 
     def _log(self) -> None:
-        while not self._over.wait(LOG_EVERY):
+        while not self._over.wait(LOG_INTERVAL_SECONDS):
             if parts := self._parts():
                 self.say("  ".join(parts.values()))

@@ -32,7 +32,7 @@ from hyrfpack.outputs import Outputs
 from hyrfpack.scene import Scene
 from hyrfpack.train import Trainer, train
 from hyrfpack.train.decisions import max_pilot_steps
-from hyrfpack.train.progress import SMOOTHING
+from hyrfpack.train.progress import RUNNING_MEAN_WEIGHT
 from hyrfpack.train.run import is_begun
 
 SCENE, RUN, PACKED, EXPORTED = (PRODUCTS[stage] for stage in ("poses", "training", "compression", "export"))
@@ -156,7 +156,8 @@ class _TrainingProgress:
             return
         self._begin("training")
         if not math.isnan(mse):
-            self._mse = mse if math.isnan(self._mse) else SMOOTHING * mse + (1 - SMOOTHING) * self._mse
+            weight = 1.0 if math.isnan(self._mse) else RUNNING_MEAN_WEIGHT
+            self._mse = mse if weight == 1 else weight * mse + (1 - weight) * self._mse
         quality = () if math.isnan(self._mse) else (f"PSNR {psnr_from_mse(self._mse):.2f}",)
         self._reporter.update(step / self._steps, f"{step:,}/{self._steps:,}", *quality, f"{gaussians:,} Gaussians")
         if step == self._steps:

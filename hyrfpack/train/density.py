@@ -1,9 +1,9 @@
 """Density control: where Gaussians are added and which are removed.
 
-Gaussians are cloned where they are small and split where they are large, those first whose projected centre has the
-largest absolute gradients (3DGS; AbsGS), until there are more than the budget allows. Then the count falls to the
-budget: in each round those go that pictures would miss least. So a budget is filled with the best of what was tried,
-and not with what came first.
+Small Gaussians are cloned and large ones are split, in the order of the largest absolute gradients of their projected
+centres (3DGS; AbsGS), until their number exceeds the budget. Then each round prunes the Gaussians with the lowest
+importance scores, until their number equals the budget. So the budget is filled with the best candidates instead of the
+first ones.
 """
 
 from __future__ import annotations
@@ -21,27 +21,33 @@ from hyrfpack.train.config import DensityConfig
 from hyrfpack.train.optimizer import Optimizer
 
 SPLIT_SHRINK = 1.6
-FADING = 0.8  # what a round leaves of the squares of those before
-SATURATED = 0.02  # light that an opaque Gaussian is taken to let through: its logit hardly moves it, and yet it counts
-COLLECTED = ("gradients", "views", "squares")
-FAINT = 0.2  # of two this faint the error asked for more light than one sends; halved each round, they would go out
-LEAST_INTERVAL = 5  # steps; after fewer, what is new has hardly moved
-FEW = 0.1  # huge Gaussians are outliers, to be removed, up to this share of all
+SQUARED_GRADIENT_DECAY = 0.8  # factor that each round applies to the sums of earlier rounds
+# The importance score divides by the transmittance of a Gaussian. The logit of an opaque one hardly moves its opacity,
+# so that without this bound its score would be noise.
+MIN_SCORE_TRANSMITTANCE = 0.02
+STATE_NAMES = ("gradients", "views", "squares")
+# A Gaussian fainter than this keeps its opacity when it is cloned or split. The error asked for more light than it
+# sends, and Gaussians halved in each round would vanish.
+MIN_HALVED_OPACITY = 0.2
+MIN_ROUND_INTERVAL_STEPS = 5  # After fewer steps, new Gaussians have hardly moved.
+MAX_OUTLIER_SHARE = 0.1  # If more Gaussians than this are huge, they carry the scene and are kept.
 
 
 class DensityControl:
-    """Collects gradients and, at its rounds, edits the model through the optimiser.
+    """Collects gradients and, in its rounds, edits the model through the optimiser.
 
-    A Gaussian of opacity o is worth to a picture about what its loss changes without it: to first order o dL/do, or
-    dL/dx / (1 - o) by the opacity's logit x. The sum of its squares over views is the Gauss-Newton estimate of the
-    loss's rise, up to a factor, where residuals are as good as random; a view that does not show it adds nothing.
+    Removing a Gaussian of opacity o changes a view's loss L by about o dL/do, which is dL/dx / (1 - o) for the logit x
+    of its opacity. The importance score is the sum of the squares of this over views. Where residuals are random, it is
+    the Gauss-Newton estimate of the rise of the loss, up to a factor. A view without the
+    Gaussian adds nothing.
 
-    Each process of several collects of its own views; a round begins with the sums, so that all decide alike.
+    Each of several processes observes its own views. A round first sums what all have observed, so that all take the
+    same decisions.
 
     Attributes:
         gradients: (N,) sum over views of the mean2d gradient's norm, NDC units.
         views: (N,) in how many views each Gaussian was visible since the last round.
-        squares: (N,) sum over views of the squared gradient of the opacity's explicit logit; earlier rounds fade.
+        squares: (N,) sum over views of the squared gradient of the opacity's explicit logit; earlier rounds decay.
     """
 
     def __init__(
@@ -62,7 +68,7 @@ class DensityControl:
         self.device = device
         self.first = max(1, round(config.start * steps))
         self.last = round(config.stop * steps)
-        self.interval = max(LEAST_INTERVAL, (self.last - self.first) // max(1, config.rounds))
+        self.interval = max(MIN_ROUND_INTERVAL_STEPS, (self.last - self.first) // max(1, config.rounds))
         self.last -= max(0, self.last - self.first) % self.interval  # of the last round
         self.peak = min(max(self.first, round(config.peak * steps)), self.last)
         self.reset_interval = (self.peak - self.first) // (config.resets + 1) if config.resets else None
@@ -70,19 +76,19 @@ class DensityControl:
         self.clear(initial)
 
     def clear(self, count: int) -> None:
-        """Forget the gradients of centres; there are `count` Gaussians now."""
+        """Reset the sums of centre gradients to zero, for `count` Gaussians."""
         self.gradients = torch.zeros(count, device=self.device)
         self.views = torch.zeros(count, device=self.device)
 
     def watching(self, step: int) -> bool:
-        """Whether gradients of this step (counted from 1) will still be used."""
+        """Return whether a later round uses the gradients of this step, counted from 1."""
         return step <= self.last
 
     def observe(self, rendering: Rendering, camera: Camera, model: HybridModel) -> None:
         """Collect the gradients of one view, after backward."""
         if rendering.absgrad is None:
             return
-        # To pick the visible would make the host wait for the device: zeros are added instead.
+        # Selecting the visible Gaussians would make the host wait for the device, so zeros are added for the others.
         ndc = rendering.absgrad * tensor_like((camera.width / 2, camera.height / 2), rendering.absgrad)
         lengths = torch.where(rendering.visible, torch.linalg.vector_norm(ndc, dim=-1), 0)
         self.gradients.index_add_(0, rendering.indices, lengths.to(self.gradients.dtype))
@@ -101,7 +107,7 @@ class DensityControl:
             self._reset(model, optimizer)
 
     def target(self, step: int) -> int:
-        """The most Gaussians that the round after this step leaves: up along a line until the peak, then down."""
+        """Return the most Gaussians after this step's round: linear up to the peak, then linear down to the budget."""
         most = self.config.excess * self.budget
         if step < self.peak:
             return int(self.initial + (most - self.initial) * (step - self.first) / (self.peak - self.first))
@@ -111,7 +117,7 @@ class DensityControl:
 
     @torch.no_grad()
     def _round(self, step: int, model: HybridModel, optimizer: Optimizer) -> None:
-        for name in COLLECTED:
+        for name in STATE_NAMES:
             self.ranks.all_reduce(getattr(self, name))
         explicit = model.gaussians
         geometry = model.decode_geometry()
@@ -134,40 +140,44 @@ class DensityControl:
         optimizer.replace_gaussians(
             keep, {name: torch.cat((clones[name], children[name])) for name in Gaussians.PARAMETER_NAMES}
         )
-        # What two share is each one's half.
+        # The children of one Gaussian share its sum equally.
         self.squares[cloned] /= 2
-        self.squares = FADING * torch.cat((self.squares[keep], self.squares[cloned], self.squares[split.repeat(2)] / 2))
+        self.squares = SQUARED_GRADIENT_DECAY * torch.cat(
+            (self.squares[keep], self.squares[cloned], self.squares[split.repeat(2)] / 2)
+        )
         if not self.ranks.is_main:  # what came before is summed once
             self.squares.zero_()
         self.clear(len(model))
 
     def _alive(self, geometry: Geometry, sizes: Tensor, target: int) -> Tensor:
-        """(N,) bool: the Gaussians to be kept, at most `target`; those that are faint or huge are not."""
-        huge = ~(sizes <= self.config.prune_scale)  # also where it is not a number
-        if huge.sum() > FEW * len(huge):  # they carry the scene, as over an even sky without a background sphere
+        """Return the mask (N,) of the Gaussians to keep: neither faint nor huge, and at most `target` of them."""
+        huge = ~(sizes <= self.config.prune_scale)  # True also where the size is NaN
+        if huge.sum() > MAX_OUTLIER_SHARE * len(
+            huge
+        ):  # they carry the scene, as over an even sky without a background sphere
             huge = torch.zeros_like(huge)
         alive = (geometry.opacities >= self.config.prune_opacity) & ~huge
         if not alive.any():  # never end with an empty scene: keep the most opaque
             alive[geometry.opacities.argmax()] = True
         if alive.sum() > target:
-            worth = self.squares / (1 - geometry.opacities).clamp_min(SATURATED).square()
-            worth = torch.where(alive, worth, -1.0)
-            alive[torch.argsort(worth, descending=True, stable=True)[max(1, target) :]] = False
+            importance = self.squares / (1 - geometry.opacities).clamp_min(MIN_SCORE_TRANSMITTANCE).square()
+            importance = torch.where(alive, importance, -1.0)
+            alive[torch.argsort(importance, descending=True, stable=True)[max(1, target) :]] = False
         return alive
 
     def _split(
         self, step: int, model: HybridModel, geometry: Geometry, bounds: Tensor, split: Tensor
     ) -> dict[str, Tensor]:
-        """Two children for each Gaussian at `split`, drawn from it, 1.6 times smaller on every axis as decoded."""
+        """Sample two children from each Gaussian at `split`; their decoded scales are `SPLIT_SHRINK` times smaller."""
         explicit = model.gaussians
         generator = torch.Generator().manual_seed((self.seed * 1_000_003 + step) % 2**64)
         twice = split.repeat(2)
         scales, quats = geometry.scales[twice], geometry.quats[twice]
-        # Drawn on the CPU: the same numbers on every device.
+        # Sampling on the CPU gives the same numbers for every device.
         offsets = torch.randn(len(twice), 3, generator=generator).to(scales.device) * scales
         positions = explicit.positions[twice] + rotate(quats, offsets)
 
-        # The neural part stays as it is, so the explicit logit alone must bring the shrinking about.
+        # The neural part does not change, so the explicit logit alone must shrink the Gaussian.
         old = explicit.scale_logits[twice]
         if model.config.scale_rule == "sum":
             fraction = scales / bounds[twice]
@@ -183,12 +193,12 @@ class DensityControl:
         }
 
     def state_dict(self) -> dict[str, Tensor]:
-        """What was collected."""
-        return {name: getattr(self, name) for name in COLLECTED}
+        """Return the sums observed so far, by name."""
+        return {name: getattr(self, name) for name in STATE_NAMES}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """The inverse of `state_dict`."""
-        for name in COLLECTED:
+        """Restore what `state_dict` returned."""
+        for name in STATE_NAMES:
             setattr(self, name, state[name].to(self.device))
 
     @torch.no_grad()
@@ -201,9 +211,12 @@ class DensityControl:
 
 
 def _dimmed(explicit: Gaussians, geometry: Geometry, parents: Tensor) -> Tensor:
-    """(n, 1) opacity logits by which two let through what each parent does, 1 - sqrt(1 - o), but FAINT ones stay."""
+    """Return opacity logits (n, 1) with which two Gaussians transmit as much light as their parent.
+
+    The opacity o of the parent becomes 1 - sqrt(1 - o), but not less than `MIN_HALVED_OPACITY` if o is not less.
+    """
     old = geometry.opacities[parents, None].double()
-    new = torch.maximum(1 - (1 - old).sqrt(), old.clamp_max(FAINT))
+    new = torch.maximum(1 - (1 - old).sqrt(), old.clamp_max(MIN_HALVED_OPACITY))
     return explicit.opacity_logits[parents] + logit(new) - logit(old)
 
 

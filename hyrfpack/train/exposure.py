@@ -1,7 +1,8 @@
-"""Exposure and white balance of each training photo: estimated from tracks, learnt beside the model, left out of it.
+"""Per-image gains: exposure and white balance of each training photo, learnt beside the model.
 
-A photo is taken to be the picture that the model renders, exposed by gains of three channels (`evaluate.exposure`). The
-mean of their logarithms over all training photos is zero, so that the model has the photos' mean exposure.
+The gains are initialised from the colours of tracked points. A training photo is compared with the render exposed by
+the photo's three gains (`hyrfpack.model.exposure.expose`). The mean of the log gains over all training photos is zero,
+so that the model has the photos' mean exposure.
 """
 
 from __future__ import annotations
@@ -27,17 +28,19 @@ from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.exposure_map import ExposureFit, fit_exposure_map
 
-PULL = 1e-4  # towards gains of one: the gradient of a gain's logarithm, for each unit of it
-LONGEST = 500  # tracks of a photo that are looked at, the longest ones
-REACH = 2  # pixels around a point whose mean is its colour in a photo
-USABLE = 8, 247  # of 255, that every pixel of it lies between
-LEAST = 10  # usable points, of a photo whose gains are told
-ROUNDS = 10  # of reweighting
-CAUCHY = 2.385  # standard deviations at which an observation counts half; 95 % efficient for normal errors
-DAMPING = 0.01  # observations of gains of one that each photo gets: they hold what nothing else determines
-MIN_SHARED_POINTS = (
-    10  # of two photos whose exposures are compared: a few glossy points must not set a whole group apart
-)
+GAIN_DECAY = 1e-4  # weight decay of log gains: added to the gradient, for each unit of log gain
+MAX_TRACKS_PER_PHOTO = 500  # the longest ones
+COLOR_WINDOW_RADIUS_PIXELS = 2  # A point's colour in a photo is the mean of a square window around it.
+MIN_PIXEL_LEVEL, MAX_PIXEL_LEVEL = 8, 247  # A window with a level outside these is nearly black or clipped.
+MIN_POINTS_PER_PHOTO = 10  # A photo with fewer usable points starts with gains of one.
+REWEIGHTING_ROUNDS = 10
+# Scale of the Cauchy weights in standard deviations: an error of this size counts half. The estimate is 95 % efficient
+# for normal errors.
+CAUCHY_SCALE = 2.385
+# Each photo gets this many virtual observations of gains of one, which determine what no track determines.
+PRIOR_OBSERVATIONS = 0.01
+# Two photos with fewer points in common are not compared, so that a few glossy points cannot shift a whole group.
+MIN_SHARED_POINTS = 10
 
 
 @dataclass(frozen=True)
@@ -55,10 +58,13 @@ class Observations:
 
 
 def observe(scene: Scene, cache: PictureCache) -> Observations:
-    """Colours that the training photos show where their tracks have points; each photo is read once.
+    """Measure the colours of tracked points in the training photos, reading each photo once.
 
-    Left out: what lies near the border, masked, transparent, nearly black or white, and points that no other photo
-    sees; of each photo the longest tracks count.
+    Windows that leave the photo or are masked, transparent, nearly black or nearly white are left out, and points that
+    only one photo sees.
+
+    Raises:
+        HyrfDataError: a photo cannot be read.
     """
     seen = {view.name: scene.tracks.get(view.name, np.zeros(0, np.int64)) for view in scene.train}
     lengths = sum((np.bincount(rows, minlength=len(scene.points)) for rows in seen.values()), np.zeros(1, np.int64))
@@ -67,7 +73,7 @@ def observe(scene: Scene, cache: PictureCache) -> Observations:
         numbers = {view.name: number for number, view in enumerate(scene.train)}
         for view, picture in pictures:
             rows = seen[view.name][lengths[seen[view.name]] > 1]
-            rows = rows[np.argsort(-lengths[rows], kind="stable")[:LONGEST]]
+            rows = rows[np.argsort(-lengths[rows], kind="stable")[:MAX_TRACKS_PER_PHOTO]]
             usable, logits = _colors(picture, view.camera, scene.points[rows])
             parts.append((np.full(len(logits), numbers[view.name]), rows[usable], logits))
     if not parts:
@@ -78,17 +84,17 @@ def observe(scene: Scene, cache: PictureCache) -> Observations:
 
 
 def _colors(picture: Picture, camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which of the points (M, 3) can be used, and the logits of their colours."""
+    """Return which of the points (M, 3) are usable, (M,) bool, and the logits of the usable ones' colours."""
     x, y, z = (points @ camera.rotation.T + camera.camera_from_world[:3, 3]).T
     with np.errstate(divide="ignore", invalid="ignore"):
         column, row = np.floor(camera.fx * x / z + camera.cx), np.floor(camera.fy * y / z + camera.cy)
-    inside = (z > 0) & (column >= REACH) & (column < camera.width - REACH)
-    inside &= (row >= REACH) & (row < camera.height - REACH)
-    around = np.arange(-REACH, REACH + 1)
+    inside = (z > 0) & (column >= COLOR_WINDOW_RADIUS_PIXELS) & (column < camera.width - COLOR_WINDOW_RADIUS_PIXELS)
+    inside &= (row >= COLOR_WINDOW_RADIUS_PIXELS) & (row < camera.height - COLOR_WINDOW_RADIUS_PIXELS)
+    around = np.arange(-COLOR_WINDOW_RADIUS_PIXELS, COLOR_WINDOW_RADIUS_PIXELS + 1)
     rows = row[inside].astype(np.int64)[:, None, None] + around[:, None]
     columns = column[inside].astype(np.int64)[:, None, None] + around
     rgb = picture.rgb[rows, columns]
-    good = ((rgb >= USABLE[0]) & (rgb <= USABLE[1])).all(axis=(1, 2, 3))
+    good = ((rgb >= MIN_PIXEL_LEVEL) & (rgb <= MAX_PIXEL_LEVEL)).all(axis=(1, 2, 3))
     for counted in (picture.mask, None if picture.alpha is None else picture.alpha == 255):
         if counted is not None:
             good &= counted[rows, columns].all(axis=(1, 2))
@@ -99,45 +105,47 @@ def _colors(picture: Picture, camera: Camera, points: np.ndarray) -> tuple[np.nd
 
 
 def gains_from(observed: Observations, photos: int) -> np.ndarray:
-    """Logarithms of each photo's gains, (photos, 3), with a mean of zero over those that anything is known of.
+    """Estimate each photo's log gains, (photos, 3), from the colours of shared points.
 
-    A point has one colour, and a photo shows it exposed by the photo's gains g:
+    Photo i shows point p with the point's colour, exposed by the photo's gains g:
 
         logit y_ip = log g_i + c_p + e        weighted least squares over log g and c
 
-    with weights 1 / (1 + (|e| / 2.385 s)^2), iterated, and s the standard deviation of the rest by its median, so that
-    occlusions and highlights hardly count. For given weights the best c_p is a mean, which leaves a sparse system of
-    the gains, solved by conjugate gradients. Photos that fewer than LEAST points tell of get 0. Groups of photos
-    that no two photos with MIN_SHARED_POINTS points in common connect are not compared: each keeps a mean near 0.
+    The weights 1 / (1 + (|e| / 2.385 s)^2) are iterated, where s is the standard deviation of the residuals estimated
+    from their median, so that occlusions and highlights hardly count. For given weights the best c_p is a weighted
+    mean. That leaves a sparse linear system for the gains, which conjugate gradients solve. The mean log gain of all
+    photos with at least `MIN_POINTS_PER_PHOTO` points is 0; the other photos get 0. Groups of photos that are not
+    connected by pairs with `MIN_SHARED_POINTS` common points are not compared: each group keeps a mean near 0.
     """
     gains = np.zeros((photos, 3))
-    known = np.bincount(observed.photo, minlength=photos) >= LEAST
+    known = np.bincount(observed.photo, minlength=photos) >= MIN_POINTS_PER_PHOTO
     if not known.any():
         return gains
     photo, logits = observed.photo, observed.logits
     point = _points_of_groups(observed, photos)
     weights = np.ones(len(photo))
-    for _ in range(ROUNDS):
+    for _ in range(REWEIGHTING_ROUNDS):
         shares = csr_array((weights, (point, photo)), shape=(point.max() + 1, photos))
-        total, held = shares.sum(1), shares.sum(0) + DAMPING
-        system = diags_array(held) - shares.T @ diags_array(1 / total) @ shares
+        point_weights, photo_weights = shares.sum(1), shares.sum(0) + PRIOR_OBSERVATIONS
+        system = diags_array(photo_weights) - shares.T @ diags_array(1 / point_weights) @ shares
         errors = np.empty_like(logits)
         for channel, logit in enumerate(logits.T):
             rest = logit - _means(point, weights, logit)[point]
-            told = np.bincount(photo, weights * rest, minlength=photos)
-            gains[:, channel], _ = cg(system, told, gains[:, channel], rtol=1e-6, M=diags_array(1 / held))
+            right = np.bincount(photo, weights * rest, minlength=photos)
+            preconditioner = diags_array(1 / photo_weights)
+            gains[:, channel], _ = cg(system, right, gains[:, channel], rtol=1e-6, M=preconditioner)
             rest = logit - gains[photo, channel]
             errors[:, channel] = rest - _means(point, weights, rest)[point]
         size = np.sqrt((errors**2).mean(1))
         spread = max(1.4826 * float(np.median(size)), 1e-4)
-        weights = 1 / (1 + (size / (CAUCHY * spread)) ** 2)
+        weights = 1 / (1 + (size / (CAUCHY_SCALE * spread)) ** 2)
     gains[~known] = 0
     gains[known] -= gains[known].mean(0)
     return gains
 
 
 def _points_of_groups(observed: Observations, photos: int) -> np.ndarray:
-    """(K,) rows of points, where a point that several groups of photos see is another one in each of them."""
+    """Return point rows (K,) in which a point that several groups of photos see has one row for each group."""
     _, point = np.unique(observed.point, return_inverse=True)
     sees = csr_array((np.ones(len(point)), (observed.photo, point)), shape=(photos, point.max() + 1))
     _, group = connected_components((sees @ sees.T) >= MIN_SHARED_POINTS, directed=False)
@@ -146,47 +154,46 @@ def _points_of_groups(observed: Observations, photos: int) -> np.ndarray:
 
 
 def _means(group: np.ndarray, weights: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """The weighted mean of each group's values."""
+    """Return the weighted mean of each group's values."""
     return np.bincount(group, weights * values) / np.bincount(group, weights)
 
 
 class Exposures:
-    """The gains of each training photo and Adam's state of them.
+    """Holds the gains of each training photo and their Adam state.
 
     Attributes:
-        values: (N, 3) logarithms of the gains, in the order of the views, of mean zero over these.
+        values: (N, 3) log gains, in the order of the views, with mean zero.
     """
 
     def __init__(self, views: Sequence[View], gains: np.ndarray, device: torch.device) -> None:
-        """Args: gains: (N, 3) logarithms to start from."""
+        """Start from `gains`, (N, 3) log gains."""
         self._row = {view.name: row for row, view in enumerate(views)}
         self.values = nn.Parameter(torch.from_numpy(gains - gains.mean(0)).float().to(device))
         self._exp_avg, self._exp_avg_sq = torch.zeros_like(self.values), torch.zeros_like(self.values)
         self._steps = [0] * len(views)
 
     def exposed(self, rgb: Tensor, view: View) -> Tensor:
-        """A render (H, W, 3) as the view's photo was exposed; differentiable."""
+        """Expose a render (H, W, 3) like the view's photo; differentiable."""
         return apply_exposure_gains(rgb, self.values[self._row[view.name]].exp())
 
     def fit_map(self, frame: Frame, views: Sequence[View]) -> ExposureFit:
-        """Fit the exposure map of the views' gains; `views` as at the start, `frame` that of the model."""
+        """Fit an exposure map to the gains; `views` as given at the start, `frame` the model's."""
         poses = [frame.local_pose(view.camera) for view in views]
         return fit_exposure_map(poses, self.values.detach().cpu().numpy())
 
     @torch.no_grad()
     def step(self, rate: float, views: Iterable[View]) -> Tensor:
-        """One step of Adam for the photos of these views, by the gradients of `values`, which are cleared; then the
-        mean of all is taken off.
+        """Take one Adam step for the photos of these views, clear the gradients, and subtract the mean of all gains.
 
         Returns:
-            Bool scalar on the device: whether a gradient was not finite, whose gain took no step. Nothing waits for
-            the device.
+            Bool scalar on the device: whether a gradient was not finite. Its gain takes no step. The host does not wait
+            for the device.
         """
         assert self.values.grad is not None
         rows = sorted({self._row[view.name] for view in views})
         for row in rows:
             self._steps[row] += 1
-        gradients = [self.values.grad[row] + PULL * self.values[row] for row in rows]
+        gradients = [self.values.grad[row] + GAIN_DECAY * self.values[row] for row in rows]
         values, *moments = ([tensor[row] for row in rows] for tensor in (self.values, self._exp_avg, self._exp_avg_sq))
         broken = adam_step(values, gradients, *moments, step=[self._steps[row] for row in rows], rate=rate).any()
         self.values.grad = None
@@ -194,7 +201,7 @@ class Exposures:
         return broken
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Gains, moments and step counts."""
+        """Return gains, Adam moments and step counts."""
         return {
             "values": self.values.detach(),
             "exp_avg": self._exp_avg,
@@ -203,7 +210,7 @@ class Exposures:
         }
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """The inverse of `state_dict`; the views must be those of then."""
+        """Restore what `state_dict` returned for the same views."""
         device = self.values.device
         values, self._exp_avg, self._exp_avg_sq = (
             state[name].to(device).clone() for name in ("values", "exp_avg", "exp_avg_sq")
@@ -213,7 +220,7 @@ class Exposures:
 
 
 def exposure_spread(scene: Scene, cache: PictureCache) -> float:
-    """Standard deviation of the training photos' exposures by their tracks, stops; 0 where no tracks tell.
+    """Estimate the standard deviation of the training photos' exposures in stops, from their tracks; 0 without tracks.
 
     Raises:
         HyrfDataError: a photo cannot be read.

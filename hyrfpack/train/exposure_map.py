@@ -20,9 +20,9 @@ from hyrfpack.model.exposure import (
 
 # The kernel's lengths and the ridge that are tried: position in root mean square distances of the cameras from their
 # mean, direction as an angle in degrees, ridge as the variance of noise relative to that of the gains.
-POSITION_LENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)
-DIRECTION_ANGLES = (15.0, 30.0, 60.0, 120.0)
-RIDGES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
+POSITION_LENGTHS_RADII = (0.25, 0.5, 1.0, 2.0, 4.0)
+DIRECTION_LENGTHS_DEGREES = (15.0, 30.0, 60.0, 120.0)
+RIDGE_VARIANCES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 MAX_SLOPE_PER_DEGREE = 0.15  # change of a log gain for each degree of viewing angle, by its bound
 MAX_SLOPE_PER_RADIUS = 20.0  # and for each root mean square distance of the cameras from their mean
 MIN_CENTER_VARIANCE_RIDGES = 0.1  # of a centre given those before it: with less, it is left out
@@ -60,11 +60,11 @@ def fit_exposure_map(poses: Sequence[np.ndarray], log_gains: np.ndarray) -> Expo
     directions = matrices[:, 2, :3]
     radius = float(np.sqrt(np.square(positions - positions.mean(0)).sum(1).mean())) or 1.0
     candidates = []
-    for length, angle in product(POSITION_LENGTHS, DIRECTION_ANGLES):
+    for length, angle in product(POSITION_LENGTHS_RADII, DIRECTION_LENGTHS_DEGREES):
         lengths = np.array([length * radius, 2 * np.sin(np.radians(angle) / 2)], np.float32)
         features = np.concatenate((positions / lengths[0], directions / lengths[1]), 1)
         centers, factor, variances = choose_centers(features)
-        for ridge in RIDGES:
+        for ridge in RIDGE_VARIANCES:
             count = int((variances >= MIN_CENTER_VARIANCE_RIDGES * ridge).sum())  # they fall
             error = leave_one_out_error(factor[:, :count], gains, ridge)
             candidates.append((error, lengths, centers[:count], ridge))
@@ -115,7 +115,7 @@ def choose_centers(features: np.ndarray) -> tuple[list[int], np.ndarray, np.ndar
     variances: list[float] = []
     while len(centers) < min(MAX_CENTERS, len(features)):
         row = int(residual.argmax())
-        if residual[row] < MIN_CENTER_VARIANCE_RIDGES * RIDGES[0]:
+        if residual[row] < MIN_CENTER_VARIANCE_RIDGES * RIDGE_VARIANCES[0]:
             break
         column = (inverse_quadratic_kernel(features, features[row : row + 1])[:, 0] - factor @ factor[row]) / np.sqrt(
             residual[row]

@@ -1,4 +1,4 @@
-"""A training run told to programs: one line of JSON a record, and scalars for TensorBoard where it is installed."""
+"""The training log for programs: one line of JSON for each record, and TensorBoard scalars where it is installed."""
 
 from __future__ import annotations
 
@@ -21,25 +21,27 @@ from hyrfpack.evaluate.metrics import psnr_from_mse
 from hyrfpack.train.progress import Pace
 from hyrfpack.train.trainer import is_recorded
 
-LONGEST = 10.0  # seconds between two records, at most
-SCALARS = ("loss", "psnr", "gaussians", "steps_per_second", "memory_bytes", "gpu_memory_bytes")
+MAX_RECORD_INTERVAL_SECONDS = 10.0
+SCALAR_NAMES = ("loss", "psnr", "gaussians", "steps_per_second", "memory_bytes", "gpu_memory_bytes")
 
 
 class TrainingLog:
-    """Writes records of a run to a file as they come, each at once: whoever reads it sees the run as it is.
+    """Writes the records of a run to a file, each one as soon as it is known.
 
-    Each line is an object with "event": "step" (where `is_recorded` says so, every LONGEST seconds), or "end" (where
-    "complete" says whether it is, "error" why not). That of a step has
+    Each line is a JSON object with the key "event". Its value is "step" for a step of which `is_recorded` is true, and
+    for the first step that ends `MAX_RECORD_INTERVAL_SECONDS` after the last record. Its value is "end" for the end of
+    the run, where "complete" tells whether the run is complete, and "error" why it failed. A step has
 
         step, steps         taken and to be taken
-        loss, psnr          means over the steps since the record before; dB; null where masks left nothing of them
+        loss, psnr          means over the steps since the last record, psnr in dB; null where masks left no pixel
         gaussians           of the model
-        memory_bytes        the most that the process has had so far; null where the system does not tell
+        memory_bytes        peak memory of the process so far; null where the system does not tell it
         gpu_memory_bytes    the same of the GPU; null on a CPU
-        steps_per_second    lately
-        seconds, seconds_left   since training began or was gone on with, and to go, about
+        steps_per_second    current speed
+        seconds             since training started or was resumed
+        seconds_left        estimated
 
-    A file that can no longer be written, as on a full disk, ends the log and not the run.
+    If the file can no longer be written, as on a full disk, the log ends and the run continues.
     """
 
     def __init__(
@@ -51,9 +53,9 @@ class TrainingLog:
         warn: Callable[[str], None] = warnings.warn,
         overwrite: bool = True,
     ) -> None:
-        """Begin a log, or go on with one where steps are done already; TensorBoard's files go to a folder of its name.
+        """Start a log, or continue one if steps are done already. TensorBoard's files go to a folder of its name.
 
-        Without `overwrite`, a file that is there when a log begins is kept, and the log takes a free name beside it.
+        Without `overwrite`, an existing file is kept when a log starts, and the log gets a free name beside it.
 
         Raises:
             HyrfError: the file cannot be written.
@@ -77,13 +79,13 @@ class TrainingLog:
         self.scalars = _summary_writer(self.path)
 
     def step(self, step: int, loss: float, mse: float, gaussians: int) -> None:
-        """Take in one finished step."""
+        """Add one finished step."""
         now = time.monotonic()
         speed, left = self.pace.at(step, now)
         if mse == mse:  # not all of the photo is masked
             self.losses.append(loss)
             self.errors.append(mse)
-        if not (is_recorded(step, self.steps) or now - self.last >= LONGEST):
+        if not (is_recorded(step, self.steps) or now - self.last >= MAX_RECORD_INTERVAL_SECONDS):
             return
         count = len(self.errors)
         record = {
@@ -104,12 +106,12 @@ class TrainingLog:
         self.errors.clear()
         self._write(record)
         if self.scalars is not None:
-            for name in SCALARS:
+            for name in SCALAR_NAMES:
                 if record[name] is not None:
                     self.scalars.add_scalar(f"train/{name}", record[name], step)
 
     def end(self, *, complete: bool, step: int, **facts: Any) -> None:
-        """Write the last record: whether the run is complete, and what it came to."""
+        """Write the last record: whether the run is complete, and facts about the result."""
         self._write({"event": "end", "complete": complete, "step": step, **facts})
         if self.scalars is not None:
             for name, value in facts.items():
@@ -136,7 +138,7 @@ class TrainingLog:
             self.file.flush()
         except OSError as error:
             self.warn(f"{self.path}: the log cannot be written ({error.strerror}); training goes on without it")
-            with suppress(OSError):  # it tries once more to write what is left
+            with suppress(OSError):  # closing tries to write the rest once more
                 self.file.close()
 
 
@@ -149,7 +151,7 @@ def _open_new(path: Path) -> TextIO:
 
 
 def peak_memory() -> int | None:
-    """The most memory in bytes that this process has had so far; None where the system does not tell.
+    """Return the peak memory of this process in bytes; None where the system does not tell it.
 
     Example:
         >>> peak_memory() is None or peak_memory() > 1_000_000
@@ -163,7 +165,7 @@ def peak_memory() -> int | None:
 
 
 def _short(value: Any) -> Any:
-    """A number, of six digits."""
+    """Round a float to six significant digits."""
     return float(f"{value:.6g}") if isinstance(value, float) else value
 
 

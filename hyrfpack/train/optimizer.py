@@ -1,4 +1,4 @@
-"""Adam over a HybridModel whose Gaussians come and go."""
+"""Adam for a HybridModel to which density control adds and removes Gaussians."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.adam import adam_step
 from hyrfpack.train.config import LearningRates
 
-MOMENTS = ("exp_avg", "exp_avg_sq")
-BETAS = 0.9, 0.999
+MOMENT_NAMES = ("exp_avg", "exp_avg_sq")
+ADAM_BETAS = 0.9, 0.999
 
 
 @dataclass
 class _State:
-    """What Adam keeps of one parameter: running means of gradients and of their squares, and the steps taken."""
+    """Adam's state of one parameter: running means of gradients and of squared gradients, and the steps taken."""
 
     exp_avg: Tensor
     exp_avg_sq: Tensor
@@ -29,33 +29,33 @@ class _State:
 class Optimizer:
     """Adam (betas 0.9, 0.999, eps 1e-15) with one group for each kind of Gaussian property and one for the fields.
 
-    Where a step takes the mean gradient of W views, its means run over as many views as with one: b becomes
-    1 - W (1 - b).
+    If a step uses the mean gradient of W views, each beta b becomes 1 - W (1 - b), so that the running means cover as
+    many views as with one view a step.
 
     Attributes:
         groups: parameters by the group's name, which is that of its learning rate.
     """
 
     def __init__(self, model: HybridModel, rates: LearningRates, views: int = 1) -> None:
-        """Args: views: W."""
+        """Start without any state; `views` is W, the views of each step."""
         self.model = model
         self.rates = rates
         self.views = views
-        first, second = (beta if views == 1 else max(0.0, 1 - views * (1 - beta)) for beta in BETAS)
+        first, second = (beta if views == 1 else max(0.0, 1 - views * (1 - beta)) for beta in ADAM_BETAS)
         self.betas = first, second
         self.groups: dict[str, list[nn.Parameter]] = {
             name: [getattr(model.gaussians, name)] for name in Gaussians.PARAMETER_NAMES
         }
         self.groups["fields"] = [*model.geometry.parameters(), *model.radiance.parameters()]
         self._states: dict[nn.Parameter, _State] = {}
-        self._stepped: list[str] = []  # groups of the parameters that the last step was of
+        self._stepped: list[str] = []  # group of each parameter in the last step
 
     def step(self, step: int, steps: int) -> Tensor:
         """Take one step with the learning rates due at `step` (from 0) of `steps`, and clear the gradients.
 
         Returns:
             (tensors,) float32 on the model's device, for `names`: not 0 for a parameter with gradients that are not
-            finite; these numbers took no step. Nothing waits for the device.
+            finite. Elements with such gradients take no step. The host does not wait for the device.
         """
         stepped = [(name, p) for name, group in self.groups.items() for p in group if p.grad is not None]
         self._stepped = [name for name, _ in stepped]
@@ -81,7 +81,7 @@ class Optimizer:
         return broken.float()
 
     def names(self, broken: Sequence[float]) -> list[str]:
-        """The groups that the last `step` found broken."""
+        """Return the names of the groups that the last `step` flagged as broken."""
         return list(dict.fromkeys(name for name, flag in zip(self._stepped, broken, strict=True) if flag))
 
     def replace_gaussians(self, keep: Tensor, new: dict[str, Tensor]) -> None:
@@ -98,7 +98,7 @@ class Optimizer:
             edit(name, new[name])
 
     def reset(self, name: str, values: Tensor) -> None:
-        """Set one kind of Gaussian property and forget its moments."""
+        """Set one kind of Gaussian property and reset its moments to zero."""
         self._edit(name, lambda _: values, torch.zeros_like)
 
     def _edit(self, name: str, values: Callable[[Tensor], Tensor], moments: Callable[[Tensor], Tensor]) -> None:
@@ -106,25 +106,27 @@ class Optimizer:
         new = nn.Parameter(values(old.detach()).contiguous())
         state = self._states.pop(old, None)
         if state is not None:
-            exp_avg, exp_avg_sq = (moments(getattr(state, moment)).contiguous() for moment in MOMENTS)
+            exp_avg, exp_avg_sq = (moments(getattr(state, moment)).contiguous() for moment in MOMENT_NAMES)
             self._states[new] = _State(exp_avg, exp_avg_sq, state.step)
         self.groups[name] = [new]
         setattr(self.model.gaussians, name, new)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Moments and step counts, tensors only, by group and position."""
+        """Return moments and step counts as tensors, by group and position."""
         return {
             f"{name}.{i}.{key}": torch.as_tensor(getattr(self._states[parameter], key))
             for name, parameters in self.groups.items()
             for i, parameter in enumerate(parameters)
             if parameter in self._states
-            for key in (*MOMENTS, "step")
+            for key in (*MOMENT_NAMES, "step")
         }
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """The inverse of `state_dict`; the parameters must have the shapes they had then."""
+        """Restore what `state_dict` returned for parameters of the same shapes."""
         for name, parameters in self.groups.items():
             for i, parameter in enumerate(parameters):
                 if (step := state.get(f"{name}.{i}.step")) is not None:
-                    first, second = (state[f"{name}.{i}.{moment}"].to(parameter.device).clone() for moment in MOMENTS)
+                    first, second = (
+                        state[f"{name}.{i}.{moment}"].to(parameter.device).clone() for moment in MOMENT_NAMES
+                    )
                     self._states[parameter] = _State(first, second, int(step))

@@ -1,4 +1,4 @@
-"""The live line of a training run, and of what comes before its first and after its last step."""
+"""The progress line of a training run, and of the work before its first and after its last step."""
 
 from __future__ import annotations
 
@@ -15,22 +15,27 @@ from rich.text import Text
 
 from hyrfpack.evaluate.metrics import psnr_from_mse
 
-SMOOTHING = 0.05  # weight of the newest step in the running means
-LOG_EVERY = 15.0  # seconds between lines when standard error is not a terminal
-FIRST_PHASE_LOG_SECONDS = 2.0  # a phase that takes longer than this gets a line there
-MIN_ETA_SECONDS = 1.0  # a phase shows no remaining time below this, nor before it has taken as long
-COLD_STEPS = 2  # in which kernels are compiled: they say nothing of the speed
-FAIR_STEPS, FAIR_SECONDS = 3, 10.0  # from which on the speed is known well enough to speak of hours
-LONG = 3600.0  # seconds left, from which on it is told what would make them fewer
-BAR = 8, 24  # columns, at least and at most
-DROPPED = ("gaussians", "loss", "gone", "speed", "psnr", "left")  # where a terminal is narrow, the first ones first
+RUNNING_MEAN_WEIGHT = 0.05  # of the newest step
+LOG_INTERVAL_SECONDS = 15.0  # between lines when standard error is not a terminal
+FIRST_PHASE_LOG_SECONDS = 2.0  # There, a phase that takes longer than this gets a line.
+MIN_ETA_SECONDS = 1.0  # A phase shows no remaining time below this, nor before it has taken as long.
+COMPILATION_STEPS = 2  # The first steps compile kernels, so that they do not count for the speed.
+# Advice to shorten the run is given once its speed was measured over so many steps and seconds, if so much
+# time is left.
+MIN_ADVICE_STEPS = 3
+MIN_ADVICE_SECONDS = 10.0
+MIN_ADVICE_SECONDS_LEFT = 3600.0
+MIN_BAR_COLUMNS, MAX_BAR_COLUMNS = 8, 24
+# Parts that a narrow terminal leaves out, the least important ones first.
+OPTIONAL_PARTS = ("gaussians", "loss", "gone", "speed", "psnr", "left")
 
 
 class Pace:
-    """How fast steps are taken, by what was measured since the kernels are compiled.
+    """Measures the speed of a run since its kernels were compiled.
 
     Attributes:
-        warm, warm_step: when that was, and after which step.
+        warm: time of the monotonic clock when they were compiled.
+        warm_step: the step after which they were compiled.
     """
 
     def __init__(self, steps: int, done: int) -> None:
@@ -38,10 +43,10 @@ class Pace:
         self.start = self.warm = monotonic()
 
     def at(self, step: int, now: float) -> tuple[float, float]:
-        """Steps a second and seconds left after this step, taken `now`."""
+        """Return steps per second and seconds left after this step, which was finished at the time `now`."""
         since, taken = (self.warm, self.warm_step) if step > self.warm_step else (self.start, self.first)
         speed = max(step - taken, 1) / max(now - since, 1e-9)
-        if step - self.first <= COLD_STEPS:
+        if step - self.first <= COMPILATION_STEPS:
             self.warm, self.warm_step = now, step
         return speed, (self.steps - step) / speed
 
@@ -49,13 +54,17 @@ class Pace:
 class ProgressLine:
     """Shows step, steps/s, loss, PSNR, Gaussians and time left on standard error.
 
-    On a terminal one line that is redrawn and always fits; elsewhere (a log file) a plain line every few seconds.
-    Where there is no standard error, nothing; and one that goes away does not end the training.
+    A terminal shows one line that is redrawn and always fits. Elsewhere, as in a log file, a plain line is printed
+    every few seconds. A missing or closed standard error does not end the training.
     """
 
     def __init__(self, steps: int, done: int, quiet: bool = False, advice: str = "") -> None:
-        """Args: quiet: show nothing; advice: what would shorten the run ("fewer --steps or a GPU"), told once where
-        more than an hour is left; without it, nothing is."""
+        """Start at step `done` of `steps`.
+
+        Args:
+            quiet: show nothing.
+            advice: what would shorten the run ("fewer steps or a GPU"), shown once if more than an hour is left.
+        """
         self.steps = steps
         self.start = self.last_log = monotonic()
         self.pace = Pace(steps, done)
@@ -78,7 +87,7 @@ class ProgressLine:
                 self.live.stop()
 
     def note(self, sentence: str) -> None:
-        """Tell the person something between the steps."""
+        """Print a sentence above the line."""
         if self.live:
             with suppress(OSError, ValueError):
                 self.live.console.print(sentence, markup=False, highlight=False)
@@ -86,9 +95,9 @@ class ProgressLine:
             _print(sentence)
 
     def update(self, step: int, loss: float, mse: float, gaussians: int) -> None:
-        """Take in one finished step."""
+        """Show one finished step."""
         if not math.isnan(mse):
-            weight = SMOOTHING if self.loss is not None else 1.0
+            weight = RUNNING_MEAN_WEIGHT if self.loss is not None else 1.0
             self.loss = loss * weight + (self.loss or 0) * (1 - weight)
             self.mse = mse * weight + (self.mse or 0) * (1 - weight)
         now = monotonic()
@@ -96,7 +105,7 @@ class ProgressLine:
         if self.quiet or self.loss is None or self.mse is None:
             return
         self._advise(step, now, left)
-        due = self.live is not None or now - self.last_log >= LOG_EVERY or step == self.steps
+        due = self.live is not None or now - self.last_log >= LOG_INTERVAL_SECONDS or step == self.steps
         if not due:
             return
         parts = {
@@ -117,21 +126,23 @@ class ProgressLine:
             _print("step " + "  ".join(parts.values()))
 
     def _advise(self, step: int, now: float, left: float) -> None:
-        fair = step - self.pace.warm_step >= FAIR_STEPS and now - self.pace.warm >= FAIR_SECONDS
-        if self.advice and fair and left > LONG:
+        steps, seconds = step - self.pace.warm_step, now - self.pace.warm
+        is_speed_known = steps >= MIN_ADVICE_STEPS and seconds >= MIN_ADVICE_SECONDS
+        if self.advice and is_speed_known and left > MIN_ADVICE_SECONDS_LEFT:
             self.note(f"this takes {left / 3600:.1f} more hours; {self.advice} would shorten it")
             self.advice = ""
 
 
 class PhaseLine:
-    """Shows work other than training steps on standard error: what is done, how far it is, and the time gone and left.
+    """Shows work other than training steps on standard error, with its progress, elapsed and remaining time.
 
-    On a terminal one line, which is removed at the end; elsewhere a plain line where a phase takes longer, and then
-    every few seconds. The clock runs on between two updates. Where there is no standard error, nothing.
+    A terminal shows one line, which is removed at the end. Elsewhere a plain line is printed for a phase of more than
+    `FIRST_PHASE_LOG_SECONDS`, and then every `LOG_INTERVAL_SECONDS`. The elapsed time is kept current between two
+    updates. A missing or closed standard error is ignored.
     """
 
     def __init__(self, quiet: bool = False) -> None:
-        """Args: quiet: show nothing."""
+        """Start without a phase; `quiet` shows nothing."""
         self.quiet = quiet or sys.stderr is None
         self.what, self.done, self.total = "", 0, 0
         self.start = monotonic()
@@ -156,7 +167,7 @@ class PhaseLine:
             self._logger.join()
 
     def note(self, sentence: str) -> None:
-        """Tell the person something that stays."""
+        """Print a sentence that stays."""
         if self.live:
             with suppress(OSError, ValueError):
                 self.live.console.print(sentence, markup=False, highlight=False)
@@ -164,11 +175,11 @@ class PhaseLine:
             _print(sentence)
 
     def update(self, what: str, done: int, total: int) -> None:
-        """Take in how far the work is.
+        """Show progress.
 
         Args:
-            what: is done; a new text begins a new phase.
-            done, total: items of it; a total of 0 says that nobody knows.
+            what: the work; another text starts a new phase.
+            done, total: items; a total of 0 means that it is not known.
         """
         if what != self.what:
             self.start = monotonic()
@@ -179,7 +190,7 @@ class PhaseLine:
             yield StatusLine(parts, self.done / self.total if self.total else 0.0, ("gone", "left", "count"))
 
     def parts(self, now: float) -> dict[str, str]:
-        """What is known at a time of the monotonic clock, by name in the order of reading."""
+        """Return the parts of the line at a time of the monotonic clock, by name in reading order."""
         if not self.what:
             return {}
         gone = now - self.start
@@ -193,18 +204,22 @@ class PhaseLine:
         return parts
 
     def _log(self) -> None:
-        """Print a line where one is due, until it is over."""
-        printed: tuple[float, float] = (-1.0, 0.0)  # the start of the phase that the last line was about, and when
+        """Print lines when they are due, until the end."""
+        printed: tuple[float, float] = (-1.0, 0.0)  # start of the phase in the last line, and time of that line
         while not self._over.wait(0.25):
             now, start = monotonic(), self.start
-            due = FIRST_PHASE_LOG_SECONDS <= now - start if printed[0] != start else now - printed[1] >= LOG_EVERY
+            due = (
+                FIRST_PHASE_LOG_SECONDS <= now - start
+                if printed[0] != start
+                else now - printed[1] >= LOG_INTERVAL_SECONDS
+            )
             if due and (parts := self.parts(now)):
                 printed = start, now
                 _print("  ".join(parts.values()))
 
 
 def duration(seconds: float) -> str:
-    """Of 120 seconds and less as "60 s", of more as hours, minutes and seconds: "1:04:09"."""
+    """Format a duration: up to 120 seconds as "60 s", longer ones as hours, minutes and seconds, "1:04:09"."""
     whole = round(seconds)
     if whole <= 120:
         return f"{whole} s"
@@ -212,32 +227,32 @@ def duration(seconds: float) -> str:
 
 
 class StatusLine:
-    """What is known of long work, as one line of any terminal's width.
+    """The progress of long work as one line that fits any terminal width.
 
     Attributes:
-        parts: by name, in the order of reading; those that have no room are left out in the order of `dropped`.
-        share: of the run that is done, drawn as a bar where there is room for one.
+        parts: by name, in reading order; where the line is too long, parts are left out in the order of `optional`.
+        share: of the work that is done, drawn as a bar where there is room for one.
     """
 
-    def __init__(self, parts: dict[str, str], share: float, dropped: Sequence[str] = DROPPED) -> None:
-        self.parts, self.share, self.dropped = parts, share, dropped
+    def __init__(self, parts: dict[str, str], share: float, optional: Sequence[str] = OPTIONAL_PARTS) -> None:
+        self.parts, self.share, self.optional = parts, share, optional
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         words, width = dict(self.parts), options.max_width
-        for name in self.dropped:
+        for name in self.optional:
             if len("  ".join(words.values())) > width:
                 words.pop(name, None)
         steps, *others = words.values()
         line = Text(steps, no_wrap=True, overflow="crop")
-        room = min(width - len("  ".join(words.values())) - 2, BAR[1])
-        if room >= BAR[0]:
+        room = min(width - len("  ".join(words.values())) - 2, MAX_BAR_COLUMNS)
+        if room >= MIN_BAR_COLUMNS:
             done, mark = round(self.share * room), "-" if options.ascii_only else "\u2501"
             line.append("  ").append(mark * done, "bar.complete").append(mark * (room - done), "bar.back")
         yield line.append("".join(f"  {word}" for word in others))
 
 
 def _live_on_terminal(line: RenderableType, transient: bool = False) -> Live | None:
-    """A display that redraws a line on standard error; None where that is no terminal that can."""
+    """Return a display that redraws a line on standard error; None where that is no terminal that can."""
     if not sys.stderr.isatty():
         return None
     console = Console(stderr=True)
@@ -245,5 +260,5 @@ def _live_on_terminal(line: RenderableType, transient: bool = False) -> Live | N
 
 
 def _print(line: str) -> None:
-    with suppress(OSError, ValueError):  # a log file on a full disk or a closed one does not end the training
+    with suppress(OSError, ValueError):  # A log file that is closed or on a full disk must not end the training.
         print(line, file=sys.stderr, flush=True)

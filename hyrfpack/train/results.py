@@ -1,4 +1,4 @@
-"""What a finished run leaves: the model, then scores, pictures, the training curve and `metrics.json`.
+"""Files of a finished run: the model, then scores, pictures, the training curve and `metrics.json`.
 
 The model is written first. Everything else can be computed again from the model and the training record, a small file
 beside it that is removed when all results are there. So a full disk or an interruption after the last step costs no
@@ -35,11 +35,10 @@ from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.decisions import is_budget_open
 from hyrfpack.train.trainer import Trainer
 
-CURVE, VIEWS = "curve.png", "views"
-RECORD = "training.json"  # the training record
+CURVE_FILE, VIEWS_FOLDER, RECORD_FILE = "curve.png", "views", "training.json"
 RECORD_VERSION = 1
-BACKGROUND_SEEN = 1e-3  # a background that gets less than this share of the light is not there
-BACKGROUND_VIEWS = 16  # training views, at most, that decide whether the background is seen
+MIN_BACKGROUND_LIGHT_SHARE = 1e-3  # A background sphere that gives less of the light to all views is removed.
+MAX_BACKGROUND_VIEWS = 16  # training views that decide this
 
 Phase = Callable[[str, int, int], None]  # what is being done, items done, items in all (0: not known)
 
@@ -89,7 +88,7 @@ def read_record(out: Path) -> TrainingRecord | None:
         The record, or None where there is none, or it is damaged, or it belongs to another model.
     """
     try:
-        content = json.loads((out / RECORD).read_bytes())
+        content = json.loads((out / RECORD_FILE).read_bytes())
         if content.pop("version") != RECORD_VERSION:
             return None
         record = TrainingRecord(**content)
@@ -169,20 +168,24 @@ def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) ->
     record = TrainingRecord(MODEL_FILE, digest, trainer.step, _settings_of(scene, config), metrics)
     is_recorded = True
     try:
-        write_atomic(out / RECORD, record.encode())
+        write_atomic(out / RECORD_FILE, record.encode())
     except HyrfError:
         is_recorded = False
     try:
         name = Path(write_model(data, out / MODEL_FILE, overwrite=overwrite).file).name
     except HyrfError:
-        _remove(out / RECORD)
+        _remove(out / RECORD_FILE)
         raise
     if name != record.model:
         record = dataclasses.replace(record, model=name)
         with suppress(HyrfError):
-            write_atomic(out / RECORD, record.encode())
+            write_atomic(out / RECORD_FILE, record.encode())
     if overwrite:
-        for result in (METRICS_FILE, CURVE, *_picture_files(scene)):  # they would be taken for results of this model
+        for result in (
+            METRICS_FILE,
+            CURVE_FILE,
+            *_picture_files(scene),
+        ):  # they would be taken for results of this model
             _remove(out / result)
     if is_recorded and (overwrite or trainer.saved is not None):
         _remove(out / CHECKPOINT_FILE)  # which also frees space for the results
@@ -224,7 +227,7 @@ def write_results(
             scores = evaluate(
                 model,
                 scene.test,
-                pictures=out / VIEWS,
+                pictures=out / VIEWS_FOLDER,
                 overwrite=overwrite,
                 report=lambda _, share: phase("scoring held-out photos", round(share * photos), photos),
                 warn=unwritten.append,
@@ -234,13 +237,13 @@ def write_results(
             is_scored = False
             reasons.append(str(error))
         if unwritten or not is_scored:
-            missing.append(VIEWS)
+            missing.append(VIEWS_FOLDER)
             reasons += unwritten
-    phase(f"drawing {CURVE}", 0, 0)
+    phase(f"drawing {CURVE_FILE}", 0, 0)
     try:
-        draw_training_curve(metrics["curve"], out / CURVE, overwrite=overwrite)
+        draw_training_curve(metrics["curve"], out / CURVE_FILE, overwrite=overwrite)
     except HyrfError as error:
-        missing.append(CURVE)
+        missing.append(CURVE_FILE)
         reasons.append(str(error))
     try:
         if is_scored:
@@ -251,7 +254,7 @@ def write_results(
         missing.append(METRICS_FILE)
         reasons.append(str(error))
     if not missing:
-        _remove(out / RECORD)
+        _remove(out / RECORD_FILE)
     return Results(metrics, tuple(missing), tuple(reasons))
 
 
@@ -263,7 +266,7 @@ def _settings_of(scene: Scene, config: TrainConfig) -> dict[str, Any]:
 
 def _picture_files(scene: Scene) -> list[str]:
     """The pictures of held-out views, by their paths in the run's folder."""
-    return [f"{VIEWS}/{name}" for name in picture_names(scene.test).values()]
+    return [f"{VIEWS_FOLDER}/{name}" for name in picture_names(scene.test).values()]
 
 
 def _remove(path: Path) -> None:
@@ -277,14 +280,16 @@ def _drop_unseen_background(trainer: Trainer, phase: Phase) -> HybridModel:
     model = trainer.model
     if not model.config.background:
         return model
-    views = evenly_spaced(trainer.scene.train, BACKGROUND_VIEWS)
+    views = evenly_spaced(trainer.scene.train, MAX_BACKGROUND_VIEWS)
     seen = 0.0
     for done, view in enumerate(views):
         phase("measuring the light from the background", done, len(views))
         seen = max(seen, float((1 - render(model, view.camera, background=False).alpha).mean()))
-    if seen >= BACKGROUND_SEEN:
+    if seen >= MIN_BACKGROUND_LIGHT_SHARE:
         trainer.choices["background"] += f"; up to {seen:.1%} of a view's light comes from it"
         return model
-    trainer.choices["background"] = f"none: no training view gets more than {BACKGROUND_SEEN:.1%} of its light from it"
+    trainer.choices["background"] = (
+        f"none: no training view gets more than {MIN_BACKGROUND_LIGHT_SHARE:.1%} of its light from it"
+    )
     model.config = dataclasses.replace(model.config, background=False)
     return model

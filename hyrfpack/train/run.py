@@ -38,9 +38,9 @@ from hyrfpack.train.log import TrainingLog
 from hyrfpack.train.pilots import Report, is_usable
 from hyrfpack.train.progress import PhaseLine, ProgressLine
 from hyrfpack.train.results import (
-    CURVE,
-    RECORD,
-    VIEWS,
+    CURVE_FILE,
+    RECORD_FILE,
+    VIEWS_FOLDER,
     Phase,
     Results,
     TrainingRecord,
@@ -52,10 +52,10 @@ from hyrfpack.train.results import (
 from hyrfpack.train.setup import check_target
 from hyrfpack.train.trainer import Trainer
 
-__all__ = ["VIEWS", "TrainResult", "is_begun", "resuming", "train"]
+__all__ = ["VIEWS_FOLDER", "TrainResult", "is_begun", "resuming", "train"]
 
 # What ends a run early; Windows has no SIGHUP.
-STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 CHOICE_LABELS = {"exposure": "Exposure compensation", "max_gaussians": "Gaussians at most"}
 Observer = Callable[[Trainer], None]
 
@@ -201,7 +201,7 @@ def _train_in_folder(
     if record is not None:
         return _complete(record, scene, out, config, device, phase, silent, log, ranks)
     if overwrite and not resume and ranks.is_main:
-        (out / RECORD).unlink(missing_ok=True)  # of the earlier run: this one is not to be taken for it
+        (out / RECORD_FILE).unlink(missing_ok=True)  # of the earlier run: this one is not to be taken for it
     if resume:
         saved = ranks.run_on_all(lambda: _with_saved_decisions(config, checkpoint) if ranks.is_main else config)
         decisions = Decisions(ranks.broadcast(saved), {}, [])
@@ -388,9 +388,9 @@ def _prepare(
 
 
 def _check_outputs(out: Path, scene: Scene, *, overwrite: bool) -> None:
-    views = [f"{VIEWS}/{name}" for name in picture_names(scene.test).values()]
+    views = [f"{VIEWS_FOLDER}/{name}" for name in picture_names(scene.test).values()]
     Outputs(scene=scene, overwrite=overwrite).folder(
-        out, [MODEL_FILE, CHECKPOINT_FILE, METRICS_FILE, CURVE, RECORD, *views]
+        out, [MODEL_FILE, CHECKPOINT_FILE, METRICS_FILE, CURVE_FILE, RECORD_FILE, *views]
     )
 
 
@@ -426,7 +426,7 @@ def _stop_requests() -> Iterator:
     if threading.current_thread() is not threading.main_thread():  # signals belong to the main thread
         yield requested.is_set
         return
-    found = {number: signal.getsignal(number) for number in STOPPING}
+    found = {number: signal.getsignal(number) for number in STOP_SIGNALS}
     previous = {number: handler for number, handler in found.items() if handler not in (signal.SIG_IGN, None)}
 
     def handle(number: int, _frame: object) -> None:

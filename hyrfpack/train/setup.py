@@ -1,7 +1,7 @@
-"""From a scene to an untrained model: regime, frame, sizes and the first Gaussians.
+"""Set up an untrained model for a scene: preset, frame, sizes and initial Gaussians.
 
-"Model only what a scene needs": every size here follows from the photos and the length of the run, and each choice
-is recorded with its reason, for `hyrfpack info`.
+Every size follows from the photos and the length of the run. Each choice is recorded with its reason, which
+`hyrfpack info` shows.
 """
 
 from __future__ import annotations
@@ -24,25 +24,31 @@ from hyrfpack.train.config import FULL_STEPS, TrainConfig
 from hyrfpack.train.silhouette import inside_silhouettes
 
 SYNTHETIC_HALF_BOX = 1.3  # NeRF-synthetic objects lie in [-1.3, 1.3]^3
-# Gaussians that a full-length run may have, whichever is more: for each pixel of one photo, or of all of them
-# (Mip-NeRF 360 at 1 megapixel: 0.85 and 0.9 million; published models have up to 2.5).
-PER_PHOTO_PIXEL, PER_PIXEL = 0.85, 1 / 240
-LEAST_BUDGET = 5_000
-# Bytes of decoders and headers in a packed file, and of each Gaussian with its table rows. By itself `compress` takes 2
-# to 6 bytes for a Gaussian, most often 4 to 5: of the same bytes, more and coarser ones are better.
-PACKED, PACKED_GAUSSIAN = 8_000, 3.5
-LEAST_TARGETED = 250  # Gaussians, however small the file shall be
-LARGER = 2  # at most: how many times the usual budget a target size may bring
+# The budget of a full-length run is the larger of two: Gaussians for each pixel of one photo, and for each pixel of all
+# photos. For Mip-NeRF 360 at 1 megapixel they give 0.85 and 0.9 million; published models have up to 2.5 million.
+GAUSSIANS_PER_PIXEL_OF_ONE_PHOTO = 0.85
+GAUSSIANS_PER_PIXEL_OF_ALL_PHOTOS = 1 / 240
+MIN_BUDGET = 5_000
+# A packed file has so many bytes of decoders and headers, and so many for each Gaussian with its table rows. By itself
+# `compress` takes 2 to 6 bytes for a Gaussian, most often 4 to 5. Of two files of equal size, the one with more
+# Gaussians and coarser numbers scores higher.
+PACKED_HEADER_BYTES = 8_000
+PACKED_BYTES_PER_GAUSSIAN = 3.5
+MIN_TARGETED_BUDGET = 250
+MAX_TARGETED_BUDGET_RATIO = 2  # of the budget for a target size to the usual one
 GAUSSIANS_PER_ROW = 20  # for each row and level of the radiance table; the paper's models have 8 to 20
 INITIAL_OPACITY = 0.1
-INITIAL_SIZE = (1e-5, 0.5)  # local units over S(p)
-FARTHEST = 1e4  # local units per axis; to pull in what is farther turns it by 2e-4 radians at most, seen from the box
-ONE_PLACE = 1e-3  # cameras spread by less than this share of their distance to the points see it all from one place
+MIN_INITIAL_SIZE, MAX_INITIAL_SIZE = 1e-5, 0.5  # local units over S(p)
+# In local units for each axis. Pulling in a point that is farther away changes its direction, seen from the box, by
+# 2e-4 radians at most.
+MAX_INITIAL_COORDINATE = 1e4
+# Cameras whose spread is a smaller share than this of their distance to the points count as standing in one place.
+MIN_CAMERA_SPREAD_RATIO = 1e-3
 BACKGROUND_RGB = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": (0.0, 0.0, 0.0)}
 
 
 def detect_preset(scene: Scene) -> tuple[str, str]:
-    """The paper's regime that fits a scene, and the reason in words.
+    """Choose the preset (the paper's regime) that fits a scene, and give the reason in words.
 
     - "synthetic": photos with coverage (an object without a background);
     - "large": the cameras look the same way and fly across it (aerial surveys);
@@ -68,11 +74,11 @@ def detect_preset(scene: Scene) -> tuple[str, str]:
 
 
 def scene_frame(scene: Scene, preset: str) -> Frame:
-    """The box B0 of a scene under a regime, in the scene's own axes.
+    """Return the frame of a scene under a preset: the box B0, in the scene's own axes.
 
-    NeRF-synthetic layouts +-1.3 around the origin; "synthetic" ones of other layouts, where the unit is not known,
-    and "large" the 1st to 99th percentile of the points; otherwise the box of the cameras, or of the points where the
-    cameras share one place.
+    NeRF-synthetic layouts have +-1.3 around the origin. Other "synthetic" scenes, whose unit is not known, and "large"
+    ones have the 1st to 99th percentile of the points. Others have the box of the cameras, or of the points where all
+    cameras stand in one place.
     """
     if preset == "synthetic" and scene.layout == "blender":
         return Frame((0.0, 0.0, 0.0), SYNTHETIC_HALF_BOX, (1.0, 1.0, 1.0))
@@ -80,9 +86,9 @@ def scene_frame(scene: Scene, preset: str) -> Frame:
     low, high = positions.min(0), positions.max(0)
     if len(scene.points):
         reach = float(np.median(np.linalg.norm(scene.points - positions.mean(0), axis=1)))
-        if preset in ("large", "synthetic") or (high - low).max() <= ONE_PLACE * reach:
+        if preset in ("large", "synthetic") or (high - low).max() <= MIN_CAMERA_SPREAD_RATIO * reach:
             low, high = np.percentile(scene.points, [1, 99], axis=0)
-    # No points, or all coincident, and one place (up to rounding): a box of unit size in front of the first camera.
+    # Without an extent (up to rounding), a box of unit size in front of the first camera is used.
     if (high - low).max() <= 1e-9 * np.abs(positions).max():
         forward = scene.train[0].camera.forward
         low, high = positions[0] + forward - 1, positions[0] + forward + 1
@@ -90,34 +96,37 @@ def scene_frame(scene: Scene, preset: str) -> Frame:
 
 
 def budget_for(scene: Scene, config: TrainConfig) -> tuple[int, str]:
-    """The most Gaussians a run may have, and why.
+    """Return the Gaussian budget of a run and the reason in words.
 
-    It is the configured factor times what follows from the photos' pixels and, as a shorter run can fit fewer, from the
-    square root of its length. Of a target size it is about what fits in, and at most `LARGER` times as many as without.
+    The budget is the configured factor times a number that grows with the photos' pixels and with the square root of
+    the run's length, because a shorter run can fit fewer Gaussians. For a target size it is about what fits in, and at
+    most `MAX_TARGETED_BUDGET_RATIO` times the usual budget.
     """
     if config.max_gaussians is not None:
         return config.max_gaussians, "asked for"
     pixels = sum(view.camera.width * view.camera.height for view in scene.train)
-    full = max(PER_PHOTO_PIXEL * pixels / len(scene.train), PER_PIXEL * pixels)
+    full = max(GAUSSIANS_PER_PIXEL_OF_ONE_PHOTO * pixels / len(scene.train), GAUSSIANS_PER_PIXEL_OF_ALL_PHOTOS * pixels)
     length = math.sqrt(min(1.0, config.steps / FULL_STEPS))
-    budget, why = max(LEAST_BUDGET, round(full * length)), f"{pixels:,} pixels in all, {config.steps:,} steps"
+    budget, why = max(MIN_BUDGET, round(full * length)), f"{pixels:,} pixels in all, {config.steps:,} steps"
     if config.target_bytes is not None:
-        fitting = max(LEAST_TARGETED, round((config.target_bytes - PACKED) / PACKED_GAUSSIAN))
-        if fitting <= LARGER * budget:
+        fitting = max(
+            MIN_TARGETED_BUDGET, round((config.target_bytes - PACKED_HEADER_BYTES) / PACKED_BYTES_PER_GAUSSIAN)
+        )
+        if fitting <= MAX_TARGETED_BUDGET_RATIO * budget:
             return fitting, f"to be packed into {config.target_bytes:,} bytes"
-        return LARGER * budget, f"{LARGER} times what suits {why}"
+        return MAX_TARGETED_BUDGET_RATIO * budget, f"{MAX_TARGETED_BUDGET_RATIO} times what suits {why}"
     if config.budget_factor not in (None, 1):
         return max(1, round(config.budget_factor * budget)), f"{config.budget_factor:g} times what suits {why}"
     return budget, why
 
 
 def check_target(scene: Scene, config: TrainConfig) -> None:
-    """Refuse a target size that no packed model of these photos can have.
+    """Check that a packed model of these photos can be as small as the target size.
 
     A file carries some of the cameras, so that its smallest size depends on the scene.
 
     Raises:
-        HyrfError: the target size is below that.
+        HyrfError: the target size is smaller than that.
     """
     if config.target_bytes is None or not scene.train:
         return
@@ -127,7 +136,7 @@ def check_target(scene: Scene, config: TrainConfig) -> None:
 
 
 def table_size_for(budget: int, config: TrainConfig) -> tuple[int, str]:
-    """log2 of the radiance table's rows per level for that many Gaussians, and why."""
+    """Return log2 of the radiance table's rows per level for a budget, and the reason in words."""
     if config.log2_table_size is not None:
         return config.log2_table_size, "asked for"
     log2 = round(math.log2(max(1, budget / GAUSSIANS_PER_ROW)))
@@ -135,10 +144,10 @@ def table_size_for(budget: int, config: TrainConfig) -> tuple[int, str]:
 
 
 def build_model(scene: Scene, config: TrainConfig) -> tuple[HybridModel, int, dict[str, str]]:
-    """An untrained model for a scene.
+    """Build an untrained model for a scene.
 
     Returns:
-        The model, its budget of Gaussians, and the choices made, each with its reason.
+        The model, its Gaussian budget, and by setting the choice and its reason.
 
     Raises:
         HyrfTrainingError: the scene has no training views.
@@ -187,11 +196,11 @@ def build_model(scene: Scene, config: TrainConfig) -> tuple[HybridModel, int, di
 
 
 def initial_points(scene: Scene, frame: Frame, budget: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Local positions (N, 3) float64 and colours (N, 3) in [0, 1] to start from, N at most the budget.
+    """Return initial local positions (N, 3) float64 and colours (N, 3) in [0, 1], where N is at most the budget.
 
-    The scene's points (a random part of them if they are too many), or without points half a budget of random ones
-    in the box - for photos with coverage only where all silhouettes agree. Points that a reconstruction flung far out
-    are pulled in, along the line to the frame's centre, to where half precision still holds them.
+    They are the scene's points, or a random subset of them. A scene without points starts from half a budget of random
+    points in the box; where photos have transparency, in the visual hull. Outliers of the reconstruction are pulled in,
+    along the line to the frame's centre, to coordinates that half precision can hold.
     """
     generator = np.random.default_rng(seed)
     if len(scene.points):
@@ -199,7 +208,7 @@ def initial_points(scene: Scene, frame: Frame, budget: int, seed: int) -> tuple[
         if len(points) > budget:
             chosen = np.sort(generator.choice(len(points), budget, replace=False))
             points, colors = points[chosen], colors[chosen]
-        return points / np.maximum(1, np.abs(points).max(axis=1, keepdims=True) / FARTHEST), colors
+        return points / np.maximum(1, np.abs(points).max(axis=1, keepdims=True) / MAX_INITIAL_COORDINATE), colors
     count = max(1, budget // 2)
     half = np.array(frame.half_extent)
     if not scene.has_alpha:
@@ -208,7 +217,7 @@ def initial_points(scene: Scene, frame: Frame, budget: int, seed: int) -> tuple[
 
 
 def _gaussians(points: np.ndarray, colors: np.ndarray, config: ModelConfig) -> Gaussians:
-    """Gaussians at points, as large as the gaps between them: sigma is the rms distance to the 3 nearest."""
+    """Place Gaussians at points; sigma is the root mean square distance to the 3 nearest points."""
     positions = torch.from_numpy(points).float()
     bounds = scale_bounds(positions, config)
     if len(points) > 1:
@@ -216,7 +225,7 @@ def _gaussians(points: np.ndarray, colors: np.ndarray, config: ModelConfig) -> G
         sizes = np.sqrt((distances[:, 1:] ** 2).mean(1))
     else:
         sizes = np.full(len(points), 0.1)
-    fraction = (torch.from_numpy(sizes).float()[:, None] / bounds).clamp(*INITIAL_SIZE)
+    fraction = (torch.from_numpy(sizes).float()[:, None] / bounds).clamp(MIN_INITIAL_SIZE, MAX_INITIAL_SIZE)
     if config.scale_rule == "product":
         fraction = (2 * fraction).clamp(max=0.999)  # the neural factor starts at a half
     return Gaussians(

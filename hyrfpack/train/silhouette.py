@@ -1,4 +1,4 @@
-"""Random points inside an object's visual hull."""
+"""Sampling of random points inside an object's visual hull."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import numpy as np
 from hyrfpack.model import Frame
 from hyrfpack.scene import Scene, evenly_spaced
 
-VIEWS = 24  # silhouettes compared; more would hardly carve more
-AGREEMENT = 0.95  # share of the views that see a point which must see it covered
+MAX_SILHOUETTES = 24  # More would hardly make the hull smaller.
+MIN_COVERED_SHARE = 0.95  # of the views that see a point, for the point to be inside
 
 
 def inside_silhouettes(
@@ -20,7 +20,7 @@ def inside_silhouettes(
         Local positions (N, 3) and mean pixel colours (N, 3) in [0, 1]; N is `count`, or less when hardly any point
         of the box lies inside the silhouettes (then points of the whole box fill up, in grey).
     """
-    pictures = [(view.camera, view.load()) for view in evenly_spaced(scene.train, VIEWS)]
+    pictures = [(view.camera, view.load()) for view in evenly_spaced(scene.train, MAX_SILHOUETTES)]
     half = np.array(frame.half_extent)
     kept_points: list[np.ndarray] = []
     kept_colors: list[np.ndarray] = []
@@ -41,7 +41,7 @@ def inside_silhouettes(
             seen[inside] += 1
             covered[inside] += coverage > 0.5
             colors[inside] += coverage[:, None] * (picture.rgb[row, column] / 255)
-        good = (seen > 0) & (covered >= AGREEMENT * seen)
+        good = (seen > 0) & (covered >= MIN_COVERED_SHARE * seen)
         kept_points.append(points[good])
         kept_colors.append(colors[good] / covered[good, None].clip(1))
         found += int(good.sum())

@@ -1,4 +1,4 @@
-"""What decides, while a model trains, how many Gaussians there are and where."""
+"""The interface of density control strategies, which add and remove Gaussians during training."""
 
 from __future__ import annotations
 
@@ -13,18 +13,17 @@ from hyrfpack.train.optimizer import Optimizer
 
 
 class Strategy(Protocol):
-    """A strategy of density control: `Trainer(scene, config, strategy=...)` trains with one of your own.
+    """Interface of a density control strategy, for `Trainer(scene, config, strategy=...)`.
 
-    The trainer calls it in every step: `watching` before the view is rendered, `observe` when its gradients are there,
-    `act` after the optimiser's step. What it draws at random it draws from the seed and the step, and what it collects
-    is in its state, so that a run that goes on from a checkpoint ends like one that never stopped. Of several processes
-    each has a strategy that observes its own views: what decides has to be summed first, as by `Ranks.add`, so that all
-    decide alike.
+    In every step the trainer calls `watching` before it renders the view, `observe` after the backward pass, and `act`
+    after the optimiser's step. A resumed run must end like an uninterrupted one: seed random numbers by the run's seed
+    and the step, and put everything observed into the state. On several processes each strategy observes its own
+    views; sum what decides over the ranks first (`Ranks.all_reduce`), so that all take the same decisions.
 
-    `hyrfpack.train.DensityControl` is the one that there is by default.
+    The default strategy is `hyrfpack.train.DensityControl`.
 
     Example:
-        >>> class Faintest:  # leaves out whatever has become fainter than a hundredth, every hundred steps
+        >>> class PruneFaint:  # every hundred steps, prunes Gaussians of less than 1 % opacity
         ...     def watching(self, step):
         ...         return False
         ...     def observe(self, rendering, camera, model):
@@ -38,20 +37,20 @@ class Strategy(Protocol):
         ...         return {}
         ...     def load_state_dict(self, state):
         ...         pass
-        >>> trainer = Trainer(scene, TrainConfig(steps=2000), strategy=Faintest())
+        >>> trainer = Trainer(scene, TrainConfig(steps=2000), strategy=PruneFaint())
     """
 
     def watching(self, step: int) -> bool:
-        """Whether absolute gradients of projected centres are wanted in this step, counted from 1."""
+        """Return whether this step, counted from 1, needs absolute gradients of the projected centres."""
 
     def observe(self, rendering: Rendering, camera: Camera, model: HybridModel) -> None:
-        """Look at one view after backward: what was rendered, and the gradients of the model's parameters."""
+        """Observe one view after the backward pass: the rendering, and the gradients of the model's parameters."""
 
     def act(self, step: int, model: HybridModel, optimizer: Optimizer) -> None:
-        """Change which Gaussians there are, through the optimiser, which keeps their moments with them."""
+        """Add and remove Gaussians through the optimiser, which keeps the moments of the others."""
 
     def state_dict(self) -> dict[str, Tensor]:
-        """All that was collected since the start and is still needed."""
+        """Return everything observed that later steps need."""
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """The inverse of `state_dict`; the model has the Gaussians that it had then."""
+        """Restore what `state_dict` returned for a model with the same Gaussians."""

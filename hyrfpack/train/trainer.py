@@ -1,4 +1,4 @@
-"""The trainer: one view a step and process, until the run is done, interrupted or broken."""
+"""The training loop: each step renders one view on each process."""
 
 from __future__ import annotations
 
@@ -30,40 +30,40 @@ from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.density import DensityControl
+from hyrfpack.train.distributed import StepStats, average_gradients, check_settings, digest, pack_step_stats
 from hyrfpack.train.exposure import exposures_for
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.setup import build_model
 from hyrfpack.train.strategy import Strategy
-from hyrfpack.train.together import Told, averaged, check_settings, digest, to_tell
 from hyrfpack.version import __version__
 
-RECORDS = 200  # points on the training curve
+MIN_CURVE_RECORDS = 200  # A longer run has up to twice as many.
 
 
 def shuffled(views: Sequence[View], seed: int, places: range) -> Iterator[View]:
-    """The views at these places, counted from 0, of an endless order: each epoch is a permutation of its own."""
-    there, order = -1, np.zeros(0, np.int64)
+    """Yield the views at these places, counted from 0, of an endless order; each epoch is another permutation."""
+    current_epoch, order = -1, np.zeros(0, np.int64)
     for index in places:
         epoch, place = divmod(index, len(views))
-        if epoch != there:
-            there, order = epoch, np.random.default_rng((seed, epoch)).permutation(len(views))
+        if epoch != current_epoch:
+            current_epoch, order = epoch, np.random.default_rng((seed, epoch)).permutation(len(views))
         yield views[order[place]]
 
 
 def is_recorded(step: int, steps: int) -> bool:
-    """Whether this step of a run is one of the about RECORDS that are written down, the last one among them."""
-    return step % max(1, steps // RECORDS) == 0 or step == steps
+    """Return whether the training curve has a record of this step; the last step has one."""
+    return step % max(1, steps // MIN_CURVE_RECORDS) == 0 or step == steps
 
 
 class Trainer:
-    """Holds a run: model, optimiser, strategy of density control, and the step they are at.
+    """Holds the state of a run: model, optimiser, density control strategy and step.
 
-    On several processes (ranks) each renders another view of a step, and all take it by the mean of their gradients:
-    `TrainConfig.steps` counts views, so W processes take as many steps over W, larger ones (`LearningRates.at`).
-    All hold the same model, bit by bit, for they see the same gradients and decide by the same numbers.
+    Of several processes (ranks), each renders another view in a step, and all apply the mean of their gradients.
+    `TrainConfig.steps` counts views, so that W processes take 1/W as many steps with larger learning rates
+    (`LearningRates.at`). All ranks hold the same model, bit by bit, because they apply the same gradients.
 
     Attributes:
-        steps: of the optimiser, until the end.
+        steps: optimiser steps of the whole run.
 
     Example:
         >>> trainer = Trainer(scene, TrainConfig(steps=2000))
@@ -84,8 +84,8 @@ class Trainer:
         """Set up a run.
 
         Args:
-            model: to go on with, changed in place; None builds an untrained one that fits the scene.
-            strategy: what adds and removes Gaussians; None for `DensityControl` as configured.
+            model: the model to continue with, changed in place; None builds an untrained one for the scene.
+            strategy: adds and removes Gaussians; None for `DensityControl` as configured.
             ranks: the processes that train together, each of which sets up the same run.
         """
         self.ranks = ranks
@@ -95,8 +95,8 @@ class Trainer:
         self.cache = cache or PictureCache()
         self.device = device
         self.photos = Photos(device)
-        self.choices: dict[str, str] = {}  # what was chosen for the run, each with its reason
-        self.pilots: list[dict] = []  # scores of the pilot runs by which it was chosen
+        self.choices: dict[str, str] = {}  # by setting: the choice and its reason
+        self.pilots: list[dict] = []  # scores of the pilot runs that decided
         if model is None:
             model, self.budget, self.choices = build_model(scene, config)
         else:
@@ -107,15 +107,15 @@ class Trainer:
             config.density, self.steps, self.budget, len(self.model), config.seed, device, ranks
         )
         self.step = 0
-        self.saved: int | None = None  # the step that the checkpoint on disk is of
+        self.saved: int | None = None  # step of the checkpoint on disk
         self.records: list[dict] = []
         self.seconds: dict[str, float] = defaultdict(float)  # by stage, over all parts of a resumed run
         self.elapsed = 0.0
 
     def _take(self, model: HybridModel) -> None:
-        """Train this model from here on."""
+        """Replace the trained model and start a new optimiser for it."""
         model.precision = self.config.precision
-        if not any(parameter.requires_grad for parameter in model.parameters()):  # as of a model that was loaded
+        if not any(parameter.requires_grad for parameter in model.parameters()):  # a loaded model has none
             model.requires_grad_(True)
         self.model = model.to(self.device)
         self.optimizer = Optimizer(self.model, self.config.learning_rates, self.ranks.size)
@@ -131,24 +131,24 @@ class Trainer:
         warn: Callable[[str], None] = warnings.warn,
         overwrite: bool = True,
     ) -> bool:
-        """Train until the last step, or until `stop()` says so.
+        """Train until the last step, or until `stop()` returns True.
 
         Args:
-            checkpoint: where to keep the run's state; written every `checkpoint_every` steps and when stopped early.
+            checkpoint: path of the checkpoint; written every `checkpoint_every` steps and when stopped early.
             report: called after each step with the loss and the mean squared error of its view (NaN where the whole
                 photo is masked).
-            stop: asked after each step; by several processes during each, to be the last.
-            warn: told when a checkpoint cannot be written, as on a full disk. Training goes on and tries again at the
-                next one, for hours of work are worth more than a checkpoint.
-            overwrite: replace a file at `checkpoint` that is of another run.
+            stop: called in each step; the run ends after the step in which it returns True.
+            warn: called with a sentence when a checkpoint cannot be written, as on a full disk. Training continues and
+                tries again at the next checkpoint.
+            overwrite: replace a file at `checkpoint` that belongs to another run.
 
         Returns:
             Whether the run is complete.
 
         Raises:
             HyrfTrainingError: a parameter, the loss or a gradient is not finite; step, view and group are named.
-            HyrfError: stopped early, and the checkpoint cannot be written; or, on all processes, one of them cannot go
-                on or has gone.
+            HyrfError: the run was stopped early and the checkpoint cannot be written; or one of several processes
+                cannot continue or has ended.
         """
         every = self.config.checkpoint_every or max(1, self.steps // 20)
         check_settings(self.ranks, {**self._settings(), "versions": (__version__, torch.__version__)})
@@ -179,12 +179,16 @@ class Trainer:
         return True
 
     def _order(self) -> Iterator[View]:
-        """This rank's views, in the order of the steps still to come."""
+        """Yield this rank's views of the remaining steps."""
         first, count = self.step * self.ranks.size, self.steps * self.ranks.size
         return shuffled(self.scene.train, self.config.seed, range(first + self.ranks.rank, count, self.ranks.size))
 
     def _train_step(self, views: Iterator[tuple[View, Picture]], stop: Callable[[], bool]) -> tuple[float, float, bool]:
-        """Take a step: loss and mean squared error, means over all ranks' views, and whether one of them is to stop."""
+        """Take a step.
+
+        Returns:
+            Loss and mean squared error, means over all ranks' views, and whether any rank was asked to stop.
+        """
         problem: HyrfError | None = None
         try:
             with self._timed("data"):
@@ -195,26 +199,26 @@ class Trainer:
                 raise
             problem = refusal
             loss = error = torch.zeros((), device=self.device)
-        said = torch.stack((loss, error))
+        packed = torch.stack((loss, error))
         if not self.ranks.is_single:
             with self._timed("exchange"):
-                mine = to_tell(loss, error, stop=stop(), problem=problem is not None)
-                said = averaged(self.ranks, self._learnt(), mine)
+                own_stats = pack_step_stats(loss, error, stop=stop(), problem=problem is not None)
+                packed = average_gradients(self.ranks, self._learnt_parameters(), own_stats)
         with self._timed("optimizer"):
             broken = self.optimizer.step(self.step - 1, self.steps)
             if self.exposures is not None:
-                # A photo's gains take as many steps as in one process.
+                # The gains of a photo take as many steps as in a single process.
                 seen, all_seen = (self.ranks.size * steps for steps in (self.step - 1, self.steps))
                 rate = self.config.learning_rates.at("exposure", seen, all_seen)
                 broken = torch.cat((broken, self.exposures.step(rate, self._views_of_step())[None]))
         with self._timed("loss"):
-            # All that the host wants to know of this step, in one wait for the device.
-            numbers = torch.cat((said, broken)).tolist()
-        said_numbers, flags = numbers[: len(said)], numbers[len(said) :]
-        told = Told(*said_numbers) if self.ranks.is_single else Told.of(said_numbers, self.ranks.size)
-        if told.problem:
+            # The host waits for the device once in each step: here.
+            numbers = torch.cat((packed, broken)).tolist()
+        sums, flags = numbers[: len(packed)], numbers[len(packed) :]
+        stats = StepStats(*sums) if self.ranks.is_single else StepStats.from_sums(sums, self.ranks.size)
+        if stats.problem:
             self.ranks.raise_if_any(problem)
-        if not np.isfinite(told.loss):
+        if not np.isfinite(stats.loss):
             self._refuse("the loss is not finite", self._nonfinite_parameters())
         if any(flags):
             self._refuse("a gradient is not finite", self._groups(flags))
@@ -222,11 +226,15 @@ class Trainer:
             before = self.model.gaussians.positions
             self.strategy.act(self.step, self.model, self.optimizer)
             if not self.ranks.is_single and self.model.gaussians.positions is not before:
-                self._stay_alike()
-        return told.loss, told.error, told.stop
+                self._synchronize()
+        return stats.loss, stats.error, stats.stop
 
     def _gradients(self, view: View, picture: Picture) -> tuple[Tensor, Tensor]:
-        """Add a view's gradients: its loss and mean squared error (NaN where all of the photo is masked), scalars."""
+        """Accumulate the gradients of one view.
+
+        Returns:
+            Scalars: the view's loss, and its mean squared error, NaN where all of the photo is masked.
+        """
         with self._timed("data"):
             solid = self._solid()
             target, mask = self.photos.get(view.name, picture, solid)
@@ -253,7 +261,7 @@ class Trainer:
             return loss.detach(), _mean_square(image.detach() - target, mask)
 
     def _fit_exposure_map(self) -> None:
-        """Give the model the exposure map of the per-image gains that were learnt, if any."""
+        """Fit the exposure map to the learnt per-image gains, if any, and store it in the model."""
         if self.exposures is None:
             return
         fit = self.exposures.fit_map(self.model.config.frame, self.scene.train)
@@ -261,28 +269,28 @@ class Trainer:
         error = fit.leave_one_out_error * STOPS_PER_LOG_GAIN
         self.choices["exposure_map"] = f"{len(fit.map.positions)} centers; leave-one-out error {error:.2f} stops"
 
-    def _learnt(self) -> list[nn.Parameter]:
-        """What gradients are shared of."""
+    def _learnt_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters whose gradients are averaged over the ranks."""
         return [*self.model.parameters(), *([] if self.exposures is None else [self.exposures.values])]
 
     def _views_of_step(self) -> list[View]:
-        """The views that the ranks render in this step."""
+        """Return the views that all ranks render in this step."""
         places = range((self.step - 1) * self.ranks.size, self.step * self.ranks.size)
         return list(shuffled(self.scene.train, self.config.seed, places))
 
-    def _stay_alike(self) -> None:
-        """See that all ranks still hold the same numbers after Gaussians came and went; else take those of rank 0."""
+    def _synchronize(self) -> None:
+        """Check that all ranks hold the same parameters after density control; if not, take those of rank 0."""
         if len(set(self.ranks.all_gather(digest(self.model.parameters())))) > 1:
             self._restore(self.ranks.broadcast(self._tensors()))
 
     def _record(self, loss: float, mse: float) -> None:
-        """Keep what the step came to for the curve, unless all of its photo is masked."""
+        """Add the step to the training curve if it has a record, unless all of its photo is masked."""
         if not np.isnan(mse) and is_recorded(self.step, self.steps):
             record = {"step": self.step, "loss": loss, "psnr": psnr_from_mse(mse), "gaussians": len(self.model)}
             self.records.append({**record, "seconds": round(self.elapsed, 3)})
 
     def _solid(self) -> np.ndarray | None:
-        """The colour behind this step's picture, None when the model has a background of its own."""
+        """Return the background colour (3,) of this step's view; None when the model has a background sphere."""
         if self.model.config.background:
             return None
         if self.config.background_color == "random":
@@ -291,7 +299,7 @@ class Trainer:
         return np.array(self.model.config.solid, np.float32)
 
     def _groups(self, flags: Sequence[float]) -> list[str]:
-        """The parameter groups with a gradient that is not finite."""
+        """Return the names of the parameter groups with a gradient that is not finite."""
         count = len(flags) - (self.exposures is not None)
         return self.optimizer.names(flags[:count]) + ["exposure"] * any(flags[count:])
 
@@ -322,7 +330,7 @@ class Trainer:
         return {**self.config.to_dict(), "views": views, "strategy": type(self.strategy).__qualname__, **chosen}
 
     def _tensors(self) -> dict[str, Tensor]:
-        """The run's state, but for what each rank has collected for density control, on the CPU."""
+        """Return the run's state on the CPU, without what each rank has observed for density control."""
         tensors: dict[str, Tensor] = {f"model.{name}": p for name, p in self.model.named_parameters()}
         tensors |= {f"adam.{name}": value for name, value in self.optimizer.state_dict().items()}
         if self.exposures is not None:
@@ -330,7 +338,7 @@ class Trainer:
         return _on_cpu(tensors)
 
     def _restore(self, tensors: dict[str, Tensor]) -> None:
-        """The inverse of `_tensors`."""
+        """Restore what `_tensors` returned."""
         explicit = [tensors[f"model.gaussians.{name}"] for name in Gaussians.PARAMETER_NAMES]
         model = HybridModel(self.model.config, Gaussians(*explicit))
         model.load_state_dict(_under("model.", tensors))
@@ -341,18 +349,18 @@ class Trainer:
             self.exposures.load_state_dict(_under("exposure.", tensors))
 
     def save(self, path: Path, *, overwrite: bool = True) -> None:
-        """Write the run's state to `path`; rank 0 does, and all have to call it.
+        """Write a checkpoint to `path`. All ranks must call this; rank 0 writes.
 
         Raises:
-            HyrfError: the file cannot be written, or not without `overwrite`.
+            HyrfError: the file cannot be written, or exists and `overwrite` is False.
         """
-        collected = self.ranks.all_gather(_on_cpu(self.strategy.state_dict()))
+        observed = self.ranks.all_gather(_on_cpu(self.strategy.state_dict()))
         if not self.ranks.is_main:
             self.saved = self.step
             return
         tensors = self._tensors()
-        for rank, values in enumerate(collected):
-            tensors |= {f"{_collected_by(rank)}{name}": value for name, value in values.items()}
+        for rank, values in enumerate(observed):
+            tensors |= {f"{_strategy_prefix(rank)}{name}": value for name, value in values.items()}
         progress = {
             "step": self.step,
             "records": self.records,
@@ -365,7 +373,7 @@ class Trainer:
         self.saved = self.step
 
     def load(self, path: Path) -> None:
-        """Go on from the state at `path`, which rank 0 reads; the result is the one an uninterrupted run gives.
+        """Resume from the checkpoint at `path`, which rank 0 reads. The result equals that of an uninterrupted run.
 
         Raises:
             HyrfTrainingError: as `load_checkpoint`.
@@ -375,7 +383,7 @@ class Trainer:
         )
         tensors, progress = self.ranks.broadcast(saved)
         self._restore(tensors)
-        self.strategy.load_state_dict(_under(_collected_by(self.ranks.rank), tensors))
+        self.strategy.load_state_dict(_under(_strategy_prefix(self.ranks.rank), tensors))
         self.step, self.records = progress["step"], progress["records"]
         self.saved = self.step
         self.seconds, self.elapsed = defaultdict(float, progress["seconds"]), progress["elapsed"]
@@ -388,17 +396,17 @@ def _on_cpu(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Those whose names start so, by the rest of their names."""
+    """Select the tensors whose names start with `prefix`, and remove it from the names."""
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
-def _collected_by(rank: int) -> str:
-    """What names start with in a checkpoint of what a rank has collected for density control."""
+def _strategy_prefix(rank: int) -> str:
+    """Return the name prefix of what a rank has observed for density control, in a checkpoint."""
     return f"density{rank or ''}."
 
 
 def _mean_square(error: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
-    """Mean of the squares over the pixels (H, W, 3) that count; NaN where none does."""
+    """Return the mean square of `error` (H, W, 3) over the pixels inside the mask; NaN where there are none."""
     squares = error.square()
     if mask is None:
         return squares.mean()

@@ -25,7 +25,7 @@ from hyrfpack.model import Frame, HybridModel
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.train import Trainer
-from hyrfpack.train.setup import FARTHEST, initial_points
+from hyrfpack.train.setup import MAX_INITIAL_COORDINATE, initial_points
 
 HALF_A_STEP = 20 * np.log10(2 * 255)  # dB: the root mean square error is half a step of 8 bits
 
@@ -200,13 +200,14 @@ def test_a_few_points_flung_far_out_do_no_harm(distance):
 
 def test_points_flung_far_out_are_pulled_in_along_their_direction():
     frame = Frame((5.0, -7.0, 11.0), 2.0, (1.0, 1.0, 0.25))
-    local = np.array([[1.0, 2.0, -3.0], [0.0, -FARTHEST, 1.0], [4e6, -3e6, 1e6], [1e300, 0.0, 1e299]])
+    local = np.array([[1.0, 2.0, -3.0], [0.0, -MAX_INITIAL_COORDINATE, 1.0], [4e6, -3e6, 1e6], [1e300, 0.0, 1e299]])
     scene = with_points(frame.to_world(local))
 
     points, _ = initial_points(scene, frame, budget=10, seed=0)
 
     np.testing.assert_allclose(points[:2], local[:2], rtol=1e-12)
-    np.testing.assert_allclose(points[2:], FARTHEST * np.array([[1, -0.75, 0.25], [1, 0, 0.1]]), rtol=1e-5, atol=1e-9)
+    pulled_in = MAX_INITIAL_COORDINATE * np.array([[1, -0.75, 0.25], [1, 0, 0.1]])
+    np.testing.assert_allclose(points[2:], pulled_in, rtol=1e-5, atol=1e-9)
 
 
 # -- light -----------------------------------------------------------------------------------------------------------

@@ -32,7 +32,7 @@ def test_one_line_fits_every_terminal(width, words):
 
 
 def test_elsewhere_a_plain_line_comes_every_few_seconds(capsys, monkeypatch):
-    monkeypatch.setattr(display, "LOG_EVERY", 0.01)
+    monkeypatch.setattr(display, "LOG_INTERVAL_SECONDS", 0.01)
     with Display() as shown:
         sleep(0.05)
         shown.show(TRAINING)
@@ -44,7 +44,7 @@ def test_elsewhere_a_plain_line_comes_every_few_seconds(capsys, monkeypatch):
 
 
 def test_nothing_is_said_of_a_time_that_is_not_known(capsys, monkeypatch):
-    monkeypatch.setattr(display, "LOG_EVERY", 0.01)
+    monkeypatch.setattr(display, "LOG_INTERVAL_SECONDS", 0.01)
     with Display() as shown:
         Reporter(["import", "export"], shown.show).begin("import")
         sleep(0.1)

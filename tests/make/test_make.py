@@ -23,7 +23,7 @@ from hyrfpack.lock import exclusive_folder
 from hyrfpack.make import Stopped, make, stages
 from hyrfpack.make.progress import Progress, Reporter
 from hyrfpack.splats.formats import ply
-from hyrfpack.train.setup import LEAST_BUDGET
+from hyrfpack.train.setup import MIN_BUDGET
 
 ENDINGS = (".hyrf", ".html", ".spz", ".points.ply", "")  # of each kind one: tests/export has the others
 STAGES = ["training", "compression", "scoring", "export"]
@@ -171,7 +171,7 @@ def test_of_few_photos_few_are_held_out(count, held_out, posed, tmp_path):
 def test_a_target_size_is_met(made, posed, tmp_path):
     whole = (made / "model.hyrf").stat().st_size
     result = make(posed, tmp_path / "scene.hyrf", target_bytes=whole * 3 // 4)
-    assert result.bytes <= whole * 3 // 4 and result.gaussians < LEAST_BUDGET
+    assert result.bytes <= whole * 3 // 4 and result.gaussians < MIN_BUDGET
 
 
 def test_the_number_of_gaussians_and_the_preset_are_passed_to_the_training(posed, tmp_path):

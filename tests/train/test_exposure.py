@@ -14,7 +14,7 @@ from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.evaluate import evaluate
 from hyrfpack.scene import Scene, View
 from hyrfpack.train import TrainConfig, Trainer
-from hyrfpack.train.exposure import PULL, USABLE, Exposures, Observations, gains_from, observe
+from hyrfpack.train.exposure import GAIN_DECAY, MIN_PIXEL_LEVEL, Exposures, Observations, gains_from, observe
 
 CPU = torch.device("cpu")
 SHORT = TrainConfig(steps=30, seed=3, max_gaussians=160, exposure=True)
@@ -84,7 +84,7 @@ def test_each_photo_is_read_once_and_what_is_masked_clipped_or_outside_is_left_o
         return dataclasses.replace(view, load=lambda: reads.append(view.name) or picture)
 
     views = [
-        changed(black, rgb=np.full((64, 64, 3), USABLE[0] - 1, np.uint8)),
+        changed(black, rgb=np.full((64, 64, 3), MIN_PIXEL_LEVEL - 1, np.uint8)),
         changed(masked, mask=np.arange(64)[:, None] < np.full(64, 32)),
         changed(see_through, alpha=np.full((64, 64), 254, np.uint8)),
         changed(usual),
@@ -136,7 +136,7 @@ def test_steps_are_adams_with_a_pull_to_one_and_keep_the_mean():
         (exposures.exposed(image, views[number]) ** 2).mean().backward()
         assert not exposures.step(0.01, [views[number]])
         odds = image.double() / (1 - image.double()) * expected[number].exp()
-        loss = ((odds / (1 + odds)) ** 2).mean() + PULL / 2 * expected[number].square().sum()
+        loss = ((odds / (1 + odds)) ** 2).mean() + GAIN_DECAY / 2 * expected[number].square().sum()
         expected[number].grad = None
         loss.backward()
         optimizers[number].step()

@@ -17,7 +17,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, log, train
 from hyrfpack.train.log import TrainingLog, peak_memory
-from hyrfpack.train.trainer import RECORDS
+from hyrfpack.train.trainer import MIN_CURVE_RECORDS
 
 CPU = torch.device("cpu")
 CONFIG = TrainConfig(steps=30, seed=1, max_gaussians=120, checkpoint_every=1)
@@ -54,13 +54,13 @@ def test_each_line_says_where_the_run_is_and_the_last_what_it_came_to(tmp_path: 
 
 
 def test_records_of_a_long_run_are_means_and_few(tmp_path: Path) -> None:
-    steps = 5 * RECORDS
+    steps = 5 * MIN_CURVE_RECORDS
     with TrainingLog(tmp_path / "log.jsonl", steps, 0, CPU) as written:
         for step in range(1, steps + 1):
             written.step(step, loss=step, mse=0.01 if step % 2 else math.nan, gaussians=7)
 
     records = read(tmp_path / "log.jsonl")
-    assert len(records) == RECORDS
+    assert len(records) == MIN_CURVE_RECORDS
     assert records[0]["loss"] == 3 and records[0]["psnr"] == pytest.approx(20)  # of steps 1, 3 and 5
     assert records[1]["loss"] == 8  # of 7 and 9
 

@@ -14,7 +14,7 @@ from hyrfpack.train.progress import PhaseLine, ProgressLine, duration
 
 
 def test_a_log_file_gets_plain_lines_with_all_that_matters(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "LOG_EVERY", 0.0)
+    monkeypatch.setattr(progress, "LOG_INTERVAL_SECONDS", 0.0)
     with ProgressLine(20, 0) as line:
         for step in range(1, 21):
             line.update(step, 0.25, 0.01, 1234)
@@ -35,7 +35,7 @@ def test_the_last_step_is_always_said(capsys):
 
 
 def test_quiet_says_nothing(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "LOG_EVERY", 0.0)
+    monkeypatch.setattr(progress, "LOG_INTERVAL_SECONDS", 0.0)
     with ProgressLine(3, 0, quiet=True) as line:
         line.update(3, 1.0, 0.1, 5)
     assert capsys.readouterr() == ("", "")
@@ -52,7 +52,7 @@ def test_running_means_start_at_the_first_value_and_follow():
 
 def test_steps_without_an_error_leave_the_means_alone(capsys, monkeypatch):
     """A photo that is masked all over has none."""
-    monkeypatch.setattr(progress, "LOG_EVERY", 0.0)
+    monkeypatch.setattr(progress, "LOG_INTERVAL_SECONDS", 0.0)
     with ProgressLine(10, 0) as line:
         line.update(1, 0.0, float("nan"), 5)
         assert capsys.readouterr().err == ""

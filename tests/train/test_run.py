@@ -22,7 +22,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.render import render
 from hyrfpack.scene import Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer, progress, train
-from hyrfpack.train.run import STOPPING, _stop_requests
+from hyrfpack.train.run import STOP_SIGNALS, _stop_requests
 
 CONFIG = TrainConfig(
     steps=60,
@@ -164,7 +164,7 @@ def test_a_background_that_no_view_sees_is_dropped(tmp_path):
     one_step = dataclasses.replace(CONFIG, steps=1, max_gaussians=500)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrfpack.train.setup.INITIAL_OPACITY", 0.9999)
-        patch.setattr("hyrfpack.train.setup.INITIAL_SIZE", (0.45, 0.5))
+        patch.setattr("hyrfpack.train.setup.MIN_INITIAL_SIZE", 0.45)
         closed = train(scene, tmp_path / "closed", one_step, quiet=True)
     open_air = train(a_scene(), tmp_path / "open", one_step, quiet=True)
 
@@ -190,7 +190,7 @@ def test_speed_is_told_of_all_parts_of_a_resumed_run(finished, tmp_path):
 
 
 def test_a_long_run_says_once_what_would_shorten_it(tmp_path, capsys, monkeypatch):
-    for name in ("FAIR_STEPS", "FAIR_SECONDS", "LONG"):
+    for name in ("MIN_ADVICE_STEPS", "MIN_ADVICE_SECONDS", "MIN_ADVICE_SECONDS_LEFT"):
         monkeypatch.setattr(progress, name, 0)
     train(a_scene(), tmp_path, dataclasses.replace(CONFIG, steps=8))
     (told,) = [line for line in capsys.readouterr().err.splitlines() if "more hours" in line]
@@ -232,7 +232,7 @@ def test_a_terminal_that_closes_may_say_so_twice():
 
 
 @pytest.mark.usefixtures("signals")
-@pytest.mark.parametrize("number", STOPPING)
+@pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_a_signal_that_is_ignored_stays_ignored(number):
     """SIGHUP under nohup, Ctrl-C in the background of a script."""
     signal.signal(number, signal.SIG_IGN)
@@ -243,7 +243,7 @@ def test_a_signal_that_is_ignored_stays_ignored(number):
 
 
 @pytest.mark.usefixtures("signals")
-@pytest.mark.parametrize("number", STOPPING)
+@pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_an_interrupt_saves_exits_cleanly_and_resumes_to_the_same_model(number, whole, tmp_path):
     child = start_child(tmp_path, "train")
     checkpoint = tmp_path / "checkpoint.pt"

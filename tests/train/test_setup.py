@@ -13,10 +13,10 @@ from hyrfpack.model import Frame
 from hyrfpack.scene import Picture, Scene, evenly_spaced
 from hyrfpack.train import TrainConfig
 from hyrfpack.train.setup import (
-    LARGER,
-    LEAST_TARGETED,
-    PACKED,
-    PACKED_GAUSSIAN,
+    MAX_TARGETED_BUDGET_RATIO,
+    MIN_TARGETED_BUDGET,
+    PACKED_BYTES_PER_GAUSSIAN,
+    PACKED_HEADER_BYTES,
     budget_for,
     build_model,
     detect_preset,
@@ -210,14 +210,20 @@ def test_a_factor_multiplies_what_pixels_and_steps_suggest(factor):
 @pytest.mark.parametrize("target", [22_000, 29_000, 36_000])
 def test_a_budget_for_a_target_size_fills_what_decoders_leave(target):
     budget, reason = budget_for(around_an_object(), TrainConfig(target_bytes=target))
-    assert (budget, reason) == ((target - PACKED) / PACKED_GAUSSIAN, f"to be packed into {target:,} bytes")
+    assert (budget, reason) == (
+        (target - PACKED_HEADER_BYTES) / PACKED_BYTES_PER_GAUSSIAN,
+        f"to be packed into {target:,} bytes",
+    )
 
 
 def test_a_budget_for_a_target_size_is_neither_nothing_nor_more_than_photos_can_use():
     scene = around_an_object()
-    assert budget_for(scene, TrainConfig(target_bytes=1))[0] == LEAST_TARGETED
+    assert budget_for(scene, TrainConfig(target_bytes=1))[0] == MIN_TARGETED_BUDGET
     usual, why = budget_for(scene, TrainConfig())
-    assert budget_for(scene, TrainConfig(target_bytes=10**9)) == (LARGER * usual, f"{LARGER} times what suits {why}")
+    assert budget_for(scene, TrainConfig(target_bytes=10**9)) == (
+        MAX_TARGETED_BUDGET_RATIO * usual,
+        f"{MAX_TARGETED_BUDGET_RATIO} times what suits {why}",
+    )
 
 
 @pytest.mark.parametrize("budget", [1, 1000, 30_000, 500_000, 3_000_000, 10**9])

@@ -23,8 +23,8 @@ from hyrfpack.render import render
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, Trainer
 from hyrfpack.train.density import DensityControl
+from hyrfpack.train.distributed import StepStats, average_gradients, check_settings, digest, pack_step_stats
 from hyrfpack.train.optimizer import Optimizer
-from hyrfpack.train.together import Told, averaged, check_settings, digest, to_tell
 from hyrfpack.train.trainer import shuffled
 
 SIZE = 2
@@ -85,10 +85,12 @@ NUMBERS = st.floats(0, 10, width=32)
 def test_what_ranks_tell_is_means_over_views_and_whether_any_stops_or_has_a_problem(rows):
     """An error of None: all of the photo is masked."""
     told = [
-        to_tell(torch.tensor(loss), torch.tensor(math.nan if error is None else error), stop=stop, problem=problem)
+        pack_step_stats(
+            torch.tensor(loss), torch.tensor(math.nan if error is None else error), stop=stop, problem=problem
+        )
         for loss, error, stop, problem in rows
     ]
-    found = Told.of(torch.stack(told).sum(0).tolist(), len(rows))
+    found = StepStats.from_sums(torch.stack(told).sum(0).tolist(), len(rows))
     errors = [error for _, error, _, _ in rows if error is not None]
     assert found.loss == pytest.approx(np.mean([row[0] for row in rows]), rel=1e-5, abs=1e-30)
     assert found.error == pytest.approx(np.mean(errors) if errors else math.nan, rel=1e-5, abs=1e-30, nan_ok=True)
@@ -97,16 +99,16 @@ def test_what_ranks_tell_is_means_over_views_and_whether_any_stops_or_has_a_prob
 
 def test_a_loss_that_is_not_finite_is_told_as_such():
     told = torch.stack(
-        [to_tell(torch.tensor(loss), torch.tensor(1.0), stop=False, problem=False) for loss in (1, math.nan)]
+        [pack_step_stats(torch.tensor(loss), torch.tensor(1.0), stop=False, problem=False) for loss in (1, math.nan)]
     )
-    assert math.isnan(Told.of(told.sum(0).tolist(), 2).loss)
+    assert math.isnan(StepStats.from_sums(told.sum(0).tolist(), 2).loss)
 
 
 def test_one_process_keeps_its_gradients_and_its_settings():
     weight = torch.nn.Parameter(torch.zeros(3, 2))
     weight.grad = torch.arange(6.0).view(3, 2)
     expected = weight.grad.clone()
-    assert averaged(SINGLE_PROCESS, [weight], torch.tensor([2.0, 5.0])).tolist() == [2.0, 5.0]
+    assert average_gradients(SINGLE_PROCESS, [weight], torch.tensor([2.0, 5.0])).tolist() == [2.0, 5.0]
     assert torch.equal(weight.grad, expected)
     check_settings(SINGLE_PROCESS, {"seed": 1})
 

@@ -1,4 +1,4 @@
-"""What processes that train one model tell each other in a step: gradients and a few numbers, in one message."""
+"""Exchange of gradients and step statistics between the processes that train one model."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from hyrfpack.parallel.ranks import Ranks
 
 
 @dataclass(frozen=True)
-class Told:
-    """What the ranks have told each other of a step.
+class StepStats:
+    """Statistics of one step over all ranks.
 
     Attributes:
-        loss, error: means over the ranks' views; the mean squared error is NaN where all of each photo is masked.
-        stop, problem: whether some rank is asked to stop, or cannot go on.
+        loss: mean over the ranks' views.
+        error: mean squared error over the ranks' views; NaN where the photos of all ranks are masked completely.
+        stop: whether any rank was asked to stop.
+        problem: whether any rank cannot continue.
     """
 
     loss: float
@@ -29,39 +31,46 @@ class Told:
     problem: bool = False
 
     @classmethod
-    def of(cls, sums: Sequence[float], ranks: int) -> Told:
-        """From the sums over so many ranks of what `to_tell` makes."""
+    def from_sums(cls, sums: Sequence[float], ranks: int) -> StepStats:
+        """Unpack the sums over `ranks` ranks of what `pack_step_stats` returns."""
         loss, error, counted, stop, problem = sums
         return cls(loss / ranks, error / counted if counted else math.nan, stop > 0, problem > 0)
 
 
-def to_tell(loss: Tensor, error: Tensor, *, stop: bool, problem: bool) -> Tensor:
-    """A rank's share of `Told`, (5,), to be summed; loss and error are scalars."""
+def pack_step_stats(loss: Tensor, error: Tensor, *, stop: bool, problem: bool) -> Tensor:
+    """Pack one rank's statistics into a tensor (5,), whose sum over ranks `StepStats.from_sums` unpacks.
+
+    Args:
+        loss: scalar.
+        error: scalar mean squared error; NaN where all of the photo is masked.
+        stop, problem: see `StepStats`.
+    """
     masked = torch.isnan(error)
     flags = torch.tensor((stop, problem), dtype=loss.dtype).to(loss.device, non_blocking=True)
     return torch.cat((torch.stack((loss, torch.where(masked, 0, error), (~masked).to(loss))), flags))
 
 
-def averaged(ranks: Ranks, parameters: Sequence[nn.Parameter], numbers: Tensor) -> Tensor:
-    """Give every rank the mean of all ranks' gradients, and the sum of some numbers.
+def average_gradients(ranks: Ranks, parameters: Sequence[nn.Parameter], numbers: Tensor) -> Tensor:
+    """Replace the gradients by their means over all ranks, and sum some numbers over all ranks.
 
-    All is laid end to end and summed as one: a message costs more by its number than by its bytes. A parameter
-    without a gradient counts as one of zeros. Sums have the same bits on all ranks.
+    Gradients and numbers travel in one message, because the cost of an all-reduce depends more on the number of
+    messages than on their bytes. A parameter without a gradient counts as one with a gradient of zeros. The sums have
+    the same bits on all ranks.
 
     Args:
-        parameters: of the same shapes on each rank; their gradients are replaced.
+        parameters: with the same shapes on each rank.
         numbers: (K,) float32 on the parameters' device.
 
     Returns:
         (K,) sums of the numbers.
 
     Raises:
-        HyrfError: another process has gone.
+        HyrfError: another process has ended.
 
     Example:
         >>> weight = nn.Parameter(torch.zeros(2))
         >>> weight.grad = torch.ones(2)
-        >>> averaged(Ranks(), [weight], torch.tensor([3.0])), weight.grad
+        >>> average_gradients(Ranks(), [weight], torch.tensor([3.0])), weight.grad
         (tensor([3.]), tensor([1., 1.]))
     """
     gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
@@ -73,10 +82,10 @@ def averaged(ranks: Ranks, parameters: Sequence[nn.Parameter], numbers: Tensor) 
 
 
 def check_settings(ranks: Ranks, settings: Mapping[str, object]) -> None:
-    """Refuse to train one model by different settings.
+    """Check that all ranks were started with the same settings.
 
     Raises:
-        HyrfTrainingError: a rank was started with others than rank 0; the first such one and what differs are named.
+        HyrfTrainingError: a rank has other settings than rank 0; the first such rank and the settings are named.
     """
     first, *others = ranks.all_gather(settings)
     for rank, theirs in enumerate(others, 1):
@@ -88,8 +97,8 @@ def check_settings(ranks: Ranks, settings: Mapping[str, object]) -> None:
 
 
 def digest(tensors: Iterable[Tensor]) -> str:
-    """SHA-256 of the bits of tensors."""
-    known = hashlib.sha256()
+    """Return the SHA-256 digest of the tensors' bytes, in hexadecimal digits."""
+    hasher = hashlib.sha256()
     for tensor in tensors:
-        known.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    return known.hexdigest()
+        hasher.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return hasher.hexdigest()
