@@ -11,7 +11,12 @@ import torch
 from hyrfpack.compress.sensitivity import MAX_SENSITIVITY_VIEWS, MIN_SENSITIVITY_VIEWS, TARGET_DRAWN_GAUSSIANS
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.train.config import FULL_STEPS, TrainConfig
-from hyrfpack.train.decisions import MAX_PILOT_STEPS, MIN_BUDGET_STEPS, max_pilot_steps
+from hyrfpack.train.decisions import (
+    MAX_BUDGET_PILOT_STEPS,
+    MIN_BUDGET_STEPS,
+    max_exposure_pilot_steps,
+    max_pilot_steps,
+)
 from hyrfpack.train.setup import budget_for
 
 # Seconds, of two CPU cores: for a megapixel that is trained on once, and that is drawn and followed back while packing.
@@ -139,5 +144,6 @@ def forecast_photos(sizes: Sequence[tuple[int, int]], plan: Plan, device: torch.
     width, height = sizes[0] if sizes else (1920, 1080)
     shrunk = min(1.0, plan.max_size / max(width, height)) if plan.max_size else 1.0
     pixels, count = width * height * shrunk**2 / 1e6, len(sizes) or UNKNOWN
-    pilot_steps = MAX_PILOT_STEPS if plan.steps >= MIN_BUDGET_STEPS else 0
+    pilot_steps = MAX_BUDGET_PILOT_STEPS + max_exposure_pilot_steps(count - count // 8)
+    pilot_steps *= plan.steps >= MIN_BUDGET_STEPS
     return {"poses": POSES * count, **forecast(pixels, plan, 20_000, count // 8, pilot_steps, device)}

@@ -1,6 +1,6 @@
-"""Short training runs before the long one, scored on validation photos: the place where a scene decides what it needs.
+"""Pilot runs: short training runs before the long one, scored on validation photos taken from the training photos.
 
-Validation photos are taken from the training photos; held-out photos have no part in it.
+Held-out photos have no part in them.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.setup import budget_for
 from hyrfpack.train.trainer import Trainer
 
-BUDGET_REFERENCE_STEPS = 500  # a pilot has at most the Gaussians of a run of this length
-MAX_TRAINING_VIEWS = 150  # as many as a pilot has steps at most
+BUDGET_REFERENCE_STEPS = 500  # A pilot has the budget of a run of this length, unless it asks for another one.
+MAX_TRAINING_VIEWS = 150  # A pilot of 150 steps trains on no more photos.
 MAX_VALIDATION_VIEWS = 8
-MIN_TRAINING_VIEWS = 8  # of fewer photos none can be spared
+MIN_TRAINING_VIEWS = 8  # With fewer photos, none can be spared for validation.
 
 Report = Callable[[int, float, float, int], None]  # step, loss, mean squared error, Gaussians
 Phase = Callable[[str, int, int], None]  # what is being done, items done, items in all (0: not known)
 
 
 class PilotsStopped(Exception):
-    """The run was asked to end while pilots ran."""
+    """Raised when the run is asked to end during pilot runs."""
 
 
 @dataclass(frozen=True)
 class PilotScore:
-    """What one pilot run came to on the validation photos.
+    """The scores of one pilot run on the validation photos.
 
     Attributes:
         steps, seed: of the run.
@@ -53,14 +53,28 @@ class PilotScore:
     psnr_per_view: list[float] = field(default_factory=list)
 
 
-class ScenePilots:
-    """Runs pilots of one scene and remembers their scores.
+@dataclass(frozen=True)
+class Fold:
+    """One split of a scene's training photos.
 
     Attributes:
-        validation: the photos that pilots are scored on; none where masks leave nothing of them.
-        budget: Gaussians at most of a pilot, unless it is told otherwise.
+        scene: the scene with the photos that pilots train on, and none held out.
+        validation: the photos that pilots are scored on; empty where masks leave nothing of them.
+        max_gaussians: the budget of a pilot that has no budget of its own.
+    """
+
+    scene: Scene
+    validation: list[View]
+    max_gaussians: int
+
+
+class ScenePilots:
+    """Runs pilots of one scene and keeps their scores.
+
+    Attributes:
+        scene, config, cache: as given.
         scores: of all pilots so far.
-        steps: that pilots have taken so far.
+        steps: that all pilots have taken so far.
     """
 
     def __init__(
@@ -72,63 +86,68 @@ class ScenePilots:
         report: Report = lambda step, loss, mse, gaussians: None,
         stop: Callable[[], bool] = lambda: False,
         phase: Phase = lambda what, done, total: None,
-        *,
-        validation_every: int | None = None,
-        max_validation: int = MAX_VALIDATION_VIEWS,
-        steps_before: int = 0,
     ) -> None:
-        """Choose the validation photos.
+        """Start without any scores.
 
         Args:
             scene: whose training photos are used.
             config: of the run to come.
             cache: keeps photos that are decoded.
-            report: told after each step its number among those of all pilots, the loss and mean squared error of its
-                view, and how many Gaussians there are.
-            stop: asked after each step.
-            phase: told what is being done, and how many of how many steps, photos or views are done.
-            validation_every, max_validation: see `split`.
-            steps_before: that other pilots of the scene have taken, for `report`.
+            report: called after each step with its number among those of all pilots, the loss and mean squared error
+                of its view, and the number of Gaussians.
+            stop: called after each step; True ends the pilots.
+            phase: called with what is being done, and how many of how many steps, photos or views are done.
+        """
+        self.scene, self.config, self.cache = scene, config, cache
+        self._device, self._report, self._stop, self._phase = device, report, stop, phase
+        self.scores: list[PilotScore] = []
+        self.steps = 0
+
+    def fold(self, every: int | None = None, max_validation: int = MAX_VALIDATION_VIEWS, number: int = 0) -> Fold:
+        """Split the training photos.
+
+        Args:
+            every, max_validation, number: see `split`.
 
         Raises:
             HyrfError: a photo cannot be read.
         """
-        training, validation = split(scene.train, validation_every, max_validation)
-        self.config, self.cache = config, cache
-        self._device, self._report, self._stop, self._phase = device, report, stop, phase
-        self.validation: list[View] = []
-        for done, view in enumerate(validation):
-            phase("reading photos to score pilot runs on", done, len(validation))
-            if is_usable(cache.get(view)):
-                self.validation.append(view)
-        self.scene = dataclasses.replace(scene, train=training, test=[])
-        self.budget, _ = budget_for(self.scene, TrainConfig(steps=BUDGET_REFERENCE_STEPS))
-        self.scores: list[PilotScore] = []
-        self.steps = steps_before
+        training, views = split(self.scene.train, every, max_validation, number)
+        validation: list[View] = []
+        for done, view in enumerate(views):
+            self._phase("reading photos to score pilot runs on", done, len(views))
+            if is_usable(self.cache.get(view)):
+                validation.append(view)
+        scene = dataclasses.replace(self.scene, train=training, test=[])
+        return Fold(scene, validation, budget_for(scene, TrainConfig(steps=BUDGET_REFERENCE_STEPS))[0])
 
-    def run(self, name: str, steps: int, *, seed: int, exposure: bool, max_gaussians: int | None = None) -> PilotScore:
+    def run(
+        self, name: str, fold: Fold, steps: int, *, seed: int, exposure: bool, max_gaussians: int | None = None
+    ) -> PilotScore:
         """Train a pilot and score it on the validation photos.
 
         Args:
             name: of the pilot, for progress ("pilot run 1 of 2").
+            fold: photos to train on and validation photos.
             steps: of the run.
-            seed, exposure, max_gaussians: replace those of the run to come; None for `budget`.
+            seed, exposure, max_gaussians: replace those of the run to come; None for the fold's budget.
 
         Raises:
             PilotsStopped: `stop` said so.
             HyrfError: as `Trainer.run`.
         """
+        max_gaussians = max_gaussians or fold.max_gaussians
         settings = dataclasses.replace(
             self.config,
             steps=steps,
             seed=seed,
             exposure=exposure,
-            max_gaussians=max_gaussians or self.budget,
+            max_gaussians=max_gaussians,
             budget_factor=None,
             target_bytes=None,
         )
         self._phase(f"{name}: reading photos", 0, 0)
-        trainer = Trainer(self.scene, settings, self.cache, self._device)
+        trainer = Trainer(fold.scene, settings, self.cache, self._device)
         before = self.steps
 
         def tell(trainer: Trainer, loss: float, mse: float) -> None:
@@ -139,16 +158,16 @@ class ScenePilots:
         trainer.run(report=tell, stop=self._stop)
         if self._stop():
             raise PilotsStopped
-        count = len(self.validation)
+        count = len(fold.validation)
         result: Evaluation = evaluate(
             trainer.model,
-            self.validation,
+            fold.validation,
             report=lambda _, share: self._phase(f"{name}: scoring", round(share * count), count),
         )
         score = PilotScore(
             steps=steps,
             seed=seed,
-            max_gaussians=max_gaussians or self.budget,
+            max_gaussians=max_gaussians,
             exposure=exposure,
             psnr=result.psnr,
             ssim=result.ssim,
@@ -160,23 +179,24 @@ class ScenePilots:
 
 
 def is_usable(picture: Picture) -> bool:
-    """Whether its mask leaves anything of it."""
+    """Return whether the mask leaves any pixel of the picture."""
     return picture.mask is None or bool(picture.mask.any())
 
 
 def split(
-    views: Sequence[View], every: int | None = None, most: int = MAX_VALIDATION_VIEWS
+    views: Sequence[View], every: int | None = None, max_validation: int = MAX_VALIDATION_VIEWS, number: int = 0
 ) -> tuple[list[View], list[View]]:
-    """Photos to train pilots on and validation photos.
+    """Split photos into those that pilots train on and validation photos.
 
-    The rest is trained on; of many photos those that are nearest to a validation photo, for spread over a large set
-    they would show too little of each place.
+    Pilots train on the photos that do not validate; of many, on those next to a validation photo, because photos spread
+    over a large set would show too little of each place.
 
     Args:
-        every: one of so many photos validates; None for 8, or 5 where there are few.
-        most: validation photos.
+        every: one of so many photos validates; None for 8, or 5 of fewer than 16 photos.
+        max_validation: the most validation photos.
+        number: of the fold. Folds 0 to `every` - 1 have no validation photo in common.
     """
     every = every or (8 if len(views) >= 16 else 5)
-    chosen = evenly_spaced(range(every // 2, len(views), every), most)
+    chosen = evenly_spaced(range((every // 2 + number) % every, len(views), every), max_validation)
     others = sorted(set(range(len(views))) - set(chosen), key=lambda n: min(abs(n - place) for place in chosen))
     return [views[n] for n in sorted(others[:MAX_TRAINING_VIEWS])], [views[n] for n in chosen]

@@ -18,7 +18,7 @@ from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
 from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.scene import Scene, View
 from hyrfpack.train import TrainConfig, budget_pilots, decisions, exposure_pilots, pilots, train
-from hyrfpack.train.budget_pilots import FACTORS, measure_budget
+from hyrfpack.train.budget_pilots import BUDGET_FACTORS, measure_budget
 from hyrfpack.train.decisions import (
     MIN_BUDGET_STEPS,
     MIN_EXPOSURE_STEPS,
@@ -40,7 +40,7 @@ def a_scene(views: int = 10) -> Scene:
 
 
 def measured(scene: Scene, config: TrainConfig = LONG, **options) -> tuple[float, str]:
-    return measure_budget(ScenePilots(scene, config, PictureCache(), CPU, **options))
+    return measure_budget(ScenePilots(scene, config, PictureCache(), CPU, **options), exposure=False)
 
 
 @pytest.fixture
@@ -133,7 +133,7 @@ def test_pilots_say_the_same_twice_and_report_each_step():
     told: list[tuple] = []
     first = measured(a_scene(), report=lambda *facts: told.append(facts))
     assert first == measured(a_scene())
-    assert first is not None and first[0] in FACTORS
+    assert first is not None and first[0] in BUDGET_FACTORS
     assert [step for step, *_ in told] in (list(range(1, 13)), list(range(1, 25)))
     assert all(np.isfinite(loss) and mse > 0 and gaussians > 0 for _, loss, mse, gaussians in told)
 
@@ -262,7 +262,7 @@ def relit(scene: Scene, stops: list[float]) -> Scene:
         ([20.3, 20.2], (-2.0, 2.0, 0.0, -2.0, 2.0), False, 2),
         ([20.5, 20.5], (-9.0, 0.0, 0.0, 0.0, 0.0), False, 1),
         ([22.5, 22.5], (-9.0, 0.0, 0.0, 0.0, 0.0), True, 2),
-        ([20.5, 19.9], (0.0,) * 5, False, 2),
+        ([20.3, 19.9], (0.0,) * 5, False, 2),
         ([20.05, 20.05], (0.0,) * 5, False, 2),
         ([19.9, 25.0], (0.0,) * 5, False, 1),
         ([20.0, 25.0], (0.0,) * 5, False, 1),
@@ -273,7 +273,7 @@ def test_gains_are_learnt_only_where_renders_come_closer_to_photos_by_more_than_
 ):
     monkeypatch.setattr(exposure_pilots, "exposure_spread", lambda *_: 1.0)
     scores |= {False: [20.0, 20.0], True: compensated, "apart": apart}
-    runs = ScenePilots(a_scene(20), LONG, PictureCache(), CPU, validation_every=4)
+    runs = ScenePilots(a_scene(20), LONG, PictureCache(), CPU)
     decision, reason = measure_exposure(runs)
 
     assert decision is expected and "validation photos" in reason
@@ -283,15 +283,29 @@ def test_gains_are_learnt_only_where_renders_come_closer_to_photos_by_more_than_
 
 
 def test_photos_of_one_exposure_take_no_pilots():
-    runs = ScenePilots(a_scene(20), LONG, PictureCache(), CPU, validation_every=4)
+    runs = ScenePilots(a_scene(20), LONG, PictureCache(), CPU)
     decision, reason = measure_exposure(runs)
     assert (decision, runs.scores) == (False, []) and "stops" in reason
 
 
-def test_few_photos_take_no_pilots_for_exposure_and_learn_no_gains():
-    runs = ScenePilots(relit(a_scene(16), [0.5, -0.5]), LONG, PictureCache(), CPU, validation_every=4)
-    decision, reason = measure_exposure(runs)
-    assert (decision, runs.scores) == (False, []) and "4 validation photos are too few" in reason
+@pytest.mark.parametrize(("photos", "rounds"), [(8, 3), (11, 3), (12, 2), (100, 2)])
+def test_few_photos_take_more_rounds_so_that_six_photos_validate(scores, monkeypatch, photos, rounds):
+    monkeypatch.setattr(exposure_pilots, "exposure_spread", lambda *_: 1.0)
+    scores |= {False: [20.0] * 4, True: [20.3] * 4, "apart": (0.0,) * 5}
+    validated: list[list[str]] = []
+    fold = ScenePilots.fold
+
+    def recorded(*arguments):
+        result = fold(*arguments)
+        validated.append([view.name for view in result.validation])
+        return result
+
+    monkeypatch.setattr(ScenePilots, "fold", recorded)
+    decision, _ = measure_exposure(ScenePilots(a_scene(photos), LONG, PictureCache(), CPU))
+
+    names = [name for views in validated for name in views]
+    assert decision and len(validated) == rounds
+    assert len(set(names)) == len(names) >= 6
 
 
 @pytest.mark.parametrize(
@@ -299,13 +313,18 @@ def test_few_photos_take_no_pilots_for_exposure_and_learn_no_gains():
     [
         ({}, 8, True),
         ({}, 7, False),
-        ({"steps": MIN_EXPOSURE_STEPS - 1}, 8, False),
+        ({"steps": 2_999}, 8, False),
+        ({"steps": 2_000}, 12, True),
+        ({"steps": 1_999}, 31, False),
+        ({"steps": MIN_EXPOSURE_STEPS}, 32, True),
+        ({"steps": MIN_EXPOSURE_STEPS - 1}, 32, False),
         ({"exposure": False}, 8, False),
         ({"exposure": True}, 8, False),
     ],
 )
-def test_exposure_is_decided_where_nobody_has_said_and_there_is_time_and_photos_enough(change, views, expected):
-    assert measures_exposure(a_scene(views), dataclasses.replace(LONG, **change)) is expected
+def test_exposure_is_decided_where_no_setting_does_and_pilots_take_no_more_steps_than_the_run(change, views, expected):
+    config = dataclasses.replace(TrainConfig(steps=3_000), **change)
+    assert measures_exposure(a_scene(views), config) is expected
 
 
 def test_photos_with_transparency_get_no_gains():
@@ -326,6 +345,7 @@ def test_a_short_run_without_a_decision_learns_no_gains():
 @pytest.mark.usefixtures("short", "signals")
 def test_a_run_that_goes_on_keeps_its_exposure_compensation(tmp_path, monkeypatch):
     monkeypatch.setattr(decisions, "MIN_EXPOSURE_STEPS", 10)
+    monkeypatch.setattr(decisions, "max_exposure_pilot_steps", lambda _: 10)
     monkeypatch.setattr(decisions, "measure_exposure", lambda *_: (True, "by a coin"))
     scene, config = relit(a_scene(), [0.5, -0.5]), TrainConfig(steps=10)
     train(scene, tmp_path / "whole", config, quiet=True)
