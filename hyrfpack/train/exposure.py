@@ -1,8 +1,8 @@
 """Per-image gains: exposure and white balance of each training photo, learnt beside the model.
 
-The gains are initialised from the colours of tracked points. A training photo is compared with the render exposed by
-the photo's three gains (`hyrfpack.model.exposure.expose`). The mean of the log gains over all training photos is zero,
-so that the model has the photos' mean exposure.
+The gains are initialised from the colours of tracked points. A training photo is compared with the render that its
+three gains expose (`hyrfpack.model.exposure.apply_exposure_gains`). The mean of the log gains over all training photos
+is zero, so that the model has the photos' mean exposure.
 """
 
 from __future__ import annotations
