@@ -1,6 +1,7 @@
-"""Poses from photos: a COLMAP reconstruction by pycolmap, of two mappers' results the one that explains more.
+"""Camera poses from photos: run pycolmap's two mappers and choose the result that explains more matches.
 
-`estimate.py` is the whole of it, in the caller's process; what `worker.py` imports runs in processes of their own.
+`estimate.py` controls the stages in the caller's process. The modules that `worker.py` imports run in one process for
+each stage.
 """
 
 from hyrfpack.poses.estimate import PosesReport as PosesReport

@@ -1,4 +1,4 @@
-"""What pairs of photos say of the camera: its focal length where EXIF does not, and whether it ever moved."""
+"""Estimate a camera's focal length from matched photos, and detect whether the camera only rotated between them."""
 
 from __future__ import annotations
 
@@ -8,79 +8,89 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from hyrfpack.poses.job import GUESS
+from hyrfpack.poses.job import DEFAULT_FOCAL_RATIO
 
-FOCALS = np.geomspace(0.45, 2.8, 17)  # that are tried, in longer sides: wide angles of phones to short telephotos
-_PRIOR = 0.01, 0.5  # how much of the matches an e-fold off from the guess must explain more: (share, in e-folds) ^ 2
-_CLOSE = 1.0  # pixels: the error of a match that fits; tight, for loose ones fit any focal length
-_TRIALS = 150  # of RANSAC for each pair and focal length
-_TURN_ERROR = 3.0  # pixels: how far off a match may be that a camera which only turned explains
-_PANORAMA = 0.85  # share of a pair's matches from which on it only turned
+# Focal lengths over the longer side of the picture, from the wide angles of phones to short telephoto lenses.
+CANDIDATE_FOCAL_RATIOS = np.geomspace(0.45, 2.8, 17)
+# A focal length this far from the default (in natural logarithms) must explain this ratio of the matches more.
+_PRIOR_PENALTY = 0.01
+_PRIOR_LOG_WIDTH = 0.5
+_RANSAC_ERROR_PIXELS = 1.0  # a looser threshold would accept any focal length
+_MAX_RANSAC_TRIALS = 150
+_ROTATION_INLIER_PIXELS = 3.0  # a rotation explains a match if its error is below this
+_ROTATION_ONLY_INLIER_RATIO = 0.85  # a pair with this ratio of matches explained by a rotation has no translation
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
-    """Matched pixels of two photos of one camera.
+class PixelMatches:
+    """Matches between two photos of one camera, in pixels.
 
     Attributes:
-        pixels1, pixels2: (M, 2).
+        pixels1: (M, 2) pixel coordinates in the first photo.
+        pixels2: (M, 2) pixel coordinates in the second photo.
     """
 
     pixels1: np.ndarray
     pixels2: np.ndarray
 
 
-def search_focal(
-    pairs: Sequence[Pair], camera: pycolmap.Camera, seed: int, progress: Callable[[float], None] = lambda share: None
+def search_focal_ratio(
+    pairs: Sequence[PixelMatches],
+    camera: pycolmap.Camera,
+    seed: int,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> float:
-    """The focal length with which calibrated geometry explains most matches, in longer sides of the picture.
+    """Search the focal length, over the longer side, with which calibrated geometry explains the most matches.
 
-    Where pairs do not tell (flat ground from above, motion straight ahead) it is near the guess.
+    The score of a candidate is the mean inlier ratio minus a small penalty for its distance from DEFAULT_FOCAL_RATIO.
+    The penalty decides where matches cannot, such as with flat ground from above or motion straight ahead.
 
     Args:
-        pairs: of the camera's own photos.
-        camera: its size and model; its focal length does not matter.
-        seed: of RANSAC.
-        progress: called with the share of the search that is done.
+        pairs: matches between photos of the camera.
+        camera: the camera, of which only size and model are used.
+        seed: random seed of RANSAC.
+        progress: called with the ratio of the search that is done.
     """
     options = pycolmap.RANSACOptions()
-    options.max_error, options.random_seed = _CLOSE, seed % 2**31
-    options.min_num_trials, options.max_num_trials = _TRIALS // 3, _TRIALS
+    options.max_error, options.random_seed = _RANSAC_ERROR_PIXELS, seed % 2**31
+    options.min_num_trials, options.max_num_trials = _MAX_RANSAC_TRIALS // 3, _MAX_RANSAC_TRIALS
     scores = []
-    for place, focal in enumerate(FOCALS):
-        progress(place / len(FOCALS))
-        tried = with_focal(camera, focal)
-        found = [pycolmap.estimate_essential_matrix(p.pixels1, p.pixels2, tried, tried, options) for p in pairs]
+    for place, focal in enumerate(CANDIDATE_FOCAL_RATIOS):
+        progress(place / len(CANDIDATE_FOCAL_RATIOS))
+        candidate = camera_with_focal(camera, focal)
+        found = [pycolmap.estimate_essential_matrix(p.pixels1, p.pixels2, candidate, candidate, options) for p in pairs]
         shares = [0.0 if f is None else f["num_inliers"] / len(p.pixels1) for f, p in zip(found, pairs, strict=True)]
-        scores.append(np.mean(shares) - _PRIOR[0] * (np.log(focal / GUESS) / _PRIOR[1]) ** 2)
-    return float(FOCALS[int(np.argmax(scores))])
+        scores.append(np.mean(shares) - _PRIOR_PENALTY * (np.log(focal / DEFAULT_FOCAL_RATIO) / _PRIOR_LOG_WIDTH) ** 2)
+    return float(CANDIDATE_FOCAL_RATIOS[int(np.argmax(scores))])
 
 
-def with_focal(camera: pycolmap.Camera, focal: float) -> pycolmap.Camera:
-    """A copy of a camera without distortion, with a focal length in longer sides."""
+def camera_with_focal(camera: pycolmap.Camera, focal: float) -> pycolmap.Camera:
+    """Return a copy of a camera without distortion, whose focal length is `focal` times the longer side."""
     width, height = camera.width, camera.height
     model = camera.model_name
     return pycolmap.Camera.create_from_model_name(camera.camera_id, model, focal * max(width, height), width, height)
 
 
-def turned_only(pairs: Sequence[Pair], camera: pycolmap.Camera, focals: Sequence[float]) -> float:
-    """The share of pairs between which the camera turned and did not move, at the focal length where it is largest.
+def rotation_only_share(pairs: Sequence[PixelMatches], camera: pycolmap.Camera, focal_ratios: Sequence[float]) -> float:
+    """Return the share of pairs between which the camera only rotated, at the focal length where it is largest.
 
     Args:
-        pairs: of one camera's photos.
-        camera: its size.
-        focals: that are possible, in longer sides.
+        pairs: matches between photos of one camera.
+        camera: the camera, of which only the size is used.
+        focal_ratios: possible focal lengths, over the longer side.
     """
-    longer, centre = max(camera.width, camera.height), np.array([camera.width, camera.height]) / 2
+    longer_side, centre = max(camera.width, camera.height), np.array([camera.width, camera.height]) / 2
     shares = []
-    for focal in focals:
-        turned = [_turn_explains(p, centre, focal * longer) >= _PANORAMA for p in pairs]
-        shares.append(float(np.mean(turned)))
+    for focal in focal_ratios:
+        is_rotation_only = [
+            _rotation_inlier_share(p, centre, focal * longer_side) >= _ROTATION_ONLY_INLIER_RATIO for p in pairs
+        ]
+        shares.append(float(np.mean(is_rotation_only)))
     return max(shares, default=0.0)
 
 
-def _turn_explains(pair: Pair, centre: np.ndarray, focal: float) -> float:
-    """The share of a pair's matches that a rotation explains: least squares, reweighted to be robust."""
+def _rotation_inlier_share(pair: PixelMatches, centre: np.ndarray, focal: float) -> float:
+    """Fit a rotation to the matches of a pair by reweighted least squares; return the share of matches it explains."""
     first, second = (
         np.column_stack([(pixels - centre) / focal, np.ones(len(pixels))]) for pixels in (pair.pixels1, pair.pixels2)
     )
@@ -93,4 +103,4 @@ def _turn_explains(pair: Pair, centre: np.ndarray, focal: float) -> float:
         rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
         error = np.linalg.norm(first @ rotation.T - second, axis=1) * focal
         weights = 1 / np.maximum(error, 0.5)
-    return float(np.mean(error < _TURN_ERROR))
+    return float(np.mean(error < _ROTATION_INLIER_PIXELS))

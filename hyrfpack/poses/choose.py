@@ -1,95 +1,97 @@
-"""Which reconstruction is taken, why, and of which photos it is sure."""
+"""Choose between the results of the two mappers, and confirm the chosen poses by the other result."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from hyrfpack.poses.compare import Poses, compare
+from hyrfpack.poses.alignment import Poses, align_poses
 
-_WORDS = {"incremental": "the incremental mapper", "global": "the global mapper"}
-_BARELY = 0.002  # of the matches: a lead in what is explained that says nothing
-_MOSTLY = 0.9  # of the photos: where the mappers agree on fewer, it is said
+_MAPPER_NAMES = {"incremental": "the incremental mapper", "global": "the global mapper"}
+_TIE_MATCH_RATIO = 0.002  # a lead of at most this ratio of all matches is not significant
+_MIN_CONFIRMED_RATIO = 0.9  # the report mentions it if the mappers agree on a smaller ratio of the photos
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """What a mapper made, in numbers.
+    """The result of a mapper, with the figures by which it is compared.
 
     Attributes:
         mapper: "incremental" or "global".
-        poses: (3, 4) camera_from_world by photo, of its largest piece.
-        apart: the same of its other pieces, each in a frame of its own.
-        explained: matches between all photos that the largest piece explains (`evidence`).
-        track: mean number of photos that see a point of it.
-        error: mean reprojection error in pixels of the working copies.
+        poses: (3, 4) camera_from_world by photo name, of the largest piece.
+        other_pieces: the poses of the other pieces, each in a frame of its own.
+        explained_matches: number of matches between all photos that the largest piece explains
+            (`count_explained_matches`).
+        mean_track_length: mean number of photos that see a point of the largest piece.
+        mean_reprojection_error: mean reprojection error in pixels of the working copies.
     """
 
     mapper: str
     poses: Poses
-    apart: Sequence[Poses]
-    explained: int
-    track: float
-    error: float
+    other_pieces: Sequence[Poses]
+    explained_matches: int
+    mean_track_length: float
+    mean_reprojection_error: float
 
 
-def choose(candidates: Sequence[Candidate], matches: int) -> tuple[Candidate, str]:
-    """Choose between what the mappers made, and say why.
+def choose_candidate(candidates: Sequence[Candidate], matches: int) -> tuple[Candidate, str]:
+    """Choose the candidate that explains the most matches between photos, and return it with the reason.
 
-    The one that explains most of the matches between photos is taken: neither the number of photos nor the reprojection
-    error shows that photos are folded onto others, for each mapper drops the points that would. Where they explain the
-    same, the one with more photos, then the one with the longer tracks.
+    The number of photos and the reprojection error do not show whether a part of the scene was folded onto another one,
+    because each mapper drops the points that would show it. If candidates explain about the same number of matches, the
+    one with more photos is chosen, then the one with longer tracks.
 
     Args:
-        candidates: one or two.
-        matches: verified matches between all photos.
+        candidates: one or two results.
+        matches: number of verified matches between all photos.
     """
-    most = max(candidate.explained for candidate in candidates)
-    near = [candidate for candidate in candidates if most - candidate.explained <= _BARELY * matches]
-    chosen = max(near, key=lambda candidate: (len(candidate.poses), candidate.track))
-    name, figures = _WORDS[chosen.mapper], _figures(chosen, matches)
+    most = max(candidate.explained_matches for candidate in candidates)
+    tied = [candidate for candidate in candidates if most - candidate.explained_matches <= _TIE_MATCH_RATIO * matches]
+    chosen = max(tied, key=lambda candidate: (len(candidate.poses), candidate.mean_track_length))
+    name, figures = _MAPPER_NAMES[chosen.mapper], _describe_figures(chosen, matches)
     others = [candidate for candidate in candidates if candidate is not chosen]
     if not others:
         return chosen, f"{name} was taken ({figures}); the other one posed no photos"
     (other,) = others
-    against = f"{name} was taken ({figures}; {_WORDS[other.mapper]}: {_figures(other, matches)})"
-    if other not in near:
+    against = f"{name} was taken ({figures}; {_MAPPER_NAMES[other.mapper]}: {_describe_figures(other, matches)})"
+    if other not in tied:
         return chosen, f"{against}: it explains more of what was matched"
     lead = "poses more photos" if len(chosen.poses) > len(other.poses) else "follows points through more photos"
     return chosen, f"{against}: both explain what was matched alike, and it {lead}"
 
 
-def confirmed(poses: Poses, other: Candidate | None) -> frozenset[str]:
-    """Photos whose poses agree with those of the other mapper.
+def confirmed_photos(poses: Poses, other: Candidate | None) -> frozenset[str]:
+    """Return the photos whose poses agree with those of the other mapper.
 
-    Of its pieces the one that most agree with counts, for how pieces lie to each other it does not say.
+    Only the piece of the other mapper with the most agreeing photos counts, because the pieces have no common frame.
     """
-    pieces = [] if other is None else [other.poses, *other.apart]
-    return max((compare(piece, poses).same for piece in pieces), key=len, default=frozenset())
+    pieces = [] if other is None else [other.poses, *other.other_pieces]
+    return max((align_poses(piece, poses).agreeing for piece in pieces), key=len, default=frozenset())
 
 
-def doubt(poses: Poses, other: Candidate | None) -> str:
-    """One sentence where too few photos are sure; "" where all is well."""
-    sure = confirmed(poses, other)
-    if len(sure) >= _MOSTLY * len(poses):
+def describe_doubt(poses: Poses, other: Candidate | None) -> str:
+    """Return a sentence about the photos that are not confirmed; "" if enough are."""
+    agreed = confirmed_photos(poses, other)
+    if len(agreed) >= _MIN_CONFIRMED_RATIO * len(poses):
         return ""
     if other is None:
         return f"nothing confirms the poses of these {len(poses)} photos, for one mapper alone found any; look at them"
-    lacking = len(set(poses).difference(other.poses, *other.apart))
-    apart = len(set().union(*other.apart).intersection(poses).difference(sure))
-    unlike = len(poses) - len(sure) - lacking - apart
+    lacking = len(set(poses).difference(other.poses, *other.other_pieces))
+    in_other_pieces = len(set().union(*other.other_pieces).intersection(poses).difference(agreed))
+    unlike = len(poses) - len(agreed) - lacking - in_other_pieces
     parts = [f"poses {unlike} of them differently"] if unlike > 0 else []
-    parts += [f"has {apart} in pieces of their own"] if apart else []
+    parts += [f"has {in_other_pieces} in pieces of their own"] if in_other_pieces else []
     parts += [f"has no pose for {lacking}"] if lacking else []
     return (
-        f"{len(sure)} of {len(poses)} posed photos are sure; {_WORDS[other.mapper]} {' and '.join(parts)}, so look at "
-        "the result before you trust it"
+        f"{len(agreed)} of {len(poses)} posed photos are sure; {_MAPPER_NAMES[other.mapper]} {' and '.join(parts)}, "
+        "so look at the result before you trust it"
     )
 
 
-def _figures(candidate: Candidate, matches: int) -> str:
-    share = candidate.explained / matches if matches else 0.0
+def _describe_figures(candidate: Candidate, matches: int) -> str:
+    """Return the figures of a candidate as text."""
+    share = candidate.explained_matches / matches if matches else 0.0
     return (
-        f"{len(candidate.poses)} photos, {share:.1%} of the matches, mean track {candidate.track:.2f}, error "
-        f"{candidate.error:.2f} pixels"
+        f"{len(candidate.poses)} photos, {share:.1%} of the matches, mean track {candidate.mean_track_length:.2f}, "
+        f"error {candidate.mean_reprojection_error:.2f} pixels"
     )

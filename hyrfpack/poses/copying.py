@@ -1,4 +1,4 @@
-"""Copies of the user's photos and masks that share their disk space where the file system can do that."""
+"""Copy photos and masks; the copies share the disk space of the originals if the file system supports it."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
-_FICLONE = 0x40049409  # ioctl of Linux: make this file share all blocks of another
+_FICLONE = 0x40049409  # ioctl request of Linux (linux/fs.h) that makes a file share all blocks of another file
 
 
 def copy_file(source: Path, target: Path) -> None:
-    """Copy a file with its times and permissions, so that an edit of one never changes the other.
+    """Copy a file with its times and permissions; later edits of one file never change the other.
 
-    On Linux file systems with reflinks (Btrfs, XFS, bcachefs) the copy shares the blocks of its source until one of the
-    two is changed, and takes no space before. Elsewhere all bytes are copied.
+    On Linux file systems with reflinks (Btrfs, XFS, bcachefs) the copy shares the blocks of its source and takes no
+    space until one of the two is changed. Elsewhere all bytes are copied.
 
     Args:
-        source: the file; links are followed.
-        target: is created.
+        source: file to copy; links are followed.
+        target: path of the copy, which is created or overwritten.
 
     Raises:
         OSError: the source cannot be read, or the target cannot be written.
@@ -26,19 +26,19 @@ def copy_file(source: Path, target: Path) -> None:
     source = Path(os.path.realpath(source))
     if not _reflink(source, target):
         shutil.copyfile(source, target)
-    with suppress(OSError):  # not every file system keeps them
+    with suppress(OSError):  # some file systems keep neither times nor permissions
         shutil.copystat(source, target)
 
 
 def _reflink(source: Path, target: Path) -> bool:
-    """Whether the target is now a reflink of the source; where that is impossible, it may be left as an empty file."""
+    """Make the target a reflink of the source; return False if that is impossible, which may leave an empty target."""
     try:
         import fcntl
-    except ModuleNotFoundError:  # not on Windows
+    except ModuleNotFoundError:  # Windows has no fcntl
         return False
     with source.open("rb") as reading, target.open("wb") as writing:
         try:
             fcntl.ioctl(writing.fileno(), _FICLONE, reading.fileno())
-        except OSError:  # another file system, one without reflinks, or another system than Linux
+        except OSError:  # two file systems, one without reflinks, or no Linux
             return False
     return True

@@ -1,4 +1,4 @@
-"""pycolmap's database of an estimation: cameras, photos, features, matches."""
+"""Access to the pycolmap database of an estimation: cameras, photos, features and matches."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ import pycolmap
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.poses.job import Job
-from hyrfpack.poses.process import Tell
-from hyrfpack.poses.watch import count_rows, watching_rows
+from hyrfpack.poses.process import Report
+from hyrfpack.poses.watch import count_rows, report_new_rows
 
-pycolmap.logging.minloglevel = 1  # warnings and errors, into the stage's log
-Cameras = dict[int, pycolmap.Camera]  # by number
+pycolmap.logging.minloglevel = 1  # only warnings and errors go into the log of a stage
+Cameras = dict[int, pycolmap.Camera]  # by camera number
 
-FOUND = 15  # matches that a pair of photos needs to count as one (pycolmap's own default)
-_NO_PAIR = ("UNDEFINED", "DEGENERATE", "WATERMARK")
+MIN_PAIR_MATCHES = 15  # a pair of photos with fewer verified matches is ignored (pycolmap's own default)
+_UNUSABLE_PAIR_KINDS = ("UNDEFINED", "DEGENERATE", "WATERMARK")
 
 
 @contextmanager
-def opened(job: Job) -> Iterator[pycolmap.Database]:
-    """The database, closed in the end."""
+def open_database(job: Job) -> Iterator[pycolmap.Database]:
+    """Open the database and close it at the end of the block."""
     database = pycolmap.Database.open(job.database)
     try:
         yield database
@@ -33,10 +33,11 @@ def opened(job: Job) -> Iterator[pycolmap.Database]:
 
 
 def make_database(job: Job) -> None:
-    """Make the database with all cameras and photos, in order, for what comes later shall not depend on threads.
+    """Create the database with all cameras and photos, unless it exists.
 
-    Cameras have one coefficient of radial distortion. Their focal length, or the guess of it, counts as known: pairs of
-    photos are verified by calibrated geometry then, and by the uncalibrated one where that fits more.
+    Cameras and photos are written in order, so that later results do not depend on the order of threads. Cameras have
+    one coefficient of radial distortion. Their focal length counts as known even if it is a guess. Then pairs are
+    verified by calibrated geometry, or by uncalibrated geometry if that explains more matches.
     """
     if job.database.exists():
         return
@@ -66,61 +67,63 @@ def make_database(job: Job) -> None:
 
 
 def verified_pairs(database: pycolmap.Database) -> Iterator[tuple[int, int, np.ndarray, str]]:
-    """(first photo, second photo, (M, 2) matches, kind of geometry) of each pair that geometry holds together."""
+    """Yield (first image, second image, (M, 2) matches, kind of geometry) of each geometrically verified pair."""
     pair_ids, geometries = database.read_two_view_geometries()
     for pair_id, geometry in zip(pair_ids, geometries, strict=True):
         kind = pycolmap.TwoViewGeometryConfiguration(geometry.config).name
-        if len(geometry.inlier_matches) >= FOUND and kind not in _NO_PAIR:
+        if len(geometry.inlier_matches) >= MIN_PAIR_MATCHES and kind not in _UNUSABLE_PAIR_KINDS:
             first, second = pycolmap.pair_id_to_image_pair(pair_id)
             yield first, second, np.asarray(geometry.inlier_matches), kind
 
 
 def read_cameras(database: pycolmap.Database) -> Cameras:
-    """Cameras by their number."""
+    """Read all cameras, by number."""
     return {camera.camera_id: camera for camera in database.read_all_cameras()}
 
 
-def recalibrate(job: Job, name: str, decide: Callable[[Cameras], Cameras], tell: Tell) -> bool:
-    """Give the database better cameras, and check all its pairs by their geometry with these.
+def recalibrate(job: Job, step_name: str, decide: Callable[[Cameras], Cameras], report_progress: Report) -> bool:
+    """Replace cameras in the database by better ones, and verify all pairs again with them.
 
-    What was decided is kept before anything is changed, so that an interrupted call does the same when it is repeated.
+    The decision is saved before the database is changed, so that a repeated call after an interruption does the same.
 
     Args:
-        name: of this step, for what is kept.
-        decide: cameras as they are -> those to be replaced, by number.
-        tell: called with what is going on and the share of this step that is done, from 0.5 on.
+        job: the estimation.
+        step_name: name of this step, used in the names of its files.
+        decide: maps the present cameras to the replacements, both by number.
+        report_progress: called with a description and the ratio of this step that is done, from 0.5 on.
 
     Returns:
-        Whether there was a camera to replace.
+        Whether any camera was replaced.
     """
-    decided, done = job.work / f"{name}.json", job.work / f"{name}.done"
-    with opened(job) as database:
+    decisions_path, done = job.work / f"{step_name}.json", job.work / f"{step_name}.done"
+    with open_database(job) as database:
         cameras = read_cameras(database)
-    if not decided.exists():
-        better = {number: camera.params.tolist() for number, camera in decide(cameras).items()}
-        write_atomic(decided, json.dumps(better).encode())
-    kept = json.loads(decided.read_text())
-    if kept and not done.exists():
-        with opened(job) as database:
-            for number, parameters in kept.items():
+    if not decisions_path.exists():
+        better_parameters = {number: camera.params.tolist() for number, camera in decide(cameras).items()}
+        write_atomic(decisions_path, json.dumps(better_parameters).encode())
+    decisions = json.loads(decisions_path.read_text())
+    if decisions and not done.exists():
+        with open_database(job) as database:
+            for number, parameters in decisions.items():
                 camera = cameras[int(number)]
                 camera.params, camera.has_prior_focal_length = parameters, True
                 database.update_camera(camera)
             database.clear_two_view_geometries()
         count = count_rows(job, "matches")
 
-        def tell_done(done: int) -> None:
+        def report_done(done: int) -> None:
             share = min(done / max(count, 1), 1.0)
-            tell(f"verifying pairs with better focal lengths, {min(done, count):,} of {count:,}", 0.5 + 0.5 * share)
+            doing = f"verifying pairs with better focal lengths, {min(done, count):,} of {count:,}"
+            report_progress(doing, 0.5 + 0.5 * share)
 
-        with watching_rows(job, "two_view_geometries", tell_done):
-            pycolmap.geometric_verification(job.database, two_view_geometry_options=verification(job.seed))
+        with report_new_rows(job, "two_view_geometries", report_done):
+            pycolmap.geometric_verification(job.database, two_view_geometry_options=verification_options(job.seed))
         done.touch()
-    return bool(kept)
+    return bool(decisions)
 
 
-def verification(seed: int) -> pycolmap.TwoViewGeometryOptions:
-    """How pairs are checked, the same way in each run."""
+def verification_options(seed: int) -> pycolmap.TwoViewGeometryOptions:
+    """Return the settings by which pairs are verified, with a fixed random seed."""
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = seed % 2**31
     return options

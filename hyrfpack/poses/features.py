@@ -1,4 +1,4 @@
-"""Features of each photo, found in working copies of a bounded size."""
+"""Find the features of each photo in a working copy of limited size."""
 
 from __future__ import annotations
 
@@ -18,46 +18,51 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.data.pictures import read_mask, read_pixels
 from hyrfpack.data.quality import measure_sharpness
 from hyrfpack.errors import HyrfDataError, strip_path
-from hyrfpack.poses.database import make_database, opened
+from hyrfpack.poses.database import make_database, open_database
 from hyrfpack.poses.job import Job, chunks
-from hyrfpack.poses.process import Tell
-from hyrfpack.poses.watch import watching_rows
+from hyrfpack.poses.process import Report
+from hyrfpack.poses.watch import report_new_rows
 
-_MOST = 8192  # features of a photo
-_SMALL = 1000  # pixels of the longer side up to which features are also found between pixels (twice the resolution)
-_CHUNK = 16  # photos between two lines of progress, and that are done again after an interruption, at most
+_MAX_FEATURES_PER_PHOTO = 8192
+_MAX_UPSAMPLED_SIDE_PIXELS = 1000  # in copies up to this size, features are also found at twice the resolution
+_PHOTOS_PER_CHUNK = 16  # results are saved after each chunk, so an interruption costs at most one chunk
 
 
-def find_features(job: Job, tell: Tell) -> dict[str, Any]:
-    """Find the features of all photos that have none yet.
+def find_features(job: Job, report_progress: Report) -> dict[str, Any]:
+    """Find the features of all photos that have none yet in the database.
+
+    Args:
+        job: the estimation.
+        report_progress: see `run_stage`.
 
     Returns:
-        "sharpness": of each photo that could be decoded, by name; "unreadable": the reason for each other one.
+        "sharpness" of each decodable photo by name, "unreadable" with the reason for each other photo, and "keypoints"
+        with the number of features of each decodable photo.
     """
     make_database(job)
-    kept = job.work / "features.json"
+    facts_path = job.work / "features.json"
     facts: dict[str, Any] = {"sharpness": {}, "unreadable": {}}
-    if kept.exists():
-        facts = json.loads(kept.read_text())
+    if facts_path.exists():
+        facts = json.loads(facts_path.read_text())
     numbers = {name: number for number, name in enumerate(job.names, start=1)}
     known = {*facts["sharpness"], *facts["unreadable"]}
     done = len(known)
 
-    def tell_done(done: int) -> None:
+    def report_done(done: int) -> None:
         number = min(done + 1, len(job.names))
-        tell(f"features of photo {number:,} of {len(job.names):,}", done / len(job.names))
+        report_progress(f"features of photo {number:,} of {len(job.names):,}", done / len(job.names))
 
     for camera, device in enumerate(job.devices, start=1):
-        mine = [
+        camera_photos = [
             name for name, of in zip(job.names, job.device_of, strict=True) if of + 1 == camera and name not in known
         ]
-        for names in chunks(mine, _CHUNK):
-            tell_done(done)
+        for names in chunks(camera_photos, _PHOTOS_PER_CHUNK):
+            report_done(done)
             folder = job.work / "working"
             shutil.rmtree(folder, ignore_errors=True)
             with ThreadPoolExecutor(os.cpu_count()) as pool:
-                make = partial(_make_copy, job, folder, device.working_size)
-                copies = list(pool.map(make, names, [numbers[name] for name in names]))
+                write_copy = partial(_write_working_copy, job, folder, device.working_size)
+                copies = list(pool.map(write_copy, names, [numbers[name] for name in names]))
             for name, (sharp, reason) in zip(names, copies, strict=True):
                 if reason:
                     facts["unreadable"][name] = reason
@@ -65,20 +70,20 @@ def find_features(job: Job, tell: Tell) -> dict[str, Any]:
                     facts["sharpness"][name] = sharp
             readable = [numbers[name] for name, (_, reason) in zip(names, copies, strict=True) if not reason]
             first = done + len(names) - len(readable)
-            with watching_rows(job, "keypoints", lambda found, first=first: tell_done(first + found)):  # type: ignore[misc]
-                _extract(job, folder, readable, camera)
-            write_atomic(kept, json.dumps(facts).encode())
+            with report_new_rows(job, "keypoints", lambda found, first=first: report_done(first + found)):  # type: ignore[misc]
+                _extract_features(job, folder, readable, camera)
+            write_atomic(facts_path, json.dumps(facts).encode())
             done += len(names)
     shutil.rmtree(job.work / "working", ignore_errors=True)
-    with opened(job) as database:
+    with open_database(job) as database:
         facts["keypoints"] = {
             name: database.num_keypoints_for_image(numbers[name]) for name in job.names if name in facts["sharpness"]
         }
     return facts
 
 
-def _make_copy(job: Job, folder: Path, size: tuple[int, int], name: str, number: int) -> tuple[float, str]:
-    """Write the grey working copy of a photo, and its mask where it has one; returns its sharpness, or why not."""
+def _write_working_copy(job: Job, folder: Path, size: tuple[int, int], name: str, number: int) -> tuple[float, str]:
+    """Write the grey working copy of a photo and its mask; return (sharpness, "") or (0, the reason for failure)."""
     try:
         rgb, alpha = read_pixels(job.images / name, size)
     except HyrfDataError as error:
@@ -89,7 +94,7 @@ def _make_copy(job: Job, folder: Path, size: tuple[int, int], name: str, number:
     copy = folder / "photos" / job.working_name(number)
     copy.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray((grey + 0.5).astype(np.uint8)).save(copy, compress_level=1)
-    if job.masks:  # where some photos have a mask, pycolmap wants one of each
+    if job.masks:  # if any photo has a mask, pycolmap needs one for each photo
         mask = folder / "masks" / f"{job.working_name(number)}.png"
         mask.parent.mkdir(parents=True, exist_ok=True)
         usable = np.ones(size[::-1], bool)
@@ -99,12 +104,13 @@ def _make_copy(job: Job, folder: Path, size: tuple[int, int], name: str, number:
     return float(measure_sharpness(grey / 255)), ""
 
 
-def _extract(job: Job, folder: Path, numbers: list[int], camera: int) -> None:
+def _extract_features(job: Job, folder: Path, numbers: list[int], camera: int) -> None:
+    """Extract the features of these images, all of one camera, into the database."""
     if not numbers:
         return
     options = pycolmap.FeatureExtractionOptions()
-    options.sift.max_num_features = _MOST
-    options.sift.first_octave = -1 if max(job.devices[camera - 1].working_size) <= _SMALL else 0
+    options.sift.max_num_features = _MAX_FEATURES_PER_PHOTO
+    options.sift.first_octave = -1 if max(job.devices[camera - 1].working_size) <= _MAX_UPSAMPLED_SIDE_PIXELS else 0
     reader = pycolmap.ImageReaderOptions()
     reader.existing_camera_id = camera
     if (folder / "masks").is_dir():

@@ -1,4 +1,4 @@
-"""The last stage: one of the mappers' results is chosen, completed, and made the scene's own."""
+"""Last stage of an estimation: choose one of the mappers' results, complete and refine it, and save it."""
 
 from __future__ import annotations
 
@@ -13,101 +13,110 @@ import numpy as np
 import pycolmap
 
 from hyrfpack.data.pictures import fit_size, read_pixels
-from hyrfpack.poses.choose import Candidate, choose, confirmed, doubt
-from hyrfpack.poses.compare import Poses
-from hyrfpack.poses.database import opened, verified_pairs
-from hyrfpack.poses.evidence import Matches, evidence
+from hyrfpack.poses.alignment import Poses
+from hyrfpack.poses.choose import Candidate, choose_candidate, confirmed_photos, describe_doubt
+from hyrfpack.poses.database import open_database, verified_pairs
+from hyrfpack.poses.explained_matches import RayMatches, count_explained_matches
 from hyrfpack.poses.job import Job
-from hyrfpack.poses.mapping import SMALLEST, THREADS, add_points, go_on, read_pieces
-from hyrfpack.poses.process import Tell
+from hyrfpack.poses.mapping import MIN_PIECE_PHOTOS, SOLVER_THREADS, add_two_view_points, complete_model, read_pieces
+from hyrfpack.poses.process import Report
 
-_BENT = 0.99  # times the reprojection error with one coefficient of distortion: what four must do better than
-_MANY = 20  # photos of a camera, from which on four are found
-_STRAIGHT = 1.003  # times that error: what none may do worse
-_DOUBTED = 0.5  # pixels off, from which on an observation counts less: poses err by a third less than without
-_AS_GOOD = 0.997  # of what a result explains: enough for the lens that fits it
-_COLORED = 400  # pixels of the longer side of the pictures that points take their colours from
+# Limits of the reprojection error with another lens model, relative to the error with one radial coefficient.
+_MAX_OPENCV_ERROR_RATIO = 0.99
+_MAX_PINHOLE_ERROR_RATIO = 1.003
+_MIN_OPENCV_PHOTOS = 20  # fewer photos of a camera do not determine the four coefficients of the OPENCV model
+_CAUCHY_SCALE_PIXELS = 0.5  # with this robust loss, the errors of poses are a third smaller than without
+_MIN_REFITTED_MATCH_RATIO = 0.997  # a refit with another lens model must keep this ratio of the explained matches
+_COLOR_PICTURE_SIDE_PIXELS = 400  # points get their colours from pictures with this longer side
 
 
-def finish(job: Job, models: list[str], tell: Tell) -> dict[str, Any]:
-    """Choose between the mappers' results, complete the chosen one, and save it as `job.model("chosen")`.
+def finish_reconstruction(job: Job, models: list[str], report_progress: Report) -> dict[str, Any]:
+    """Choose between the mappers' results, complete the chosen one, and save it as `job.model_folder("chosen")`.
 
     Args:
         job: the estimation.
-        models: names of the results.
-        tell: see `run_stage`.
+        models: names of the mappers' results.
+        report_progress: see `run_stage`.
 
     Returns:
-        "registered", "sure", "apart" (posed in another piece): names of photos; "mapper", "why", "doubt"; "angle": the
-        median of the largest angles in degrees between rays that meet in a point. Without any photo posed,
-        "registered" alone, empty.
+        "registered", "sure" (confirmed by the other mapper) and "apart" (posed in another piece): names of photos.
+        "mapper", "why" and "doubt": the choice and sentences about it. "angle": the median over points of the largest
+        triangulation angle in degrees. If no photo is posed, only "registered", which is empty.
     """
-    tell("comparing the results", 0.0)
-    pieces = {name: read_pieces(job.model(name)) for name in models}
-    pieces = {name: found for name, found in pieces.items() if found and found[0].num_reg_images() >= SMALLEST}
+    report_progress("comparing the results", 0.0)
+    pieces = {name: read_pieces(job.model_folder(name)) for name in models}
+    pieces = {name: found for name, found in pieces.items() if found and found[0].num_reg_images() >= MIN_PIECE_PHOTOS}
     if not pieces:
         return {"registered": []}
-    found = {_candidate(job, name, models): models[0] for name, models in pieces.items()}
-    best: dict[str, Candidate] = {}  # of each mapper
-    for candidate in sorted(found, key=lambda candidate: candidate.explained):
+    found = {_make_candidate(job, name, models): models[0] for name, models in pieces.items()}
+    best: dict[str, Candidate] = {}  # the best result of each mapper
+    for candidate in sorted(found, key=lambda candidate: candidate.explained_matches):
         best[candidate.mapper] = candidate
-    chosen, why = choose(list(best.values()), _count_matches(job))
+    chosen, why = choose_candidate(list(best.values()), _count_matches(job))
     other = next((candidate for candidate in best.values() if candidate is not chosen), None)
-    model, poses, explained = found[chosen], chosen.poses, chosen.explained
+    model, poses, explained_count = found[chosen], chosen.poses, chosen.explained_matches
     steps: list[tuple[str, float, Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction], float]] = [
-        ("looking for poses of the other photos", 0.1, partial(go_on, job), 1.0),
-        ("adding points that two photos see", 0.4, partial(add_points, job), 1.0),
-        ("finding the lens distortion", 0.5, partial(_with_fitting_lens, tell=tell), _AS_GOOD),
+        ("looking for poses of the other photos", 0.1, partial(complete_model, job), 1.0),
+        ("adding points that two photos see", 0.4, partial(add_two_view_points, job), 1.0),
+        (
+            "finding the lens distortion",
+            0.5,
+            partial(_choose_lens, report_progress=report_progress),
+            _MIN_REFITTED_MATCH_RATIO,
+        ),
     ]
-    for doing, share, refine, least in steps:
-        tell(doing, share)
+    for doing, share, refine, min_match_ratio in steps:
+        report_progress(doing, share)
         refined = refine(model)
-        its_poses = _poses(job, refined)
-        its_explained = evidence(its_poses, _matches(job, refined))
-        if len(its_poses) >= len(poses) and its_explained >= least * explained:
-            model, poses, explained = refined, its_poses, its_explained
-    _enlarge(job, model)
-    _color(job, model, tell)
-    _save(job, model)
-    apart = {name for candidate in best.values() for piece in candidate.apart for name in piece}
+        refined_poses = _read_poses(job, refined)
+        refined_explained_count = count_explained_matches(refined_poses, _read_ray_matches(job, refined))
+        if len(refined_poses) >= len(poses) and refined_explained_count >= min_match_ratio * explained_count:
+            model, poses, explained_count = refined, refined_poses, refined_explained_count
+    _rescale_to_photos(job, model)
+    _color_points(job, model, report_progress)
+    _save_chosen(job, model)
+    apart = {name for candidate in best.values() for piece in candidate.other_pieces for name in piece}
     return {
         "registered": sorted(poses),
-        "sure": sorted(confirmed(poses, other)),
+        "sure": sorted(confirmed_photos(poses, other)),
         "apart": sorted(apart - set(poses)),
         "mapper": chosen.mapper,
         "why": why,
-        "doubt": doubt(poses, other),
-        "angle": _median_angle(model),
+        "doubt": describe_doubt(poses, other),
+        "angle": _median_triangulation_angle(model),
     }
 
 
-def _candidate(job: Job, name: str, pieces: list[pycolmap.Reconstruction]) -> Candidate:
+def _make_candidate(job: Job, name: str, pieces: list[pycolmap.Reconstruction]) -> Candidate:
+    """Describe the pieces of a result, the largest first, by the figures that are compared."""
     first, *others = pieces
-    poses = _poses(job, first)
+    poses = _read_poses(job, first)
     return Candidate(
         name.partition("-")[0],
         poses,
-        [_poses(job, piece) for piece in others if piece.num_reg_images() >= SMALLEST],
-        evidence(poses, _matches(job, first)),
+        [_read_poses(job, piece) for piece in others if piece.num_reg_images() >= MIN_PIECE_PHOTOS],
+        count_explained_matches(poses, _read_ray_matches(job, first)),
         first.compute_mean_track_length(),
         first.compute_mean_reprojection_error(),
     )
 
 
-def _poses(job: Job, model: pycolmap.Reconstruction) -> Poses:
+def _read_poses(job: Job, model: pycolmap.Reconstruction) -> Poses:
+    """Return the poses of a model by photo name."""
     posed = (image for image in model.images.values() if image.has_pose)
     return {job.names[image.image_id - 1]: np.asarray(image.cam_from_world().matrix()) for image in posed}
 
 
 def _count_matches(job: Job) -> int:
-    with opened(job) as database:
+    """Return the number of verified matches between all photos."""
+    with open_database(job) as database:
         return sum(len(matches) for _, _, matches, _ in verified_pairs(database))
 
 
-def _matches(job: Job, model: pycolmap.Reconstruction) -> list[Matches]:
-    """The verified matches between the posed photos of a model, as rays of its cameras."""
+def _read_ray_matches(job: Job, model: pycolmap.Reconstruction) -> list[RayMatches]:
+    """Return the verified matches between the posed photos of a model, as rays of its cameras."""
     rays, pixel = {}, {}
-    with opened(job) as database:
+    with open_database(job) as database:
         for image in model.images.values():
             if image.has_pose:
                 camera = model.cameras[image.camera_id]
@@ -115,7 +124,7 @@ def _matches(job: Job, model: pycolmap.Reconstruction) -> list[Matches]:
                 rays[image.image_id] = np.asarray(camera.cam_from_img(pixels)).reshape(-1, 2)
                 pixel[image.image_id] = 1 / camera.mean_focal_length()
         return [
-            Matches(
+            RayMatches(
                 job.names[first - 1],
                 job.names[second - 1],
                 rays[first][matches[:, 0]],
@@ -127,47 +136,50 @@ def _matches(job: Job, model: pycolmap.Reconstruction) -> list[Matches]:
         ]
 
 
-def _with_fitting_lens(model: pycolmap.Reconstruction, tell: Tell) -> pycolmap.Reconstruction:
-    """A copy refined with the lens that its photos need.
+def _choose_lens(model: pycolmap.Reconstruction, report_progress: Report) -> pycolmap.Reconstruction:
+    """Choose the lens model that fits the photos, and return a copy refined with it.
 
-    Where four coefficients of distortion (COLMAP's OPENCV) fit clearly better than the one so far, they are taken, if
-    there are photos enough to tell. Where none fits as well, the cameras are pinholes: their photos are used as they
-    are, all others are resampled when they are loaded.
+    COLMAP's OPENCV model, with four coefficients of distortion, is chosen if it fits clearly better than one radial
+    coefficient and each camera has enough photos. A pinhole model is chosen if it fits as well as one coefficient,
+    because only photos with distortion must be resampled when they are loaded.
     """
-    error = _with_lens(model, "SIMPLE_RADIAL").compute_mean_reprojection_error()
+    error = _refit_with_lens(model, "SIMPLE_RADIAL").compute_mean_reprojection_error()
     photos = Counter(image.camera_id for image in model.images.values() if image.has_pose)
-    tell("finding the lens distortion, 1 of 3 models tried", 0.6)
-    if min(photos.values()) >= _MANY:
-        bent = _with_lens(model, "OPENCV")
-        if bent.compute_mean_reprojection_error() < _BENT * error:
-            return bent
-    tell("finding the lens distortion, 2 of 3 models tried", 0.7)
-    straight = _with_lens(model, "SIMPLE_PINHOLE")
-    return straight if straight.compute_mean_reprojection_error() <= _STRAIGHT * error else model
+    report_progress("finding the lens distortion, 1 of 3 models tried", 0.6)
+    if min(photos.values()) >= _MIN_OPENCV_PHOTOS:
+        opencv = _refit_with_lens(model, "OPENCV")
+        if opencv.compute_mean_reprojection_error() < _MAX_OPENCV_ERROR_RATIO * error:
+            return opencv
+    report_progress("finding the lens distortion, 2 of 3 models tried", 0.7)
+    pinhole = _refit_with_lens(model, "SIMPLE_PINHOLE")
+    return pinhole if pinhole.compute_mean_reprojection_error() <= _MAX_PINHOLE_ERROR_RATIO * error else model
 
 
-def _with_lens(model: pycolmap.Reconstruction, lens: str) -> pycolmap.Reconstruction:
-    """A copy with cameras of another model (COLMAP's name), refined; those of the model are SIMPLE_RADIAL."""
+def _refit_with_lens(model: pycolmap.Reconstruction, lens: str) -> pycolmap.Reconstruction:
+    """Return a copy of a SIMPLE_RADIAL model, refined with cameras of the lens model `lens` (COLMAP's name)."""
     model = pycolmap.Reconstruction(model)
     for camera in model.cameras.values():
-        focal, x, y, bend = camera.params
+        focal, x, y, radial_distortion = camera.params
         parameters = {
             "SIMPLE_PINHOLE": [focal, x, y],
-            "SIMPLE_RADIAL": [focal, x, y, bend],
-            "OPENCV": [focal, focal, x, y, bend, 0.0, 0.0, 0.0],
+            "SIMPLE_RADIAL": [focal, x, y, radial_distortion],
+            "OPENCV": [focal, focal, x, y, radial_distortion, 0.0, 0.0, 0.0],
         }
         camera.model, camera.params = getattr(pycolmap.CameraModelId, lens), parameters[lens]
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    options.ceres.solver_options.num_threads = THREADS
-    options.ceres.loss_function_type, options.ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, _DOUBTED
+    options.ceres.solver_options.num_threads = SOLVER_THREADS
+    options.ceres.loss_function_type, options.ceres.loss_function_scale = (
+        pycolmap.LossFunctionType.CAUCHY,
+        _CAUCHY_SCALE_PIXELS,
+    )
     pycolmap.bundle_adjustment(model, options)
     model.update_point_3d_errors()
     return model
 
 
-def _enlarge(job: Job, model: pycolmap.Reconstruction) -> None:
-    """Bring cameras and observations from the size of the working copies to that of the photos, and give them names."""
+def _rescale_to_photos(job: Job, model: pycolmap.Reconstruction) -> None:
+    """Rescale cameras and observations from the working copies to the photos, and name the images as the photos."""
     for number, camera in model.cameras.items():
         camera.rescale(*job.devices[number - 1].size)
     for image in model.images.values():
@@ -178,16 +190,18 @@ def _enlarge(job: Job, model: pycolmap.Reconstruction) -> None:
             point.xy = point.xy * scale
 
 
-def _color(job: Job, model: pycolmap.Reconstruction, tell: Tell) -> None:
-    """Give each point the mean colour of the pixels that see it."""
+def _color_points(job: Job, model: pycolmap.Reconstruction, report_progress: Report) -> None:
+    """Give each point the mean colour of the pixels in which it is observed."""
     sums: dict[int, np.ndarray] = {}
     for number, image in enumerate(model.images.values(), start=1):
-        tell(f"colouring points, photo {number:,} of {len(model.images):,}", 0.8 + 0.2 * number / len(model.images))
+        report_progress(
+            f"colouring points, photo {number:,} of {len(model.images):,}", 0.8 + 0.2 * number / len(model.images)
+        )
         seen = [(point.point3D_id, point.xy) for point in image.points2D if point.has_point3D()]
         if not (image.has_pose and seen):
             continue
         device = job.devices[image.camera_id - 1]
-        width, height = size = fit_size(device.size[0], device.size[1], _COLORED)
+        width, height = size = fit_size(device.size[0], device.size[1], _COLOR_PICTURE_SIDE_PIXELS)
         rgb, _ = read_pixels(job.images / image.name, size)
         scale = np.array(size) / np.array(device.size)
         for point_id, xy in seen:
@@ -198,17 +212,18 @@ def _color(job: Job, model: pycolmap.Reconstruction, tell: Tell) -> None:
         model.points3D[point_id].color = np.round(np.array(color) / count).astype(np.uint8)
 
 
-def _save(job: Job, model: pycolmap.Reconstruction) -> None:
+def _save_chosen(job: Job, model: pycolmap.Reconstruction) -> None:
+    """Save the chosen model in one step, so that no incomplete one is ever found."""
     folder = job.work / "scratch"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     model.write(folder)
-    shutil.rmtree(job.model("chosen"), ignore_errors=True)
-    os.replace(folder, job.model("chosen"))
+    shutil.rmtree(job.model_folder("chosen"), ignore_errors=True)
+    os.replace(folder, job.model_folder("chosen"))
 
 
-def _median_angle(model: pycolmap.Reconstruction) -> float:
-    """The median over points of the largest angle between two of the rays that meet there, in degrees."""
+def _median_triangulation_angle(model: pycolmap.Reconstruction) -> float:
+    """Return the median over points of the largest angle between two of their viewing rays, in degrees."""
     places = {number: image.projection_center() for number, image in model.images.items() if image.has_pose}
     largest = []
     for point in model.points3D.values():

@@ -1,4 +1,4 @@
-"""What one estimation is about, as the processes that work on it pass it on."""
+"""Description of one pose estimation, passed as a JSON file to the processes that run its stages."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from pathlib import Path
 from hyrfpack.atomic import write_atomic
 from hyrfpack.data.pictures import fit_size
 
-LARGEST = 1600  # pixels of the longer side of the pictures that features are found in
-GUESS = 0.8  # focal length in longer sides where nothing is known: between a phone's wide and its normal lens
+MAX_WORKING_SIDE_PIXELS = 1600  # longer side of the working copies in which features are found
+# Focal length over longer side of the picture if EXIF has none, between the wide and the normal lens of a phone.
+DEFAULT_FOCAL_RATIO = 0.8
 
 
 @dataclass(frozen=True)
 class Device:
-    """Photos that share one camera.
+    """Camera that a group of photos shares.
 
     Attributes:
         size: (width, height) of its photos in pixels.
-        focal: in pixels of the photos, or None where EXIF does not tell.
+        focal: focal length in pixels of the photos; None if EXIF has none.
     """
 
     size: tuple[int, int]
@@ -28,29 +29,29 @@ class Device:
 
     @property
     def working_size(self) -> tuple[int, int]:
-        """(width, height) of the pictures that features are found in."""
-        return fit_size(*self.size, LARGEST)
+        """Return the (width, height) in pixels of the working copies in which features are found."""
+        return fit_size(*self.size, MAX_WORKING_SIDE_PIXELS)
 
     @property
     def working_focal(self) -> float:
-        """Focal length in pixels of these, a guess where it is not known."""
-        focal = GUESS * max(self.size) if self.focal is None else self.focal
+        """Return the focal length in pixels of the working copies, guessed by DEFAULT_FOCAL_RATIO if unknown."""
+        focal = DEFAULT_FOCAL_RATIO * max(self.size) if self.focal is None else self.focal
         return focal * max(self.working_size) / max(self.size)
 
 
 @dataclass(frozen=True)
 class Job:
-    """One estimation.
+    """Photos and settings of one estimation.
 
     Attributes:
         images: folder of the photos.
-        work: folder of products in progress.
-        names: of the photos, sorted; image n of the database is names[n - 1].
-        devices: of camera n of the database at n - 1.
+        work: folder of intermediate products.
+        names: photo names, sorted; image n of the database is names[n - 1].
+        devices: cameras; camera n of the database is devices[n - 1].
         device_of: for each photo, an index into `devices`.
-        masks: the file of each photo's mask by name, for those that have one.
+        masks: path of the mask by photo name, for photos that have one.
         matching: "exhaustive", "sequential" or "retrieval".
-        seed: of everything random.
+        seed: random seed.
     """
 
     images: Path
@@ -64,28 +65,29 @@ class Job:
 
     @property
     def database(self) -> Path:
-        """Features and matches, as pycolmap keeps them."""
+        """Return the path of pycolmap's database of features and matches."""
         return self.work / "database.db"
 
     def working_name(self, number: int) -> str:
-        """What image `number` is called in the database, and its working copy.
+        """Return the name of image `number` in the database, which is also the file name of its working copy.
 
-        Not as its photo is: pycolmap's lists of pairs end names at spaces, and file systems names at 255 bytes.
+        The photo's own name is not used, because pycolmap's pair lists cut names at spaces and file systems limit
+        names to 255 bytes.
         """
         return f"{number:06d}.png"
 
-    def model(self, name: str) -> Path:
-        """The folder of a mapper's pieces, numbered from 0."""
+    def model_folder(self, name: str) -> Path:
+        """Return the folder of a result, which for a mapper has one COLMAP model per piece, numbered from 0."""
         return self.work / name
 
     def save(self, path: Path) -> None:
-        """Write it as JSON."""
+        """Write the job as JSON."""
         values = asdict(self) | {"images": str(self.images), "work": str(self.work)}
         write_atomic(path, json.dumps(values).encode())
 
     @staticmethod
     def load(path: Path) -> Job:
-        """Read what `save` wrote."""
+        """Read a job that `save` wrote."""
         values = json.loads(path.read_text())
         devices = tuple(Device(tuple(device["size"]), device["focal"]) for device in values["devices"])
         places = {"images": Path(values["images"]), "work": Path(values["work"])}
@@ -94,5 +96,5 @@ class Job:
 
 
 def chunks(items: list, size: int) -> Iterable[list]:
-    """The items in order, `size` at a time."""
+    """Split the items into consecutive lists of at most `size`."""
     return (items[start : start + size] for start in range(0, len(items), size))

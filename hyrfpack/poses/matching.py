@@ -1,4 +1,4 @@
-"""Matches between photos, held to geometry, and the focal lengths that they tell."""
+"""Match photos, verify the matches geometrically, and estimate unknown focal lengths from them."""
 
 from __future__ import annotations
 
@@ -11,153 +11,181 @@ import pycolmap
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.poses import pairs as pairing
-from hyrfpack.poses.calibrate import FOCALS, Pair, search_focal, turned_only, with_focal
-from hyrfpack.poses.database import FOUND, opened, read_cameras, recalibrate, verification, verified_pairs
+from hyrfpack.poses.calibrate import (
+    CANDIDATE_FOCAL_RATIOS,
+    PixelMatches,
+    camera_with_focal,
+    rotation_only_share,
+    search_focal_ratio,
+)
+from hyrfpack.poses.database import (
+    MIN_PAIR_MATCHES,
+    open_database,
+    read_cameras,
+    recalibrate,
+    verification_options,
+    verified_pairs,
+)
 from hyrfpack.poses.job import Job
-from hyrfpack.poses.process import Tell
-from hyrfpack.poses.watch import watching_rows
+from hyrfpack.poses.process import Report
+from hyrfpack.poses.watch import report_new_rows
 
-_STEP = 2.0  # seconds of matching between two lines of progress, about
-_FIRST, _LARGEST = 100, 2000  # pairs that are matched at a time, at first and at most
-_STRONG = 2 * FOUND  # matches of the pairs that focal lengths are read from
-_LOOKED_AT = 40  # of them
-_ENOUGH = 5  # of them, without which they say nothing
-_FOCALS = "estimating focal lengths from matches"
-_CHANGED = 0.05  # of a focal length: beyond, pairs are verified anew
+_PORTION_SECONDS = 2.0  # pairs are matched in portions that take about so long, and are saved after each
+_FIRST_PORTION_PAIRS = 100
+_MAX_PORTION_PAIRS = 2000
+# The focal length of a camera is estimated from pairs of its photos with many matches.
+_MIN_FOCAL_PAIR_MATCHES = 2 * MIN_PAIR_MATCHES
+_MAX_FOCAL_PAIRS = 40
+_MIN_FOCAL_PAIRS = 5
+_FOCAL_SEARCH_DESCRIPTION = "estimating focal lengths from matches"
+_FOCAL_CHANGE_THRESHOLD = 0.05  # pairs are verified again if the focal length changes by more than this ratio
 
 
-def match(job: Job, tell: Tell) -> dict[str, Any]:
-    """Match all pairs that are to be, find unknown focal lengths, and verify all pairs with them.
+def match_photos(job: Job, report_progress: Report) -> dict[str, Any]:
+    """Match the chosen pairs, estimate unknown focal lengths, and verify all pairs with them.
+
+    Args:
+        job: the estimation.
+        report_progress: see `run_stage`.
 
     Returns:
-        "pairs": how many hold together; "matched": photos in them; "turned": the share of pairs between which the
-        camera only turned, a panorama where it is nearly all.
+        "pairs": the number of verified pairs; "matched": names of the photos in them; "turned": the share of pairs
+        between which the camera only rotated, near 1 for photos from one place.
     """
     marker = job.work / "matches.json"
     if marker.exists():
         return json.loads(marker.read_text())
-    if not (job.work / "focal.json").exists():  # which is decided on all matches
-        _match_pairs(job, _choose_pairs(job, tell), tell)
+    if not (job.work / "focal.json").exists():  # focal lengths are estimated after all pairs are matched
+        _match_pairs(job, _choose_pairs(job, report_progress), report_progress)
 
-    def told(doing: str, share: float) -> None:
-        tell(doing, 0.82 + 0.13 * share)
+    def report_part(doing: str, share: float) -> None:
+        report_progress(doing, 0.82 + 0.13 * share)
 
-    told(_FOCALS, 0.0)
-    recalibrate(job, "focal", lambda cameras: _better_focals(job, cameras, told), told)
-    tell("checking that the camera moved", 0.95)
-    answer = _sum_up(job)
+    report_part(_FOCAL_SEARCH_DESCRIPTION, 0.0)
+    recalibrate(job, "focal", lambda cameras: _estimate_focals(job, cameras, report_part), report_part)
+    report_progress("checking that the camera moved", 0.95)
+    answer = _summarize_matches(job)
     write_atomic(marker, json.dumps(answer).encode())
     return answer
 
 
-def _choose_pairs(job: Job, tell: Tell) -> pairing.Pairs:
+def _choose_pairs(job: Job, report_progress: Report) -> pairing.Pairs:
+    """Choose the pairs to match, by the matching mode of the job."""
     count = len(job.names)
     if job.matching == "exhaustive":
-        return pairing.exhaustive(count)
-    with opened(job) as database:
+        return pairing.exhaustive_pairs(count)
+    with open_database(job) as database:
         found = []
         for number in range(1, count + 1):
             there = database.exists_descriptors(number)
             found.append(database.read_descriptors(number).data if there else np.zeros((0, 128), np.uint8))
 
     def progress(done: int) -> None:
-        tell(f"choosing which photos to match, {done:,} of {count:,}", 0.02 * done / count)
+        report_progress(f"choosing which photos to match, {done:,} of {count:,}", 0.02 * done / count)
 
-    similarity = pairing.similarities(found, job.seed, progress)
-    choose = pairing.sequential if job.matching == "sequential" else pairing.retrieval
+    similarity = pairing.compute_similarities(found, job.seed, progress)
+    choose = pairing.sequential_pairs if job.matching == "sequential" else pairing.retrieval_pairs
     return choose(count, similarity)
 
 
-def _match_pairs(job: Job, pairs: pairing.Pairs, tell: Tell) -> None:
-    """Match pairs of photos, in portions that the database keeps."""
+def _match_pairs(job: Job, pairs: pairing.Pairs, report_progress: Report) -> None:
+    """Match pairs of photos in portions, each of which the database keeps after an interruption."""
     names = [job.working_name(number) for number in range(1, len(job.names) + 1)]
-    with opened(job) as database:
-        known = {number for number in range(1, len(names) + 1) if database.exists_keypoints(number)}
+    with open_database(job) as database:
+        has_features = {number for number in range(1, len(names) + 1) if database.exists_keypoints(number)}
         matched = {
             pair
             for pair in pairs
             if database.exists_matches(pair[0] + 1, pair[1] + 1)
             and database.exists_two_view_geometry(pair[0] + 1, pair[1] + 1)
         }
-    wanted = [pair for pair in pairs if pair[0] + 1 in known and pair[1] + 1 in known]
-    left = [pair for pair in wanted if pair not in matched]
-    done, size = len(wanted) - len(left), _FIRST
+    matchable = [pair for pair in pairs if pair[0] + 1 in has_features and pair[1] + 1 in has_features]
+    remaining = [pair for pair in matchable if pair not in matched]
+    done, size = len(matchable) - len(remaining), _FIRST_PORTION_PAIRS
     portion = job.work / "pairs.txt"
     options = pycolmap.ImportedPairingOptions()
     options.match_list_path = portion
 
-    def tell_done(done: int) -> None:
-        number, share = min(done + 1, len(wanted)), min(done / len(wanted), 1.0)
-        tell(f"matching pair {number:,} of {len(wanted):,}", 0.02 + 0.8 * share)
+    def report_done(done: int) -> None:
+        number, share = min(done + 1, len(matchable)), min(done / len(matchable), 1.0)
+        report_progress(f"matching pair {number:,} of {len(matchable):,}", 0.02 + 0.8 * share)
 
-    while left:
-        tell_done(done)
-        now, left = left[:size], left[size:]
+    while remaining:
+        report_done(done)
+        now, remaining = remaining[:size], remaining[size:]
         portion.write_text("".join(f"{names[first]} {names[second]}\n" for first, second in now), encoding="utf-8")
         began = time.monotonic()
-        with watching_rows(job, "two_view_geometries", lambda found, done=done: tell_done(done + found)):  # type: ignore[misc]
+        with report_new_rows(job, "two_view_geometries", lambda found, done=done: report_done(done + found)):  # type: ignore[misc]
             pycolmap.match_image_pairs(
-                job.database, pairing_options=options, verification_options=verification(job.seed)
+                job.database, pairing_options=options, verification_options=verification_options(job.seed)
             )
         pace = len(now) / max(time.monotonic() - began, 1e-3)
-        done, size = done + len(now), int(np.clip(pace * _STEP, _FIRST // 4, _LARGEST))
+        done, size = (
+            done + len(now),
+            int(np.clip(pace * _PORTION_SECONDS, _FIRST_PORTION_PAIRS // 4, _MAX_PORTION_PAIRS)),
+        )
     portion.unlink(missing_ok=True)
 
 
-def _better_focals(job: Job, cameras: dict[int, pycolmap.Camera], tell: Tell) -> dict[int, pycolmap.Camera]:
-    """The cameras whose focal length EXIF does not tell and that is another than was guessed."""
-    with opened(job) as database:
-        strong = _strong_pairs(job, database)
+def _estimate_focals(
+    job: Job, cameras: dict[int, pycolmap.Camera], report_progress: Report
+) -> dict[int, pycolmap.Camera]:
+    """Estimate focal lengths that EXIF lacks; return the cameras whose focal length differs from the guess."""
+    with open_database(job) as database:
+        strong = _sample_strong_pairs(job, database)
     found: dict[int, float] = {}
     for number, device in enumerate(job.devices, start=1):
-        own = strong.get(number, [])
-        if device.focal is None and len(own) >= _ENOUGH:
+        camera_pairs = strong.get(number, [])
+        if device.focal is None and len(camera_pairs) >= _MIN_FOCAL_PAIRS:
 
             def progress(share: float, number: int = number) -> None:
                 camera = f", camera {number} of {len(job.devices)}" if len(job.devices) > 1 else ""
-                tell(f"{_FOCALS}{camera}", 0.5 * (number - 1 + share) / len(job.devices))
+                report_progress(f"{_FOCAL_SEARCH_DESCRIPTION}{camera}", 0.5 * (number - 1 + share) / len(job.devices))
 
-            found[number] = search_focal(own, cameras[number], job.seed, progress)
+            found[number] = search_focal_ratio(camera_pairs, cameras[number], job.seed, progress)
     typical = float(np.median(list(found.values()))) if found else None
     better = {}
     for number, device in enumerate(job.devices, start=1):
         if device.focal is None and typical is not None:
-            now = with_focal(cameras[number], found.get(number, typical))
-            if abs(now.focal_length / cameras[number].focal_length - 1) > _CHANGED:
+            now = camera_with_focal(cameras[number], found.get(number, typical))
+            if abs(now.focal_length / cameras[number].focal_length - 1) > _FOCAL_CHANGE_THRESHOLD:
                 better[number] = now
     return better
 
 
-def _strong_pairs(job: Job, database: pycolmap.Database) -> dict[int, list[Pair]]:
-    """By camera: pairs of its photos with many matches, spread at random over them."""
+def _sample_strong_pairs(job: Job, database: pycolmap.Database) -> dict[int, list[PixelMatches]]:
+    """Return, by camera, a random sample of pairs of its photos that have many matches."""
     rng = np.random.default_rng(job.seed)
-    mine: dict[int, list[tuple[int, int, np.ndarray]]] = {}
+    candidates_of: dict[int, list[tuple[int, int, np.ndarray]]] = {}
     for first, second, matches, _ in verified_pairs(database):
         device = job.device_of[first - 1] + 1
-        if len(matches) >= _STRONG and job.device_of[second - 1] + 1 == device:
-            mine.setdefault(device, []).append((first, second, matches))
+        if len(matches) >= _MIN_FOCAL_PAIR_MATCHES and job.device_of[second - 1] + 1 == device:
+            candidates_of.setdefault(device, []).append((first, second, matches))
     chosen = {}
-    for device, candidates in mine.items():
-        picked = rng.permutation(len(candidates))[:_LOOKED_AT]
-        chosen[device] = [_pair(database, *candidates[place]) for place in picked]
+    for device, candidates in candidates_of.items():
+        picked = rng.permutation(len(candidates))[:_MAX_FOCAL_PAIRS]
+        chosen[device] = [_read_pixel_matches(database, *candidates[place]) for place in picked]
     return chosen
 
 
-def _pair(database: pycolmap.Database, first: int, second: int, matches: np.ndarray) -> Pair:
+def _read_pixel_matches(database: pycolmap.Database, first: int, second: int, matches: np.ndarray) -> PixelMatches:
+    """Read the pixel coordinates of the matches between two images."""
     pixels1, pixels2 = (np.asarray(database.read_keypoints(number))[:, :2] for number in (first, second))
-    return Pair(pixels1[matches[:, 0]].astype(np.float64), pixels2[matches[:, 1]].astype(np.float64))
+    return PixelMatches(pixels1[matches[:, 0]].astype(np.float64), pixels2[matches[:, 1]].astype(np.float64))
 
 
-def _sum_up(job: Job) -> dict[str, Any]:
-    """What came of matching, for the person and for what is decided next."""
-    with opened(job) as database:
+def _summarize_matches(job: Job) -> dict[str, Any]:
+    """Return the answer of this stage, see `match_photos`."""
+    with open_database(job) as database:
         pairs = [(first, second) for first, second, _, _ in verified_pairs(database)]
-        cameras, strong = read_cameras(database), _strong_pairs(job, database)
+        cameras, strong = read_cameras(database), _sample_strong_pairs(job, database)
     turned, counted = 0.0, 0
-    for number, own in strong.items():
-        camera, known = cameras[number], job.devices[number - 1].focal is not None
-        focals = [camera.focal_length / max(camera.width, camera.height)] if known else list(FOCALS[:13])
-        turned += turned_only(own, camera, focals) * len(own)
-        counted += len(own)
+    for number, camera_pairs in strong.items():
+        camera, has_focal = cameras[number], job.devices[number - 1].focal is not None
+        focals = (
+            [camera.focal_length / max(camera.width, camera.height)] if has_focal else list(CANDIDATE_FOCAL_RATIOS[:13])
+        )
+        turned += rotation_only_share(camera_pairs, camera, focals) * len(camera_pairs)
+        counted += len(camera_pairs)
     matched = sorted({job.names[number - 1] for pair in pairs for number in pair})
     return {"pairs": len(pairs), "matched": matched, "turned": turned / counted if counted else 0.0}

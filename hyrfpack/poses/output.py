@@ -1,4 +1,4 @@
-"""The scene's folder: what is in progress lies in a folder in it, and takes its place when all is done."""
+"""Write a scene's folder: products are built in its sub-folder .poses and moved into place when all is done."""
 
 from __future__ import annotations
 
@@ -15,42 +15,54 @@ from typing import Any
 from hyrfpack.atomic import check_writable, write_atomic
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.outputs import COLMAP_MODEL_FOLDERS, COLMAP_TABLE_NAMES, PICTURE_SUFFIXES, POSE_FILE_NAMES
-from hyrfpack.poses.made import FOLDERS, REPORT, Made, are_all, files_of, read_report, remove, still_there
+from hyrfpack.poses.owned_files import (
+    OWNED_FOLDERS,
+    REPORT_NAME,
+    OwnedFiles,
+    has_only,
+    list_files,
+    read_report,
+    remove_files,
+    unchanged_files,
+)
 
-_VERSION = 4  # of what is kept on the way; older products are made anew
-_FINGERPRINT = "fingerprint"  # of what is made from which photos
+_PRODUCTS_VERSION = 4  # products in progress of another version are discarded
+_FINGERPRINT_NAME = "fingerprint"  # this file identifies the photos and settings of the products in progress
 
 
-class Output:
-    """What one estimation puts into a scene's folder.
+class SceneOutput:
+    """The folder of a scene, into which one estimation writes.
 
     Attributes:
         scene: the folder.
-        work: the folder in it of products in progress.
-        read: files that the estimation reads, resolved: none of them is removed.
+        work: its sub-folder of products in progress.
+        protected: resolved paths of files that the estimation reads and that are therefore never removed.
     """
 
     def __init__(self, scene: Path) -> None:
         self.scene = scene
         self.work = scene / ".poses"
-        self.read: frozenset[Path] = frozenset()
+        self.protected: frozenset[Path] = frozenset()
 
-    def check_place(self, photos: Path) -> None:
-        """Raises HyrfError: there are no photos, or the scene cannot be a folder."""
+    def check_paths(self, photos: Path) -> None:
+        """Check both paths. Raises HyrfError: the photos do not exist, or a file has the name of the scene's folder."""
         if not photos.exists():
             raise HyrfDataError(f"{photos}: there is no such folder or video; name the one that holds the photos")
         if os.path.lexists(self.scene) and not self.scene.is_dir():
             raise HyrfError(f"{self.scene}: this is a file; name a folder for the scene")
 
-    def check(self, photos: Path, overwrite: bool) -> None:
-        """Raises HyrfError: there are poses or photos in the folder that may not be replaced, or it cannot be written.
+    def check_replaceable(self, photos: Path, overwrite: bool) -> None:
+        """Check that the folder can be written and has nothing that may not be replaced.
 
         Args:
-            photos: where these are.
-            overwrite: poses of ours may be replaced.
+            photos: path of the photos.
+            overwrite: poses that an earlier estimation wrote may be replaced.
+
+        Raises:
+            HyrfError: the folder has poses or photos that may not be replaced, or it cannot be written.
         """
-        there = set(os.listdir(self.scene))
-        if there.intersection((*COLMAP_MODEL_FOLDERS, *COLMAP_TABLE_NAMES, *POSE_FILE_NAMES, "colmap")):
+        names = set(os.listdir(self.scene))
+        if names.intersection((*COLMAP_MODEL_FOLDERS, *COLMAP_TABLE_NAMES, *POSE_FILE_NAMES, "colmap")):
             if read_report(self.scene) is None:
                 raise HyrfError(
                     f"{self.scene}: the folder has poses of another program, which are kept; train on them, or name "
@@ -60,119 +72,127 @@ class Output:
                 raise HyrfError(
                     f"{self.scene}: the folder has poses already; use them, or replace them with `overwrite=True`"
                 )
-        if not same(photos, self.scene) and any(name.lower().endswith(PICTURE_SUFFIXES) for name in there):
+        if not is_same_path(photos, self.scene) and any(name.lower().endswith(PICTURE_SUFFIXES) for name in names):
             raise HyrfError(f"{self.scene}: photos lie in this folder; name another for the scene")
         check_writable(self.scene)
 
     def check_free(self, name: str) -> None:
-        """Raises HyrfError: in one of the scene's folders lies what is not of our making, or is read."""
+        """Check a sub-folder. Raises HyrfError: it has files that no estimation wrote, or that this one reads."""
         folder = self.scene / name
-        ours = {made: size for made, size in self.made().items() if self.scene.resolve() / made not in self.read}
-        if os.path.lexists(folder) and not are_all(self.scene, name, ours):
+        ours = {
+            owned: size
+            for owned, size in self.owned_files().items()
+            if self.scene.resolve() / owned not in self.protected
+        }
+        if os.path.lexists(folder) and not has_only(self.scene, name, ours):
             raise HyrfError(
                 f"{folder}: there are files that are not of these photos; name another folder for the scene, or "
                 f"{self.scene} itself as that of the photos"
             )
 
-    def reads(self, files: Collection[Path]) -> None:
-        """Say what the estimation reads."""
-        self.read = frozenset(path.resolve() for path in files)
+    def protect(self, files: Collection[Path]) -> None:
+        """Declare the files that the estimation reads, which are then never removed."""
+        self.protected = frozenset(path.resolve() for path in files)
 
-    def claim(self, settings: list[Any]) -> bool:
-        """Make the folder of products, or find that of the same call; returns whether it goes on.
+    def claim_work_folder(self, settings: list[Any]) -> bool:
+        """Create the folder of products in progress, or take over that of an interrupted call.
 
         Args:
-            settings: plain values, all that decides what comes of the files that are read.
+            settings: plain values of all settings that affect the products.
+
+        Returns:
+            Whether products of an interrupted call with the same files and settings are resumed.
         """
-        states = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(self.read)]
-        fingerprint = hashlib.sha256(json.dumps([_VERSION, settings, states]).encode()).hexdigest()
-        kept = self.work / _FINGERPRINT
-        if kept.is_file() and kept.read_text() == fingerprint:
+        states = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(self.protected)]
+        fingerprint = hashlib.sha256(json.dumps([_PRODUCTS_VERSION, settings, states]).encode()).hexdigest()
+        fingerprint_path = self.work / _FINGERPRINT_NAME
+        if fingerprint_path.is_file() and fingerprint_path.read_text() == fingerprint:
             return True
         self.clear()
         self.work.mkdir()
-        write_atomic(kept, fingerprint.encode())
+        write_atomic(fingerprint_path, fingerprint.encode())
         return False
 
-    def make(self, name: str, fill: Callable[[Path], object], keep: bool = False) -> Path:
-        """One of the scene's folders, in progress: filled whole or not at all, unless it is there.
+    def make_folder(self, name: str, fill: Callable[[Path], object], resume_filling: bool = False) -> Path:
+        """Fill one of the scene's folders in progress, unless it is already complete, and return its path.
 
         Args:
-            name: of the folder.
+            name: name of the folder.
             fill: called with the folder to fill.
-            keep: what an interrupted call has filled in stays.
+            resume_filling: files that an interrupted call has put into the folder stay.
         """
         folder, unfinished = self.work / name, self.work / f"unfinished-{name}"
         if not folder.is_dir():
-            if not keep:
+            if not resume_filling:
                 shutil.rmtree(unfinished, ignore_errors=True)
             unfinished.mkdir(exist_ok=True)
             try:
                 fill(unfinished)
-            except OSError:  # such as a full disk, which copies of many photos would keep full
-                if not keep:
+            except OSError:  # unfinished copies of many photos would keep a full disk full
+                if not resume_filling:
                     shutil.rmtree(unfinished, ignore_errors=True)
                 raise
             os.replace(unfinished, folder)
         return folder
 
-    def made(self) -> Made:
-        """What earlier calls put into the scene's images/ and masks/."""
-        return still_there(self.scene, (read_report(self.scene) or {}).get("made"))
+    def owned_files(self) -> OwnedFiles:
+        """Return the files that earlier calls wrote into the scene's images/ and masks/ and that are unchanged."""
+        return unchanged_files(self.scene, (read_report(self.scene) or {}).get("made"))
 
-    def put(self, model: Path, report: dict[str, Any]) -> None:
-        """Bring photos, masks and model to their places.
+    def install(self, model: Path, report: dict[str, Any]) -> None:
+        """Move photos, masks and the model to their places in the scene.
 
-        Old poses go first, so that they never lie beside new photos, and the report says what is ours before it is
-        there: what is ours may be made anew.
+        Old poses are removed first, so that they never lie beside new photos. The report lists the owned files before
+        they are in place, so that a call after an interruption may replace them.
 
         Args:
-            model: the COLMAP model's folder.
-            report: to be written, but for what was made.
+            model: folder of the COLMAP model.
+            report: content of the report, without the list of owned files.
         """
-        old = self.made()
-        new: Made = {}
-        in_progress = [name for name in FOLDERS if (self.work / name).is_dir()]
+        old_files = self.owned_files()
+        new_files: OwnedFiles = {}
+        in_progress = [name for name in OWNED_FOLDERS if (self.work / name).is_dir()]
         for name in in_progress:
-            new |= files_of(self.work / name, name)
+            new_files |= list_files(self.work / name, name)
         replaced, unfinished = self.work / "replaced", self.work / "sparse"
         for folder in (replaced, unfinished):
             shutil.rmtree(folder, ignore_errors=True)
         if os.path.lexists(self.scene / "sparse"):
             os.replace(self.scene / "sparse", replaced)
-        self._record(report, old | new)
-        remove(self.scene, old, self.read)
+        self._write_report(report, old_files | new_files)
+        remove_files(self.scene, old_files, self.protected)
         for name in in_progress:
             if (self.scene / name).is_dir():
                 (self.scene / name).rmdir()
             os.replace(self.work / name, self.scene / name)
-        self._record(report, self.made())
+        self._write_report(report, self.owned_files())
         unfinished.mkdir()
         os.replace(model, unfinished / "0")
         os.replace(unfinished, self.scene / "sparse")
         self.clear()
 
-    def _record(self, report: dict[str, Any], made: Made) -> None:
-        write_atomic(self.scene / REPORT, json.dumps(report | {"made": made}, indent=1).encode())
+    def _write_report(self, report: dict[str, Any], owned: OwnedFiles) -> None:
+        """Write the report with the list of owned files."""
+        write_atomic(self.scene / REPORT_NAME, json.dumps(report | {"made": owned}, indent=1).encode())
 
     def clear(self) -> None:
-        """Remove products in progress."""
+        """Remove the folder of products in progress."""
         shutil.rmtree(self.work, ignore_errors=True)
 
-    def clear_if_bare(self) -> None:
-        """Remove the folder of products if nothing is in progress in it."""
-        if all(path.is_dir() or path.name == _FINGERPRINT for path in self.work.rglob("*")):
+    def clear_if_empty(self) -> None:
+        """Remove the folder of products in progress if there are none in it."""
+        if all(path.is_dir() or path.name == _FINGERPRINT_NAME for path in self.work.rglob("*")):
             self.clear()
 
 
-def same(first: Path, second: Path) -> bool:
-    """Whether two paths are of one place."""
+def is_same_path(first: Path, second: Path) -> bool:
+    """Return whether two paths lead to the same place."""
     return first.resolve() == second.resolve()
 
 
 @contextmanager
-def disk_errors(out: Path) -> Iterator[None]:
-    """What the disk refuses is one sentence; what is done is kept."""
+def explain_disk_errors(out: Path) -> Iterator[None]:
+    """Turn errors of the disk in the block into a HyrfError of one sentence."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Which photos are matched with which."""
+"""Choose which pairs of photos are matched."""
 
 from __future__ import annotations
 
@@ -6,48 +6,55 @@ from collections.abc import Callable
 
 import numpy as np
 
-EXHAUSTIVE_UP_TO = 200  # photos of an unordered set: beyond, only those that look alike are matched
-_WORDS = 64  # of the vocabulary that photos are summed up by
-_SAMPLE = 50_000  # descriptors that it is made from
-_ROUNDS = 12  # of k-means
-_ALIKE, _BESIDE = 40, 5  # unordered: the most similar photos, and the neighbours by name on each side
-_AHEAD, _LOOPS = 10, 8  # ordered: the next photos, and the most similar ones that are farther away
+MAX_EXHAUSTIVE_PHOTOS = 200  # in larger unordered sets, only similar photos are matched
+_VOCABULARY_WORDS = 64
+_VOCABULARY_SAMPLE_DESCRIPTORS = 50_000
+_KMEANS_ITERATIONS = 12
+# Each photo of an unordered set is matched with so many similar photos, and neighbours by name on each side.
+_RETRIEVAL_SIMILAR_PHOTOS = 40
+_RETRIEVAL_NEIGHBOURS = 5
+# Each photo of a sequence is matched with so many next photos, and similar ones farther away, which close loops.
+_SEQUENTIAL_NEIGHBOURS = 10
+_LOOP_CLOSURE_PHOTOS = 8
 
 Pairs = list[tuple[int, int]]
 
 
 def choose_matching(count: int, ordered: bool) -> str:
-    """ "exhaustive", "sequential" or "retrieval", by what a set is."""
+    """Return "exhaustive", "sequential" or "retrieval", by the number of photos and whether they form a sequence."""
     if ordered:
         return "sequential"
-    return "exhaustive" if count <= EXHAUSTIVE_UP_TO else "retrieval"
+    return "exhaustive" if count <= MAX_EXHAUSTIVE_PHOTOS else "retrieval"
 
 
-def exhaustive(count: int) -> Pairs:
-    """All pairs, those of near names first."""
+def exhaustive_pairs(count: int) -> Pairs:
+    """Return all pairs, those of photos with neighbouring names first."""
     return [(first, first + step) for step in range(1, count) for first in range(count - step)]
 
 
-def sequential(count: int, similarity: np.ndarray) -> Pairs:
-    """Each photo with the next ten and those 16, 32, 64 ... later, and with those that look alike wherever they are.
+def sequential_pairs(count: int, similarity: np.ndarray) -> Pairs:
+    """Pair each photo of a sequence with the next ten, those 16, 32, 64 ... later, and the most similar distant ones.
 
     Args:
-        count: photos.
-        similarity: (count, count), from `similarities`.
+        count: number of photos.
+        similarity: (count, count) matrix from `compute_similarities`.
     """
-    steps = [*range(1, _AHEAD + 1), *(2**power for power in range(4, 12))]
+    steps = [*range(1, _SEQUENTIAL_NEIGHBOURS + 1), *(2**power for power in range(4, 12))]
     pairs = {(first, first + step) for step in steps for first in range(count - step)}
-    far = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) > _AHEAD
-    return sorted(pairs | _most_alike(np.where(far, similarity, -np.inf), _LOOPS))
+    far = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) > _SEQUENTIAL_NEIGHBOURS
+    return sorted(pairs | _most_similar_pairs(np.where(far, similarity, -np.inf), _LOOP_CLOSURE_PHOTOS))
 
 
-def retrieval(count: int, similarity: np.ndarray) -> Pairs:
-    """Each photo with those that look most like it, and with its neighbours by name."""
-    beside = {(first, first + step) for step in range(1, _BESIDE + 1) for first in range(count - step)}
-    return sorted(beside | _most_alike(similarity, _ALIKE))
+def retrieval_pairs(count: int, similarity: np.ndarray) -> Pairs:
+    """Pair each photo of an unordered set with the most similar ones and with its neighbours by name."""
+    neighbours = {
+        (first, first + step) for step in range(1, _RETRIEVAL_NEIGHBOURS + 1) for first in range(count - step)
+    }
+    return sorted(neighbours | _most_similar_pairs(similarity, _RETRIEVAL_SIMILAR_PHOTOS))
 
 
-def _most_alike(similarity: np.ndarray, most: int) -> set[tuple[int, int]]:
+def _most_similar_pairs(similarity: np.ndarray, most: int) -> set[tuple[int, int]]:
+    """Pair each photo with at most `most` photos of the highest finite similarity."""
     pairs = set()
     for photo, row in enumerate(similarity):
         row = row.copy()
@@ -58,31 +65,31 @@ def _most_alike(similarity: np.ndarray, most: int) -> set[tuple[int, int]]:
     return pairs
 
 
-def similarities(
+def compute_similarities(
     descriptors: list[np.ndarray], seed: int, progress: Callable[[int], None] = lambda done: None
 ) -> np.ndarray:
-    """How alike photos are, by what their features look like (VLAD, Jegou et al. 2010).
+    """Compute the similarity of each pair of photos from their feature descriptors (VLAD, Jegou et al. 2010).
 
-    A vocabulary is made from the set itself; each photo is the sum of what its descriptors differ by from their nearest
-    words, normalised word by word (Arandjelovic and Zisserman 2013) and as a whole.
+    The vocabulary is learned from the set itself. The vector of a photo sums the differences between its descriptors
+    and their nearest words, normalised for each word (Arandjelovic and Zisserman 2013) and as a whole.
 
     Args:
-        descriptors: (N, 128) uint8 of each photo; N may be 0.
-        seed: of the sample and of where k-means starts.
+        descriptors: (N, 128) uint8 descriptors of each photo; N may be 0.
+        seed: random seed of the descriptor sample and of k-means.
         progress: called with the number of photos that are done.
 
     Returns:
         (photos, photos) cosines in [-1, 1]; 0 for photos without features.
     """
     rng = np.random.default_rng(seed)
-    share = max(1, _SAMPLE // max(len(descriptors), 1))
-    sample = [found[rng.permutation(len(found))[:share]] for found in descriptors]
+    sample_per_photo = max(1, _VOCABULARY_SAMPLE_DESCRIPTORS // max(len(descriptors), 1))
+    sample = [found[rng.permutation(len(found))[:sample_per_photo]] for found in descriptors]
     words = _k_means(np.concatenate(sample).astype(np.float32), rng)
     sums = np.zeros((len(descriptors), *words.shape), np.float32)
     for photo, found in enumerate(descriptors):
         if len(found):
             values = found.astype(np.float32)
-            nearest = _nearest(values, words)
+            nearest = _nearest_words(values, words)
             np.add.at(sums[photo], nearest, values - words[nearest])
         progress(photo + 1)
     sums /= np.maximum(np.linalg.norm(sums, axis=2, keepdims=True), 1e-6)
@@ -92,10 +99,10 @@ def similarities(
 
 
 def _k_means(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(words, 128) centres; where there are fewer values than words, the values."""
-    words = values[rng.permutation(len(values))[:_WORDS]]
-    for _ in range(_ROUNDS):
-        nearest = _nearest(values, words)
+    """Return (words, 128) k-means centres; the values themselves if there are no more of them than words."""
+    words = values[rng.permutation(len(values))[:_VOCABULARY_WORDS]]
+    for _ in range(_KMEANS_ITERATIONS):
+        nearest = _nearest_words(values, words)
         sums = np.zeros_like(words)
         np.add.at(sums, nearest, values)
         counts = np.bincount(nearest, minlength=len(words))[:, None]
@@ -103,6 +110,6 @@ def _k_means(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return words
 
 
-def _nearest(values: np.ndarray, words: np.ndarray) -> np.ndarray:
-    """(N,) index of the word nearest to each value."""
+def _nearest_words(values: np.ndarray, words: np.ndarray) -> np.ndarray:
+    """Return the index of the word nearest to each value: (N,)."""
     return np.argmin((words**2).sum(1) - 2 * values @ words.T, axis=1)

@@ -1,4 +1,4 @@
-"""Work that a library may crash, or be long in, is done in a process of its own."""
+"""Run the stages of an estimation in processes of their own, because pycolmap may crash or block for long."""
 
 from __future__ import annotations
 
@@ -16,109 +16,111 @@ from typing import Any
 
 from hyrfpack.errors import HyrfDataError, HyrfError
 
-REPEAT_SECONDS = 2.0  # without news, after which the last is told again: what is shown then goes on counting
-_PATIENCE = 3.0  # seconds that a process gets to end before it is killed
-_DOING = {
+MAX_SILENCE_SECONDS = 2.0  # the last message is reported again after this time, so that a display keeps counting
+_TERMINATION_TIMEOUT_SECONDS = 3.0  # a process that takes longer to terminate is killed
+_STAGE_DESCRIPTIONS = {
     "features": "finding features",
     "matches": "matching photos",
     "global": "posing all photos at once",
     "incremental": "posing photos one by one",
 }
-_FINISHING = "finishing the poses"
-_ROOT = str(Path(__file__).parents[2])  # what hyrfpack is imported from
+_FINISH_DESCRIPTION = "finishing the poses"
+_IMPORT_ROOT = str(Path(__file__).parents[2])  # the folder from which hyrfpack was imported
 
-Tell = Callable[[str, float], None]
-
-
-class Crashed(HyrfError):
-    """The process of a stage ended by itself, without an answer."""
+Report = Callable[[str, float], None]
 
 
-def run_stage(job: Path, stage: str, tell: Tell, *more: str) -> dict[str, Any]:
-    """Run one stage of an estimation and wait for it.
+class StageCrashedError(HyrfError):
+    """The process of a stage ended without an answer."""
 
-    An exception here, KeyboardInterrupt above all, ends the process before it is raised on; what the stage has saved
-    stays. The process ends also when this one is killed.
+
+def run_stage(job: Path, stage: str, report_progress: Report, *arguments: str) -> dict[str, Any]:
+    """Run one stage of an estimation in a process of its own and wait for its answer.
+
+    An exception in this process, such as KeyboardInterrupt, terminates the stage's process before it is raised again.
+    Files that the stage has saved stay. If this process is killed, the stage's process ends, too.
 
     Args:
-        job: file of the Job.
-        stage: its name, as `worker.run` knows it.
-        tell: called with what is going on and the share of the stage that is done, at least every two seconds.
-        more: arguments of the stage.
+        job: path of the saved Job.
+        stage: name of the stage, see `worker.run`.
+        report_progress: called with a description of the current work and the ratio of the stage that is done, at least
+            every MAX_SILENCE_SECONDS.
+        arguments: further arguments of the stage.
 
     Returns:
-        What the stage has to say.
+        The answer of the stage.
 
     Raises:
-        HyrfDataError: the stage refuses the photos.
-        Crashed: the process ended without an answer: the library crashed or ran out of memory or disk.
+        HyrfDataError: the stage rejected the photos.
+        StageCrashedError: the process ended without an answer: the library crashed or ran out of memory or disk space.
     """
-    command = [sys.executable, "-m", "hyrfpack.poses.worker", str(job), stage, *more]
-    path = os.pathsep.join(filter(None, (_ROOT, os.environ.get("PYTHONPATH"))))
+    command = [sys.executable, "-m", "hyrfpack.poses.worker", str(job), stage, *arguments]
+    path = os.pathsep.join(filter(None, (_IMPORT_ROOT, os.environ.get("PYTHONPATH"))))
     environment = {**os.environ, "PYTHONPATH": path}
     log = job.parent / f"{stage}.log"
     with log.open("wb") as errors:
         process = subprocess.Popen(
             command,
             env=environment,
-            stdin=subprocess.PIPE,  # never written to: its end tells the process that this one is gone
+            stdin=subprocess.PIPE,  # never written to; it is closed when this process ends, which ends the other one
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,
             encoding="utf-8",
-            errors="replace",  # in what a library prints
-            start_new_session=True,  # Ctrl-C reaches this process alone, which ends the other
+            errors="replace",  # a library may print text that is not UTF-8
+            start_new_session=True,  # Ctrl-C reaches only this process, which then ends the other one
         )
         try:
-            answer = _listen(process, tell, _DOING.get(stage, _FINISHING))
+            answer = _read_answer(process, report_progress, _STAGE_DESCRIPTIONS.get(stage, _FINISH_DESCRIPTION))
             code = process.wait()
         finally:
-            _end(process)
+            _terminate(process)
     if "refused" in answer:
         raise HyrfDataError(answer["refused"])
     if code or not answer:
-        raise Crashed(_explain(stage, code, log))
+        raise StageCrashedError(_explain_crash(stage, code, log))
     return answer
 
 
-def _listen(process: subprocess.Popen, tell: Tell, doing: str) -> dict[str, Any]:
-    """Hear a process out, and tell `doing` until it says something itself; returns its answer, empty for none."""
+def _read_answer(process: subprocess.Popen, report_progress: Report, doing: str) -> dict[str, Any]:
+    """Report the progress messages of a process until it ends; return its answer, empty if it sent none."""
     answer: dict[str, Any] = {}
     latest: dict[str, Any] = {"doing": doing, "share": 0.0}
-    tell(latest["doing"], latest["share"])
+    report_progress(latest["doing"], latest["share"])
     lines: Queue[str | None] = Queue()
     Thread(target=_read_lines, args=(process, lines), daemon=True).start()
     while True:
         try:
-            line = lines.get(timeout=REPEAT_SECONDS)
+            line = lines.get(timeout=MAX_SILENCE_SECONDS)
         except Empty:
-            tell(latest["doing"], latest["share"])
+            report_progress(latest["doing"], latest["share"])
             continue
         if line is None:
             return answer
-        with suppress(ValueError):  # what a library prints is no JSON
+        with suppress(ValueError):  # lines that a library prints are not JSON
             message = json.loads(line)
             if isinstance(message, dict) and "doing" in message:
                 latest = message
-                tell(latest["doing"], latest["share"])
+                report_progress(latest["doing"], latest["share"])
             elif isinstance(message, dict) and "answer" in message:
                 answer = message["answer"]
 
 
 def _read_lines(process: subprocess.Popen, lines: Queue[str | None]) -> None:
-    """Put the lines of a process into a queue, and None behind the last."""
+    """Put the output lines of a process into a queue, and None after the last one."""
     assert process.stdout is not None
-    with suppress(ValueError, OSError):  # closed by `_end`
+    with suppress(ValueError, OSError):  # `_terminate` has closed the pipe
         for line in process.stdout:
             lines.put(line)
     lines.put(None)
 
 
-def _end(process: subprocess.Popen) -> None:
+def _terminate(process: subprocess.Popen) -> None:
+    """Terminate a process, kill it if that takes too long, and close its pipes."""
     if process.poll() is None:
         process.terminate()
         try:
-            process.wait(_PATIENCE)
+            process.wait(_TERMINATION_TIMEOUT_SECONDS)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
@@ -128,9 +130,9 @@ def _end(process: subprocess.Popen) -> None:
                 pipe.close()
 
 
-def _explain(stage: str, code: int, log: Path) -> str:
-    """One sentence about a process that ended without an answer."""
-    doing = _DOING.get(stage, _FINISHING)
+def _explain_crash(stage: str, code: int, log: Path) -> str:
+    """Return a sentence that says why a process ended without an answer and what to do."""
+    doing = _STAGE_DESCRIPTIONS.get(stage, _FINISH_DESCRIPTION)
     text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
     if "disk is full" in text or "No space left" in text or "disk I/O error" in text:
         return f"{log.parent}: the disk is full; free some space and run the same command again, which goes on here"

@@ -1,4 +1,4 @@
-"""Reading videos with PyAV: which frames there are, and a frame as the picture that a player shows."""
+"""Read videos with PyAV: iterate over the frames, and convert a frame to the picture that a player shows."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ import numpy as np
 
 from hyrfpack.errors import HyrfDataError, needs_package
 from hyrfpack.outputs import VIDEO_SUFFIXES, StrPath
-from hyrfpack.poses.hdr import HLG, PQ, standard_range
+from hyrfpack.poses.hdr import HLG, PQ, tone_map_to_srgb
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-_HD = 720  # lines; untagged videos of so many and more are Rec. 709 in colour, others Rec. 601
-_UNSPECIFIED, _REC709 = 2, 1  # ITU-T H.273, of matrix coefficients
+_MIN_REC709_LINES = 720  # videos without a colour tag are read as Rec. 709 from this height on, as players do
+# Numbers of colour matrices in ITU-T H.273.
+_H273_UNSPECIFIED = 2
+_H273_REC709 = 1
 
 
 def is_video(path: StrPath) -> bool:
-    """Whether a file is called like a video (.mp4, .mov, .mkv, .webm and so on, in any case).
+    """Return whether a file name has the ending of a video (.mp4, .mov, .mkv, .webm and so on, in any case).
 
     Example:
         >>> is_video("clip.MOV"), is_video("photo.jpg")
@@ -31,28 +33,28 @@ def is_video(path: StrPath) -> bool:
 
 
 class Video:
-    """An open video: its length and its frames.
+    """An open video file.
 
     Attributes:
-        seconds: that its header says it takes, 0 where it does not say.
-        size: (width, height) in pixels of the frames as they are stored.
-        aspect: width of a pixel over its height.
-        damaged: packets and frames that could not be decoded so far.
+        seconds: duration according to the header; 0 if the header has none.
+        size: (width, height) of the stored frames in pixels, before rotation.
+        aspect: pixel aspect ratio, the width of a pixel divided by its height.
+        damaged_count: number of packets and frames that could not be decoded so far.
     """
 
     def __init__(self, container: Any) -> None:
         self._container, self._stream = container, container.streams.video[0]
         self._stream.thread_type = "AUTO"
-        self.damaged = 0
+        self.damaged_count = 0
         self.size = (self._stream.codec_context.width, self._stream.codec_context.height)
         self.aspect = float(self._stream.sample_aspect_ratio or 1) or 1.0
         length, unit = self._stream.duration, self._stream.time_base
         self.seconds = float(length * unit) if length and unit else (container.duration or 0) / 1e6
 
     def frames(self) -> Iterator[tuple[int, float, Any]]:
-        """Number, time in seconds and av.VideoFrame of every frame that can be decoded, in the order of showing.
+        """Yield the number, the time in seconds and the av.VideoFrame of each decodable frame, in display order.
 
-        What is damaged is skipped and counted. The numbers are the same each time that a file is read.
+        Damaged packets and frames are skipped and counted. A frame has the same number each time the file is read.
         """
         import av
 
@@ -63,18 +65,18 @@ class Video:
             try:
                 packet = next(packets, None)
             except av.error.FFmpegError:
-                self.damaged += 1
+                self.damaged_count += 1
                 return
             if packet is None:
                 return
             try:
                 frames = packet.decode()
             except av.error.FFmpegError:
-                self.damaged += 1
+                self.damaged_count += 1
                 continue
             for frame in frames:
                 if getattr(frame, "is_corrupt", False):
-                    self.damaged += 1
+                    self.damaged_count += 1
                     continue
                 time = last if frame.time is None else float(frame.time)
                 start = time if start is None else start
@@ -84,11 +86,11 @@ class Video:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Video]:
-    """Open a video.
+def open_video(path: Path) -> Iterator[Video]:
+    """Open a video file and close it at the end of the block.
 
     Raises:
-        HyrfDataError: it is missing, unreadable, cut off before its table of contents, or has no pictures.
+        HyrfDataError: the file is missing, unreadable, cut off before its table of contents, or has no video stream.
         HyrfError: PyAV is not installed.
     """
     with needs_package("av", f"{path}: reading videos"):
@@ -100,9 +102,9 @@ def opened(path: Path) -> Iterator[Video]:
         raise HyrfDataError(f"{path}: the video is empty (0 bytes); copy it again")
     try:
         container = av.open(str(path))
-    except Exception as error:  # PyAV raises whatever FFmpeg's demuxers report, and what the system says
+    except Exception as error:  # PyAV passes on many types of errors, of FFmpeg's demuxers and of the system
         raise HyrfDataError(
-            f"{path}: this cannot be read as a video ({_reason(error)}); copy it again in full, or save it as .mp4"
+            f"{path}: this cannot be read as a video ({_error_text(error)}); copy it again in full, or save it as .mp4"
         ) from error
     try:
         if not container.streams.video:
@@ -112,32 +114,32 @@ def opened(path: Path) -> Iterator[Video]:
         container.close()
 
 
-def gray_picture(frame: Any, longer: int) -> np.ndarray:
-    """A frame as luma, shrunk to at most `longer` pixels on the longer side, as it is stored: (H, W) uint8."""
-    scale = min(1.0, longer / max(frame.width, frame.height))
+def decode_gray(frame: Any, max_side: int) -> np.ndarray:
+    """Return the luma of a frame as stored, shrunk to at most `max_side` pixels on the longer side: (H, W) uint8."""
+    scale = min(1.0, max_side / max(frame.width, frame.height))
     width, height = (max(2, round(side * scale)) for side in (frame.width, frame.height))
     return frame.reformat(width=width, height=height, format="gray", interpolation="AREA").to_ndarray()
 
 
-def upright_picture(frame: Any, aspect: float) -> Image:
-    """A frame as players show it: upright, with square pixels, high dynamic range brought to the ordinary one."""
+def decode_upright(frame: Any, aspect: float) -> Image:
+    """Return a frame as players show it: upright, with square pixels, and tone mapped if it has high dynamic range."""
     from PIL import Image
 
-    colors = _REC709 if frame.colorspace == _UNSPECIFIED and frame.height >= _HD else None
+    color_matrix = _H273_REC709 if frame.colorspace == _H273_UNSPECIFIED and frame.height >= _MIN_REC709_LINES else None
     if frame.color_trc in (PQ, HLG):
-        wide = frame.reformat(format="rgb48le", src_colorspace=colors).to_ndarray()
-        picture = Image.fromarray(standard_range(wide, frame.color_trc))
+        signal = frame.reformat(format="rgb48le", src_colorspace=color_matrix).to_ndarray()
+        picture = Image.fromarray(tone_map_to_srgb(signal, frame.color_trc))
     else:
-        picture = Image.fromarray(frame.reformat(format="rgb24", src_colorspace=colors).to_ndarray())
+        picture = Image.fromarray(frame.reformat(format="rgb24", src_colorspace=color_matrix).to_ndarray())
     if abs(aspect - 1) > 0.01:
         picture = picture.resize((round(picture.width * aspect), picture.height), Image.Resampling.LANCZOS)
-    turn = round(frame.rotation / 90) % 4  # counter-clockwise
-    if turn:
-        kinds = Image.Transpose.ROTATE_90, Image.Transpose.ROTATE_180, Image.Transpose.ROTATE_270
-        picture = picture.transpose(kinds[turn - 1])
+    quarter_turns = round(frame.rotation / 90) % 4  # counter-clockwise
+    if quarter_turns:
+        rotations = Image.Transpose.ROTATE_90, Image.Transpose.ROTATE_180, Image.Transpose.ROTATE_270
+        picture = picture.transpose(rotations[quarter_turns - 1])
     return picture
 
 
-def _reason(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     text = getattr(error, "strerror", None) or str(error) or type(error).__name__
     return text.splitlines()[0][:120]

@@ -1,4 +1,4 @@
-"""Progress of long calls into the library, which say nothing themselves: a second thread looks at what they write."""
+"""Progress of long pycolmap calls, which report nothing: a second thread reads the files that they write."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pathlib import Path
 from threading import Event, Thread
 
 from hyrfpack.poses.job import Job
-from hyrfpack.poses.process import Tell
+from hyrfpack.poses.process import Report
 
-LOOK_SECONDS = 1.0  # between two looks
+POLL_INTERVAL_SECONDS = 1.0
 
-# What the global mapper writes into its log as it begins a phase; what the phase is called; the share of the mapping
-# that was done before it, as measured on sets of 50 to 100 photos.
+# For each phase of the global mapper: the line in its log at the start, the name of the phase, and the ratio of the
+# mapping that is done before it, measured on sets of 50 to 100 photos.
 _GLOBAL_PHASES = (
     ("=== Running rotation averaging", "camera rotations", 0.02),
     ("=== Running track establishment", "tracks of points", 0.04),
@@ -25,32 +25,32 @@ _GLOBAL_PHASES = (
 
 
 @contextmanager
-def watching(look: Callable[[], None]) -> Iterator[None]:
-    """Call `look` every second from a second thread while the block runs.
+def poll_in_background(poll: Callable[[], None]) -> Iterator[None]:
+    """Call `poll` every POLL_INTERVAL_SECONDS from a second thread while the block runs.
 
-    What keeps `look` from reading (a locked database, a log that is not there yet) is passed over.
+    Errors that `poll` meets while it reads are ignored, such as a locked database or a log that does not exist yet.
     """
-    over = Event()
+    stopped = Event()
 
-    def watch() -> None:
-        while not over.wait(LOOK_SECONDS):
+    def poll_until_stopped() -> None:
+        while not stopped.wait(POLL_INTERVAL_SECONDS):
             with suppress(sqlite3.Error, OSError):
-                look()
+                poll()
 
-    thread = Thread(target=watch, daemon=True)
+    thread = Thread(target=poll_until_stopped, daemon=True)
     thread.start()
     try:
         yield
     finally:
-        over.set()
+        stopped.set()
         thread.join()
 
 
 def count_rows(job: Job, table: str) -> int:
-    """How many rows a table of the database has, also while the library writes to it.
+    """Return the number of rows in a table of the database, also while the library writes to it.
 
     Raises:
-        sqlite3.Error: it cannot be read at the moment.
+        sqlite3.Error: the table cannot be read at the moment.
     """
     connection = sqlite3.connect(f"{job.database.resolve().as_uri()}?mode=ro", uri=True, timeout=0.5)
     try:
@@ -60,42 +60,42 @@ def count_rows(job: Job, table: str) -> int:
 
 
 @contextmanager
-def watching_rows(job: Job, table: str, tell: Callable[[int], None]) -> Iterator[None]:
-    """Tell how many rows a table has got since the block began, while it runs."""
+def report_new_rows(job: Job, table: str, report_count: Callable[[int], None]) -> Iterator[None]:
+    """While the block runs, report how many rows a table has gained since the block began."""
     before = count_rows(job, table)
-    with watching(lambda: tell(max(count_rows(job, table) - before, 0))):
+    with poll_in_background(lambda: report_count(max(count_rows(job, table) - before, 0))):
         yield
 
 
 @contextmanager
-def watching_global_mapper(log: Path, doing: str, tell: Tell) -> Iterator[None]:
-    """Tell the phase that the global mapper is in, by the log that it writes to, while the block runs.
+def report_global_mapping_phase(log: Path, doing: str, report_progress: Report) -> Iterator[None]:
+    """While the block runs, report the phase of the global mapper, read from its log.
 
     Args:
-        log: file that the library's messages go to.
-        doing: words before the phase.
-        tell: called with the words and the share of the mapping that is done.
+        log: file of the library's messages.
+        doing: description that comes before the phase.
+        report_progress: called with the description and the ratio of the mapping that is done.
     """
     before = log.stat().st_size if log.exists() else 0
 
-    def look() -> None:
+    def poll() -> None:
         with log.open("rb") as file:
             file.seek(before)
             text = file.read().decode("utf-8", "replace")
-        phase, share = global_mapping_phase(text)
+        phase, share = parse_global_mapping_phase(text)
         if phase:
-            tell(f"{doing}: {phase}", share)
+            report_progress(f"{doing}: {phase}", share)
 
-    with watching(look):
+    with poll_in_background(poll):
         yield
 
 
-def global_mapping_phase(log: str) -> tuple[str, float]:
-    """The phase of the global mapper and the share of its work before it, by its log; ("", 0.0) before the first."""
-    begun = [(log.rfind(mark), name, share) for mark, name, share in _GLOBAL_PHASES if mark in log]
-    if not begun:
+def parse_global_mapping_phase(log: str) -> tuple[str, float]:
+    """Return the present phase of the global mapper and the ratio of its work before it; ("", 0.0) before the first."""
+    started = [(log.rfind(mark), name, share) for mark, name, share in _GLOBAL_PHASES if mark in log]
+    if not started:
         return "", 0.0
-    place, name, share = max(begun)
+    place, name, share = max(started)
     if name == "bundle adjustment":
         rounds = log.count("fixed-rotation stage finished", place)
         return (f"{name}, round {rounds + 1}", min(share + 0.06 * rounds, 0.69))

@@ -1,8 +1,9 @@
-"""The process that one stage of an estimation runs in: `python -m hyrfpack.poses.worker JOB STAGE [MODEL ...]`.
+"""Entry point of the process that runs one stage of an estimation.
 
-It says what it does as lines of JSON on standard output, the last of them the answer. It ends when whoever started it
-is gone: standard input is closed then, and on Linux the kernel kills it, for a long call into the library holds up
-every thread of Python's.
+The command is `python -m hyrfpack.poses.worker JOB STAGE [MODEL ...]`.
+It writes its progress as lines of JSON to standard output; the last line is the answer. It ends when its parent process
+ends, because its standard input is then closed. On Linux the kernel kills it as well, because a long call into pycolmap
+can block every Python thread.
 """
 
 from __future__ import annotations
@@ -16,67 +17,68 @@ import threading
 from pathlib import Path
 from typing import Any
 
-import hyrfpack  # first: it imports zlib before pycolmap  # noqa: F401
+import hyrfpack  # must come first, because it imports zlib before pycolmap  # noqa: F401
 from hyrfpack.errors import HyrfError
 from hyrfpack.poses.job import Job
 
-_one_at_a_time = threading.Lock()  # a second thread tells of progress during long calls, see `watch`
-_DIES_WITH_PARENT = 1  # PR_SET_PDEATHSIG
+_output_lock = threading.Lock()  # a second thread reports progress during long calls, see `watch`
+_PR_SET_PDEATHSIG = 1  # option of Linux's prctl: the signal that a process gets when its parent ends
 
 
-def say(message: dict[str, Any]) -> None:
-    """Send one line to whoever started this."""
-    with _one_at_a_time:
+def send_message(message: dict[str, Any]) -> None:
+    """Send one message to the parent process, as a line of JSON."""
+    with _output_lock:
         sys.stdout.write(json.dumps(message) + "\n")
         sys.stdout.flush()
 
 
-def tell(doing: str, share: float) -> None:
-    """Say what is going on, and the share of this stage that is done."""
-    say({"doing": doing, "share": share})
+def report_progress(doing: str, share: float) -> None:
+    """Send a description of the current work and the ratio of this stage that is done."""
+    send_message({"doing": doing, "share": share})
 
 
 def run(job: Job, stage: str, models: list[str]) -> dict[str, Any]:
-    """Run one stage; `models` are the mappers' results that "finish" chooses between."""
+    """Run one stage and return its answer; `models` names the mappers' results from which "finish" chooses."""
     if stage == "features":
         from hyrfpack.poses.features import find_features
 
-        return find_features(job, tell)
+        return find_features(job, report_progress)
     if stage == "matches":
-        from hyrfpack.poses.matching import match
+        from hyrfpack.poses.matching import match_photos
 
-        return match(job, tell)
+        return match_photos(job, report_progress)
     if stage == "finish":
-        from hyrfpack.poses.finish import finish
+        from hyrfpack.poses.finish import finish_reconstruction
 
-        return finish(job, models, tell)
+        return finish_reconstruction(job, models, report_progress)
     from hyrfpack.poses.mapping import map_globally, map_incrementally
 
-    return {"global": map_globally, "incremental": map_incrementally}[stage](job, tell)
+    return {"global": map_globally, "incremental": map_incrementally}[stage](job, report_progress)
 
 
 def main(job: str, stage: str, *models: str) -> None:
-    """Run one stage of a job and say what came out."""
-    _die_with_parent()
+    """Run one stage of a saved job and send its answer."""
+    _exit_with_parent()
     try:
         answer = run(Job.load(Path(job)), stage, list(models))
     except HyrfError as error:
         answer = {"refused": str(error)}
-    say({"answer": answer})
+    send_message({"answer": answer})
 
 
-def _die_with_parent() -> None:
+def _exit_with_parent() -> None:
+    """Make this process exit when its parent process ends."""
     parent = os.getppid()
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_DIES_WITH_PARENT, signal.SIGKILL)
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:
             os._exit(1)
 
-    def watch() -> None:
+    def wait_for_end_of_input() -> None:
         os.read(0, 1)
         os._exit(1)
 
-    threading.Thread(target=watch, daemon=True).start()
+    threading.Thread(target=wait_for_end_of_input, daemon=True).start()
 
 
 if __name__ == "__main__":

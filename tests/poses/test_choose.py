@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from made_up_poses import circle, moved
 
-from hyrfpack.poses.choose import Candidate, choose, confirmed, doubt
+from hyrfpack.poses.choose import Candidate, choose_candidate, confirmed_photos, describe_doubt
 
 
-def candidate(mapper: str, poses: dict, explained: int, track: float = 5.0, apart: tuple = ()) -> Candidate:
-    return Candidate(mapper, poses, apart, explained, track, 0.4)
+def candidate(mapper: str, poses: dict, explained: int, track: float = 5.0, other_pieces: tuple = ()) -> Candidate:
+    return Candidate(mapper, poses, other_pieces, explained, track, 0.4)
 
 
 def test_the_one_that_explains_more_is_taken_though_it_has_fewer_photos_or_shorter_tracks():
@@ -16,7 +16,7 @@ def test_the_one_that_explains_more_is_taken_though_it_has_fewer_photos_or_short
     fewer = {name: pose for name, pose in poses.items() if name < "020"}
     right = candidate("incremental", fewer, 900, track=4.0)
     folded = candidate("global", poses, 700, track=6.0)
-    chosen, why = choose([folded, right], 1000)
+    chosen, why = choose_candidate([folded, right], 1000)
     assert chosen is right
     assert "explains more" in why and "90.0% of the matches" in why and "70.0%" in why
 
@@ -25,21 +25,21 @@ def test_among_equals_more_photos_and_then_longer_tracks_decide():
     poses = circle()
     fewer = {name: pose for name, pose in poses.items() if name < "020"}
     a, b = candidate("incremental", fewer, 901), candidate("global", poses, 900)
-    assert choose([a, b], 1000)[0] is b
+    assert choose_candidate([a, b], 1000)[0] is b
     a, b = candidate("incremental", poses, 901, 5.5), candidate("global", poses, 902, 5.0)
-    assert choose([a, b], 1000)[0] is a
+    assert choose_candidate([a, b], 1000)[0] is a
 
 
 def test_all_is_well_where_both_agree_and_said_where_they_do_not():
     poses = circle()
     names = sorted(poses)
     folded = {**poses, **{name: poses[onto] for name, onto in zip(names[16:], names[:8], strict=True)}}
-    assert doubt(poses, candidate("global", moved(poses), 1000)) == ""
-    said = doubt(poses, candidate("global", moved(folded), 800))
+    assert describe_doubt(poses, candidate("global", moved(poses), 1000)) == ""
+    said = describe_doubt(poses, candidate("global", moved(folded), 800))
     assert said.startswith("16 of 24 posed photos are sure; the global mapper poses 8 of them differently")
     lacking = {name: poses[name] for name in names[:10]}
-    assert "has no pose for 14" in doubt(poses, candidate("incremental", moved(lacking), 400))
-    assert "nothing confirms the poses of these 24 photos" in doubt(poses, None)
+    assert "has no pose for 14" in describe_doubt(poses, candidate("incremental", moved(lacking), 400))
+    assert "nothing confirms the poses of these 24 photos" in describe_doubt(poses, None)
 
 
 def test_of_the_other_mappers_pieces_the_largest_that_agrees_confirms():
@@ -47,6 +47,6 @@ def test_of_the_other_mappers_pieces_the_largest_that_agrees_confirms():
     names = sorted(poses)
     first = moved({name: poses[name] for name in names[:9]}, seed=3)
     second = moved({name: poses[name] for name in names[9:]}, scale=0.2, seed=4)
-    other = candidate("incremental", first, 500, apart=(second,))
-    assert confirmed(poses, other) == set(names[9:])
-    assert doubt(poses, other).startswith("15 of 24 posed photos are sure")
+    other = candidate("incremental", first, 500, other_pieces=(second,))
+    assert confirmed_photos(poses, other) == set(names[9:])
+    assert describe_doubt(poses, other).startswith("15 of 24 posed photos are sure")

@@ -12,7 +12,7 @@ import pytest
 from commands import refused, succeeded
 
 import hyrfpack
-from hyrfpack.poses.compare import compare
+from hyrfpack.poses.alignment import align_poses
 
 
 def poses_of(scene: hyrfpack.Scene) -> dict[str, np.ndarray]:
@@ -23,7 +23,7 @@ def test_all_photos_are_where_they_were_taken_whatever_their_names(taken, posed)
     folder, known = taken
     out, report, _, _ = posed
     scene = hyrfpack.load_scene(out)
-    assert compare(poses_of(scene), known).same == set(known)
+    assert align_poses(poses_of(scene), known).agreeing == set(known)
     assert (report.photos, report.registered, report.left_out) == (len(known), len(known), {})
     assert report.sure == len(known)
     assert report.mapper in ("incremental", "global") and report.why.startswith(f"the {report.mapper} mapper was taken")
@@ -31,7 +31,7 @@ def test_all_photos_are_where_they_were_taken_whatever_their_names(taken, posed)
 
 def test_points_lie_on_the_walls_and_have_the_photos_colours(taken, posed):
     scene = hyrfpack.load_scene(posed[0])
-    found = compare(poses_of(scene), taken[1])
+    found = align_poses(poses_of(scene), taken[1])
     points = found.scale * scene.points @ found.rotation.T + found.shift
     off = np.abs(points).min(axis=1)  # the walls are x = 0, y = 0 and z = 0
     assert np.median(off) < 0.02

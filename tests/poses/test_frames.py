@@ -14,9 +14,9 @@ from scipy import ndimage
 
 import hyrfpack
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.poses.frames import RECORD, choose_frames, frame_times, is_video
-from hyrfpack.poses.hdr import HLG, PQ, standard_range
-from hyrfpack.poses.motion import distances, track
+from hyrfpack.poses.frames import RECORD_NAME, choose_frames, frame_times, is_video
+from hyrfpack.poses.hdr import HLG, PQ, tone_map_to_srgb
+from hyrfpack.poses.motion import motion_distances, track_windows
 
 av = pytest.importorskip("av")
 
@@ -106,7 +106,7 @@ def test_blurred_and_repeated_frames_are_never_taken(wall, tmp_path):
     assert np.diff([places[number] for number in numbers]).min() > 0  # of frames that repeat another only one
     assert report.blurred == len(range(1, 80, 3))
     assert unlike(tmp_path / "frames", numbers[3], frames[numbers[3]]) < 4
-    assert json.loads((tmp_path / "frames" / RECORD).read_text())["frames"] == numbers
+    assert json.loads((tmp_path / "frames" / RECORD_NAME).read_text())["frames"] == numbers
 
 
 def test_frames_are_spread_by_motion_and_not_by_time(wall, tmp_path):
@@ -124,9 +124,9 @@ def test_frames_are_spread_by_motion_and_not_by_time(wall, tmp_path):
 
 def test_motion_is_measured_right_and_a_shaking_camera_goes_nowhere(wall):
     small = [seen(wall, x)[:, :160].mean(axis=2).astype(np.uint8) for x in (10, 12, 15, 21, 35, 45, 33, 20, 10)]
-    found = track(small)
+    found = track_windows(small)
     expected = np.array([0, 2, 5, 11, 25, 35, 23, 10, 0]) / 160
-    assert distances(found, 0, slice(0, 9)) == pytest.approx(expected, abs=0.006)
+    assert motion_distances(found, 0, slice(0, 9)) == pytest.approx(expected, abs=0.006)
 
 
 def test_the_same_call_again_does_nothing_and_an_interrupted_one_goes_on(wall, tmp_path):
@@ -254,7 +254,7 @@ def test_videos_are_known_by_their_endings():
 )
 def test_high_dynamic_range_keeps_grey_and_its_light(transfer, signal, light):
     """Points of the curves as BT.2408 and BT.2100 tabulate them; squeezed above 0.7 of white paper's light."""
-    shown = standard_range(np.full((1, 1, 3), round(signal * 65535), np.uint16), transfer)[0, 0].astype(float)
+    shown = tone_map_to_srgb(np.full((1, 1, 3), round(signal * 65535), np.uint16), transfer)[0, 0].astype(float)
     assert np.ptp(shown) <= 1
     linear = ((shown[0] / 255 + 0.055) / 1.055) ** 2.4 if shown[0] > 10 else shown[0] / 255 / 12.92
     share = light / 203
@@ -265,7 +265,7 @@ def test_high_dynamic_range_keeps_grey_and_its_light(transfer, signal, light):
 def test_high_dynamic_range_clips_nothing():
     ramp = np.repeat(np.arange(0, 65536, 257, dtype=np.uint16)[None, :, None], 3, axis=2)
     for transfer in (PQ, HLG):
-        shown = standard_range(ramp, transfer)[0, :, 0].astype(int)
+        shown = tone_map_to_srgb(ramp, transfer)[0, :, 0].astype(int)
         assert (np.diff(shown) >= 0).all() and shown[0] == 0 and (shown == 255).sum() < 60
 
 
@@ -305,12 +305,12 @@ def test_a_video_tells_how_far_it_is_at_each_step(wall, tmp_path):
 
 
 def test_a_frame_that_is_left_out_is_named_with_its_time(wall, tmp_path):
-    from hyrfpack.poses.estimate import _Estimation
+    from hyrfpack.poses.estimate import _PoseEstimation
 
     video = write(tmp_path / "clip.mp4", [seen(wall, 4 * number) for number in range(60)])
-    estimation = _Estimation(video, tmp_path / "scene", "auto", None, 0, False, None, None)
+    estimation = _PoseEstimation(video, tmp_path / "scene", "auto", None, 0, False, None, None)
     (tmp_path / "scene").mkdir()
-    estimation.output.check(video, overwrite=False)
-    job = estimation._prepare()
+    estimation.output.check_replaceable(video, overwrite=False)
+    job = estimation._prepare_job()
     number = int(job.names[5][6:12])
-    assert estimation._name(job.names[5]) == f"{job.names[5]} (at {number / 30:.1f} s)"
+    assert estimation._user_name(job.names[5]) == f"{job.names[5]} (at {number / 30:.1f} s)"

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from hyrfpack.poses.pairs import choose_matching, exhaustive, retrieval, sequential, similarities
+from hyrfpack.poses.pairs import (
+    choose_matching,
+    compute_similarities,
+    exhaustive_pairs,
+    retrieval_pairs,
+    sequential_pairs,
+)
 
 
 def looks(groups: list[int], seed: int = 0) -> list[np.ndarray]:
@@ -20,21 +26,21 @@ def test_the_kind_follows_from_the_set():
 
 
 def test_exhaustive_is_every_pair_once():
-    pairs = exhaustive(7)
+    pairs = exhaustive_pairs(7)
     assert len(set(pairs)) == len(pairs) == 21
     assert all(first < second for first, second in pairs)
 
 
 def test_photos_that_show_the_same_look_alike():
     groups = [0, 1, 2, 0, 1, 2, 0, 1, 2]
-    similar = similarities(looks(groups), seed=0)
+    similar = compute_similarities(looks(groups), seed=0)
     same = np.equal.outer(groups, groups)
     assert similar[same].min() > similar[~same].max()
-    assert np.array_equal(similar, similarities(looks(groups), seed=0))
+    assert np.array_equal(similar, compute_similarities(looks(groups), seed=0))
 
 
 def test_photos_without_features_are_like_none():
-    similar = similarities([*looks([0, 0]), np.zeros((0, 128), np.uint8)], seed=0)
+    similar = compute_similarities([*looks([0, 0]), np.zeros((0, 128), np.uint8)], seed=0)
     assert np.isfinite(similar).all() and not similar[2].any()
 
 
@@ -42,7 +48,7 @@ def test_sequential_closes_loops():
     count = 60
     similar = np.zeros((count, count))
     similar[2, 57] = similar[57, 2] = 1.0
-    pairs = sequential(count, similar)
+    pairs = sequential_pairs(count, similar)
     assert {(0, 1), (0, 10), (0, 16), (2, 57)} <= set(pairs)
     assert all(first < second for first, second in pairs) and len(set(pairs)) == len(pairs)
 
@@ -52,6 +58,6 @@ def test_retrieval_takes_those_that_look_alike_and_neighbours():
     rng = np.random.default_rng(0)
     similar = rng.uniform(0, 0.1, (count, count))
     similar[5, 290] = 0.9
-    pairs = set(retrieval(count, similar))
+    pairs = set(retrieval_pairs(count, similar))
     assert (5, 290) in pairs and (5, 6) in pairs
     assert len(pairs) < count * 46

@@ -9,8 +9,8 @@ from PIL import Image
 
 import hyrfpack
 from hyrfpack.data.equirectangular import FACES
-from hyrfpack.poses.compare import compare
-from hyrfpack.poses.prepare import find_masks, look_at, make_masks
+from hyrfpack.poses.alignment import align_poses
+from hyrfpack.poses.prepare import find_masks, make_masks, read_headers
 
 COUNT, HEIGHT = 3, 320
 
@@ -34,7 +34,7 @@ def test_the_faces_of_panoramas_are_posed(panoramas, tmp_path):
     views = hyrfpack.load_scene(tmp_path / "scene").views
     assert {f"p{number}_front.jpg" for number in range(COUNT)} <= {view.name for view in views}
     poses = {view.name: view.camera.camera_from_world[:3] for view in views}
-    assert len(compare(poses, expected).same) >= COUNT
+    assert len(align_poses(poses, expected).agreeing) >= COUNT
     for view in views:  # a quarter of a turn wide
         assert view.camera.fx == pytest.approx(view.camera.width / 2, rel=0.05)
 
@@ -53,7 +53,7 @@ def test_masks_of_panoramas_are_cut_with_them(panoramas, tmp_path):
     mask[HEIGHT // 2 :] = 0  # what lies below the horizon
     (tmp_path / "masks").mkdir()
     Image.fromarray(mask).save(tmp_path / "masks" / "p0.png")
-    photos, left_out = look_at(folder, [folder / "p0.jpg"], in_place=False)
+    photos, left_out = read_headers(folder, [folder / "p0.jpg"], in_place=False)
     assert len(photos) == len(FACES) and not left_out
     made = make_masks(photos, find_masks(photos, tmp_path / "masks"), tmp_path / "made")
     usable = {name: np.asarray(Image.open(path).convert("L")) > 0 for name, path in made.items()}

@@ -16,7 +16,15 @@ from hyrfpack.data.folder import list_photos, read_photo_facts
 from hyrfpack.data.pictures import read_pixels
 from hyrfpack.poses.copying import copy_file
 from hyrfpack.poses.job import Device, Job
-from hyrfpack.poses.prepare import Photo, devices_of, find_masks, in_order, look_at, make_images, make_masks
+from hyrfpack.poses.prepare import (
+    Photo,
+    find_masks,
+    group_by_device,
+    is_ordered_sequence,
+    make_images,
+    make_masks,
+    read_headers,
+)
 
 # Pixels of a picture that is stored on its side, and how EXIF says that it is turned upright.
 TURNED = {3: 2, 6: 1, 8: 3}  # orientation: quarter turns, against the clock, from upright to stored
@@ -41,7 +49,7 @@ def save(path: Path, pixels: np.ndarray, orientation: int = 1, exif: dict | None
 
 
 def looked_at(folder: Path, in_place: bool = False) -> tuple[list[Photo], dict[str, str]]:
-    return look_at(folder, list_photos(folder), in_place)
+    return read_headers(folder, list_photos(folder), in_place)
 
 
 @pytest.mark.parametrize("orientation", [3, 6, 8])
@@ -141,9 +149,9 @@ def test_printing_inks_stored_on_their_side_become_colours_without_the_profile_o
 def test_in_place_nothing_is_turned(tmp_path):
     save(tmp_path / "a.jpg", upright(), 6)
     photos, _ = looked_at(tmp_path, in_place=True)
-    devices, _ = devices_of(photos, in_place=True)
+    devices, _ = group_by_device(photos, in_place=True)
     assert devices[0].size == (60, 80)  # as it is stored
-    assert devices_of(photos, in_place=False)[0][0].size == (80, 60)
+    assert group_by_device(photos, in_place=False)[0][0].size == (80, 60)
 
 
 def test_copies_and_unreadable_files_are_left_out_with_the_reason(tmp_path):
@@ -166,7 +174,7 @@ def test_cameras_are_told_apart_by_folder_device_size_and_zoom(tmp_path):
     save(tmp_path / "d.jpg", upright(5)[:, :40], exif=wide, device="One")
     save(tmp_path / "left" / "e.jpg", upright(6), exif=wide, device="One")
     photos, _ = looked_at(tmp_path)
-    devices, of = devices_of(photos, in_place=False)
+    devices, of = group_by_device(photos, in_place=False)
     assert [photo.name for photo in photos] == ["a1.jpg", "a2.jpg", "b.jpg", "c.jpg", "d.jpg", "left/e.jpg"]
     assert of == (0, 0, 1, 2, 3, 4)
     # A diagonal of 100 pixels stands for one of 43.27 mm.
@@ -180,7 +188,7 @@ def test_photos_that_follow_each_other(tmp_path):
         save(tmp_path / "walk" / f"IMG_{number}.jpg", upright(number), exif={0x9003: f"2024:05:01 12:0{number}:00"})
         save(tmp_path / "frames" / f"frame_{number:03d}.png", upright(number))
         save(tmp_path / "any" / f"{'abcd'[number]}.png", upright(number))
-    ordered = {name: in_order(looked_at(tmp_path / name)[0]) for name in ("burst", "walk", "frames", "any")}
+    ordered = {name: is_ordered_sequence(looked_at(tmp_path / name)[0]) for name in ("burst", "walk", "frames", "any")}
     assert ordered == {"burst": True, "walk": False, "frames": True, "any": False}
 
 

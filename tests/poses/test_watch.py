@@ -12,7 +12,7 @@ import pytest
 
 from hyrfpack.poses import process, watch
 from hyrfpack.poses.job import Job
-from hyrfpack.poses.watch import count_rows, global_mapping_phase, watching, watching_rows
+from hyrfpack.poses.watch import count_rows, parse_global_mapping_phase, poll_in_background, report_new_rows
 
 # Lines of pycolmap 4.2.1's global mapper, in the order of its work.
 LOG = [
@@ -39,7 +39,7 @@ def job_with_pairs(folder: Path, count: int) -> Job:
 
 
 def test_the_phase_of_the_global_mapper_follows_its_log_and_never_goes_back():
-    found = [global_mapping_phase("\n".join(LOG[:lines])) for lines in range(len(LOG) + 1)]
+    found = [parse_global_mapping_phase("\n".join(LOG[:lines])) for lines in range(len(LOG) + 1)]
     assert [phase for phase, _ in found] == [
         "",
         "camera rotations",
@@ -66,7 +66,7 @@ def test_rows_are_counted_while_another_connection_writes(tmp_path):
 
 
 def test_rows_that_a_long_call_writes_are_told_while_it_runs(tmp_path, monkeypatch):
-    monkeypatch.setattr(watch, "LOOK_SECONDS", 0.01)
+    monkeypatch.setattr(watch, "POLL_INTERVAL_SECONDS", 0.01)
     job, told, seen = job_with_pairs(tmp_path, 5), [], threading.Event()
 
     def tell(count: int) -> None:
@@ -74,7 +74,7 @@ def test_rows_that_a_long_call_writes_are_told_while_it_runs(tmp_path, monkeypat
         if count == 2:
             seen.set()
 
-    with watching_rows(job, "two_view_geometries", tell):
+    with report_new_rows(job, "two_view_geometries", tell):
         writer = sqlite3.connect(job.database)
         writer.executemany("INSERT INTO two_view_geometries VALUES (?)", [(6,), (7,)])
         writer.commit()
@@ -84,20 +84,20 @@ def test_rows_that_a_long_call_writes_are_told_while_it_runs(tmp_path, monkeypat
 
 
 def test_what_cannot_be_read_does_not_end_the_call_that_is_watched(monkeypatch):
-    monkeypatch.setattr(watch, "LOOK_SECONDS", 0.01)
+    monkeypatch.setattr(watch, "POLL_INTERVAL_SECONDS", 0.01)
     tried = threading.Event()
 
     def look() -> None:
         tried.set()
         raise sqlite3.OperationalError("database is locked")
 
-    with watching(look):
+    with poll_in_background(look):
         assert tried.wait(60)
 
 
 def test_a_stage_that_says_nothing_for_long_is_told_again_and_again(tmp_path, monkeypatch):
     """The worker tells something once and then ends only when it was told of three times."""
-    monkeypatch.setattr(process, "REPEAT_SECONDS", 0.05)
+    monkeypatch.setattr(process, "MAX_SILENCE_SECONDS", 0.05)
     script = (
         "import sys, json; print(json.dumps({'doing': 'solving', 'share': 0.5}), flush=True); sys.stdin.read(1); "
         "print(json.dumps({'answer': {'found': 1}}), flush=True)"
@@ -112,8 +112,8 @@ def test_a_stage_that_says_nothing_for_long_is_told_again_and_again(tmp_path, mo
             worker.stdin.write("x")
             worker.stdin.flush()
 
-    answer = process._listen(worker, tell, "starting")
-    process._end(worker)
+    answer = process._read_answer(worker, tell, "starting")
+    process._terminate(worker)
     assert answer == {"found": 1}
     assert told[0] == ("starting", 0.0) and told.count(("solving", 0.5)) >= 3
 
@@ -138,12 +138,12 @@ def test_every_stage_tells_how_far_it_is_by_its_own_measure(posed):
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
 def test_shares_told_out_of_order_never_go_back(share, tmp_path):
-    from hyrfpack.poses.estimate import _Estimation
+    from hyrfpack.poses.estimate import _PoseEstimation
 
     told: list[float] = []
-    estimation = _Estimation(
+    estimation = _PoseEstimation(
         tmp_path, tmp_path / "scene", "auto", None, 0, False, lambda _, done: told.append(done), None
     )
-    estimation._tell("matches", "matching", 0.9)
-    estimation._tell("matches", "matching", share)
+    estimation._report_progress("matches", "matching", 0.9)
+    estimation._report_progress("matches", "matching", share)
     assert told[0] == told[1]

@@ -19,7 +19,7 @@ import numpy as np
 import pycolmap
 
 import hyrfpack
-from hyrfpack.poses.compare import Poses, compare
+from hyrfpack.poses.alignment import Poses, align_poses
 from hyrfpack.poses.job import Job
 from hyrfpack.poses.mapping import read_pieces
 from tools.tables import markdown
@@ -51,7 +51,11 @@ def measure(folder: Path, out: Path, seed: int) -> dict:
                 runs = []
                 for model in sorted(Path(path).glob(f"{mapper}*/")):
                     pieces = [read_poses(piece, job) for piece in read_pieces(model)]
-                    right = [f"{len(compare(piece, known).same)} of {len(piece)}" for piece in pieces if len(piece) > 2]
+                    right = [
+                        f"{len(align_poses(piece, known).agreeing)} of {len(piece)}"
+                        for piece in pieces
+                        if len(piece) > 2
+                    ]
                     runs.append(" + ".join(right) or "none")
                 alone[mapper] = "; ".join(runs)
         remove(path, **options)
@@ -66,7 +70,7 @@ def measure(folder: Path, out: Path, seed: int) -> dict:
         "set": folder.name,
         "photos": len(known),
         "registered": report.registered,
-        "right": len(compare(found, known).same),
+        "right": len(align_poses(found, known).agreeing),
         "sure": report.sure,
         "seconds": sum(report.seconds.values()),
         "mapper": report.mapper,

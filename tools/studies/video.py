@@ -25,7 +25,7 @@ from scipy import ndimage
 import hyrfpack
 from hyrfpack.data.pictures import PhotoFile
 from hyrfpack.data.undistort import undistort
-from hyrfpack.poses.frames import RECORD, FrameReport, choose_frames
+from hyrfpack.poses.frames import RECORD_NAME, FrameReport, choose_frames
 from hyrfpack.scene import Picture, View
 from hyrfpack.train import TrainConfig
 from tools.studies.train_sets import DATA
@@ -109,7 +109,7 @@ def moved(pixels: np.ndarray, length: float, angle: float) -> np.ndarray:
 
 def row(name: str, kinds: list[str], folder: Path, report: FrameReport, seconds: float) -> list[str]:
     """One line of the table: a repeated frame taken instead of its photo counts as the photo."""
-    taken = json.loads((folder / RECORD).read_text())["frames"]
+    taken = json.loads((folder / RECORD_NAME).read_text())["frames"]
     numbers = np.cumsum([kind == "photo" for kind in kinds])  # of the photo that each frame shows
     blurred = [number for number in taken if kinds[number] == "blurred"]
     seen = [numbers[number] for number in taken if kinds[number] != "blurred"]

@@ -7,13 +7,13 @@ import pytest
 from made_up_poses import circle, line, moved
 from scipy.spatial.transform import Rotation
 
-from hyrfpack.poses.compare import centres, compare, extent
+from hyrfpack.poses.alignment import align_poses, camera_extent, camera_positions
 
 
 @pytest.mark.parametrize("poses", [circle(), line()])
 def test_the_same_cameras_in_another_frame_agree_all(poses):
-    found = compare(poses, moved(poses))
-    assert found.same == set(poses)
+    found = align_poses(poses, moved(poses))
+    assert found.agreeing == set(poses)
     assert found.distance.max() < 1e-9
     assert found.scale == pytest.approx(2.5)
 
@@ -21,8 +21,8 @@ def test_the_same_cameras_in_another_frame_agree_all(poses):
 def test_small_errors_agree_and_large_ones_do_not():
     exact = circle()
     rough = moved(circle(noise=0.02))
-    assert compare(rough, exact).same == set(exact)
-    assert len(compare(moved(circle(noise=1.0, seed=2)), exact).same) < 12
+    assert align_poses(rough, exact).agreeing == set(exact)
+    assert len(align_poses(moved(circle(noise=1.0, seed=2)), exact).agreeing) < 12
 
 
 def test_a_third_that_is_folded_onto_the_rest_is_found():
@@ -31,8 +31,8 @@ def test_a_third_that_is_folded_onto_the_rest_is_found():
     names = sorted(exact)
     for name, onto in zip(names[16:], names[:8], strict=True):  # a wall taken for another
         folded[name] = exact[onto]
-    assert compare(moved(folded), exact).same == set(names[:16])
-    assert compare(exact, moved(folded)).same == set(names[:16])
+    assert align_poses(moved(folded), exact).agreeing == set(names[:16])
+    assert align_poses(exact, moved(folded)).agreeing == set(names[:16])
 
 
 def test_cameras_in_the_right_places_that_look_elsewhere_do_not_agree():
@@ -40,8 +40,8 @@ def test_cameras_in_the_right_places_that_look_elsewhere_do_not_agree():
     turned = dict(exact)
     for name in sorted(exact)[:5]:
         about = Rotation.from_euler("y", 30, degrees=True).as_matrix() @ exact[name][:, :3]
-        turned[name] = np.column_stack([about, -about @ centres({name: exact[name]})[0]])
-    assert compare(turned, exact).same == set(sorted(exact)[5:])
+        turned[name] = np.column_stack([about, -about @ camera_positions({name: exact[name]})[0]])
+    assert align_poses(turned, exact).agreeing == set(sorted(exact)[5:])
 
 
 def test_a_mirrored_scene_does_not_agree():
@@ -51,22 +51,22 @@ def test_a_mirrored_scene_does_not_agree():
     for name, pose in exact.items():
         rotation = mirror @ pose[:, :3] @ mirror  # depth reversed, as under weak perspective
         flipped[name] = np.column_stack([rotation, mirror @ pose[:, 3] + np.array([0, 0, 6.0])])
-    assert len(compare(flipped, exact).same) < len(exact) / 2
+    assert len(align_poses(flipped, exact).agreeing) < len(exact) / 2
 
 
 def test_only_photos_of_both_are_compared_and_two_never_agree():
     exact = circle()
     half = {name: pose for name, pose in exact.items() if name < "012"}
-    assert compare(half, exact).same == set(half)
+    assert align_poses(half, exact).agreeing == set(half)
     two = dict(list(exact.items())[:2])
-    assert compare(two, exact).same == frozenset()
-    assert compare({}, exact).same == frozenset()
+    assert align_poses(two, exact).agreeing == frozenset()
+    assert align_poses({}, exact).agreeing == frozenset()
     one_place = {name: np.column_stack([np.eye(3), np.zeros(3)]) for name in exact}
-    assert compare(one_place, exact).same == frozenset()
-    assert compare(exact, one_place).same == frozenset()
+    assert align_poses(one_place, exact).agreeing == frozenset()
+    assert align_poses(exact, one_place).agreeing == frozenset()
 
 
 def test_the_extent_is_the_diagonal_of_the_box_around_the_cameras():
-    assert extent(line(12)) == pytest.approx(11)
+    assert camera_extent(line(12)) == pytest.approx(11)
     far = {**circle(100), "astray.jpg": np.column_stack([np.eye(3), [1e6, 0, 0]])}
-    assert extent(far) < 12
+    assert camera_extent(far) < 12

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from made_up_poses import circle, moved
 
-from hyrfpack.poses.evidence import Matches, evidence, explained
+from hyrfpack.poses.explained_matches import RayMatches, count_explained_matches, explained_mask
 
 
-def pairs_of(poses: dict[str, np.ndarray], noise: float = 0.0) -> list[Matches]:
+def pairs_of(poses: dict[str, np.ndarray], noise: float = 0.0) -> list[RayMatches]:
     """Matches of points around the origin, between neighbours, pixels of a thousandth."""
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.5, 0.5, (40, 3))
@@ -18,14 +18,14 @@ def pairs_of(poses: dict[str, np.ndarray], noise: float = 0.0) -> list[Matches]:
         seen = points @ pose[:, :3].T + pose[:, 3]
         rays[name] = seen[:, :2] / seen[:, 2:] + rng.normal(0, noise, (40, 2))
     near = [(a, b) for i, a in enumerate(names) for b in names[i + 1 : i + 4]]
-    return [Matches(a, b, rays[a], rays[b], 0.001) for a, b in near]
+    return [RayMatches(a, b, rays[a], rays[b], 0.001) for a, b in near]
 
 
 def test_the_right_poses_explain_all_in_any_frame():
     poses = circle()
     pairs = pairs_of(poses, noise=0.0003)
     total = sum(len(pair.rays1) for pair in pairs)
-    assert evidence(poses, pairs) == evidence(moved(poses), pairs) >= 0.999 * total
+    assert count_explained_matches(poses, pairs) == count_explained_matches(moved(poses), pairs) >= 0.999 * total
 
 
 def test_a_folded_half_and_lacking_photos_explain_less():
@@ -34,19 +34,21 @@ def test_a_folded_half_and_lacking_photos_explain_less():
     names = sorted(poses)
     folded = {**poses, **{name: poses[onto] for name, onto in zip(names[16:], names[:8], strict=True)}}
     some = {name: poses[name] for name in names[:16]}
-    assert evidence(folded, pairs) < evidence(poses, pairs)
-    assert evidence(some, pairs) < evidence(poses, pairs)
+    assert count_explained_matches(folded, pairs) < count_explained_matches(poses, pairs)
+    assert count_explained_matches(some, pairs) < count_explained_matches(poses, pairs)
 
 
 def test_a_match_behind_a_camera_or_off_its_line_is_not_explained():
     poses = circle(8)
     pair = pairs_of(poses)[0]
-    assert explained(poses, pair).all()
-    off = Matches(pair.first, pair.second, pair.rays1, pair.rays2 + np.array([0.0, 0.01]), pair.pixel)
-    assert not explained(poses, off).any()
+    assert explained_mask(poses, pair).all()
+    off = RayMatches(pair.first, pair.second, pair.rays1, pair.rays2 + np.array([0.0, 0.01]), pair.pixel)
+    assert not explained_mask(poses, off).any()
     backwards = {
         name: np.column_stack([np.diag([-1.0, 1.0, -1.0]) @ pose[:, :3], np.diag([-1.0, 1.0, -1.0]) @ pose[:, 3]])
         for name, pose in poses.items()
     }
-    behind = Matches(pair.first, pair.second, pair.rays1 * [-1, -1], pair.rays2 * [-1, -1], pair.pixel)
-    assert not explained(backwards, Matches(pair.first, pair.second, -behind.rays1, -behind.rays2, pair.pixel)).all()
+    behind = RayMatches(pair.first, pair.second, pair.rays1 * [-1, -1], pair.rays2 * [-1, -1], pair.pixel)
+    assert not explained_mask(
+        backwards, RayMatches(pair.first, pair.second, -behind.rays1, -behind.rays2, pair.pixel)
+    ).all()

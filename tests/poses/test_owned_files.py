@@ -15,7 +15,7 @@ from PIL import Image
 import hyrfpack
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.poses.job import Job
-from hyrfpack.poses.made import still_there
+from hyrfpack.poses.owned_files import unchanged_files
 
 
 def photos(folder: Path, seed: int = 0, count: int = 4) -> Path:
@@ -237,4 +237,4 @@ def test_a_record_lists_nothing_outside_the_scene_nor_what_has_changed(tmp_path)
         "own.txt": 4,
         "": 0,
     }
-    assert still_there(tmp_path / "scene", forged) == {"images/0.png": size}
+    assert unchanged_files(tmp_path / "scene", forged) == {"images/0.png": size}
