@@ -188,13 +188,13 @@ def train(
 def _estimate_poses(photos: Path, run: Path, images: str | None, resume: bool, overwrite: bool) -> Path:
     """Estimate the poses of photos and return the folder of the scene, which lies in the folder of the run."""
     from hyrfpack.cli.progress import create_command_display
-    from hyrfpack.make.posed import SCENE, posed
+    from hyrfpack.make.auto_pose import SCENE_FOLDER, auto_pose
 
     try:
         with create_command_display() as display:
-            return posed(
+            return auto_pose(
                 photos, run, images=images, resume=resume, overwrite=overwrite, report=display.show, say=display.say
             )
     except KeyboardInterrupt:
-        note(f"stopped in poses; the same command goes on with {run / SCENE}")
+        note(f"stopped in poses; the same command goes on with {run / SCENE_FOLDER}")
         click.get_current_context().exit(1)

@@ -1,4 +1,4 @@
-"""The whole way in one call: photos in, scene out, in stages that are kept and gone on with."""
+"""Make a scene from photos end to end, in stages whose products are cached and resumed."""
 
 from hyrfpack.make.plan import QUALITIES
 from hyrfpack.make.progress import Progress

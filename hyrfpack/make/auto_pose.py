@@ -1,4 +1,4 @@
-"""Poses on the way to a training run of one's own: `hyrfpack train --poses`."""
+"""Estimate poses into the folder of a training run, for `hyrfpack train --poses`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.make.progress import Progress, Reporter
-from hyrfpack.make.source import Reading, Source
-from hyrfpack.make.stages import SCENE, is_posed
-from hyrfpack.make.work import Say, interruptible
+from hyrfpack.make.source import LoadSettings, Source
+from hyrfpack.make.stage_cache import Say, interruptible
+from hyrfpack.make.stages import SCENE_FOLDER, is_posed
 
 
-def posed(
+def auto_pose(
     photos: Path,
     run: Path,
     *,
@@ -25,39 +25,45 @@ def posed(
     report: Callable[[Progress], None] | None = None,
     say: Say = lambda sentence: None,
 ) -> Path:
-    """A scene of photos without poses in the folder of a run, estimated, or as an earlier call left it.
+    """Estimate the poses of photos into the folder of a training run, unless an earlier call has done so.
 
     Args:
-        photos: a folder of them or its .zip, or a video.
-        run: the run's folder; the scene is `scene/` in it.
-        images: folder of them to use.
-        resume: the run is gone on with.
-        overwrite: poses that are there are estimated anew.
-        report: told how far the work is.
-        say: told what is going on.
+        photos: a folder of photos, its .zip, or a video.
+        run: folder of the run; the scene is written to `scene/` in it.
+        images: sub-folder of the photos to use.
+        resume: the run is resumed, so the folder may have a run.
+        overwrite: estimate again if there are poses.
+        report: called with the progress.
+        say: called with sentences for the user.
+
+    Returns:
+        The folder of the scene.
 
     Raises:
-        HyrfError: nothing may or can be written there, another call is at work there, a run is there, or poses cannot
-            be estimated.
-        KeyboardInterrupt: it was interrupted; the same call goes on.
+        HyrfError: the folder may not or cannot be written, is in use by another call, or has a run; or the poses
+            cannot be estimated.
+        KeyboardInterrupt: the estimation was interrupted; the same call resumes it.
     """
-    scene, source = run / SCENE, Source.of(photos, Reading(images))
-    _check(source, run, overwrite=True)
+    scene, source = run / SCENE_FOLDER, Source.from_path(photos, LoadSettings(images))
+    _check_run_folder(source, run, overwrite=True)
     if Path(os.path.realpath(run)).is_relative_to(os.path.realpath(source.path)):
         raise HyrfError(f"{run}: the run would lie among the photos; name another folder")
     with exclusive_folder(run):
-        _check(source, run, overwrite=overwrite or resume)
-        _estimate(source.path, scene, overwrite, report, say)
+        _check_run_folder(source, run, overwrite=overwrite or resume)
+        _estimate_unless_posed(source.path, scene, overwrite, report, say)
     return scene
 
 
-def _check(source: Source, run: Path, *, overwrite: bool) -> None:
-    for outputs in source.outputs(overwrite):
+def _check_run_folder(source: Source, run: Path, *, overwrite: bool) -> None:
+    """Check that the run's folder may be written. Raises HyrfError: it lies among the sources, or has a run."""
+    for outputs in source.output_rules(overwrite):
         outputs.folder(run, [MODEL_FILE, CHECKPOINT_FILE, METRICS_FILE])
 
 
-def _estimate(photos: Path, scene: Path, overwrite: bool, report: Callable[[Progress], None] | None, say: Say) -> None:
-    """Estimate poses into the folder of a scene, unless they are there."""
+def _estimate_unless_posed(
+    photos: Path, scene: Path, overwrite: bool, report: Callable[[Progress], None] | None, say: Say
+) -> None:
+    """Estimate poses into the folder of a scene, unless it has poses and `overwrite` is not set."""
     from hyrfpack.poses import estimate_poses
 
     if is_posed(scene) and not overwrite:
@@ -66,4 +72,4 @@ def _estimate(photos: Path, scene: Path, overwrite: bool, report: Callable[[Prog
     reporter = Reporter(["poses"], report)
     reporter.begin("poses")
     with interruptible():
-        estimate_poses(photos, scene, overwrite=overwrite, report=reporter.tell, say=say)
+        estimate_poses(photos, scene, overwrite=overwrite, report=reporter.report_share, say=say)

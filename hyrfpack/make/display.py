@@ -1,4 +1,4 @@
-"""One display for all stages: on a terminal one line, elsewhere a plain line every few seconds."""
+"""Show the progress of all stages: as one live line on a terminal, elsewhere as a plain line every few seconds."""
 
 from __future__ import annotations
 
@@ -11,51 +11,51 @@ from time import monotonic
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.live import Live
 
-from hyrfpack.make.progress import OVERDUE_RATIO, Progress
+from hyrfpack.make.progress import OVERDUE_TIME_RATIO, Progress
 from hyrfpack.train.progress import LOG_INTERVAL_SECONDS, StatusLine, duration
 
 
 class Display:
-    """Shows stage, share, what the stage has to say, and the time gone and left on standard error.
+    """Shows the stage, its share and descriptions, the elapsed time and the time left on standard error.
 
-    The clock runs on between two reports, because some stages cannot tell how far they are. When the time that was
-    left at the last report is over, the time left grows with the silence. A standard error that goes away does not end
-    the work.
+    The clock runs on between two reports, because some stages do not know how far they are. When the time left at the
+    last report is over, the time left grows with the time since that report. If standard error is closed, the work
+    continues.
     """
 
     def __init__(self, wording: Callable[[str], str] = lambda sentence: sentence) -> None:
-        """Args: wording: changes the words of each sentence before it is shown."""
+        """Args: wording: rewrites each sentence before it is shown."""
         self._wording = wording
         self._start = monotonic()
         self._latest: tuple[Progress, float] | None = None
-        self._over = Event()
+        self._stopped = Event()
         self._live: Live | None = None
         if sys.stderr.isatty() and not (console := Console(stderr=True)).is_dumb_terminal:
             self._live = Live(self, console=console, refresh_per_second=4, transient=True)
-        self._lines = Thread(target=self._log, daemon=True)
+        self._log_thread = Thread(target=self._print_lines, daemon=True)
 
     def __enter__(self) -> Display:
         if self._live:
             with suppress(OSError, ValueError):
                 self._live.start(refresh=True)
         else:
-            self._lines.start()
+            self._log_thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._over.set()
+        self._stopped.set()
         if self._live:
             with suppress(OSError, ValueError):
                 self._live.stop()
         else:
-            self._lines.join()
+            self._log_thread.join()
 
     def show(self, progress: Progress) -> None:
-        """Take in how far the work is."""
+        """Show this progress from now on."""
         self._latest = progress, monotonic()
 
     def say(self, sentence: str) -> None:
-        """Tell the person something that stays."""
+        """Print a sentence that stays on the screen."""
         sentence = self._wording(sentence)
         with suppress(OSError, ValueError):
             if self._live:
@@ -70,7 +70,7 @@ class Display:
             yield StatusLine(parts, self._latest[0].share, (*droppable, "left"))
 
     def _parts(self) -> dict[str, str]:
-        """What is known, by name in the order of reading."""
+        """Return the texts of the line by name, in reading order."""
         if self._latest is None:
             return {}
         (progress, at), now = self._latest, monotonic()
@@ -81,12 +81,13 @@ class Display:
             "gone": f"{duration(now - self._start)} gone",
         }
         if progress.left is not None:
-            silent = now - at
-            left = max(progress.left - silent, OVERDUE_RATIO * silent, 1.0)
+            seconds_since_report = now - at
+            left = max(progress.left - seconds_since_report, OVERDUE_TIME_RATIO * seconds_since_report, 1.0)
             parts["left"] = f"about {duration(left)} left"
         return parts
 
-    def _log(self) -> None:
-        while not self._over.wait(LOG_INTERVAL_SECONDS):
+    def _print_lines(self) -> None:
+        """Print the present line every few seconds until the display is closed."""
+        while not self._stopped.wait(LOG_INTERVAL_SECONDS):
             if parts := self._parts():
                 self.say("  ".join(parts.values()))

@@ -1,4 +1,4 @@
-"""Which photo of a small set is held out, and what its score says."""
+"""Choose the held-out photo of a small set, and judge how much its score says."""
 
 from __future__ import annotations
 
@@ -6,22 +6,23 @@ import numpy as np
 
 from hyrfpack.scene import Scene, View
 
-NEAREST_CAMERAS = 4  # cameras beside each that tell whether it stands among others
-MAX_WEAK_VIEWS = 2  # held-out photos whose mean score depends on which ones they are
+NEAREST_CAMERAS = 4  # a camera is compared with so many neighbours
+MAX_WEAK_VIEWS = 2  # the mean score of so few held-out photos depends on which ones are held out
 # A held-out PSNR this far below that of the photos trained on means four times their squared error.
 MAX_PSNR_GAP_DB = 6.0
 
 
-def inner_view(scene: Scene) -> View:
-    """Choose the view that is best surrounded by others; the first by name of several that are equally so.
+def choose_inner_view(scene: Scene) -> View:
+    """Choose the view that is best surrounded by others; of several equally good ones, the first by name.
 
     Each camera is a point with six coordinates: its position, in units of the median distance from cameras to scene
     points, and its viewing direction. The score of a camera is the mean distance to its NEAREST_CAMERAS nearest others
-    plus the distance to their centre. The first part is large for a lonely camera, the second one for a camera at the
-    edge, which has all its neighbours on one side. The camera with the lowest score is chosen.
+    plus the distance to their centre. The first part is large for a camera that is far from all others. The second
+    part is large for a camera at the edge, which has all its neighbours on one side. The camera with the lowest score
+    is chosen.
 
     Args:
-        scene: with at least two views.
+        scene: a scene with at least two views.
     """
     views = scene.views
     positions = np.array([view.camera.position for view in views])
@@ -38,7 +39,7 @@ def inner_view(scene: Scene) -> View:
 
 
 def _median_depth(scene: Scene, positions: np.ndarray) -> float:
-    """How far the scene is from its cameras; without points the spread of the cameras, or 1 if they share one place."""
+    """Return the median distance from cameras to points; without points, the spread of the cameras, or 1 if it is 0."""
     if len(scene.points):
         depths = [np.median(np.linalg.norm(scene.points - position, axis=1)) for position in positions]
         depth = float(np.median(depths))
@@ -48,12 +49,12 @@ def _median_depth(scene: Scene, positions: np.ndarray) -> float:
 
 
 def score_note(views: int, psnr: float | None, training_psnr: float | None) -> str:
-    """Say in a sentence why a score says little of the scene; "" where there is nothing to say.
+    """Return a sentence that explains why a score says little about the scene; "" if it is meaningful.
 
     Args:
-        views: held-out photos that were scored.
-        psnr: their mean in dB; None where none was scored.
-        training_psnr: of the photos trained on, in dB; None where it is not known.
+        views: number of scored held-out photos.
+        psnr: their mean PSNR in dB; None if none was scored.
+        training_psnr: mean PSNR of the training photos in dB; None if unknown.
     """
     if psnr is None:
         return ""

@@ -1,4 +1,4 @@
-"""Fitting a time: how many steps, on photos of which size, a scene may have on this machine, by a short measurement."""
+"""Fit a plan to a time limit: choose the number of steps and the size of the photos by a short measurement."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ import torch
 
 from hyrfpack.data import PictureCache
 from hyrfpack.make.plan import (
-    BACKGROUND_PASSES,
+    BACKGROUND_SEARCH_PASSES,
     PASSES_PER_SCORED_VIEW,
     QUALITIES,
     Plan,
-    megapixels,
-    passes,
+    count_packing_passes,
+    mean_megapixels,
 )
 from hyrfpack.make.progress import Reporter
-from hyrfpack.make.source import Reading
-from hyrfpack.make.work import Say
+from hyrfpack.make.source import LoadSettings
+from hyrfpack.make.stage_cache import Say
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
@@ -32,83 +32,93 @@ from hyrfpack.train.config import FULL_STEPS
 from hyrfpack.train.decisions import decide, is_budget_open, max_pilot_steps
 from hyrfpack.train.setup import budget_for
 
-PROBE_STEPS = 45  # of a whole small run: from the first Gaussians to the budget
-RISING = DensityConfig(stop=0.6, peak=0.6, excess=1.0)  # from few Gaussians to many, for what one of them takes
-COLD_STEPS = 3  # which compile kernels
-PROBE_TIME = 0.06  # of the time, for one measurement at most
-USEFUL_STEPS = 1_000  # fewer are only a trial: smaller photos are better
-SIZES = (1200, 800, 600, 400)  # of photos, where the time is short
-SMALLEST = 640  # pixels: photos that are no larger are not shrunk further for the first measurement
-SETTLED = 0.92  # of the probe's pace per Gaussian: a trained scene hides more of what lies behind
-# A pass (drawing a view on the CPU and following it back) is the unit of all that comes after the training.
-VERIFIED = 12  # views that packing draws
-PER_GAUSSIAN, OVERHEAD = 1.5e-4, 6.0  # seconds of coding and writing, for a Gaussian and for anything
+PROBE_STEPS = 45  # a complete small run, from the first Gaussians to the budget
+# The number of Gaussians grows during most of the probe, so that the time per Gaussian can be measured.
+PROBE_DENSITY = DensityConfig(stop=0.6, peak=0.6, excess=1.0)
+PROBE_WARM_UP_STEPS = 3  # the first steps compile kernels
+MAX_PROBE_TIME_RATIO = 0.06  # a probe takes at most this ratio of the remaining time
+MIN_USEFUL_STEPS = 1_000  # if there is no time for so many steps, smaller photos give a better scene
+CANDIDATE_PHOTO_SIZES = (1200, 800, 600, 400)  # longer sides in pixels, tried in this order
+MIN_PROBE_PHOTO_SIZE = 640  # photos are not shrunk below this size in pixels for the first probe
+TRAINED_PACE_RATIO = 0.92  # steps of a trained scene take this ratio of the probe's time, because more is hidden
+# A pass, which renders a view on the CPU and back-propagates through it, is the unit of the work after training.
+VERIFICATION_VIEWS = 12  # packing renders so many views to verify its result
+CODING_SECONDS_PER_GAUSSIAN = 1.5e-4
+OVERHEAD_SECONDS = 6.0  # coding and writing take so long for a model of any size
 
 
 @dataclass(frozen=True)
-class Cost:
-    """What a scene costs on this machine, at one size of its photos.
+class SceneCost:
+    """Times that a scene takes on this machine, at one size of its photos.
 
     Attributes:
-        step, step_per_gaussian: seconds of a training step: of pixels, and for each Gaussian.
-        decoding: seconds that training waits for a photo to be decoded.
-        cpu_pass: seconds to draw a view on the CPU and follow it back, at `gaussians`.
-        gaussians: that the probe ended with.
-        asked: what decides how many Gaussians there will be; its steps are not used.
+        step_seconds: seconds of a training step without Gaussians.
+        step_seconds_per_gaussian: further seconds of a training step for each Gaussian.
+        decoding_seconds: seconds that training waits until a photo is decoded.
+        cpu_pass_seconds: seconds of a pass on the CPU with `gaussians`.
+        gaussians: number of Gaussians at the end of the probe.
+        requested: the requested plan, which determines the budget; its steps are not used.
     """
 
-    step: float
-    step_per_gaussian: float
-    decoding: float
-    cpu_pass: float
+    step_seconds: float
+    step_seconds_per_gaussian: float
+    decoding_seconds: float
+    cpu_pass_seconds: float
     gaussians: int
-    asked: Plan = Plan(FULL_STEPS, DEFAULT_MAX_SIZE)
+    requested: Plan = Plan(FULL_STEPS, DEFAULT_MAX_SIZE)
 
-    def scaled(self, pixels: float) -> Cost:
-        """That of photos with so many times the pixels, by estimate."""
-        step, per_gaussian, cpu = (pixels * t for t in (self.step, self.step_per_gaussian, self.cpu_pass))
-        return dataclasses.replace(self, step=step, step_per_gaussian=per_gaussian, cpu_pass=cpu)
+    def scaled_to_pixels(self, pixels: float) -> SceneCost:
+        """Estimate the cost of photos that have `pixels` times as many pixels."""
+        step, per_gaussian, cpu = (
+            pixels * t for t in (self.step_seconds, self.step_seconds_per_gaussian, self.cpu_pass_seconds)
+        )
+        return dataclasses.replace(
+            self, step_seconds=step, step_seconds_per_gaussian=per_gaussian, cpu_pass_seconds=cpu
+        )
 
-    def training(self, scene: Scene, steps: int) -> float:
-        """Seconds of a training, from the number of Gaussians that there are on average."""
+    def training_seconds(self, scene: Scene, steps: int) -> float:
+        """Estimate the seconds of a training from its mean number of Gaussians."""
         budget = self._budget(scene, steps)
         mean = DensityConfig().mean_count(min(budget, len(scene.points) or budget // 2), budget)
-        step = self.step + self.step_per_gaussian * mean
-        return SETTLED * steps * step + self.decoding * min(steps, len(scene.train))
+        step = self.step_seconds + self.step_seconds_per_gaussian * mean
+        return TRAINED_PACE_RATIO * steps * step + self.decoding_seconds * min(steps, len(scene.train))
 
-    def after(self, scene: Scene, steps: int) -> dict[str, float]:
-        """Seconds of what follows the last step, by part (`hyrfpack.make.progress.STAGE_PARTS`) or stage."""
+    def seconds_after_training(self, scene: Scene, steps: int) -> dict[str, float]:
+        """Estimate the seconds after the last step, by part (`hyrfpack.make.progress.STAGE_PARTS`) or stage."""
         budget = self._budget(scene, steps)
-        at_end, at_probe = (self.step + self.step_per_gaussian * n for n in (budget, self.gaussians))
-        one = SETTLED * self.cpu_pass * at_end / at_probe
+        at_end, at_probe = (self.step_seconds + self.step_seconds_per_gaussian * n for n in (budget, self.gaussians))
+        pass_seconds = TRAINED_PACE_RATIO * self.cpu_pass_seconds * at_end / at_probe
         scored = PASSES_PER_SCORED_VIEW * len(scene.test)
         return {
-            "results": one * (BACKGROUND_PASSES + scored) + OVERHEAD / 2,
-            "compression": one * (passes(budget) + VERIFIED) + PER_GAUSSIAN * budget,
-            "scoring": one * scored,
-            "export": OVERHEAD / 2,
+            "results": pass_seconds * (BACKGROUND_SEARCH_PASSES + scored) + OVERHEAD_SECONDS / 2,
+            "compression": pass_seconds * (count_packing_passes(budget) + VERIFICATION_VIEWS)
+            + CODING_SECONDS_PER_GAUSSIAN * budget,
+            "scoring": pass_seconds * scored,
+            "export": OVERHEAD_SECONDS / 2,
         }
 
     def _budget(self, scene: Scene, steps: int) -> int:
-        return budget_for(scene, dataclasses.replace(self.asked, steps=steps).config(seed=0))[0]
+        """Return the budget of a training with so many steps."""
+        return budget_for(scene, dataclasses.replace(self.requested, steps=steps).train_config(seed=0))[0]
 
-    def total(self, scene: Scene, steps: int) -> float:
-        return self.training(scene, steps) + sum(self.after(scene, steps).values())
+    def total_seconds(self, scene: Scene, steps: int) -> float:
+        """Estimate the seconds of the training and of all that follows."""
+        return self.training_seconds(scene, steps) + sum(self.seconds_after_training(scene, steps).values())
 
-    def steps_within(self, scene: Scene, seconds: float) -> int:
-        """The most steps, at least one, that all fits into so many seconds with."""
+    def max_steps_within(self, scene: Scene, seconds: float) -> int:
+        """Return the largest number of steps, at least one, with which everything fits into `seconds`."""
         low, high = 1, FULL_STEPS
         while low < high:
             middle = (low + high + 1) // 2
-            low, high = (middle, high) if self.total(scene, middle) <= seconds else (low, middle - 1)
+            low, high = (middle, high) if self.total_seconds(scene, middle) <= seconds else (low, middle - 1)
         return low
 
 
-def measure(
+def fit_plan_to_minutes(
     path: Path,
-    reading: Reading,
+    reading: LoadSettings,
     scene: Scene,
-    asked: Plan,
+    requested: Plan,
     device: torch.device,
     end: float,
     seed: int,
@@ -116,73 +126,105 @@ def measure(
     reporter: Reporter,
     say: Say,
 ) -> Plan:
-    """The plan that ends at a time, `end` by the monotonic clock, or as soon as is sensible where that is too early.
+    """Measure the cost of a scene, and return the plan with the most steps that is finished in time.
+
+    If the time is too short for a sensible scene, the plan is a draft that ends later.
 
     Args:
-        path, reading: of the photos.
-        scene: them, as they are read.
-        asked: what is asked for besides the time: target size, number of Gaussians, preset.
-        cache: keeps photos that are decoded.
+        path: path of the photos.
+        reading: settings with which they are read.
+        scene: the photos at the size of `reading`.
+        requested: the plan without a time limit, which has the target size, number of Gaussians and preset.
+        device: device of the training.
+        end: time limit by the monotonic clock, in seconds.
+        seed: random seed.
+        cache: cache of decoded photos.
+        reporter: reports progress, and gets the estimates of the plan.
+        say: called with sentences for the user.
     """
     draft = QUALITIES["draft"]
-    if (left := end - monotonic()) <= 0:
+    if (remaining := end - monotonic()) <= 0:
         say(f"the time is over before the training: a draft follows, of {draft.steps} steps")
-        shrunk = min(reading.max_size or draft.max_size, draft.max_size)
-        return dataclasses.replace(asked, steps=draft.steps, max_size=shrunk)
-    sizes = _sizes(scene, reading.max_size)
-    probed = next((size for size in reversed(sizes) if size >= SMALLEST), sizes[-1])
+        draft_max_size = min(reading.max_size or draft.max_size, draft.max_size)
+        return dataclasses.replace(requested, steps=draft.steps, max_size=draft_max_size)
+    sizes = _candidate_sizes(scene, reading.max_size)
+    probed = next((size for size in reversed(sizes) if size >= MIN_PROBE_PHOTO_SIZE), sizes[-1])
     scenes = {reading.max_size: scene}
 
     def at(size: int) -> Scene:
-        return scenes[size] if size in scenes else scenes.setdefault(size, reading.scene(path, size))
+        return scenes[size] if size in scenes else scenes.setdefault(size, reading.load(path, size))
 
-    reporter.update(0.0, f"a few steps on photos of {_longest(at(probed))} pixels")
-    cost = first = probe(at(probed), asked, device, seed, cache, PROBE_TIME * left)
+    reporter.update(0.0, f"a few steps on photos of {_longest_side(at(probed))} pixels")
+    cost = first = measure_scene_cost(at(probed), requested, device, seed, cache, MAX_PROBE_TIME_RATIO * remaining)
     for chosen in sizes:
-        cost = first.scaled(megapixels(at(chosen)) / megapixels(at(probed)))
-        if cost.steps_within(at(chosen), end - monotonic()) >= USEFUL_STEPS:
+        cost = first.scaled_to_pixels(mean_megapixels(at(chosen)) / mean_megapixels(at(probed)))
+        if cost.max_steps_within(at(chosen), end - monotonic()) >= MIN_USEFUL_STEPS:
             break
     if chosen != probed:
-        reporter.update(0.5, f"a few steps on photos of {_longest(at(chosen))} pixels")
-        cost = probe(at(chosen), asked, device, seed, cache, PROBE_TIME * left)
-    fitting = at(chosen)
-    config = dataclasses.replace(asked, steps=cost.steps_within(fitting, end - monotonic())).config(seed)
-    most = max(max_pilot_steps(fitting, config), 1)
+        reporter.update(0.5, f"a few steps on photos of {_longest_side(at(chosen))} pixels")
+        cost = measure_scene_cost(at(chosen), requested, device, seed, cache, MAX_PROBE_TIME_RATIO * remaining)
+    chosen_scene = at(chosen)
+    config = dataclasses.replace(requested, steps=cost.max_steps_within(chosen_scene, end - monotonic())).train_config(
+        seed
+    )
+    max_steps = max(max_pilot_steps(chosen_scene, config), 1)
 
-    def tell(step: int, loss: float, mse: float, gaussians: int) -> None:
-        reporter.update(0.6 + 0.4 * step / most, "pilot runs choose the exposure compensation and the Gaussian budget")
+    def report_pilot_step(step: int, loss: float, mse: float, gaussians: int) -> None:
+        reporter.update(
+            0.6 + 0.4 * step / max_steps, "pilot runs choose the exposure compensation and the Gaussian budget"
+        )
 
-    decisions = decide(fitting, config, cache, device, tell)
-    assert decisions is not None  # nothing stops it
+    decisions = decide(chosen_scene, config, cache, device, report_pilot_step)
+    assert decisions is not None  # None is only returned if the run is stopped, which nothing does here
     factor = decisions.config.budget_factor
     if is_budget_open(config) and factor is None:
-        factor = 1.0  # which stays so where there are a few more steps
+        factor = 1.0  # the decision stays the same if a few more steps fit
     for reason in decisions.reasons.values():
         say(f"pilot runs: {reason}")
-    asked = dataclasses.replace(asked, max_size=chosen, budget_factor=factor, exposure=decisions.config.exposure)
-    cost = dataclasses.replace(cost, asked=asked)
-    left = end - monotonic()
-    steps = cost.steps_within(fitting, left)
+    requested = dataclasses.replace(
+        requested, max_size=chosen, budget_factor=factor, exposure=decisions.config.exposure
+    )
+    cost = dataclasses.replace(cost, requested=requested)
+    remaining = end - monotonic()
+    steps = cost.max_steps_within(chosen_scene, remaining)
     if steps < draft.steps:
         steps = draft.steps
-        say(f"the time is short: a draft, of {steps} steps, takes about {cost.total(fitting, steps) / 60:.1f} minutes")
+        say(
+            f"the time is short: a draft, of {steps} steps, takes about "
+            f"{cost.total_seconds(chosen_scene, steps) / 60:.1f} minutes"
+        )
     else:
         enough = ", which are enough: it will be ready before" if steps == FULL_STEPS else ""
-        say(f"{left / 60:.1f} minutes are left: {steps:,} steps on photos of {_longest(fitting)} pixels{enough}")
-    reporter.estimates |= {"pilots": 0.0, "training": cost.training(fitting, steps), **cost.after(fitting, steps)}
-    return dataclasses.replace(asked, steps=steps)
+        say(
+            f"{remaining / 60:.1f} minutes are left: {steps:,} steps on photos of "
+            f"{_longest_side(chosen_scene)} pixels{enough}"
+        )
+    reporter.estimates |= {
+        "pilots": 0.0,
+        "training": cost.training_seconds(chosen_scene, steps),
+        **cost.seconds_after_training(chosen_scene, steps),
+    }
+    return dataclasses.replace(requested, steps=steps)
 
 
-def probe(scene: Scene, asked: Plan, device: torch.device, seed: int, cache: PictureCache, seconds: float) -> Cost:
-    """Measure what a scene costs by a small training run from its first Gaussians to a budget.
+def measure_scene_cost(
+    scene: Scene, requested: Plan, device: torch.device, seed: int, cache: PictureCache, seconds: float
+) -> SceneCost:
+    """Measure the cost of a scene by a small training run from its first Gaussians to the budget.
 
     Args:
-        asked: what decides how many Gaussians there will be.
-        seconds: after which it ends in any case, but for the steps that it takes to measure anything.
+        scene: the photos.
+        requested: the requested plan, which determines the budget.
+        device: device of the training.
+        seed: random seed.
+        cache: cache of decoded photos.
+        seconds: the run stops after this time, but not before it has enough steps for a measurement.
     """
-    usual = dataclasses.replace(asked, steps=TrainConfig.steps).config(seed)
-    budget, _ = budget_for(scene, usual)
-    config = TrainConfig(steps=PROBE_STEPS, seed=seed, preset=asked.preset, max_gaussians=budget, density=RISING)
+    default_config = dataclasses.replace(requested, steps=TrainConfig.steps).train_config(seed)
+    budget, _ = budget_for(scene, default_config)
+    config = TrainConfig(
+        steps=PROBE_STEPS, seed=seed, preset=requested.preset, max_gaussians=budget, density=PROBE_DENSITY
+    )
     trainer = Trainer(scene, config, cache, device)
     counts: list[int] = []
     working: list[float] = []
@@ -195,15 +237,15 @@ def probe(scene: Scene, asked: Plan, device: torch.device, seed: int, cache: Pic
         waiting.append(waited)
         counts.append(len(trainer.model))
 
-    trainer.run(report=report, stop=lambda: len(working) > 2 * COLD_STEPS and monotonic() > end)
-    step, per_gaussian = _line_through(counts[COLD_STEPS:], working[COLD_STEPS:])
+    trainer.run(report=report, stop=lambda: len(working) > 2 * PROBE_WARM_UP_STEPS and monotonic() > end)
+    step, per_gaussian_seconds = _fit_line(counts[PROBE_WARM_UP_STEPS:], working[PROBE_WARM_UP_STEPS:])
     views = [view.camera for view in evenly_spaced(scene.train, 4)]
-    cpu_pass = _cpu_pass(trainer.model, views)
-    return Cost(step, per_gaussian, statistics.fmean(waiting), cpu_pass, counts[-1], asked)
+    cpu_pass_seconds = _measure_cpu_pass(trainer.model, views)
+    return SceneCost(step, per_gaussian_seconds, statistics.fmean(waiting), cpu_pass_seconds, counts[-1], requested)
 
 
-def _line_through(counts: Sequence[int], seconds: Sequence[float]) -> tuple[float, float]:
-    """(a, b), neither negative, of seconds = a + b count: through the medians of the first and the last third."""
+def _fit_line(counts: Sequence[int], seconds: Sequence[float]) -> tuple[float, float]:
+    """Return (a, b) >= 0 of the line seconds = a + b count through the medians of the first and the last third."""
     third = max(1, len(counts) // 3)
     first, last = slice(0, third), slice(-third, None)
     x0, x1 = (float(np.median(counts[part])) for part in (first, last))
@@ -213,8 +255,8 @@ def _line_through(counts: Sequence[int], seconds: Sequence[float]) -> tuple[floa
     return y1 - slope * x1, slope
 
 
-def _cpu_pass(model: HybridModel, cameras: Sequence[Camera]) -> float:
-    """Seconds to draw a view on the CPU and follow it back to every number; the median, the first left out."""
+def _measure_cpu_pass(model: HybridModel, cameras: Sequence[Camera]) -> float:
+    """Return the median seconds of a pass on the CPU; the first one, which warms up, does not count."""
     model = model.to("cpu")
     times = []
     for camera in cameras:
@@ -224,12 +266,12 @@ def _cpu_pass(model: HybridModel, cameras: Sequence[Camera]) -> float:
     return statistics.median(times[1:] or times)
 
 
-def _sizes(scene: Scene, max_size: int) -> list[int]:
-    """Limits on the size of photos to choose from, the largest first."""
-    longest = _longest(scene)
-    return [max_size, *(size for size in SIZES if size < longest)]
+def _candidate_sizes(scene: Scene, max_size: int) -> list[int]:
+    """Return the sizes of photos to choose from, the largest first."""
+    longest = _longest_side(scene)
+    return [max_size, *(size for size in CANDIDATE_PHOTO_SIZES if size < longest)]
 
 
-def _longest(scene: Scene) -> int:
-    """Pixels of the longer side of the largest photo."""
+def _longest_side(scene: Scene) -> int:
+    """Return the longer side of the largest photo in pixels."""
     return max(max(view.camera.width, view.camera.height) for view in scene.views)

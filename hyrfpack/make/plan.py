@@ -1,4 +1,4 @@
-"""How long each stage works: what the words for a quality mean, and what that takes, roughly."""
+"""Plans of a pipeline: the qualities that can be requested, and rough estimates of the time that stages take."""
 
 from __future__ import annotations
 
@@ -19,25 +19,26 @@ from hyrfpack.train.decisions import (
 )
 from hyrfpack.train.setup import budget_for
 
-# Seconds, of two CPU cores: for a megapixel that is trained on once, and that is drawn and followed back while packing.
-# Only the first forecast needs them: what is measured on the way takes their place.
-STEP, STEP_GPU, PASS = 0.7, 0.02, 0.6
-BACKGROUND_PASSES = 8.0  # as long as so many such drawings takes the search for a background that nobody sees
-PASSES_PER_SCORED_VIEW = 2.0  # as long as so many such drawings takes a held-out photo, its scores and picture
-POSES = 3.0  # for a photo
-UNKNOWN = 100  # photos, where that is not known yet
+# Measured on two CPU cores, for the first estimate only; during the work, measured times replace it.
+CPU_STEP_SECONDS_PER_MEGAPIXEL = 0.7  # a training step
+GPU_STEP_SECONDS_PER_MEGAPIXEL = 0.02
+CPU_PASS_SECONDS_PER_MEGAPIXEL = 0.6  # a pass renders a view and back-propagates through it
+BACKGROUND_SEARCH_PASSES = 8.0  # the search for a background in unseen directions takes as long as so many passes
+PASSES_PER_SCORED_VIEW = 2.0  # scoring a held-out photo and writing its picture takes as long as so many passes
+POSE_SECONDS_PER_PHOTO = 3.0
+ASSUMED_VIDEO_PHOTOS = 100  # before a video is decoded, the number of its photos is unknown
 
 
 @dataclass(frozen=True)
 class Quality:
-    """What a word for a quality stands for.
+    """Settings of a quality.
 
     Attributes:
-        steps: of training on a CPU.
-        gpu_steps: of training on a GPU.
-        max_size: pixels of the longer side that larger photos are shrunk to.
-        finetune_steps: of fitting to the photos while packing.
-        import_steps: of learning from splats of other programs.
+        steps: training steps on a CPU.
+        gpu_steps: training steps on a GPU.
+        max_size: longer side in pixels to which larger photos are shrunk.
+        finetune_steps: fine-tuning steps during packing.
+        import_steps: distillation steps for splats of other programs.
     """
 
     steps: int
@@ -64,14 +65,14 @@ QUALITIES = {
 
 @dataclass(frozen=True)
 class Plan:
-    """What was decided for a scene.
+    """The settings that were decided for a scene.
 
     Attributes:
-        steps: of training.
-        max_size: of photos, as in `load_scene`.
-        finetune_steps: of packing.
-        target_bytes: what the packed model may have; None for no limit.
-        max_gaussians, preset, budget_factor, exposure: as in `TrainConfig`.
+        steps: training steps.
+        max_size: maximum size of the photos, see `load_scene`.
+        finetune_steps: fine-tuning steps during packing.
+        target_bytes: maximum size of the packed model in bytes; None for no limit.
+        max_gaussians, preset, budget_factor, exposure: see `TrainConfig`.
     """
 
     steps: int
@@ -83,8 +84,8 @@ class Plan:
     budget_factor: float | None = None
     exposure: bool | None = None
 
-    def config(self, seed: int) -> TrainConfig:
-        """Settings of its training."""
+    def train_config(self, seed: int) -> TrainConfig:
+        """Return the training settings of the plan."""
         return TrainConfig(
             steps=self.steps,
             seed=seed,
@@ -95,55 +96,69 @@ class Plan:
             exposure=self.exposure,
         )
 
-    def packed_into(self, target_bytes: int | None) -> Plan:
-        """The same plan for another target size, which takes the place of a measured budget."""
+    def with_target_bytes(self, target_bytes: int | None) -> Plan:
+        """Return a copy with another target size; a target size replaces the measured budget factor."""
         return replace(self, target_bytes=target_bytes, budget_factor=None if target_bytes else self.budget_factor)
 
 
-def passes(gaussians: int) -> int:
-    """How many views packing draws and follows back."""
+def count_packing_passes(gaussians: int) -> int:
+    """Return the number of views that packing renders and back-propagates through."""
     return int(np.clip(TARGET_DRAWN_GAUSSIANS // max(gaussians, 1), MIN_SENSITIVITY_VIEWS, MAX_SENSITIVITY_VIEWS))
 
 
-def megapixels(scene: Scene) -> float:
-    """Of a photo, the mean."""
+def mean_megapixels(scene: Scene) -> float:
+    """Return the mean number of megapixels of a photo."""
     return float(np.mean([view.camera.width * view.camera.height for view in scene.views])) / 1e6
 
 
-def forecast(
+def estimate_seconds(
     pixels: float, plan: Plan, gaussians: int, held_out: int, pilot_steps: int, device: torch.device
 ) -> dict[str, float]:
-    """Seconds that what follows the poses takes, roughly, by part (`hyrfpack.make.progress.STAGE_PARTS`) or stage.
+    """Estimate roughly how many seconds the stages after the poses take.
 
     Args:
         pixels: megapixels of a photo.
-        gaussians: that the model will have.
-        held_out: photos that are scored.
-        pilot_steps: of the pilot runs.
+        plan: the plan.
+        gaussians: expected number of Gaussians.
+        held_out: number of photos that are scored.
+        pilot_steps: number of steps of all pilot runs.
+        device: device of the training.
+
+    Returns:
+        Seconds by part of a stage (`hyrfpack.make.progress.STAGE_PARTS`) or by stage.
     """
-    step, scored = pixels * (STEP if device.type == "cpu" else STEP_GPU), PASSES_PER_SCORED_VIEW * held_out
+    step_seconds, scoring_passes = (
+        pixels * (CPU_STEP_SECONDS_PER_MEGAPIXEL if device.type == "cpu" else GPU_STEP_SECONDS_PER_MEGAPIXEL),
+        PASSES_PER_SCORED_VIEW * held_out,
+    )
     return {
-        "pilots": pilot_steps * step,
-        "training": 2 + plan.steps * step,
-        "results": 2 + (BACKGROUND_PASSES + scored) * pixels * PASS,
-        "compression": 3 + (passes(gaussians) + 3 * plan.finetune_steps) * pixels * PASS,
-        "scoring": 0.5 + scored * pixels * PASS,
+        "pilots": pilot_steps * step_seconds,
+        "training": 2 + plan.steps * step_seconds,
+        "results": 2 + (BACKGROUND_SEARCH_PASSES + scoring_passes) * pixels * CPU_PASS_SECONDS_PER_MEGAPIXEL,
+        "compression": 3
+        + (count_packing_passes(gaussians) + 3 * plan.finetune_steps) * pixels * CPU_PASS_SECONDS_PER_MEGAPIXEL,
+        "scoring": 0.5 + scoring_passes * pixels * CPU_PASS_SECONDS_PER_MEGAPIXEL,
         "export": 2.0,
     }
 
 
-def forecast_scene(scene: Scene, plan: Plan, device: torch.device) -> dict[str, float]:
-    """`forecast` for photos that are known."""
-    config = plan.config(seed=0)
+def estimate_scene_seconds(scene: Scene, plan: Plan, device: torch.device) -> dict[str, float]:
+    """Return `estimate_seconds` for a loaded scene."""
+    config = plan.train_config(seed=0)
     gaussians, _ = budget_for(scene, config)
-    return forecast(megapixels(scene), plan, gaussians, len(scene.test), max_pilot_steps(scene, config), device)
+    return estimate_seconds(
+        mean_megapixels(scene), plan, gaussians, len(scene.test), max_pilot_steps(scene, config), device
+    )
 
 
-def forecast_photos(sizes: Sequence[tuple[int, int]], plan: Plan, device: torch.device) -> dict[str, float]:
-    """`forecast` for photos of these (width, height) and for their poses, or where there are none, of a video."""
+def estimate_photos_seconds(sizes: Sequence[tuple[int, int]], plan: Plan, device: torch.device) -> dict[str, float]:
+    """Return `estimate_seconds` and the time for poses, for photos of these (width, height); none mean a video."""
     width, height = sizes[0] if sizes else (1920, 1080)
     shrunk = min(1.0, plan.max_size / max(width, height)) if plan.max_size else 1.0
-    pixels, count = width * height * shrunk**2 / 1e6, len(sizes) or UNKNOWN
+    pixels, count = width * height * shrunk**2 / 1e6, len(sizes) or ASSUMED_VIDEO_PHOTOS
     pilot_steps = MAX_BUDGET_PILOT_STEPS + max_exposure_pilot_steps(count - count // 8)
     pilot_steps *= plan.steps >= MIN_BUDGET_STEPS
-    return {"poses": POSES * count, **forecast(pixels, plan, 20_000, count // 8, pilot_steps, device)}
+    return {
+        "poses": POSE_SECONDS_PER_PHOTO * count,
+        **estimate_seconds(pixels, plan, 20_000, count // 8, pilot_steps, device),
+    }

@@ -1,4 +1,4 @@
-"""What is asked for, and what of it is refused before any work."""
+"""The arguments of `make`, checked before any work."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.export.folder import check_folder
 from hyrfpack.export.kinds import PLAYER_FOLDER, check_place, check_request, find_file_kind
 from hyrfpack.format.min_file_size import check_target_bytes
-from hyrfpack.make.source import Reading, Source
-from hyrfpack.make.stages import EXPORTED, PACKED
-from hyrfpack.make.state import NAME, State, digest
+from hyrfpack.make.source import LoadSettings, Source
+from hyrfpack.make.stages import EXPORT_FOLDER, PACKED_MODEL
+from hyrfpack.make.state import RECORD_NAME, WorkFolderState, file_digest
 from hyrfpack.outputs import Outputs
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.setup import check_target
 
-_OF_PHOTOS = ("training", "compression", "scoring", "export")
-_STAGES = {"model": _OF_PHOTOS[-1:], "splats": ("import", "export"), "scene": _OF_PHOTOS}
+_SCENE_STAGES = ("training", "compression", "scoring", "export")
+_STAGES_OF_SOURCE = {"model": _SCENE_STAGES[-1:], "splats": ("import", "export"), "scene": _SCENE_STAGES}
 
 
-def work_folder(output: Path) -> Path:
-    """Where the products of an output are kept if nobody says where: beside it. Raises HyrfError: it has no name."""
-    named = output if output.name.strip(".") else Path(os.path.realpath(output))
-    if not named.name:
+def default_work_folder(output: Path) -> Path:
+    """Return the default work folder of an output, which lies beside it. Raises HyrfError: the output has no name."""
+    absolute = output if output.name.strip(".") else Path(os.path.realpath(output))
+    if not absolute.name:
         raise HyrfError(f"{output}: this is the top of all folders; name a folder or a file in it")
-    return named.with_name(f"{named.stem}.work")
+    return absolute.with_name(f"{absolute.stem}.work")
 
 
 @dataclass(frozen=True)
 class Request:
-    """The arguments of `make`, and what it is given, looked at."""
+    """The arguments of `make`; the source is already inspected."""
 
     source: Source
     output: Path
     work: Path
-    reading: Reading
+    reading: LoadSettings
     quality: str
     minutes: float | None
     matching: str
@@ -52,55 +52,56 @@ class Request:
 
     @property
     def stages(self) -> list[str]:
-        """Names of those to come, in order."""
-        names = list(_STAGES.get(self.source.kind, ("poses", *_OF_PHOTOS)))
+        """Return the names of the stages to run, in order."""
+        names = list(_STAGES_OF_SOURCE.get(self.source.kind, ("poses", *_SCENE_STAGES)))
         if self.minutes is not None:
             names.insert(names.index("training"), "measurement")
         return names
 
     @property
     def makes_folder(self) -> bool:
-        """Whether the output is a folder."""
+        """Return whether the output is a folder."""
         return not self._is_model and find_file_kind(self.output) is PLAYER_FOLDER
 
     def check(self) -> None:
-        """Raises HyrfError: what is asked for cannot be, or may or can not be written."""
+        """Check the request. Raises HyrfError: it is impossible, or the output may not or cannot be written."""
         self._check_options()
         self._check_places()
-        if not self.overwrite and not self.is_made(State(self.work)):
-            for outputs in self.source.outputs(overwrite=False):
+        if not self.overwrite and not self.is_output_unchanged(WorkFolderState(self.work)):
+            for outputs in self.source.output_rules(overwrite=False):
                 self._check_output(outputs, overwrite=False)
 
-    def check_replacing(self, state: State) -> None:
-        """Raises HyrfError: the output is there, made before of something else, and may not be replaced."""
-        if not self.overwrite and os.path.lexists(self.output) and self.is_made(state):
+    def check_replacing(self, state: WorkFolderState) -> None:
+        """Check an existing output. Raises HyrfError: it was made by an earlier call and may not be replaced."""
+        if not self.overwrite and os.path.lexists(self.output) and self.is_output_unchanged(state):
             raise HyrfError(
                 f"{self.output}: this was made of other photos or with other settings; name another, or replace it "
                 "with `overwrite=True`"
             )
 
-    def is_made(self, state: State) -> bool:
-        """Whether all that is there of the output is what was made before, as a work folder's record says."""
-        top = f"{EXPORTED}/{self.output.name}"
+    def is_output_unchanged(self, state: WorkFolderState) -> bool:
+        """Return whether the output exists and its existing files are as the record of the work folder lists them."""
+        top = f"{EXPORT_FOLDER}/{self.output.name}"
         files = state.files("export").items()
         there = [(self.output / name[len(top) :].lstrip("/"), made) for name, made in files if name.startswith(top)]
         there = [(path, made) for path, made in there if os.path.lexists(path)]
-        return bool(there) and all(digest(path) == made for path, made in there)
+        return bool(there) and all(file_digest(path) == made for path, made in there)
 
     def _check_options(self) -> None:
+        """Reject options that exclude each other or do not fit the source."""
         source = self.source
         if not self._is_model:
             check_request(find_file_kind(self.output, other_endings=(".hyrf",)), self.output)
         elif source.kind == "model":
             raise HyrfError(f"{source.path}: this is a .hyrf file already; 'hyrfpack compress' makes it smaller")
         if source.kind in ("model", "splats"):
-            asked = {
+            options = {
                 "minutes": self.minutes,
                 "a target size": self.target_bytes,
                 "a number of Gaussians": self.max_gaussians,
                 "a preset": None if self.preset == "auto" else self.preset,
             }
-            for name, value in asked.items():
+            for name, value in options.items():
                 if value is not None:
                     raise HyrfError(f"{source.path}: {name} can be asked for with photos only; leave it out")
         if self.target_bytes is not None and self.max_gaussians is not None:
@@ -113,7 +114,7 @@ class Request:
             raise HyrfDataError(f"{source.path}: there is no photo in this folder; name one that has some")
 
     def _check_target(self) -> None:
-        """Refuse a target size that no file of these photos can have. Photos without poses are not read for it."""
+        """Reject a target size that no file of these photos can have; photos without poses get a weaker check."""
         if self.target_bytes is None:
             return
         if self.source.scene is None:
@@ -122,10 +123,10 @@ class Request:
             check_target(self.source.scene, TrainConfig(preset=self.preset, target_bytes=self.target_bytes))
 
     def _check_places(self) -> None:
-        """Refuse places where nothing may or can be written, whatever is there."""
-        for outputs in self.source.outputs(overwrite=True):
+        """Reject an output or a work folder that may not be written, whether or not it exists."""
+        for outputs in self.source.output_rules(overwrite=True):
             self._check_output(outputs, overwrite=True)
-            outputs.folder(self.work, [NAME])
+            outputs.folder(self.work, [RECORD_NAME])
         work, output = (Path(os.path.realpath(path)) for path in (self.work, self.output))
         if self.source.kind == "photos" and work.is_relative_to(os.path.realpath(self.source.path)):
             raise HyrfError(f"{self.work}: the work folder would lie among the photos; name another with `work`")
@@ -136,11 +137,12 @@ class Request:
             )
 
     def _check_output(self, outputs: Outputs, *, overwrite: bool) -> None:
+        """Check the output by one set of rules."""
         if self._is_model:
             outputs.file(self.output, ".hyrf")
         elif self.makes_folder:
             outputs.folder(self.output, [])
-            model = self.source.path if self.source.kind == "model" else self.work / PACKED
+            model = self.source.path if self.source.kind == "model" else self.work / PACKED_MODEL
             check_folder(self.output, [model], [self.source.scene], overwrite=overwrite, is_gallery=False)
         else:
             check_place(self.output, outputs)

@@ -1,4 +1,4 @@
-"""Photos in, scene out: what is asked for is checked, then the stages follow each other."""
+"""Make a scene from photos: check the request, then run the stages one after the other."""
 
 from __future__ import annotations
 
@@ -19,43 +19,43 @@ from hyrfpack.format import describe
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.make import stages
 from hyrfpack.make.held_out import score_note
-from hyrfpack.make.minutes import measure
-from hyrfpack.make.plan import QUALITIES, Plan, forecast_photos, forecast_scene
+from hyrfpack.make.minutes import fit_plan_to_minutes
+from hyrfpack.make.plan import QUALITIES, Plan, estimate_photos_seconds, estimate_scene_seconds
 from hyrfpack.make.progress import Progress, Reporter
-from hyrfpack.make.request import Request, work_folder
-from hyrfpack.make.source import Reading, Source
-from hyrfpack.make.state import digest_all
-from hyrfpack.make.work import Say, Stopped, Work, interruptible
+from hyrfpack.make.request import Request, default_work_folder
+from hyrfpack.make.source import LoadSettings, Source
+from hyrfpack.make.stage_cache import Say, StageCache, Stopped, interruptible
+from hyrfpack.make.state import files_digest
 from hyrfpack.outputs import StrPath
 from hyrfpack.scene import Scene
 from hyrfpack.train import Trainer
 from hyrfpack.train.config import LARGEST_SEED, PRESETS
 
-MEASUREMENT_TIME_RATIO = 0.15  # of the minutes that are left: probes and, for long runs, pilots
+MEASUREMENT_TIME_RATIO = 0.15  # probes and pilot runs take about this ratio of the remaining time
 
 __all__ = ["MakeResult", "Stopped", "make"]
 
 
 @dataclass(frozen=True)
 class MakeResult:
-    """What was made.
+    """Result of `make`.
 
     Attributes:
         output: the file or folder that was written.
-        bytes: of it.
-        gaussians: that the scene has.
-        model: the packed model, in the work folder; what was given where that was a model.
-        work: the folder of every stage's product.
-        views: how many held-out photos the model was scored on.
-        psnr, ssim: their means; None where there was nothing to score on.
-        psnr_consistent: mean, as in `hyrfpack.Evaluation`; None also where the model has no exposure map.
-        poses: what `hyrfpack.estimate_poses` reports; empty where the photos had poses.
-        training: steps, Gaussians, bytes and choices of the training; empty where there was none.
-        export: what `hyrfpack.export` reports, or `hyrfpack.distill` of splats under "import".
-        seconds: that each stage took in all calls together, those included that were interrupted or killed.
-        total_seconds: the sum of them.
-        kept: stages that were found done.
-        note: why the score says little of the scene; empty where it does say something, or there is none.
+        bytes: size of the output in bytes.
+        gaussians: number of Gaussians of the scene.
+        model: the packed model in the work folder; if the source was a model, that model.
+        work: the work folder, which holds the products of all stages.
+        views: number of held-out photos on which the model was scored.
+        psnr, ssim: mean scores of these photos; None if there were none.
+        psnr_consistent: mean score as in `hyrfpack.Evaluation`; None also if the model has no exposure map.
+        poses: report of `hyrfpack.estimate_poses`; empty if the photos had poses.
+        training: steps, Gaussians, bytes and decisions of the training; empty if there was none.
+        export: report of `hyrfpack.export`; for splats, it has the report of `hyrfpack.distill` under "import".
+        seconds: time of each stage in all calls together, interrupted and killed ones included.
+        total_seconds: sum of these times.
+        kept: names of stages whose products of an earlier call were reused.
+        note: reason why the score says little about the scene; empty if it is meaningful or there is no score.
     """
 
     output: Path
@@ -76,7 +76,7 @@ class MakeResult:
     note: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, strings, lists and dictionaries, ready for JSON."""
+        """Return the result as plain numbers, strings, lists and dictionaries, ready for JSON."""
         return {**asdict(self), "output": str(self.output), "model": str(self.model), "work": str(self.work)}
 
 
@@ -101,38 +101,43 @@ def make(
     say: Say = lambda sentence: None,
     observer: Callable[[Trainer], None] | None = None,
 ) -> MakeResult:
-    """Make a scene of photos: poses if there are none, training, compression, scores on held-out photos, export.
+    """Make a scene from photos: estimate missing poses, train, compress, score on held-out photos, and export.
 
-    Each stage's product is kept in a work folder, with what it was made from. The same call goes on after an
-    interruption, a kill included, and on a CPU ends with the same bytes as one that was not interrupted. After a change
-    of photos or settings, the stages that depend on them are done anew and the others taken as they are.
+    The product of each stage is kept in a work folder with a record of its inputs. The same call resumes an interrupted
+    or killed one, and on a CPU writes the same bytes as an uninterrupted call. After a change of photos or settings,
+    only the stages that depend on them run again.
 
     Args:
-        photos: a folder of photos, or whatever `load_scene` reads where they have poses; a video; a file of splats
-            that another program made (see `hyrfpack.distill`); or a `.hyrf` file, to be exported.
-        output: what to make; the ending says what (".hyrf", or as `hyrfpack.export` knows them).
-        quality: one of QUALITIES.
-        minutes: instead of a quality, how long the call shall take: steps and size of photos follow from a measurement.
-        work: the work folder; None for the output's name with the ending ".work" beside it.
-        images, max_size: as of `load_scene`; None for what the quality says.
-        test_every: as of `load_scene`. None holds out every 8th photo, of fewer than 16 one and of fewer than 8 none.
-        matching: as of `hyrfpack.estimate_poses`.
-        target_bytes: pack the model into so many bytes. Another size in a later call packs the trained model anew and
-            does not train it again.
-        max_gaussians, preset: as of `hyrfpack.TrainConfig`; `max_gaussians` instead of `target_bytes`.
-        seed: of all that is random, 0 to 2^64 - 1.
-        device: where to train and to pack, see `hyrfpack.device.choose_device`.
-        overwrite: replace an output that is there. Without it, one that appears in the meantime is kept, too: a file
-            gets a free name beside it, which the result tells; a folder is an error.
-        report: told how far the work is.
-        say: told what is going on, in sentences.
-        observer: of the training, as of `hyrfpack.train`.
+        photos: a folder of photos without poses, any path that `load_scene` reads, a video, a file of splats of
+            another program (see `hyrfpack.distill`), or a `.hyrf` file to export.
+        output: path of the output, whose ending selects the format (".hyrf", or one of `hyrfpack.export`).
+        quality: a key of QUALITIES.
+        minutes: time that the call may take, instead of a quality. The number of steps and the size of the photos are
+            chosen by a measurement.
+        work: the work folder; None for the name of the output with the ending ".work" beside it.
+        images, max_size: see `load_scene`; None for the default of the quality.
+        test_every: see `load_scene`. None holds out every 8th photo; of fewer than 16 photos one, and of fewer than 8
+            none.
+        matching: see `hyrfpack.estimate_poses`.
+        target_bytes: maximum size of the packed model in bytes. A later call with another size packs the trained model
+            again, without training.
+        max_gaussians, preset: see `hyrfpack.TrainConfig`; `max_gaussians` excludes `target_bytes`.
+        seed: random seed, 0 to 2^64 - 1.
+        device: device for training and packing, see `hyrfpack.device.choose_device`.
+        overwrite: replace an existing output. Without it, an output that appears during the call is kept as well: a
+            file then gets a free name beside it, which the result reports; a folder is an error.
+        report: called with the progress.
+        say: called with sentences for the user.
+        observer: observer of the training, see `hyrfpack.train`.
+
+    Returns:
+        The output, the scores, and the reports of the stages.
 
     Raises:
-        HyrfError: what is given cannot be used, the output may not or cannot be written, options do not go together
-            (all of which is found before the work), or a stage fails. What is finished is kept.
-        Stopped: it was interrupted; a KeyboardInterrupt that names the stage.
-        ValueError: a number or a word is none of those allowed.
+        HyrfError: the source cannot be used, the output may not or cannot be written, or options exclude each other,
+            all of which is checked before the work; or a stage fails. Products of finished stages are kept.
+        Stopped: the call was interrupted; a KeyboardInterrupt that names the stage.
+        ValueError: an argument is out of range or unknown.
 
     Example:
         >>> import hyrfpack
@@ -149,13 +154,13 @@ def make(
     if minutes is not None:
         check_float("minutes", minutes, 0.0)
     began = monotonic()
-    reading = Reading(images, QUALITIES[quality].max_size if max_size is None else max_size, test_every)
+    reading = LoadSettings(images, QUALITIES[quality].max_size if max_size is None else max_size, test_every)
     with interruptible():
         try:
             request = Request(
-                source=Source.of(photos, reading),
+                source=Source.from_path(photos, reading),
                 output=Path(output),
-                work=work_folder(Path(output)) if work is None else Path(work),
+                work=default_work_folder(Path(output)) if work is None else Path(work),
                 reading=reading,
                 quality=quality,
                 minutes=minutes,
@@ -172,15 +177,15 @@ def make(
                 exclusive_folder(request.work, "another folder with `work`"),
                 exclusive_folder(request.output) if request.makes_folder else nullcontext(),
             ):
-                return _Making(request, began, report, say, observer).run()
+                return _Pipeline(request, began, report, say, observer).run()
         except Stopped:
             raise
-        except KeyboardInterrupt as error:  # before, between and after the stages
+        except KeyboardInterrupt as error:  # outside the stages
             raise Stopped("preparation") from error
 
 
-class _Making:
-    """One call of `make`."""
+class _Pipeline:
+    """Runs the stages of one call of `make`."""
 
     def __init__(
         self,
@@ -190,65 +195,70 @@ class _Making:
         say: Say,
         observer: Callable[[Trainer], None] | None,
     ) -> None:
-        """Args: began: when the call did, by the monotonic clock."""
+        """Args: began: start of the call by the monotonic clock, in seconds."""
         self.observer = observer
         self.request = request
         self.source = request.source
         self.began = began
         self.say = say
         self.reporter = Reporter(request.stages, report)
-        self.work = Work(request.work, self.reporter, say, request.check_replacing)
+        self.stage_cache = StageCache(request.work, self.reporter, say, request.check_replacing)
 
     def run(self) -> MakeResult:
+        """Run all stages that the source needs."""
         kind = self.source.kind
         if kind == "model":
-            return self._result(self.source.path, scene=None)
+            return self._finish(self.source.path, scene=None)
         if kind == "splats":
             steps = QUALITIES[self.request.quality].import_steps
-            facts = stages.import_splats(self.work, self.source.path, steps, self.request.seed)
-            return self._result(self.work.folder / stages.PACKED, scene=None, imported=facts)
-        return self._from_photos()
+            facts = stages.run_import_stage(self.stage_cache, self.source.path, steps, self.request.seed)
+            return self._finish(self.stage_cache.folder / stages.PACKED_MODEL, scene=None, imported=facts)
+        return self._make_from_photos()
 
-    def _from_photos(self) -> MakeResult:
-        request, work, poses = self.request, self.work, {}
+    def _make_from_photos(self) -> MakeResult:
+        """Run all stages for photos with or without poses."""
+        request, stage_cache, poses = self.request, self.stage_cache, {}
         path, reading, scene = self.source.path, request.reading, self.source.scene
         if scene is None:
-            poses = self._poses()
-            path, reading = work.folder / stages.SCENE, Reading(None, reading.max_size, reading.test_every)
-            scene = reading.scene(path)
+            poses = self._estimate_poses()
+            path, reading = (
+                stage_cache.folder / stages.SCENE_FOLDER,
+                LoadSettings(None, reading.max_size, reading.test_every),
+            )
+            scene = reading.load(path)
         else:
             for sentence in scene.notes:
                 self.say(sentence)
         cache = PictureCache()
-        plan, scene = self._plan(path, reading, scene, cache)
+        plan, scene = self._decide_plan(path, reading, scene, cache)
         if request.minutes is None:
-            self.reporter.estimates |= forecast_scene(scene, plan, request.device)
-        training = stages.fit(
-            work, scene, self._digest(scene), plan, request.seed, request.device, cache, self.observer
+            self.reporter.estimates |= estimate_scene_seconds(scene, plan, request.device)
+        training = stages.run_training_stage(
+            stage_cache, scene, self._scene_digest(scene), plan, request.seed, request.device, cache, self.observer
         )
-        stages.pack(work, scene, plan, request.device)
-        return self._result(work.folder / stages.PACKED, scene, poses=poses, training=training)
+        stages.run_compression_stage(stage_cache, scene, plan, request.device)
+        return self._finish(stage_cache.folder / stages.PACKED_MODEL, scene, poses=poses, training=training)
 
-    def _poses(self) -> dict[str, Any]:
-        """What the estimation reports of photos without poses, or of a video."""
+    def _estimate_poses(self) -> dict[str, Any]:
+        """Estimate the poses of photos or of a video; return the report of the estimation."""
         request, source = self.request, self.source
         photos = list_photos(source.path) if source.kind == "photos" else []
         facts = first_readable_photo(photos)
         sizes = [facts.size] * len(photos) if facts else []
-        forecast = forecast_photos(sizes, self._asked(), request.device)
+        estimates = estimate_photos_seconds(sizes, self._requested_plan(), request.device)
         if request.minutes is not None:
-            forecast = {"poses": forecast["poses"], "training": max(0.0, 60 * request.minutes - forecast["poses"])}
-        self.reporter.estimates |= forecast
+            estimates = {"poses": estimates["poses"], "training": max(0.0, 60 * request.minutes - estimates["poses"])}
+        self.reporter.estimates |= estimates
         if source.archive is not None:
             self.say(f"{source.archive.name} was unpacked into {source.path}, where it is found again")
-        return stages.pose(self.work, source.path, source.files(), request.matching, request.seed)
+        return stages.run_pose_stage(self.stage_cache, source.path, source.files(), request.matching, request.seed)
 
-    def _digest(self, scene: Scene) -> str:
-        """Of all that is read of a scene; an archive's files are, where they are unpacked."""
-        return digest_all((file for file in scene.files if Path(file) != self.source.path), Path(scene.path))
+    def _scene_digest(self, scene: Scene) -> str:
+        """Return the digest of all files of a scene; an archive itself is left out, its unpacked files count."""
+        return files_digest((file for file in scene.files if Path(file) != self.source.path), Path(scene.path))
 
-    def _asked(self) -> Plan:
-        """What the quality asks for."""
+    def _requested_plan(self) -> Plan:
+        """Return the plan that the quality and the other arguments request."""
         quality = QUALITIES[self.request.quality]
         steps = quality.steps if self.request.device.type == "cpu" else quality.gpu_steps
         request = self.request
@@ -261,25 +271,25 @@ class _Making:
             request.preset,
         )
 
-    def _plan(self, path: Path, reading: Reading, scene: Scene, cache: PictureCache) -> tuple[Plan, Scene]:
-        """What is asked for or fits the minutes, and the scene at the size that this takes."""
+    def _decide_plan(self, path: Path, reading: LoadSettings, scene: Scene, cache: PictureCache) -> tuple[Plan, Scene]:
+        """Return the requested plan or the one that fits the minutes, and the scene at the plan's photo size."""
         request = self.request
         if request.minutes is None:
-            return self._asked(), scene
+            return self._requested_plan(), scene
         end = self.began + 60 * request.minutes
         left = max(0.0, end - monotonic())
         measuring = MEASUREMENT_TIME_RATIO * left
         self.reporter.estimates |= {"measurement": measuring, "training": left - measuring}
 
-        def act(going_on: bool) -> tuple[dict[str, Any], list[str]]:
-            asked = replace(self._asked(), finetune_steps=0)
-            plan = measure(
-                path, reading, scene, asked, request.device, end, request.seed, cache, self.reporter, self.say
+        def execute(resuming: bool) -> tuple[dict[str, Any], list[str]]:
+            requested = replace(self._requested_plan(), finetune_steps=0)
+            plan = fit_plan_to_minutes(
+                path, reading, scene, requested, request.device, end, request.seed, cache, self.reporter, self.say
             )
             return asdict(plan), []
 
         inputs = {
-            "photos and poses": self._digest(scene),
+            "photos and poses": self._scene_digest(scene),
             "minutes": request.minutes,
             "size of photos": reading.max_size,
             "seed": request.seed,
@@ -287,14 +297,16 @@ class _Making:
             "number of Gaussians": request.max_gaussians,
             "preset": request.preset,
         }
-        # A training that was begun keeps its plan: another target size is only packed anew.
-        earlier = {**inputs, "target size": stages.trained_for(self.work)}
-        if self.work.state.facts("measurement", earlier) is not None:
+        # A training that was begun keeps its plan; for another target size, only packing runs again.
+        earlier = {**inputs, "target size": stages.trained_target_bytes(self.stage_cache)}
+        if self.stage_cache.state.facts("measurement", earlier) is not None:
             inputs = earlier
-        plan = Plan(**self.work.stage("measurement", inputs, act)).packed_into(request.target_bytes)
-        return plan, scene if plan.max_size == reading.max_size else reading.scene(path, plan.max_size)
+        plan = Plan(**self.stage_cache.run_stage("measurement", inputs, execute)).with_target_bytes(
+            request.target_bytes
+        )
+        return plan, scene if plan.max_size == reading.max_size else reading.load(path, plan.max_size)
 
-    def _result(
+    def _finish(
         self,
         model: Path,
         scene: Scene | None,
@@ -303,17 +315,19 @@ class _Making:
         poses: dict[str, Any] | None = None,
         training: dict[str, Any] | None = None,
     ) -> MakeResult:
-        """Score, and write what is wanted."""
-        request, work = self.request, self.work
-        scores = {"views": 0} if scene is None else stages.score(work, scene, request.device)
-        exported, product = stages.write(work, model, request.output.name, scene)
-        output = stages.deliver(product, request.output, overwrite=request.overwrite)  # last: where it is, all is done
+        """Score the model, export it, and return the result."""
+        request, stage_cache = self.request, self.stage_cache
+        scores = {"views": 0} if scene is None else stages.run_scoring_stage(stage_cache, scene, request.device)
+        exported, product = stages.run_export_stage(stage_cache, model, request.output.name, scene)
+        output = stages.copy_to_output(
+            product, request.output, overwrite=request.overwrite
+        )  # last, so that an existing output means a finished call
         return MakeResult(
             output=output,
             bytes=exported["bytes"],
             gaussians=describe(model)["gaussians"],
             model=model,
-            work=work.folder,
+            work=stage_cache.folder,
             views=scores["views"],
             psnr=scores.get("psnr"),
             psnr_consistent=scores.get("psnr_consistent"),
@@ -321,8 +335,8 @@ class _Making:
             poses=poses or {},
             training=training or {},
             export={**exported, "file": str(output), **({"import": imported} if imported else {})},
-            seconds={name: round(seconds, 1) for name, seconds in work.seconds.items()},
-            total_seconds=round(sum(work.seconds.values()), 1),
-            kept=tuple(work.kept),
+            seconds={name: round(seconds, 1) for name, seconds in stage_cache.seconds.items()},
+            total_seconds=round(sum(stage_cache.seconds.values()), 1),
+            kept=tuple(stage_cache.kept),
             note=score_note(scores["views"], scores.get("psnr"), (training or {}).get("psnr")),
         )

@@ -1,4 +1,4 @@
-"""What is given to be made a scene of: photos with poses or without, a video, splats of other programs, or a model."""
+"""Inspect the source of a scene: photos with or without poses, a video, splats of another program, or a model."""
 
 from __future__ import annotations
 
@@ -11,50 +11,52 @@ from hyrfpack.data import load_scene
 from hyrfpack.data.archive import is_archive, unpack
 from hyrfpack.data.folder import list_photos
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
-from hyrfpack.make.held_out import inner_view
+from hyrfpack.make.held_out import choose_inner_view
 from hyrfpack.outputs import PICTURE_SUFFIXES, VIDEO_SUFFIXES, Outputs, StrPath
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.splats.files import READABLE_ENDINGS
 
-FEW, LEAST = 16, 8  # photos, of which one is held out, or none
-TEST_EVERY = 8  # of more, one in so many is
-_LOOSE_SOG = "meta.json"
+MIN_SPLIT_PHOTOS = 16  # of fewer photos, a single one is held out
+MIN_HELD_OUT_PHOTOS = 8  # of fewer photos, none is held out
+DEFAULT_TEST_EVERY = 8
+_SOG_INDEX_NAME = "meta.json"  # the main file of splats in SOG format that are not packed into one file
 
 
 @dataclass(frozen=True)
-class Reading:
-    """How photos are read: the arguments of `load_scene`.
+class LoadSettings:
+    """Settings with which photos are read, see `load_scene`.
 
-    Without `test_every`, one in TEST_EVERY of many photos is held out, of fewer than FEW the one that is best
-    surrounded by others (`inner_view`), and of fewer than LEAST none. A split of the set's own counts instead.
+    Without `test_every`, every 8th photo is held out (DEFAULT_TEST_EVERY). Of fewer than MIN_SPLIT_PHOTOS, only the
+    photo that is best surrounded by others is held out (`choose_inner_view`), and of fewer than MIN_HELD_OUT_PHOTOS
+    none. If the set has a split of its own, that is used instead.
     """
 
     images: str | None = None
     max_size: int = DEFAULT_MAX_SIZE
     test_every: int | None = None
 
-    def scene(self, path: Path, max_size: int | None = None) -> Scene:
-        """Read photos with poses, at another size than this if that is given."""
+    def load(self, path: Path, max_size: int | None = None) -> Scene:
+        """Read photos with poses; `max_size` replaces that of these settings."""
         size = self.max_size if max_size is None else max_size
         read = partial(load_scene, path, images=self.images, max_size=size)
-        scene = read(test_every=TEST_EVERY if self.test_every is None else self.test_every)
-        if self.test_every is not None or len(scene.views) >= FEW:
+        scene = read(test_every=DEFAULT_TEST_EVERY if self.test_every is None else self.test_every)
+        if self.test_every is not None or len(scene.views) >= MIN_SPLIT_PHOTOS:
             return scene
         scene = read(test_every=0)
-        if scene.test or len(scene.views) < LEAST:
+        if scene.test or len(scene.views) < MIN_HELD_OUT_PHOTOS:
             return scene
-        return read(held_out=[inner_view(scene).name])
+        return read(held_out=[choose_inner_view(scene).name])
 
 
 @dataclass(frozen=True)
 class Source:
-    """What is given.
+    """The source of a scene.
 
     Attributes:
-        path: the file or folder; of photos without poses, the folder that they are in.
-        kind: "photos" that have no poses, a "video", a "scene" of photos with poses, "splats" or a "model".
-        scene: the photos with poses, as they are read.
-        archive: that photos without poses came in; `path` is where they are unpacked.
+        path: the file or folder; for photos without poses, the folder that contains them.
+        kind: "photos" (without poses), "video", "scene" (photos with poses), "splats" or "model".
+        scene: the photos with poses; None for other kinds.
+        archive: the archive from which photos without poses were unpacked to `path`; None if there was none.
     """
 
     path: Path
@@ -63,29 +65,30 @@ class Source:
     archive: Path | None = None
 
     @classmethod
-    def of(cls, path: StrPath, reading: Reading) -> Source:
-        """Look at what is given.
+    def from_path(cls, path: StrPath, reading: LoadSettings) -> Source:
+        """Find out what kind of source a path leads to, and load photos that have poses.
 
         Raises:
-            HyrfDataError: it is nothing that a scene can be made of.
+            HyrfDataError: no scene can be made from it.
         """
         path = Path(path)
         if not os.path.lexists(path):
             raise HyrfDataError(f"{path}: no such file or folder; check the path")
         ending = path.suffix.lower()
-        if path.is_file() and (ending == ".hyrf" or ending in READABLE_ENDINGS or path.name == _LOOSE_SOG):
+        if path.is_file() and (ending == ".hyrf" or ending in READABLE_ENDINGS or path.name == _SOG_INDEX_NAME):
             return cls(path, "model" if ending == ".hyrf" else "splats")
         if path.is_file() and not (is_archive(path) or ending in VIDEO_SUFFIXES):
-            one = "this is one photo" if ending in PICTURE_SUFFIXES else "nothing can be made of this file"
+            what = "this is one photo" if ending in PICTURE_SUFFIXES else "nothing can be made of this file"
             raise HyrfDataError(
-                f"{path}: {one}; name a folder of photos, its .zip, a video, a .hyrf file, or splats of another program"
+                f"{path}: {what}; name a folder of photos, its .zip, a video, a .hyrf file, or splats of another "
+                "program"
             )
         try:
-            return cls(path, "scene", reading.scene(path))
+            return cls(path, "scene", reading.load(path))
         except HyrfNoPosesError:
             if ending in VIDEO_SUFFIXES and path.is_file():
                 return cls(path, "video")
-            if (path / _LOOSE_SOG).is_file():
+            if (path / _SOG_INDEX_NAME).is_file():
                 return cls(path, "splats")
             archive, folder = (path, unpack(path)) if is_archive(path) else (None, path)
             return cls(folder / (reading.images or ""), "photos", archive=archive)
@@ -101,17 +104,17 @@ class Source:
             raise
 
     def files(self) -> list[Path]:
-        """What poses are estimated from: photos and their masks, or a video."""
+        """Return the files from which poses are estimated: photos and their masks, or a video."""
         if self.path.is_file():
             return [self.path]
         masks = [self.path / "masks", self.path / "mask"]
         masks += [self.path.parent / "masks"] if self.path.name == "images" else []
         return [*list_photos(self.path), *(p for folder in masks for p in sorted(folder.rglob("*")) if p.is_file())]
 
-    def outputs(self, overwrite: bool) -> list[Outputs]:
-        """The rules of what may be written beside what is read, all of which hold."""
+    def output_rules(self, overwrite: bool) -> list[Outputs]:
+        """Return the rules that protect the source from being overwritten; all of them apply."""
         if self.kind == "photos":
             folders = sorted({photo.parent for photo in list_photos(self.path)} | {self.path})
             return [Outputs(folder=folder, overwrite=overwrite) for folder in folders]
-        folder = self.path.parent if self.path.name == _LOOSE_SOG else self.path
+        folder = self.path.parent if self.path.name == _SOG_INDEX_NAME else self.path
         return [Outputs(self.path, folder=folder, scene=self.scene, overwrite=overwrite)]

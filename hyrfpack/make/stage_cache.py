@@ -1,4 +1,4 @@
-"""A work folder, in which stages are done one after the other, kept, and gone on with."""
+"""Run the stages of a pipeline in a work folder, where their products are cached and resumed."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from typing import Any
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.make.progress import Reporter
-from hyrfpack.make.state import State
+from hyrfpack.make.state import WorkFolderState
 
-# What each stage leaves in the work folder; made anew, it goes first.
-PRODUCTS = {
+# The file or folder that each stage writes into the work folder. It is removed before a stage runs again.
+PRODUCT_NAMES = {
     "poses": "scene",
     "training": "run",
     "compression": "model.hyrf",
@@ -24,16 +24,16 @@ PRODUCTS = {
     "export": "export",
 }
 
-MIN_RECORD_SECONDS = 15.0  # between two records of the time that a stage has taken so far
+MIN_RECORD_SECONDS = 15.0  # the time that a stage has taken so far is recorded at most this often
 
 Say = Callable[[str], None]
 
 
 class Stopped(KeyboardInterrupt):
-    """The work was interrupted, by Ctrl-C, SIGTERM or a terminal that is closed; the same call goes on with it.
+    """The work was interrupted by Ctrl-C, SIGTERM or the closing of its terminal; the same call resumes it.
 
     Attributes:
-        stage: in which.
+        stage: name of the interrupted stage.
     """
 
     def __init__(self, stage: str) -> None:
@@ -41,48 +41,53 @@ class Stopped(KeyboardInterrupt):
         self.stage = stage
 
 
-class Work:
-    """Does stages, or takes those that are done from the same inputs.
+class StageCache:
+    """Runs stages, or reuses the products of stages that are finished with the same inputs.
 
     Attributes:
-        folder: where products are kept.
-        kept: stages that were found done.
-        seconds: that each stage took, in all calls together.
+        folder: the work folder, which holds the products.
+        state: the record of the work folder.
+        reporter: reports progress.
+        say: called with sentences for the user.
+        kept: names of stages whose products were reused.
+        seconds: time that each stage has taken in all calls together.
     """
 
-    def __init__(self, folder: Path, reporter: Reporter, say: Say, allow: Callable[[State], None]) -> None:
-        """Args: allow: called before a stage is done, and raises HyrfError where nothing may be made anew."""
+    def __init__(
+        self, folder: Path, reporter: Reporter, say: Say, check_replacing: Callable[[WorkFolderState], None]
+    ) -> None:
+        """Open the work folder; `check_replacing` is called before a stage runs, and raises HyrfError to prevent it."""
         self.folder = folder
-        self.state = State(folder)
+        self.state = WorkFolderState(folder)
         self.reporter = reporter
         self.say = say
         self.kept: list[str] = []
         self.seconds: dict[str, float] = {}
-        self._allow = allow
+        self._check_replacing = check_replacing
 
-    def stage(
+    def run_stage(
         self,
         name: str,
         inputs: dict[str, Any],
-        act: Callable[[bool], tuple[dict[str, Any], Sequence[str]]],
+        execute: Callable[[bool], tuple[dict[str, Any], Sequence[str]]],
         fixed: dict[str, Any] | None = None,
     ) -> dict[str, Any]:
-        """Do a stage, unless it is done.
+        """Run a stage, unless it is finished with the same inputs.
 
         Args:
-            name: of the stage.
-            inputs: plain values, all that decides what comes of it.
-            act: does it; told whether it was begun before from the same inputs. Returns facts, plain values, and the
-                files that it made, by their paths in the folder.
-            fixed: plain values that are recorded when the stage is begun, for `State.fixed`. Other ones in a later
-                call do not redo the stage.
+            name: name of the stage.
+            inputs: plain values, all on which the product of the stage depends.
+            execute: runs the stage. It gets whether an earlier call began the stage with the same inputs. It returns
+                facts, which are plain values, and the files that it wrote, as paths relative to the folder.
+            fixed: plain values that are recorded when the stage is begun, for `WorkFolderState.fixed`. Other values in
+                a later call do not run the stage again.
 
         Returns:
-            The facts.
+            The facts of the stage.
 
         Raises:
-            Stopped: it was interrupted.
-            HyrfError: it cannot be done.
+            Stopped: the stage was interrupted.
+            HyrfError: the stage failed.
         """
         facts = self.state.facts(name, inputs)
         if facts is not None:
@@ -91,62 +96,62 @@ class Work:
             self.reporter.skip(name, self.seconds[name])
             self.say(f"{name}: done before, in {self.seconds[name]:.0f} s")
             return facts
-        self._allow(self.state)
-        going_on = self.state.begun(name, inputs)
-        if not going_on:
-            if changed := self.state.changed(name, inputs):
-                self.say(f"{name}: made anew, for {' and '.join(changed)} changed")
-            if name in PRODUCTS:
-                _remove(self.folder / PRODUCTS[name])
+        self._check_replacing(self.state)
+        resuming = self.state.was_begun(name, inputs)
+        if not resuming:
+            if reasons := self.state.changed_inputs(name, inputs):
+                self.say(f"{name}: made anew, for {' and '.join(reasons)} changed")
+            if name in PRODUCT_NAMES:
+                _remove_product(self.folder / PRODUCT_NAMES[name])
             self.state.begin(name, inputs, fixed or {})
         clock = _StageClock(self.state, name)
         try:
             with self.reporter.watched_by(clock.record):
                 self.reporter.begin(name)
-                facts, files = act(going_on)
+                facts, files = execute(resuming)
         except KeyboardInterrupt as error:
-            self.state.add_seconds(name, clock.unrecorded())
+            self.state.add_seconds(name, clock.unrecorded_seconds())
             raise Stopped(name) from error
         except HyrfError as error:
-            raise type(error)(f"{name} failed: {error}{self._what_is_left(name, clock)}") from error
-        self.state.finish(name, files, facts, clock.unrecorded())
+            raise type(error)(f"{name} failed: {error}{self._describe_kept_products(name, clock)}") from error
+        self.state.finish(name, files, facts, clock.unrecorded_seconds())
         self.seconds[name] = self.state.seconds(name)
         return facts
 
-    def _what_is_left(self, name: str, clock: _StageClock) -> str:
-        """The end of the message about a stage that failed. Where the stage left nothing, its record is removed."""
-        product = self.folder / PRODUCTS[name] if name in PRODUCTS else None
-        has_product = product is not None and _has_content(product)
+    def _describe_kept_products(self, name: str, clock: _StageClock) -> str:
+        """Return the end of the message about a failed stage; remove its record if it wrote nothing."""
+        product = self.folder / PRODUCT_NAMES[name] if name in PRODUCT_NAMES else None
+        has_product = product is not None and _has_files(product)
         try:
             if not has_product:
                 self.state.forget(name)
             else:
-                self.state.add_seconds(name, clock.unrecorded())
-        except HyrfError:  # the failure of the stage is what the user needs to hear of
+                self.state.add_seconds(name, clock.unrecorded_seconds())
+        except HyrfError:  # the user needs to see the failure of the stage instead
             pass
         return f"; what is finished is kept in {self.folder}" if has_product or self.state.has_finished else ""
 
 
 class _StageClock:
-    """Records the time that a stage takes while it works, so that a killed process loses little of it."""
+    """Records the time of a running stage from time to time, so that a killed process loses little of it."""
 
-    def __init__(self, state: State, stage: str) -> None:
+    def __init__(self, state: WorkFolderState, stage: str) -> None:
         self._state, self._stage, self._since = state, stage, monotonic()
 
-    def unrecorded(self) -> float:
-        """Seconds since the last record, or since the stage began."""
+    def unrecorded_seconds(self) -> float:
+        """Return the seconds since the last record, or since the stage began."""
         return monotonic() - self._since
 
     def record(self) -> None:
-        """Write down the time so far, unless that was done a short while ago."""
-        if self.unrecorded() >= MIN_RECORD_SECONDS:
+        """Record the time so far, unless the last record is younger than MIN_RECORD_SECONDS."""
+        if self.unrecorded_seconds() >= MIN_RECORD_SECONDS:
             with suppress(HyrfError):  # a full disk ends the stage when its product is written, not here
-                self._state.add_seconds(self._stage, self.unrecorded())
+                self._state.add_seconds(self._stage, self.unrecorded_seconds())
             self._since = monotonic()
 
 
-def _has_content(product: Path) -> bool:
-    """Whether a stage has left a file. A folder without files is removed."""
+def _has_files(product: Path) -> bool:
+    """Return whether a product is a file or a folder with files; a folder without files is removed."""
     if product.is_dir():
         if any(path.is_file() for path in product.rglob("*")):
             return True
@@ -154,8 +159,8 @@ def _has_content(product: Path) -> bool:
     return product.exists()
 
 
-def _remove(path: Path) -> None:
-    """Remove a product of ours."""
+def _remove_product(path: Path) -> None:
+    """Remove the product of a stage."""
     try:
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -167,8 +172,8 @@ def _remove(path: Path) -> None:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """SIGTERM and SIGHUP interrupt as Ctrl-C does, unless whoever started the program has them ignored."""
-    if threading.current_thread() is not threading.main_thread():  # signals belong to the main thread
+    """Let SIGTERM and SIGHUP raise KeyboardInterrupt in the block, unless the process was started to ignore them."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread can set signal handlers
         yield
         return
     names = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]

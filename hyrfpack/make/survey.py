@@ -1,4 +1,4 @@
-"""What a set of photos, or a video, is like before anything is made of it, what is wrong with it and what to do."""
+"""Describe a set of photos or a video before it is used: its properties, its problems, and what to do about them."""
 
 from __future__ import annotations
 
@@ -31,40 +31,45 @@ from hyrfpack.parallel.pool import thread_count
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene, evenly_spaced
 from hyrfpack.train.setup import detect_preset
 
-MOST_DECODED, MOST_OPENED = 150, 2000  # photos, spread over larger sets: seconds, not minutes
+# Of larger sets, an evenly spaced selection is examined, so that a survey takes seconds and not minutes.
+MAX_DECODED_PHOTOS = 150
+MAX_OPENED_PHOTOS = 2000
 
-_FEW = 20  # photos: fewer hardly see a thing from all sides
-_UNEVEN = 2.5  # stops between the lightest and the darkest twentieth; real sets at one exposure have up to 2
-_DARK, _DARKER = 0.02, 3.0  # mean luminance of a dark set; stops below the median of a dark photo
-_CLIPPED = 0.25  # of the pixels
-_SAME_ZOOM = 0.03  # relative difference of focal lengths that EXIF rounds to
-_SAME_PICTURE = 1.0  # mean difference in levels of 255 of two thumbnails
-_HEADERS_SHARE, _LOOKS_SHARE = 0.2, 0.95  # of the work, that is done once headers are read, and pixels looked at
-_THUMBNAIL = 24  # pixels a side
+_MIN_RECOMMENDED_PHOTOS = 20  # fewer photos hardly show an object from all sides
+_MAX_EXPOSURE_SPREAD_STOPS = 2.5  # between the 5 % and 95 % quantiles; real sets at one exposure have up to 2
+_MIN_SET_LUMINANCE = 0.02  # a set with a lower median of the mean luminances is dark
+_DARK_PHOTO_STOPS = 3.0  # a photo so far below the median of its set is dark
+_MAX_CLIPPED_PIXEL_RATIO = 0.25
+_SAME_ZOOM_TOLERANCE = 0.03  # EXIF rounds focal lengths by up to this ratio
+_SAME_PICTURE_MAX_LEVELS = 1.0  # thumbnails of the same picture differ by less, in levels of 255 on average
+# Ratios of the whole work that are done after the headers are read and after the pixels are measured.
+_HEADERS_PROGRESS = 0.2
+_PIXELS_PROGRESS = 0.95
+_THUMBNAIL_SIDE_PIXELS = 24
 
 
 @dataclass(frozen=True)
 class PhotoSurvey:
-    """What a set of photos is like; `dataclasses.asdict` of it goes into JSON.
+    """Description of a set of photos or a video; `dataclasses.asdict` of it is written as JSON.
 
     Attributes:
-        path: what was described.
+        path: the path that was described.
         kind: "photos" or "video".
-        photos: how many there are; of a video, frames.
-        layout: of the poses, "" where there are none.
-        posed: photos with poses.
-        points: of the reconstruction.
-        preset: that training would take, and why; "" without poses.
-        sizes: "4032 x 3024" -> photos, the most frequent first; of upright pictures.
-        cameras: "Apple iPhone 12, 26 mm" -> photos; of those whose headers were read.
-        decoded: photos whose pixels were looked at, for what follows.
-        sharpness: their median, about 1 where pictures are sharp to the pixel; 0 of a video, as light is.
-        blurred: names of those blurred beside the others.
-        stops: how far the lightest and the darkest twentieth of them are apart, in stops.
-        luminance: the median of their mean linear luminance, in [0, 1].
-        frames: of a video, how many would be taken.
-        notes: sentences about what is there.
-        problems: sentences about what is wrong, each with what to do.
+        photos: number of photos; of a video, number of frames.
+        layout: layout of the poses; "" if there are none.
+        posed: number of photos with poses.
+        points: number of points of the reconstruction.
+        preset: the preset that training would use, and why; "" without poses.
+        sizes: number of photos by size, such as "4032 x 3024", of upright pictures; the most frequent first.
+        cameras: number of photos by camera, such as "Apple iPhone 12, 26 mm", of the photos whose headers were read.
+        decoded: number of photos whose pixels were measured; the next four values describe these photos.
+        sharpness: median sharpness, about 1 for pictures that are sharp to the pixel; 0 for a video.
+        blurred: names of photos that are blurred compared with the others.
+        stops: difference in stops between the 5 % and 95 % quantiles of the mean luminance; 0 for a video.
+        luminance: median of the mean linear luminance, in [0, 1]; 0 for a video.
+        frames: number of frames that would be taken of a video.
+        notes: sentences about the set.
+        problems: sentences about problems, each with advice.
     """
 
     path: str
@@ -87,27 +92,34 @@ class PhotoSurvey:
 
 
 @dataclass(frozen=True)
-class _Look:
-    """What the pixels of one photo say."""
+class _PixelMeasurement:
+    """Measurements of the pixels of one photo.
+
+    Attributes:
+        path: the photo.
+        sharpness: its sharpness.
+        exposure: its luminance and clipping.
+        thumbnail: (_THUMBNAIL_SIDE_PIXELS, _THUMBNAIL_SIDE_PIXELS) grey levels in [0, 255].
+    """
 
     path: Path
     sharpness: float
     exposure: Exposure
-    thumbnail: np.ndarray  # (_THUMBNAIL, _THUMBNAIL) in [0, 255]
+    thumbnail: np.ndarray
 
 
 def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | None = None) -> PhotoSurvey:
     """Describe a folder of photos, with poses or without, a .zip of one, or a video.
 
-    Of large sets a part is looked at, evenly spread: the headers of 2,000 photos and the pixels of 150. A video is
-    decoded once, and nothing is written.
+    Of a large set, an evenly spaced selection is examined: the headers of 2,000 photos and the pixels of 150. A video
+    is decoded once. No file is written.
 
     Args:
         path: the folder or file.
-        report: called with what is going on and the share of the work that is done, in [0, 1].
+        report: called with a description of the current work and the ratio of the work that is done, in [0, 1].
 
     Raises:
-        HyrfDataError: there is no such path, there are no photos in it, or none that can be read.
+        HyrfDataError: the path does not exist, or has no photo that can be read.
 
     Example:
         >>> survey = describe_photos("photos/bonsai")
@@ -117,39 +129,43 @@ def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | Non
         'there are only 10 photos; take 20 or more, from all around and with much overlap'
     """
     path = Path(path)
-    tell = report or (lambda text, share: None)
+    report_progress = report or (lambda text, share: None)
     if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
-        return _describe_video(path, tell)
+        return _describe_video(path, report_progress)
     raise_if_single_photo(path)
     folder = unpack(path) if is_archive(path) else path
     photos = list_photos(folder)
-    tell("reading poses", 0.0)
-    scene, problems = _scene(path, folder)
+    report_progress("reading poses", 0.0)
+    scene, problems = _load_scene_or_problem(path, folder)
     posed = _posed_files(scene)
     photos = sorted({*photos, *posed})
     if not photos:
         raise HyrfDataError(explain_no_photos(path, folder))
-    facts, unreadable = _headers(photos, folder, tell)
-    looks, undecodable = _looks([fact.path for fact in facts], folder, tell)
+    facts, unreadable = _read_header_facts(photos, folder, report_progress)
+    measurements, undecodable = _measure_all_pixels([fact.path for fact in facts], folder, report_progress)
     unreadable |= undecodable
-    if not looks:
+    if not measurements:
         raise HyrfDataError(f"{path}: {'; '.join(unreadable_sentences(unreadable, len(photos)))}")
-    blurred = [look.path for look, bad in zip(looks, is_blurred([x.sharpness for x in looks]), strict=True) if bad]
-    light = np.log2([max(look.exposure.luminance, 1e-6) for look in looks])
+    blurred = [
+        measurement.path
+        for measurement, bad in zip(measurements, is_blurred([x.sharpness for x in measurements]), strict=True)
+        if bad
+    ]
+    light = np.log2([max(measurement.exposure.luminance, 1e-6) for measurement in measurements])
     stops = float(np.ptp(np.quantile(light, (0.05, 0.95))))
 
     problems += _count_problems(len(photos), scene, len(posed), path)
     problems += unreadable_sentences(unreadable, len(photos))
-    problems += _copies(photos, looks, folder, tell)
-    problems += _blur_problems(looks, blurred, folder)
-    problems += _light_problems(looks, light, stops, folder, scene)
+    problems += _copy_problems(photos, measurements, folder, report_progress)
+    problems += _blur_problems(measurements, blurred, folder)
+    problems += _light_problems(measurements, light, stops, folder, scene)
     if scene is None:
         problems += _zoom_problems(facts) + _mask_problems(folder, photos)
     notes = list(scene.notes) if scene is not None else _header_notes(facts) + raw_photos_notes(list_raw_photos(folder))
-    if len(looks) + len(unreadable) < len(photos):
-        notes.append(f"the pixels of {len(looks)} of {len(photos)} photos were looked at, evenly spread")
+    if len(measurements) + len(unreadable) < len(photos):
+        notes.append(f"the pixels of {len(measurements)} of {len(photos)} photos were looked at, evenly spread")
     preset = ": ".join(detect_preset(scene)) if scene is not None and scene.train else ""
-    tell("described", 1.0)
+    report_progress("described", 1.0)
     return PhotoSurvey(
         path=str(path),
         kind="photos",
@@ -158,11 +174,11 @@ def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | Non
         posed=len(posed) or (len(scene.views) if scene is not None else 0),
         points=len(scene.points) if scene is not None else 0,
         preset=preset,
-        sizes=_counted(f"{fact.size[0]} x {fact.size[1]}" for fact in facts),
-        cameras=_counted(_camera(fact) for fact in facts),
-        decoded=len(looks),
-        sharpness=round(float(np.median([look.sharpness for look in looks])), 3),
-        blurred=tuple(_below(item, folder) for item in blurred),
+        sizes=_count_values(f"{fact.size[0]} x {fact.size[1]}" for fact in facts),
+        cameras=_count_values(_describe_camera(fact) for fact in facts),
+        decoded=len(measurements),
+        sharpness=round(float(np.median([measurement.sharpness for measurement in measurements])), 3),
+        blurred=tuple(_relative_name(item, folder) for item in blurred),
         stops=round(stops, 2),
         luminance=round(float(2 ** np.median(light)), 4),
         frames=0,
@@ -171,10 +187,11 @@ def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | Non
     )
 
 
-def _describe_video(path: Path, tell: Callable[[str, float], None]) -> PhotoSurvey:
+def _describe_video(path: Path, report_progress: Callable[[str, float], None]) -> PhotoSurvey:
+    """Describe a video."""
     from hyrfpack.poses.frames import survey_frames
 
-    found, size, looked = survey_frames(path, report=tell)
+    found, size, looked = survey_frames(path, report=report_progress)
     problems = [f"a video has no poses; {pose_commands(path)}"]
     return PhotoSurvey(
         path=str(path),
@@ -200,8 +217,8 @@ def _describe_video(path: Path, tell: Callable[[str, float], None]) -> PhotoSurv
     )
 
 
-def _scene(path: Path, folder: Path) -> tuple[Scene | None, list[str]]:
-    """The photos with their poses, or why there are none."""
+def _load_scene_or_problem(path: Path, folder: Path) -> tuple[Scene | None, list[str]]:
+    """Load the photos with their poses; without poses, return None and sentences about the problem."""
     try:
         return load_scene(folder, test_every=0, max_size=DEFAULT_MAX_SIZE), []
     except HyrfNoPosesError:
@@ -213,62 +230,70 @@ def _scene(path: Path, folder: Path) -> tuple[Scene | None, list[str]]:
 
 
 def _posed_files(scene: Scene | None) -> set[Path]:
+    """Return the paths of the photos with poses."""
     files = (getattr(view.load, "path", None) for view in scene.views) if scene is not None else ()
     return {Path(file) for file in files if file is not None}
 
 
-def _headers(
-    photos: list[Path], folder: Path, tell: Callable[[str, float], None]
+def _read_header_facts(
+    photos: list[Path], folder: Path, report_progress: Callable[[str, float], None]
 ) -> tuple[list[PhotoFacts], dict[str, str]]:
-    """What the headers of photos say, and why some say nothing."""
+    """Read the headers of photos; return their facts, and the reason for each photo that cannot be read, by name."""
     facts, unreadable = [], {}
-    chosen = evenly_spaced(photos, MOST_OPENED)
+    chosen = evenly_spaced(photos, MAX_OPENED_PHOTOS)
     for done, photo in enumerate(chosen):
         try:
             facts.append(read_photo_facts(photo))
         except HyrfDataError as error:
-            unreadable[_below(photo, folder)] = _reason(error, photo)
+            unreadable[_relative_name(photo, folder)] = _unreadable_reason(error, photo)
         read = f"reading the headers of photos, {done + 1:,} of {len(chosen):,}"
-        tell(read, _HEADERS_SHARE * (done + 1) / len(chosen))
+        report_progress(read, _HEADERS_PROGRESS * (done + 1) / len(chosen))
     return facts, unreadable
 
 
-def _looks(photos: list[Path], folder: Path, tell: Callable[[str, float], None]) -> tuple[list[_Look], dict[str, str]]:
-    """What the pixels of photos say, and why some say nothing."""
-    chosen = evenly_spaced(photos, MOST_DECODED)
-    looks, undecodable = [], {}
+def _measure_all_pixels(
+    photos: list[Path], folder: Path, report_progress: Callable[[str, float], None]
+) -> tuple[list[_PixelMeasurement], dict[str, str]]:
+    """Measure the pixels of photos; return the reason for each undecodable photo by name, too."""
+    chosen = evenly_spaced(photos, MAX_DECODED_PHOTOS)
+    measurements, undecodable = [], {}
     with ThreadPoolExecutor(thread_count()) as pool:
-        for done, found in enumerate(pool.map(_look, chosen)):
-            if isinstance(found, _Look):
-                looks.append(found)
+        for done, found in enumerate(pool.map(_measure_pixels, chosen)):
+            if isinstance(found, _PixelMeasurement):
+                measurements.append(found)
             else:
-                undecodable[_below(chosen[done], folder)] = found
+                undecodable[_relative_name(chosen[done], folder)] = found
             looked = f"looking at the photos, {done + 1:,} of {len(chosen):,}"
-            tell(looked, _HEADERS_SHARE + (_LOOKS_SHARE - _HEADERS_SHARE) * (done + 1) / len(chosen))
-    return looks, undecodable
+            report_progress(
+                looked, _HEADERS_PROGRESS + (_PIXELS_PROGRESS - _HEADERS_PROGRESS) * (done + 1) / len(chosen)
+            )
+    return measurements, undecodable
 
 
-def _look(path: Path) -> _Look | str:
+def _measure_pixels(path: Path) -> _PixelMeasurement | str:
+    """Measure the pixels of a photo; return the reason if it cannot be decoded."""
     try:
         gray = read_gray(path)
     except HyrfDataError as error:
-        return _reason(error, path)
-    small = Image.fromarray(gray).resize((_THUMBNAIL, _THUMBNAIL), Image.Resampling.BOX)
-    return _Look(path, measure_sharpness(gray), measure_exposure(gray), 255 * np.asarray(small))
+        return _unreadable_reason(error, path)
+    small = Image.fromarray(gray).resize((_THUMBNAIL_SIDE_PIXELS, _THUMBNAIL_SIDE_PIXELS), Image.Resampling.BOX)
+    return _PixelMeasurement(path, measure_sharpness(gray), measure_exposure(gray), 255 * np.asarray(small))
 
 
-def _reason(error: HyrfDataError, path: Path) -> str:
+def _unreadable_reason(error: HyrfDataError, path: Path) -> str:
+    """Return why a photo cannot be read, without its path and the advice, which all such photos share."""
     return strip_path(error, display_path(path)).partition(";")[0]
 
 
 def _count_problems(count: int, scene: Scene | None, posed: int, path: Path) -> list[str]:
+    """Describe too few photos, photos without poses, and missing points."""
     found = []
-    if count < _FEW:
+    if count < _MIN_RECOMMENDED_PHOTOS:
         found.append(
-            f"there {'is' if count == 1 else 'are'} only {format_photo_count(count)}; take {_FEW} or more, from all "
-            "around and with much overlap"
+            f"there {'is' if count == 1 else 'are'} only {format_photo_count(count)}; take {_MIN_RECOMMENDED_PHOTOS} "
+            "or more, from all around and with much overlap"
         )
-    if scene is None or scene.layout == "blender":  # whose splits are used in part
+    if scene is None or scene.layout == "blender":  # of Blender sets, only some of the splits are used
         return found
     without = count - posed
     if posed and without > 0:
@@ -281,9 +306,15 @@ def _count_problems(count: int, scene: Scene | None, posed: int, path: Path) -> 
     return found
 
 
-def _copies(photos: list[Path], looks: list[_Look], folder: Path, tell: Callable[[str, float], None]) -> list[str]:
-    thumbnails = np.stack([look.thumbnail for look in looks])
-    if len(looks) > 2 and np.abs(thumbnails - thumbnails[0]).mean(axis=(1, 2)).max() < _SAME_PICTURE:
+def _copy_problems(
+    photos: list[Path],
+    measurements: list[_PixelMeasurement],
+    folder: Path,
+    report_progress: Callable[[str, float], None],
+) -> list[str]:
+    """Describe copies of photos, or a set that shows the same picture throughout."""
+    thumbnails = np.stack([measurement.thumbnail for measurement in measurements])
+    if len(measurements) > 2 and np.abs(thumbnails - thumbnails[0]).mean(axis=(1, 2)).max() < _SAME_PICTURE_MAX_LEVELS:
         return ["all photos show the same picture; walk around and take photos from many places"]
     sizes: dict[int, list[Path]] = {}
     for photo in photos:
@@ -293,22 +324,23 @@ def _copies(photos: list[Path], looks: list[_Look], folder: Path, tell: Callable
     suspects = [item for group in sizes.values() if len(group) > 1 for item in group]
     for done, photo in enumerate(suspects):
         compared = f"looking for copies, {done + 1:,} of {len(suspects):,}"
-        tell(compared, _LOOKS_SHARE + (1 - _LOOKS_SHARE) * done / len(suspects))
+        report_progress(compared, _PIXELS_PROGRESS + (1 - _PIXELS_PROGRESS) * done / len(suspects))
         digest = hashlib.sha256(photo.read_bytes()).digest()
         if digest in seen:
             copies.append((photo, seen[digest]))
         seen.setdefault(digest, photo)
     if not copies:
         return []
-    first, of = (_below(item, folder) for item in copies[0])
+    first, of = (_relative_name(item, folder) for item in copies[0])
     return [
-        f"{format_photo_count(len(copies))} {_is(len(copies))} a copy of another, {first} of {of} for one; "
+        f"{format_photo_count(len(copies))} {_be(len(copies))} a copy of another, {first} of {of} for one; "
         "remove the copies"
     ]
 
 
-def _blur_problems(looks: list[_Look], blurred: list[Path], folder: Path) -> list[str]:
-    values = [look.sharpness for look in looks]
+def _blur_problems(measurements: list[_PixelMeasurement], blurred: list[Path], folder: Path) -> list[str]:
+    """Describe a blurred set, or its blurred photos."""
+    values = [measurement.sharpness for measurement in measurements]
     if np.median(values) < MIN_SHARPNESS:
         return [
             "the photos are blurred, most of them; take them again with the camera held still, in more light, and "
@@ -316,34 +348,43 @@ def _blur_problems(looks: list[_Look], blurred: list[Path], folder: Path) -> lis
         ]
     if not blurred:
         return []
-    names = format_file_names([_below(item, folder) for item in blurred])
+    names = format_file_names([_relative_name(item, folder) for item in blurred])
     return [
-        f"{format_photo_count(len(blurred))} {_is(len(blurred))} blurred ({names}); leave out or retake what is blurred"
+        f"{format_photo_count(len(blurred))} {_be(len(blurred))} blurred ({names}); leave out or retake what is blurred"
     ]
 
 
 def _light_problems(
-    looks: list[_Look], light: np.ndarray, stops: float, folder: Path, scene: Scene | None
+    measurements: list[_PixelMeasurement], light: np.ndarray, stops: float, folder: Path, scene: Scene | None
 ) -> list[str]:
+    """Describe dark, clipped or unevenly exposed photos."""
     if scene is not None and scene.has_alpha:
-        return []  # what is transparent is not dark
+        return []  # transparent pixels are not dark
     found = []
     middle = float(np.median(light))
-    if 2**middle < _DARK:
+    if 2**middle < _MIN_SET_LUMINANCE:
         found.append("the photos are dark; take them in more light, or with a longer exposure and a tripod")
-    dark = [_below(look.path, folder) for look, value in zip(looks, light, strict=True) if value < middle - _DARKER]
+    dark = [
+        _relative_name(measurement.path, folder)
+        for measurement, value in zip(measurements, light, strict=True)
+        if value < middle - _DARK_PHOTO_STOPS
+    ]
     if dark:
         found.append(
-            f"{format_photo_count(len(dark))} {_is(len(dark))} far darker than the others ({format_file_names(dark)}); "
-            "leave out what is dark"
+            f"{format_photo_count(len(dark))} {_be(len(dark))} far darker than the others "
+            f"({format_file_names(dark)}); leave out what is dark"
         )
-    bright = [_below(look.path, folder) for look in looks if look.exposure.bright > _CLIPPED]
-    if len(bright) > len(looks) / 4:
+    bright = [
+        _relative_name(measurement.path, folder)
+        for measurement in measurements
+        if measurement.exposure.bright > _MAX_CLIPPED_PIXEL_RATIO
+    ]
+    if len(bright) > len(measurements) / 4:
         found.append(
-            f"{format_photo_count(len(bright))} {_is(len(bright))} white over a quarter or more "
+            f"{format_photo_count(len(bright))} {_be(len(bright))} white over a quarter or more "
             f"({format_file_names(bright)}); expose less, and lock it"
         )
-    if stops > _UNEVEN:
+    if stops > _MAX_EXPOSURE_SPREAD_STOPS:
         found.append(
             f"the photos differ by {stops:.1f} stops in how light they are; lock exposure and white balance while you "
             "take them"
@@ -352,12 +393,13 @@ def _light_problems(
 
 
 def _zoom_problems(facts: list[PhotoFacts]) -> list[str]:
+    """Describe a mixture of focal lengths of one device."""
     lengths: dict[str, set[float]] = {}
     for fact in facts:
         if fact.focal is not None:
             known = lengths.setdefault(fact.device, set())
             relative = fact.focal / max(fact.size)
-            if not any(abs(relative / other - 1) < _SAME_ZOOM for other in known):
+            if not any(abs(relative / other - 1) < _SAME_ZOOM_TOLERANCE for other in known):
                 known.add(relative)
     most = max((len(values) for values in lengths.values()), default=0)
     if most < 2:
@@ -370,7 +412,7 @@ def _zoom_problems(facts: list[PhotoFacts]) -> list[str]:
 
 
 def _mask_problems(folder: Path, photos: list[Path]) -> list[str]:
-    """Masks that are named as no photo is; with poses the reader says so."""
+    """Describe masks whose names match no photo; for photos with poses, `load_scene` reports them."""
     masks = next((folder / name for name in ("masks", "mask") if (folder / name).is_dir()), None)
     there = [] if masks is None else [file for file in masks.rglob("*") if file.suffix.lower() in PICTURE_SUFFIXES]
     names = {photo.stem for photo in photos} | {photo.name for photo in photos}
@@ -383,11 +425,12 @@ def _mask_problems(folder: Path, photos: list[Path]) -> list[str]:
 
 
 def _header_notes(facts: list[PhotoFacts]) -> list[str]:
+    """Describe rotated, large and panoramic photos."""
     notes = []
     turned = sum(fact.orientation != 1 for fact in facts)
     if turned:
         notes.append(
-            f"{format_photo_count(turned)} {_is(turned)} stored on the side; 'hyrfpack poses' makes upright copies"
+            f"{format_photo_count(turned)} {_be(turned)} stored on the side; 'hyrfpack poses' makes upright copies"
         )
     large = sum(max(fact.size) > DEFAULT_MAX_SIZE for fact in facts)
     if large:
@@ -398,23 +441,25 @@ def _header_notes(facts: list[PhotoFacts]) -> list[str]:
     round_ = sum(fact.size[0] == 2 * fact.size[1] for fact in facts)
     if round_:
         notes.append(
-            f"{format_photo_count(round_)} {_is(round_)} twice as wide as high, as those of 360-degree cameras are"
+            f"{format_photo_count(round_)} {_be(round_)} twice as wide as high, as those of 360-degree cameras are"
         )
     return notes
 
 
-def _camera(fact: PhotoFacts) -> str:
+def _describe_camera(fact: PhotoFacts) -> str:
+    """Return the name of a photo's camera, with its focal length in 35 mm equivalents if known."""
     name = fact.device or "unknown camera"
     return name if fact.focal is None else f"{name}, {fact.focal / np.hypot(*fact.size) * np.hypot(36, 24):.0f} mm"
 
 
-def _counted(items: Iterable[str]) -> dict[str, int]:
+def _count_values(items: Iterable[str]) -> dict[str, int]:
     return dict(Counter(items).most_common())
 
 
-def _below(path: Path, folder: Path) -> str:
+def _relative_name(path: Path, folder: Path) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
 
 
-def _is(count: int) -> str:
+def _be(count: int) -> str:
+    """Return "is" or "are", by the count."""
     return "is" if count == 1 else "are"

@@ -27,7 +27,7 @@ from hyrfpack.demo.run import run_demo
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import CompressionReport, load, repack
 from hyrfpack.lock import exclusive_folder
-from hyrfpack.make.posed import posed
+from hyrfpack.make.auto_pose import auto_pose
 from hyrfpack.render.files import render_files
 from hyrfpack.splats.formats import ply
 from hyrfpack.train import TrainConfig
@@ -305,7 +305,7 @@ CALLS = {  # functions of the library that write into a folder
     "render_files": lambda: list(render_files(load("model.hyrf"), ring_of_two(), "out")),
     "write_report": lambda: write_report("out", "model.hyrf", "packed.hyrf", CompressionReport("paper", 1, 1, 1, [])),
     "run_demo": lambda: run_demo("out", steps=1),
-    "posed": lambda: posed(Path("photos"), Path("out")),
+    "posed": lambda: auto_pose(Path("photos"), Path("out")),
 }
 
 

@@ -17,7 +17,7 @@ import hyrfpack
 from hyrfpack.data import unusable
 from hyrfpack.data.unusable import format_file_names, raw_photos_notes, unreadable_sentences
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.make.source import Reading, Source
+from hyrfpack.make.source import LoadSettings, Source
 
 HEIC_HEADER = b"\0\0\0\x18ftypheic" + bytes(40)
 
@@ -132,7 +132,7 @@ def test_make_takes_a_folder_whose_first_photo_cannot_be_read(tmp_path, monkeypa
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     folder = save_photos(tmp_path / "photos", 3)
     (folder / "0-first.heic").write_bytes(HEIC_HEADER)
-    source = Source.of(folder, Reading())
+    source = Source.from_path(folder, LoadSettings())
     assert source.kind == "photos" and len(source.files()) == 4
     assert hyrfpack.data.folder.first_readable_photo(source.files()).size == (64, 48)
 

@@ -11,8 +11,8 @@ from commands import succeeded
 
 from hyrfpack import load_scene
 from hyrfpack.make import make
-from hyrfpack.make.held_out import MAX_PSNR_GAP_DB, inner_view, score_note
-from hyrfpack.make.source import Reading
+from hyrfpack.make.held_out import MAX_PSNR_GAP_DB, choose_inner_view, score_note
+from hyrfpack.make.source import LoadSettings
 from hyrfpack.scene import Camera, Scene, View
 from hyrfpack.train import photos_of
 
@@ -38,19 +38,19 @@ def scene_of(cameras: list[Camera], points: bool = True) -> Scene:
 def test_of_a_row_of_cameras_one_that_is_no_end_is_held_out(points):
     places = [(x, 0.0, -5.0) for x in np.linspace(-2, 2, 9)]
     cameras = [looking_at(place, (place[0], 0.0, 0.0)) for place in places]
-    assert inner_view(scene_of(cameras, points)).name in {"02.jpg", "03.jpg", "04.jpg", "05.jpg", "06.jpg"}
+    assert choose_inner_view(scene_of(cameras, points)).name in {"02.jpg", "03.jpg", "04.jpg", "05.jpg", "06.jpg"}
 
 
 def test_of_a_grid_of_cameras_the_one_in_the_middle_is_held_out():
     places = [(x, y, -5.0) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)]
     cameras = [looking_at(place, (place[0], place[1], 0.0)) for place in places]
-    assert inner_view(scene_of(cameras)).name == "04.jpg"
+    assert choose_inner_view(scene_of(cameras)).name == "04.jpg"
 
 
 def test_of_an_arc_with_an_outermost_first_photo_another_is_held_out():
     angles = np.radians([-80, -20, -12, -4, 4, 12, 20, 28, 36, 44, 52])
     cameras = [looking_at((5 * np.sin(a), 0.0, -5 * np.cos(a)), (0.0, 0.0, 0.0)) for a in angles]
-    chosen = inner_view(scene_of(cameras)).name
+    chosen = choose_inner_view(scene_of(cameras)).name
     assert chosen not in {"00.jpg", "01.jpg", "09.jpg", "10.jpg"}
 
 
@@ -58,19 +58,19 @@ def test_a_camera_in_the_middle_of_others_that_looks_elsewhere_is_not_held_out()
     places = [(x, y, -5.0) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)]
     cameras = [looking_at(place, (place[0], place[1], 0.0)) for place in places]
     cameras[4] = looking_at((0.0, 0.0, -5.0), (0.2, 0.0, -9.0))
-    assert inner_view(scene_of(cameras)).name != "04.jpg"
+    assert choose_inner_view(scene_of(cameras)).name != "04.jpg"
 
 
 def test_cameras_in_one_place_can_be_told_too():
     cameras = [looking_at((0.0, 0.0, 0.0), (np.sin(a), 0.0, np.cos(a))) for a in np.radians(range(0, 90, 10))]
-    assert inner_view(scene_of(cameras, points=False)).name not in {"00.jpg", "08.jpg"}
+    assert choose_inner_view(scene_of(cameras, points=False)).name not in {"00.jpg", "08.jpg"}
 
 
 @pytest.mark.parametrize("count, held_out", [(7, 0), (8, 1), (15, 1), (16, 2)])
 def test_small_sets_hold_out_an_inner_photo_and_larger_ones_every_eighth(count, held_out, posed, tmp_path):
     few = first_photos(posed, tmp_path, count)
-    scene = Reading().scene(few)
-    expected = [] if held_out == 0 else [inner_view(scene).name] if held_out == 1 else ["0000.png", "0008.png"]
+    scene = LoadSettings().load(few)
+    expected = [] if held_out == 0 else [choose_inner_view(scene).name] if held_out == 1 else ["0000.png", "0008.png"]
     assert [view.name for view in scene.test] == expected
     assert [view.name for view in load_scene(few).test] == ["0000.png", "0008.png"][: 2 if count > 8 else 1]
 
@@ -81,14 +81,14 @@ def test_a_split_of_the_sets_own_counts(posed, tmp_path):
     names = [frame["file_path"] for frame in table["frames"]]
     table |= {"train_filenames": names[:-1], "val_filenames": [], "test_filenames": names[-1:]}
     (few / "transforms.json").write_text(json.dumps(table))
-    assert [view.name for view in Reading().scene(few).test] == ["0008.png"]
+    assert [view.name for view in LoadSettings().load(few).test] == ["0008.png"]
 
 
 def test_a_run_of_a_small_set_finds_its_photos_again_with_the_same_one_held_out(posed, tmp_path):
     few = first_photos(posed, tmp_path, 9)
     work = make(few, tmp_path / "scene.hyrf", quality="draft").work
     again = photos_of(work / "run" / "model.hyrf")
-    assert [view.name for view in again.test] == [inner_view(again).name]
+    assert [view.name for view in again.test] == [choose_inner_view(again).name]
 
 
 @pytest.mark.parametrize(

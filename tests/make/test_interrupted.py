@@ -16,7 +16,7 @@ import pytest
 from hyrfpack.atomic import TEMPORARY_PREFIX
 from hyrfpack.errors import HyrfError
 from hyrfpack.make import Stopped, make, stages
-from hyrfpack.make.work import interruptible
+from hyrfpack.make.stage_cache import interruptible
 
 STAGES = {  # and what does each of them
     "training": "train",
@@ -92,7 +92,7 @@ def test_an_interrupt_in_poses_goes_on(photos, poses, tmp_path, monkeypatch):
 
 
 def test_an_output_that_was_copied_in_part_is_gone_on_with(posed, tmp_path, monkeypatch):
-    usual, copies = stages.copy, []
+    usual, copies = stages.copy_file, []
 
     def stop(source, target, **options):
         copies.append(target)
@@ -101,7 +101,7 @@ def test_an_output_that_was_copied_in_part_is_gone_on_with(posed, tmp_path, monk
         usual(source, target, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(stages, "copy", stop)
+        patch.setattr(stages, "copy_file", stop)
         with pytest.raises(Stopped):
             make(posed, tmp_path / "player", quality="draft")
     assert len(list((tmp_path / "player").iterdir())) == 2
@@ -174,7 +174,7 @@ def start(posed: Path, output: Path) -> subprocess.Popen:
 
 def test_the_time_of_interrupted_and_killed_calls_counts(posed, tmp_path, monkeypatch):
     clock = [0.0]
-    monkeypatch.setattr("hyrfpack.make.work.monotonic", lambda: clock[0])
+    monkeypatch.setattr("hyrfpack.make.stage_cache.monotonic", lambda: clock[0])
 
     def end(seconds: float, error: BaseException):
         def train(*arguments, **options):

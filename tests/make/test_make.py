@@ -145,10 +145,10 @@ def test_a_model_with_an_exposure_map_is_scored_as_render_shows_it_and_at_one_ex
     state = SimpleNamespace(inputs=lambda stage: {"photos and poses": ""})
     reporter = Reporter(["scoring"], None)
     stage = lambda name, inputs, act: act(False)[0]  # noqa: E731
-    work = SimpleNamespace(folder=tmp_path, state=state, reporter=reporter, stage=stage)
+    work = SimpleNamespace(folder=tmp_path, state=state, reporter=reporter, run_stage=stage)
     scene = load_scene(posed)
 
-    scores = stages.score(work, scene, torch.device("cpu"))
+    scores = stages.run_scoring_stage(work, scene, torch.device("cpu"))
 
     expected = evaluate(model, scene.test)
     assert scores == {

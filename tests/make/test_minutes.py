@@ -10,10 +10,10 @@ import torch
 
 from hyrfpack.data import PictureCache, load_scene
 from hyrfpack.make import make, minutes
-from hyrfpack.make.minutes import Cost, measure
+from hyrfpack.make.minutes import SceneCost, fit_plan_to_minutes
 from hyrfpack.make.plan import Plan
 from hyrfpack.make.progress import Reporter
-from hyrfpack.make.source import Reading
+from hyrfpack.make.source import LoadSettings
 from hyrfpack.train import decisions
 from hyrfpack.train.config import FULL_STEPS
 
@@ -22,7 +22,9 @@ def asked(target_bytes: int | None = None, max_gaussians: int | None = None) -> 
     return Plan(3_000, 1_600, target_bytes=target_bytes, max_gaussians=max_gaussians)
 
 
-COST = Cost(step=0.1, step_per_gaussian=1e-6, decoding=0.01, cpu_pass=0.05, gaussians=5_000)
+COST = SceneCost(
+    step_seconds=0.1, step_seconds_per_gaussian=1e-6, decoding_seconds=0.01, cpu_pass_seconds=0.05, gaussians=5_000
+)
 CPU = torch.device("cpu")
 
 
@@ -33,53 +35,60 @@ def scene(posed):
 
 @pytest.mark.parametrize("seconds", [60.0, 300.0, 1500.0])
 def test_the_most_steps_that_fit_are_taken(seconds, scene):
-    steps = COST.steps_within(scene, seconds)
+    steps = COST.max_steps_within(scene, seconds)
     assert 1 < steps < FULL_STEPS
-    assert COST.total(scene, steps) <= seconds < COST.total(scene, steps + 1)
+    assert COST.total_seconds(scene, steps) <= seconds < COST.total_seconds(scene, steps + 1)
 
 
 def test_steps_end_at_a_full_run(scene):
-    assert COST.steps_within(scene, 1e9) == FULL_STEPS
-    assert COST.steps_within(scene, 0.0) == 1
+    assert COST.max_steps_within(scene, 1e9) == FULL_STEPS
+    assert COST.max_steps_within(scene, 0.0) == 1
 
 
 def test_more_pixels_take_as_much_longer(scene):
-    four = COST.scaled(4.0)
-    assert four.training(scene, 1000) - COST.training(scene, 1000) == pytest.approx(
-        3 * (COST.training(scene, 1000) - COST.decoding * len(scene.train))
+    four = COST.scaled_to_pixels(4.0)
+    assert four.training_seconds(scene, 1000) - COST.training_seconds(scene, 1000) == pytest.approx(
+        3 * (COST.training_seconds(scene, 1000) - COST.decoding_seconds * len(scene.train))
     )
 
 
 def test_a_smaller_model_takes_less_time(scene):
-    small = replace(COST, asked=asked(15_000))
-    assert small.training(scene, 1000) < COST.training(scene, 1000)
-    assert small.after(scene, 1000)["compression"] < COST.after(scene, 1000)["compression"]
+    small = replace(COST, requested=asked(15_000))
+    assert small.training_seconds(scene, 1000) < COST.training_seconds(scene, 1000)
+    assert (
+        small.seconds_after_training(scene, 1000)["compression"]
+        < COST.seconds_after_training(scene, 1000)["compression"]
+    )
 
 
 def test_a_line_goes_through_what_is_on_a_line_and_never_falls():
     counts = list(range(100, 1000, 20))
-    assert minutes._line_through(counts, [0.5 + 1e-3 * n for n in counts]) == pytest.approx((0.5, 1e-3))
-    assert minutes._line_through(counts, [2 - 1e-3 * n for n in counts]) == (pytest.approx(1.16), 0.0)
-    assert minutes._line_through([7] * 9, [0.1] * 9) == (pytest.approx(0.1), 0.0)
+    assert minutes._fit_line(counts, [0.5 + 1e-3 * n for n in counts]) == pytest.approx((0.5, 1e-3))
+    assert minutes._fit_line(counts, [2 - 1e-3 * n for n in counts]) == (pytest.approx(1.16), 0.0)
+    assert minutes._fit_line([7] * 9, [0.1] * 9) == (pytest.approx(0.1), 0.0)
 
 
 def test_a_measurement_gives_a_cost_of_this_scene(scene):
-    cost = minutes.probe(scene, asked(), CPU, 0, PictureCache(), 5.0)
-    assert cost.step >= 0 and cost.step_per_gaussian >= 0 and cost.step + cost.step_per_gaussian > 0
-    assert cost.cpu_pass > 0 and cost.decoding >= 0 and cost.gaussians > 0
+    cost = minutes.measure_scene_cost(scene, asked(), CPU, 0, PictureCache(), 5.0)
+    assert (
+        cost.step_seconds >= 0
+        and cost.step_seconds_per_gaussian >= 0
+        and cost.step_seconds + cost.step_seconds_per_gaussian > 0
+    )
+    assert cost.cpu_pass_seconds > 0 and cost.decoding_seconds >= 0 and cost.gaussians > 0
 
 
 def test_large_photos_are_made_smaller_where_the_time_is_short(posed, scene, monkeypatch):
     def cost(scene, *_):
-        return Cost(1e-3 * scene.train[0].camera.width ** 2, 0.0, 0.0, 0.0, 100)
+        return SceneCost(1e-3 * scene.train[0].camera.width ** 2, 0.0, 0.0, 0.0, 100)
 
-    monkeypatch.setattr(minutes, "probe", cost)
-    monkeypatch.setattr(minutes, "SIZES", (24, 16, 8))
+    monkeypatch.setattr(minutes, "measure_scene_cost", cost)
+    monkeypatch.setattr(minutes, "CANDIDATE_PHOTO_SIZES", (24, 16, 8))
     said: list[str] = []
 
     def planned(seconds: float) -> Plan:
-        arguments = (posed, Reading(), scene, asked(90_000), CPU, monotonic() + seconds, 0, PictureCache())
-        return measure(*arguments, Reporter(["training"], None), said.append)
+        arguments = (posed, LoadSettings(), scene, asked(90_000), CPU, monotonic() + seconds, 0, PictureCache())
+        return fit_plan_to_minutes(*arguments, Reporter(["training"], None), said.append)
 
     plans = [planned(seconds) for seconds in (3000.0, 300.0, 100.0)]
     assert [plan.max_size for plan in plans] == [1600, 16, 8] and {plan.target_bytes for plan in plans} == {90_000}
@@ -87,12 +96,12 @@ def test_large_photos_are_made_smaller_where_the_time_is_short(posed, scene, mon
 
 
 def test_a_long_run_has_the_budget_that_the_scene_is_worth_and_a_short_one_all(posed, scene, monkeypatch):
-    monkeypatch.setattr(minutes, "probe", lambda *_: Cost(0.0, 1e-5, 0.0, 0.0, 100))
+    monkeypatch.setattr(minutes, "measure_scene_cost", lambda *_: SceneCost(0.0, 1e-5, 0.0, 0.0, 100))
     monkeypatch.setattr(decisions, "measure_budget", lambda *_: (0.5, "by a coin"))
 
     def planned(seconds: float, target_bytes: int | None = None) -> Plan:
-        arguments = (posed, Reading(), scene, asked(target_bytes), CPU, monotonic() + seconds, 0, PictureCache())
-        return measure(*arguments, Reporter(["training"], None), lambda sentence: None)
+        arguments = (posed, LoadSettings(), scene, asked(target_bytes), CPU, monotonic() + seconds, 0, PictureCache())
+        return fit_plan_to_minutes(*arguments, Reporter(["training"], None), lambda sentence: None)
 
     short, long, targeted = planned(60.0), planned(600.0), planned(600.0, 90_000)
     assert short.steps < decisions.MIN_BUDGET_STEPS <= long.steps
@@ -104,30 +113,30 @@ def test_a_long_run_has_the_budget_that_the_scene_is_worth_and_a_short_one_all(p
 def test_a_time_that_is_over_or_too_short_makes_a_draft_and_says_so(posed, scene):
     said: list[str] = []
     for seconds in (-1.0, 0.5):
-        arguments = (posed, Reading(), scene, asked(20_000), CPU, monotonic() + seconds, 0, PictureCache())
-        plan = measure(*arguments, Reporter(["training"], None), said.append)
+        arguments = (posed, LoadSettings(), scene, asked(20_000), CPU, monotonic() + seconds, 0, PictureCache())
+        plan = fit_plan_to_minutes(*arguments, Reporter(["training"], None), said.append)
         assert (plan.steps, plan.target_bytes) == (6, 20_000)
     assert "the time is over" in said[0] and "the time is short" in said[1]
 
 
 def test_a_number_of_gaussians_is_kept_to_and_no_budget_measured(posed, scene, monkeypatch):
-    monkeypatch.setattr(minutes, "probe", lambda *_: Cost(0.0, 1e-5, 0.0, 0.0, 100))
+    monkeypatch.setattr(minutes, "measure_scene_cost", lambda *_: SceneCost(0.0, 1e-5, 0.0, 0.0, 100))
     monkeypatch.setattr(decisions, "measure_budget", None)
-    arguments = (posed, Reading(), scene, asked(max_gaussians=700), CPU, monotonic() + 600, 0, PictureCache())
-    plan = measure(*arguments, Reporter(["training"], None), lambda sentence: None)
-    assert (plan.config(0).max_gaussians, plan.budget_factor) == (700, None)
+    arguments = (posed, LoadSettings(), scene, asked(max_gaussians=700), CPU, monotonic() + 600, 0, PictureCache())
+    plan = fit_plan_to_minutes(*arguments, Reporter(["training"], None), lambda sentence: None)
+    assert (plan.train_config(0).max_gaussians, plan.budget_factor) == (700, None)
 
 
 def test_photos_are_never_larger_than_asked_for(posed, scene, monkeypatch):
-    monkeypatch.setattr(minutes, "probe", lambda *_: Cost(1e-3, 0.0, 0.0, 0.0, 100))
-    reading = Reading(max_size=24)
+    monkeypatch.setattr(minutes, "measure_scene_cost", lambda *_: SceneCost(1e-3, 0.0, 0.0, 0.0, 100))
+    reading = LoadSettings(max_size=24)
     for seconds in (600.0, -1.0):
-        arguments = (posed, reading, reading.scene(posed), asked(90_000), CPU, monotonic() + seconds, 0, PictureCache())
-        assert measure(*arguments, Reporter(["training"], None), lambda sentence: None).max_size == 24
+        arguments = (posed, reading, reading.load(posed), asked(90_000), CPU, monotonic() + seconds, 0, PictureCache())
+        assert fit_plan_to_minutes(*arguments, Reporter(["training"], None), lambda sentence: None).max_size == 24
 
 
 def test_what_was_decided_is_kept(posed, tmp_path, monkeypatch):
     first = make(posed, tmp_path / "scene.hyrf", minutes=0.01)
     assert list(first.seconds)[0] == "measurement"
-    monkeypatch.setattr(minutes, "probe", None)
+    monkeypatch.setattr(minutes, "measure_scene_cost", None)
     assert "measurement" in make(posed, tmp_path / "scene.ply", minutes=0.01).kept

@@ -158,7 +158,7 @@ def test_poses_that_cannot_be_used_are_a_problem_of_the_set(data, tmp_path):
 
 
 def test_large_sets_are_looked_at_in_part(photos, monkeypatch):
-    monkeypatch.setattr("hyrfpack.make.survey.MOST_DECODED", 8)
+    monkeypatch.setattr("hyrfpack.make.survey.MAX_DECODED_PHOTOS", 8)
     survey = describe_photos(photos)
     assert survey.decoded == 8 and any("8 of 24 photos" in note for note in survey.notes)
 

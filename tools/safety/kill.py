@@ -39,7 +39,7 @@ import hyrfpack
 from hyrfpack.atomic import TEMPORARY_PREFIX, TEMPORARY_SUFFIX
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
-from hyrfpack.make.state import NAME as RECORD
+from hyrfpack.make.state import RECORD_NAME as RECORD
 from hyrfpack.train.checkpoint import DIGEST_BYTES
 
 ENVIRONMENT = {**os.environ, "HYRFPACK_THREADS": "1", "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
