@@ -6,7 +6,7 @@ import numpy as np
 
 from hyrfpack.scene import Scene, View
 
-NEAREST_CAMERAS = 4  # a camera is compared with so many neighbours
+NEAREST_CAMERAS = 4  # a camera is compared with its nearest neighbours
 MAX_WEAK_VIEWS = 2  # the mean score of so few held-out photos depends on which ones are held out
 # A held-out PSNR this far below that of the photos trained on means four times their squared error.
 MAX_PSNR_GAP_DB = 6.0

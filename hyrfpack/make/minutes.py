@@ -37,14 +37,14 @@ PROBE_STEPS = 45  # a complete small run, from the first Gaussians to the budget
 PROBE_DENSITY = DensityConfig(stop=0.6, peak=0.6, excess=1.0)
 PROBE_WARM_UP_STEPS = 3  # the first steps compile kernels
 MAX_PROBE_TIME_RATIO = 0.06  # a probe takes at most this ratio of the remaining time
-MIN_USEFUL_STEPS = 1_000  # if there is no time for so many steps, smaller photos give a better scene
+MIN_USEFUL_STEPS = 1_000  # with fewer steps, smaller photos give a better scene
 CANDIDATE_PHOTO_SIZES = (1200, 800, 600, 400)  # longer sides in pixels, tried in this order
 MIN_PROBE_PHOTO_SIZE = 640  # photos are not shrunk below this size in pixels for the first probe
 TRAINED_PACE_RATIO = 0.92  # steps of a trained scene take this ratio of the probe's time, because more is hidden
 # A pass, which renders a view on the CPU and back-propagates through it, is the unit of the work after training.
-VERIFICATION_VIEWS = 12  # packing renders so many views to verify its result
+VERIFICATION_VIEWS = 12  # packing verifies its result on this number of views
 CODING_SECONDS_PER_GAUSSIAN = 1.5e-4
-OVERHEAD_SECONDS = 6.0  # coding and writing take so long for a model of any size
+OVERHEAD_SECONDS = 6.0  # for coding and writing a model of any size
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class SceneCost:
         }
 
     def _budget(self, scene: Scene, steps: int) -> int:
-        """Return the budget of a training with so many steps."""
+        """Return the budget of a training with this number of steps."""
         return budget_for(scene, dataclasses.replace(self.requested, steps=steps).train_config(seed=0))[0]
 
     def total_seconds(self, scene: Scene, steps: int) -> float:

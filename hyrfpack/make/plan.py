@@ -23,8 +23,8 @@ from hyrfpack.train.setup import budget_for
 CPU_STEP_SECONDS_PER_MEGAPIXEL = 0.7  # a training step
 GPU_STEP_SECONDS_PER_MEGAPIXEL = 0.02
 CPU_PASS_SECONDS_PER_MEGAPIXEL = 0.6  # a pass renders a view and back-propagates through it
-BACKGROUND_SEARCH_PASSES = 8.0  # the search for a background in unseen directions takes as long as so many passes
-PASSES_PER_SCORED_VIEW = 2.0  # scoring a held-out photo and writing its picture takes as long as so many passes
+BACKGROUND_SEARCH_PASSES = 8.0  # time of the search for a background in unseen directions
+PASSES_PER_SCORED_VIEW = 2.0  # time of scoring a held-out photo and writing its picture
 POSE_SECONDS_PER_PHOTO = 3.0
 ASSUMED_VIDEO_PHOTOS = 100  # before a video is decoded, the number of its photos is unknown
 

@@ -133,7 +133,7 @@ class StageCache:
 
 
 class _StageClock:
-    """Records the time of a running stage from time to time, so that a killed process loses little of it."""
+    """Records the time of a running stage at intervals, so that a killed process loses little of it."""
 
     def __init__(self, state: WorkFolderState, stage: str) -> None:
         self._state, self._stage, self._since = state, stage, monotonic()

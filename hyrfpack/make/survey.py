@@ -38,7 +38,7 @@ MAX_OPENED_PHOTOS = 2000
 _MIN_RECOMMENDED_PHOTOS = 20  # fewer photos hardly show an object from all sides
 _MAX_EXPOSURE_SPREAD_STOPS = 2.5  # between the 5 % and 95 % quantiles; real sets at one exposure have up to 2
 _MIN_SET_LUMINANCE = 0.02  # a set with a lower median of the mean luminances is dark
-_DARK_PHOTO_STOPS = 3.0  # a photo so far below the median of its set is dark
+_DARK_PHOTO_STOPS = 3.0  # a photo this far below the median of its set is dark
 _MAX_CLIPPED_PIXEL_RATIO = 0.25
 _SAME_ZOOM_TOLERANCE = 0.03  # EXIF rounds focal lengths by up to this ratio
 _SAME_PICTURE_MAX_LEVELS = 1.0  # thumbnails of the same picture differ by less, in levels of 255 on average
@@ -50,7 +50,7 @@ _THUMBNAIL_SIDE_PIXELS = 24
 
 @dataclass(frozen=True)
 class PhotoSurvey:
-    """Description of a set of photos or a video; `dataclasses.asdict` of it is written as JSON.
+    """Description of a set of photos or a video, which `dataclasses.asdict` turns into JSON values.
 
     Attributes:
         path: the path that was described.

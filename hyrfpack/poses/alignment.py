@@ -11,7 +11,7 @@ import numpy as np
 # most this angle.
 MAX_POSITION_DIFFERENCE_RATIO = 0.02
 MAX_ROTATION_DIFFERENCE_DEGREES = 5.0
-_MAX_CANDIDATE_PAIRS = 4000  # a similarity is computed from each of at most so many pairs of cameras
+_MAX_CANDIDATE_PAIRS = 4000  # each sampled pair of cameras yields one candidate similarity
 _MAX_REFINEMENT_ROUNDS = 20
 
 Poses = Mapping[str, np.ndarray]  # (3, 4) camera_from_world by photo name

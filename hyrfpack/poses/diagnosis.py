@@ -16,7 +16,7 @@ from hyrfpack.poses.prepare import COPY_REASON_PREFIX, select_unreadable
 MIN_PHOTOS = 3
 _MIN_TYPICAL_FEATURES = 60  # photos with fewer features cannot be matched
 _MIN_CONTENT_SHARPNESS = 0.1  # a blurred photo that shows something is sharper than this
-_PANORAMA_PAIR_RATIO = 0.8  # with so many pairs without translation, the photos were taken from one place
+_PANORAMA_PAIR_RATIO = 0.8  # from this ratio of pairs without translation on, the photos show one place
 
 
 def check_photo_count(given: Path, folder: Path, usable: int, left_out: Mapping[str, str]) -> None:

@@ -12,7 +12,7 @@ HLG = 18
 
 _REFERENCE_WHITE_CD_M2 = 203.0  # diffuse white of PQ and HLG pictures according to ITU-R BT.2408
 _KNEE_WHITE_RATIO = 0.7  # light above this ratio of the reference white is compressed, light below it is kept
-_ROWS_PER_BAND = 32  # a band of so few rows stays in the processor's cache
+_ROWS_PER_BAND = 32  # a band of this height stays in the processor's cache
 _SRGB_TABLE_STEPS = 65535
 _BT2020_LUMA_WEIGHTS = np.array((0.2627, 0.6780, 0.0593), np.float32)
 _BT709_FROM_BT2020 = np.array(  # matrix of ITU-R BT.2087

@@ -10,10 +10,10 @@ MAX_EXHAUSTIVE_PHOTOS = 200  # in larger unordered sets, only similar photos are
 _VOCABULARY_WORDS = 64
 _VOCABULARY_SAMPLE_DESCRIPTORS = 50_000
 _KMEANS_ITERATIONS = 12
-# Each photo of an unordered set is matched with so many similar photos, and neighbours by name on each side.
+# Partners of a photo in an unordered set: similar photos, and neighbours by name on each side.
 _RETRIEVAL_SIMILAR_PHOTOS = 40
 _RETRIEVAL_NEIGHBOURS = 5
-# Each photo of a sequence is matched with so many next photos, and similar ones farther away, which close loops.
+# Partners of a photo in a sequence: the next photos, and similar ones farther away, which close loops.
 _SEQUENTIAL_NEIGHBOURS = 10
 _LOOP_CLOSURE_PHOTOS = 8
 
