@@ -136,7 +136,7 @@ class Container:
     def open(
         cls, path: str | os.PathLike[str], known: Collection[str] | None = None, fraction: float | None = None
     ) -> Container:
-        """Open a `.hyrf` file, or the model in the folder of a training run, and read its header and contents.
+        """Open a `.hyrf` file, or the model in the folder of a training run, and read its table of contents.
 
         The other arguments are those of the constructor.
 

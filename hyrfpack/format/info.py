@@ -38,7 +38,7 @@ def section_sizes(container: Container) -> list[SectionSize]:
 
 
 def describe(path: str | os.PathLike[str], fraction: float | None = None) -> dict:
-    """Describe a `.hyrf` file without decoding it: only the header, table of contents, metadata and exposure are read.
+    """Describe a `.hyrf` file from its header, table of contents, metadata and exposure, without decoding the model.
 
     Args:
         path: the file, or the folder of a training run, see `hyrfpack.format.find_model`.

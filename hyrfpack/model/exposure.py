@@ -122,7 +122,7 @@ class ExposureMap:
         return np.clip(logs, *self.limits.astype(np.float64)).reshape(np.shape(position))
 
     def kernel_at(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return the kernel (N, M) of viewpoints, positions and directions (N, 3), and the map's centres."""
+        """Return the kernel (N, M) between viewpoints, given by positions and directions (N, 3), and the centres."""
         return inverse_quadratic_kernel(
             self._features(np.clip(positions, *self.box.astype(np.float64)), directions), self._centers
         )

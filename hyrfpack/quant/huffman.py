@@ -101,7 +101,7 @@ class HuffmanCode:
     def left_aligned_codes(self) -> np.ndarray:
         """Return the (n,) uint64 codes, each shifted so that its first bit is bit 63."""
         shares = np.uint64(1) << (np.uint64(64) - self.lengths.astype(np.uint64))
-        return np.cumsum(shares, dtype=np.uint64) - shares  # no overflow: only the sum of all shares is 2^64
+        return np.cumsum(shares, dtype=np.uint64) - shares  # exact although the last sum, 2^64, wraps to 0
 
     @property
     def codes(self) -> np.ndarray:
