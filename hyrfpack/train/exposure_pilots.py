@@ -24,6 +24,9 @@ MIN_EXPOSURE_VALIDATION_VIEWS = 6  # in all folds together
 MIN_EXPOSURE_ROUNDS = 2
 MIN_EXPOSURE_SPREAD_STOPS = 0.05  # Photos whose exposures have a smaller standard deviation need no gains.
 MIN_EXPOSURE_GAIN_DB = 0.1
+# A gain must also be so many times its standard error over the validation photos. One would reject sets whose long runs
+# gain 0.8 dB, because long runs gain more than pilots.
+MIN_GAIN_STANDARD_ERRORS = 0.5
 MAX_VIEW_GAIN_DB = (
     3.0  # One photo counts no more, either way: one whose exposure nothing predicts must not decide alone.
 )
@@ -51,9 +54,9 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
     """Measure whether learning per-image gains makes renders more like photos that were not trained on.
 
     Each round trains a pilot with gains and one without on the same fold. Gains are learnt where the mean gain in plain
-    PSNR over the validation photos of all rounds is at least `MIN_EXPOSURE_GAIN_DB` and no less than its standard
-    error. Otherwise the safe default stands: no gains. The rounds end early where the mean gain is not positive. The
-    gain of each photo counts up to `MAX_VIEW_GAIN_DB` either way.
+    PSNR over the validation photos of all rounds is at least `MIN_EXPOSURE_GAIN_DB` and at least
+    `MIN_GAIN_STANDARD_ERRORS` times its standard error. Otherwise the safe default stands: no gains. The rounds end
+    early if the mean gain is not positive. The gain of each photo counts up to `MAX_VIEW_GAIN_DB` either way.
 
     Returns:
         Whether gains are to be learnt, and the reason in words.
@@ -83,7 +86,7 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
         if np.mean(gains) <= 0:
             break
     gain, error = float(np.mean(gains)), float(np.std(gains, ddof=1) / np.sqrt(len(gains)))
-    return gain >= max(MIN_EXPOSURE_GAIN_DB, error), (
+    return gain >= max(MIN_EXPOSURE_GAIN_DB, MIN_GAIN_STANDARD_ERRORS * error), (
         f"in {steps} steps gains and exposure map scored {gain:+.2f} dB of plain PSNR (standard error "
         f"{error:.2f}) on {len(gains)} validation photos"
     )
