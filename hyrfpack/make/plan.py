@@ -156,7 +156,7 @@ def estimate_photos_seconds(sizes: Sequence[tuple[int, int]], plan: Plan, device
     width, height = sizes[0] if sizes else (1920, 1080)
     shrunk = min(1.0, plan.max_size / max(width, height)) if plan.max_size else 1.0
     pixels, count = width * height * shrunk**2 / 1e6, len(sizes) or ASSUMED_VIDEO_PHOTOS
-    pilot_steps = MAX_BUDGET_PILOT_STEPS + max_exposure_pilot_steps(count - count // 8)
+    pilot_steps = MAX_BUDGET_PILOT_STEPS + max_exposure_pilot_steps(count - count // 8, plan.steps)
     pilot_steps *= plan.steps >= MIN_BUDGET_STEPS
     return {
         "poses": POSE_SECONDS_PER_PHOTO * count,

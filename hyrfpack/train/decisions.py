@@ -51,24 +51,20 @@ def measures_budget(scene: Scene, config: TrainConfig) -> bool:
 
 
 def measures_exposure(scene: Scene, config: TrainConfig) -> bool:
-    """Return whether pilots decide on per-image gains: no setting does, there are enough photos, and all are opaque.
-
-    The pilots must not take more steps than the run.
-    """
-    count = len(scene.train)
-    is_open = config.exposure is None and not scene.has_alpha and count >= MIN_TRAINING_VIEWS
-    return is_open and config.steps >= max(MIN_EXPOSURE_STEPS, max_exposure_pilot_steps(count))
+    """Return whether pilots decide on per-image gains: no setting does, and run and photos allow it."""
+    is_open = config.exposure is None and not scene.has_alpha
+    return is_open and config.steps >= MIN_EXPOSURE_STEPS and len(scene.train) >= MIN_TRAINING_VIEWS
 
 
 def max_pilot_steps(scene: Scene, config: TrainConfig) -> int:
     """Return the most steps that all pilots of a run take."""
     budget = MAX_BUDGET_PILOT_STEPS * measures_budget(scene, config)
-    return budget + max_exposure_pilot_steps(len(scene.train)) * measures_exposure(scene, config)
+    return budget + max_exposure_pilot_steps(len(scene.train), config.steps) * measures_exposure(scene, config)
 
 
-def max_exposure_pilot_steps(count: int) -> int:
-    """Return the most steps that the pilots for exposure take, of `count` training photos."""
-    return 2 * exposure_rounds(count) * exposure_pilot_steps(count)
+def max_exposure_pilot_steps(count: int, steps: int) -> int:
+    """Return the most steps that the pilots for exposure take before a run of `steps` steps on `count` photos."""
+    return 2 * exposure_rounds(count) * exposure_pilot_steps(steps)
 
 
 def without_pilots(config: TrainConfig) -> Decisions:

@@ -11,11 +11,12 @@ import numpy as np
 from hyrfpack.train.exposure import exposure_spread
 from hyrfpack.train.pilots import ScenePilots
 
-EXPOSURE_PILOT_STEPS = 150
-# With few photos, pilots of 150 and 300 steps underestimate the gain of a 3,000-step run by up to 3.9 dB: the longer a
-# model without gains trains, the more it fits each photo's exposure by view-dependent colours.
-FEW_PHOTOS_EXPOSURE_PILOT_STEPS = 500
-MAX_FEW_PHOTOS = 31
+# Each pilot takes this share of the run's steps, within limits. Short pilots underestimate the gain of long runs, by up
+# to 3.9 dB with 12 photos: the longer a model without gains trains, the more it fits each photo's exposure by
+# view-dependent colours.
+EXPOSURE_PILOT_SHARE = 1 / 6
+MIN_EXPOSURE_PILOT_STEPS = 150
+MAX_EXPOSURE_PILOT_STEPS = 500
 # Of so many training photos, one validates. The other decisions need fewer validation photos, because the predicted
 # exposure of a single photo has a large error.
 EXPOSURE_VALIDATION_EVERY = 4
@@ -27,14 +28,15 @@ MIN_EXPOSURE_GAIN_DB = 0.1
 # A gain must also be so many times its standard error over the validation photos. One would reject sets whose long runs
 # gain 0.8 dB, because long runs gain more than pilots.
 MIN_GAIN_STANDARD_ERRORS = 0.5
+CLEAR_GAIN_STANDARD_ERRORS = 2.0  # A gain of so many needs no further round.
 MAX_VIEW_GAIN_DB = (
     3.0  # One photo counts no more, either way: one whose exposure nothing predicts must not decide alone.
 )
 
 
-def exposure_pilot_steps(count: int) -> int:
-    """Return the steps of each pilot for a scene of `count` training photos."""
-    return EXPOSURE_PILOT_STEPS if count > MAX_FEW_PHOTOS else FEW_PHOTOS_EXPOSURE_PILOT_STEPS
+def exposure_pilot_steps(steps: int) -> int:
+    """Return the steps of each pilot before a run of `steps` steps."""
+    return min(max(round(EXPOSURE_PILOT_SHARE * steps), MIN_EXPOSURE_PILOT_STEPS), MAX_EXPOSURE_PILOT_STEPS)
 
 
 def exposure_rounds(count: int) -> int:
@@ -56,7 +58,7 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
     Each round trains a pilot with gains and one without on the same fold. Gains are learnt where the mean gain in plain
     PSNR over the validation photos of all rounds is at least `MIN_EXPOSURE_GAIN_DB` and at least
     `MIN_GAIN_STANDARD_ERRORS` times its standard error. Otherwise the safe default stands: no gains. The rounds end
-    early if the mean gain is not positive. The gain of each photo counts up to `MAX_VIEW_GAIN_DB` either way.
+    early if the mean gain is clear or not positive. The gain of each photo counts up to `MAX_VIEW_GAIN_DB` either way.
 
     Returns:
         Whether gains are to be learnt, and the reason in words.
@@ -67,26 +69,31 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
     spread = exposure_spread(pilots.scene, pilots.cache)
     if spread < MIN_EXPOSURE_SPREAD_STOPS:
         return False, f"by their tracks the photos differ by {spread:.2f} stops"
-    count = len(pilots.scene.train)
-    rounds, steps = exposure_rounds(count), exposure_pilot_steps(count)
+    rounds, steps = exposure_rounds(len(pilots.scene.train)), exposure_pilot_steps(pilots.config.steps)
     gains: list[float] = []  # of each validation photo, dB
     for number in range(rounds):
-        fold = pilots.fold(EXPOSURE_VALIDATION_EVERY, MAX_EXPOSURE_VALIDATION_VIEWS, number)
-        without, compensated = (
-            pilots.run(
-                f"pilot run {2 * number + position} of {2 * rounds} for exposure",
-                fold,
-                steps,
-                seed=pilots.config.seed ^ number,
-                exposure=exposure,
-            ).psnr_per_view
-            for position, exposure in enumerate((False, True), 1)
-        )
-        gains += np.clip(np.subtract(compensated, without), -MAX_VIEW_GAIN_DB, MAX_VIEW_GAIN_DB).tolist()
-        if np.mean(gains) <= 0:
+        gains += _gain_per_view(pilots, number, rounds, steps)
+        gain, error = float(np.mean(gains)), float(np.std(gains, ddof=1) / np.sqrt(len(gains)))
+        is_clear = len(gains) >= MIN_EXPOSURE_VALIDATION_VIEWS and gain >= CLEAR_GAIN_STANDARD_ERRORS * error
+        if is_clear or gain <= 0:
             break
-    gain, error = float(np.mean(gains)), float(np.std(gains, ddof=1) / np.sqrt(len(gains)))
     return gain >= max(MIN_EXPOSURE_GAIN_DB, MIN_GAIN_STANDARD_ERRORS * error), (
-        f"in {steps} steps gains and exposure map scored {gain:+.2f} dB of plain PSNR (standard error "
-        f"{error:.2f}) on {len(gains)} validation photos"
+        f"in {steps} steps gains and exposure map scored {gain:+.2f} dB of plain PSNR (standard error {error:.2f}) on "
+        f"{len(gains)} validation photos"
     )
+
+
+def _gain_per_view(pilots: ScenePilots, number: int, rounds: int, steps: int) -> list[float]:
+    """Return what gains bring to each validation photo in round `number` of `rounds`, dB, limited either way."""
+    fold = pilots.fold(EXPOSURE_VALIDATION_EVERY, MAX_EXPOSURE_VALIDATION_VIEWS, number)
+    without, compensated = (
+        pilots.run(
+            f"pilot run {2 * number + position} of {2 * rounds} for exposure",
+            fold,
+            steps,
+            seed=pilots.config.seed ^ number,
+            exposure=exposure,
+        ).psnr_per_view
+        for position, exposure in enumerate((False, True), 1)
+    )
+    return np.clip(np.subtract(compensated, without), -MAX_VIEW_GAIN_DB, MAX_VIEW_GAIN_DB).tolist()
