@@ -1,6 +1,6 @@
-"""Checkpoints: everything a run needs to go on as if it had never stopped.
+"""Checkpoints: the complete state of a run, from which it resumes as if it had never stopped.
 
-Order of views, colours and densification draw from generators seeded by (seed, step), so no generator state is kept.
+Random numbers come from generators seeded by (seed, step), so that no generator state is stored.
 """
 
 from __future__ import annotations
@@ -17,36 +17,40 @@ from hyrfpack.checks import check_float
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.train.config import BUDGET_FACTORS
 
-VERSION = 2
-DIGEST_BYTES = 32  # SHA-256 of all that goes before, at the end of the file
+CHECKPOINT_VERSION = 2
+DIGEST_BYTES = 32  # The file ends with the SHA-256 digest of everything before it.
 
 
 def save_checkpoint(
     path: Path, *, settings: dict, tensors: dict[str, torch.Tensor], progress: dict, overwrite: bool = True
 ) -> None:
-    """Write a checkpoint in one step.
+    """Write a checkpoint atomically.
 
     Args:
-        settings: plain values that must be the same on resuming.
+        settings: plain values that a resumed run must share.
         tensors: by name.
         progress: plain values (step, records).
         overwrite: replace a file that is there.
 
     Raises:
-        HyrfError: the file cannot be written; one that was there before stays.
+        HyrfError: the file cannot be written; an earlier file stays.
     """
     buffer = io.BytesIO()
-    texts = {"version": VERSION, "settings": json.dumps(settings, sort_keys=True), "progress": json.dumps(progress)}
+    texts = {
+        "version": CHECKPOINT_VERSION,
+        "settings": json.dumps(settings, sort_keys=True),
+        "progress": json.dumps(progress),
+    }
     torch.save({**texts, "tensors": tensors}, buffer)
     buffer.write(hashlib.sha256(buffer.getbuffer()).digest())
     write_atomic(path, buffer.getbuffer(), overwrite=overwrite, rename=False)
 
 
 def saved_decisions(path: Path) -> tuple[float | None, bool]:
-    """What pilots may have decided for the run of a checkpoint: its budget factor, and whether gains are learnt.
+    """Read what pilots may have decided for the run of a checkpoint: its budget factor, and whether gains are learnt.
 
     Raises:
-        HyrfTrainingError: it is missing, damaged or of another version.
+        HyrfTrainingError: the checkpoint is missing, damaged or of another version.
     """
     saved = _read(path)[0]
     factor, exposure = saved.get("budget_factor"), saved.get("exposure", False)
@@ -61,13 +65,13 @@ def saved_decisions(path: Path) -> tuple[float | None, bool]:
 
 
 def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor], dict]:
-    """Read a checkpoint; nothing in the file is executed.
+    """Read a checkpoint without executing anything in it.
 
     Returns:
         Tensors by name, and progress.
 
     Raises:
-        HyrfTrainingError: it is missing, damaged, or of a run with other settings (which are named).
+        HyrfTrainingError: the checkpoint is missing, damaged, or of a run with other settings, which are named.
     """
     saved, tensors, progress = _read(path)
     if different := sorted(
@@ -81,7 +85,7 @@ def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor]
 
 
 def _read(path: Path) -> tuple[dict, dict[str, torch.Tensor], dict]:
-    """Settings, tensors and progress."""
+    """Return settings, tensors and progress."""
     if not path.is_file():
         raise HyrfTrainingError(f"{path}: there is no checkpoint to resume from; train without `resume=True`")
     try:
@@ -95,7 +99,7 @@ def _read(path: Path) -> tuple[dict, dict[str, torch.Tensor], dict]:
             raise ValueError("the settings are no object")
     except Exception as error:  # torch's unpickler raises whatever it meets
         raise _damaged(path) from error
-    if version != VERSION:
+    if version != CHECKPOINT_VERSION:
         raise HyrfTrainingError(
             f"{path}: the checkpoint is of another version of hyrfpack; train anew with `overwrite=True`"
         )

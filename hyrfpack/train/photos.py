@@ -1,4 +1,4 @@
-"""The photos that a run was trained on, found again by what its folder keeps."""
+"""Reading of the photos that a run was trained on, by the record in its folder."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from hyrfpack.scene import Scene
 
 
 def photos_of(model: str | os.PathLike[str]) -> Scene | None:
-    """The photos that the model of a run's folder was trained on, read and split as they were for it.
+    """Read the photos that the model of a run's folder was trained on, with the same split.
 
     Args:
         model: the folder that `hyrfpack.train` wrote, or `model.hyrf` in it.
 
     Returns:
-        The photos, or None for a file that is no run's, or a run's that does not say what it was trained on.
+        The photos, or None for a file outside a run's folder, or a run without a record of its photos.
 
     Raises:
-        HyrfDataError: the photos are gone, or others than they were.
+        HyrfDataError: the photos are missing or have changed.
 
     Example:
         >>> import hyrfpack
@@ -34,8 +34,8 @@ def photos_of(model: str | os.PathLike[str]) -> Scene | None:
     if model.name != MODEL_FILE:
         return None
     try:
-        said = json.loads((model.parent / METRICS_FILE).read_text("utf-8"))["scene"]
-        reading, sizes = dict(said["reading"]), (said["train"], said["test"])
+        recorded = json.loads((model.parent / METRICS_FILE).read_text("utf-8"))["scene"]
+        reading, sizes = dict(recorded["reading"]), (recorded["train"], recorded["test"])
         path = reading.pop("path")
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
@@ -51,7 +51,7 @@ def photos_of(model: str | os.PathLike[str]) -> Scene | None:
 
 
 def _is_reading(path: object, options: dict) -> bool:
-    """Whether these can be arguments of `load_scene`: a run's folder may come from anywhere."""
+    """Return whether these are arguments of `load_scene`; a run's folder may come from an untrusted source."""
     text = (str, type(None))
     kinds: dict[str, Any] = {"test_every": int, "images": text, "layout": str, "model": text, "max_size": int}
     held_out = options.get("held_out", [])  # there only where photos were named

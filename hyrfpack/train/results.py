@@ -52,7 +52,7 @@ class TrainingRecord:
         model_sha256: digest of that file, in hexadecimal digits.
         step: optimiser steps taken.
         settings: plain values that decide the model, see `_settings_of`.
-        metrics: what `metrics.json` will hold, except the scores.
+        metrics: content of `metrics.json` without the scores.
     """
 
     model: str
@@ -62,18 +62,18 @@ class TrainingRecord:
     metrics: dict[str, Any]
 
     def encode(self) -> bytes:
-        """The record as JSON."""
+        """Return the record as JSON."""
         return json.dumps({"version": RECORD_VERSION, **dataclasses.asdict(self)}).encode()
 
 
 @dataclass(frozen=True)
 class Results:
-    """What was written after the training.
+    """The results written after the training.
 
     Attributes:
-        metrics: what `metrics.json` holds; without scores where these could not be computed.
+        metrics: content of `metrics.json`, without scores if these could not be computed.
         missing: files and folders that could not be written, relative to the run's folder.
-        reasons: one sentence for each failure, the first one first.
+        reasons: one sentence for each failure, in order of time.
     """
 
     metrics: dict[str, Any]
@@ -82,7 +82,7 @@ class Results:
 
 
 def read_record(out: Path) -> TrainingRecord | None:
-    """The training record of a finished model whose results are not all written yet.
+    """Read the training record of a finished model whose results are incomplete.
 
     Returns:
         The record, or None where there is none, or it is damaged, or it belongs to another model.
@@ -99,7 +99,7 @@ def read_record(out: Path) -> TrainingRecord | None:
 
 
 def changed_settings(record: TrainingRecord, scene: Scene, config: TrainConfig) -> list[str]:
-    """Names of the settings that differ from those of the finished run; what pilots decided is no difference."""
+    """Return the names of settings that differ from those of the finished run, without those that pilots decided."""
     asked = json.loads(json.dumps(_settings_of(scene, config)))
     if is_budget_open(config):
         asked["budget_factor"] = record.settings.get("budget_factor")
@@ -110,15 +110,15 @@ def changed_settings(record: TrainingRecord, scene: Scene, config: TrainConfig) 
 
 
 def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) -> TrainingRecord:
-    """Write the model of a finished run and its training record, and remove what belongs to an earlier model.
+    """Write the model of a finished run and its training record, and remove results of an earlier model.
 
-    The record is written before the model: a model on a full disk then has its record. Where only the record cannot be
-    written, the checkpoint stays in its place.
+    The record is written first, so that a model on a full disk has its record. If only the record cannot be written,
+    the checkpoint stays in its place.
 
     Args:
         trainer: of the finished run.
         out: the run's folder.
-        phase: told how far it is.
+        phase: called with the progress.
         overwrite: replace and remove files of an earlier run. Without it, a file that appeared at the model's name
             during the run is kept: the model gets a free name beside it.
 
@@ -188,7 +188,7 @@ def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) ->
         ):  # they would be taken for results of this model
             _remove(out / result)
     if is_recorded and (overwrite or trainer.saved is not None):
-        _remove(out / CHECKPOINT_FILE)  # which also frees space for the results
+        _remove(out / CHECKPOINT_FILE)  # this also frees space for the results
     return record
 
 
@@ -202,9 +202,9 @@ def write_results(
     *,
     overwrite: bool,
 ) -> Results:
-    """Score the model's file, and write pictures, curve and `metrics.json`; nothing of it fails the run.
+    """Score the model's file, and write pictures, curve and `metrics.json`. Failures do not fail the run.
 
-    The training record is removed once it is not needed any more.
+    The training record is removed once all results are written.
 
     Args:
         record: of the model in the folder.
@@ -212,7 +212,7 @@ def write_results(
         out: the run's folder.
         config: of the run.
         device: where to render.
-        phase: told how far it is.
+        phase: called with the progress.
         overwrite: replace files at the results' names; without it they are kept.
     """
     metrics, missing, reasons = dict(record.metrics), [], []
@@ -221,7 +221,7 @@ def write_results(
         unwritten: list[str] = []
         photos = len(scene.test)
         try:
-            # Scored on the file as it was written, not on what is in memory.
+            # Scores are those of the written file, not of the model in memory.
             model = hyrf_format.load(out / record.model, device)
             model.precision = config.precision
             scores = evaluate(
@@ -259,13 +259,13 @@ def write_results(
 
 
 def _settings_of(scene: Scene, config: TrainConfig) -> dict[str, Any]:
-    """Plain values that must be the same for results to be completed."""
+    """Return plain values that must be equal for results to be completed."""
     views = [[view.name, view.camera.width, view.camera.height] for view in scene.train]
     return {**config.to_dict(), "views": views, "held-out views": [view.name for view in scene.test]}
 
 
 def _picture_files(scene: Scene) -> list[str]:
-    """The pictures of held-out views, by their paths in the run's folder."""
+    """Return the paths of the pictures of held-out views, relative to the run's folder."""
     return [f"{VIEWS_FOLDER}/{name}" for name in picture_names(scene.test).values()]
 
 
@@ -276,7 +276,7 @@ def _remove(path: Path) -> None:
 
 @torch.no_grad()
 def _drop_unseen_background(trainer: Trainer, phase: Phase) -> HybridModel:
-    """The model without its background sphere if hardly any light reaches the training cameras from there."""
+    """Return the model, without its background sphere if hardly any light reaches the training cameras from there."""
     model = trainer.model
     if not model.config.background:
         return model

@@ -1,4 +1,4 @@
-"""A whole training run in a folder: train, save, score on held-out views, report."""
+"""A complete training run in a folder: train, save, score on held-out views, report."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ from hyrfpack.train.trainer import Trainer
 
 __all__ = ["VIEWS_FOLDER", "TrainResult", "is_begun", "resuming", "train"]
 
-# What ends a run early; Windows has no SIGHUP.
+# These signals end a run early. Windows has no SIGHUP.
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 CHOICE_LABELS = {"exposure": "Exposure compensation", "max_gaussians": "Gaussians at most"}
 Observer = Callable[[Trainer], None]
@@ -62,15 +62,15 @@ Observer = Callable[[Trainer], None]
 
 @dataclass(frozen=True)
 class TrainResult:
-    """What a run came to.
+    """The result of a run.
 
     Attributes:
-        complete: False when it was interrupted; the checkpoint is in the folder.
+        complete: False if the run was interrupted; the checkpoint is then in the folder.
         step: optimiser steps taken.
-        model: path of the `.hyrf` file, None when interrupted.
-        metrics: what `metrics.json` holds, empty when interrupted.
-        missing: one sentence that names the results which could not be written beside the model, as on a full disk,
-            and why; empty when all are there.
+        model: path of the `.hyrf` file; None if interrupted.
+        metrics: content of `metrics.json`; empty if interrupted.
+        missing: a sentence that names the results that could not be written beside the model, as on a full disk, and
+            why; empty if all are written.
     """
 
     complete: bool
@@ -96,7 +96,7 @@ def train(
     log: Path | str | None = None,
     ranks: Ranks = SINGLE_PROCESS,
 ) -> TrainResult:
-    """Train a model on a scene and leave everything about the run in a folder.
+    """Train a model on a scene and write all results of the run into a folder.
 
     The folder gets `model.hyrf` (profile raw), `metrics.json`, `curve.png`, `views/` (held-out photos beside their
     renders and error maps) and, while running, `checkpoint.pt`. The first Ctrl-C (or SIGTERM, or SIGHUP as when the
@@ -108,25 +108,24 @@ def train(
 
     Args:
         scene: from `hyrfpack.load_scene`.
-        out: the run's folder, made if missing.
-        config: settings, all defaults measured.
-        resume: go on from the folder's checkpoint, or complete the results of a finished model; the result is the one
-            an uninterrupted run gives.
-        overwrite: replace what an earlier run left in the folder. Without it, nothing is replaced, not even what
-            appears while training: a result gets a free name beside it, which `TrainResult.model` tells of the model.
-        cache: holds decoded photos; by default a quarter of the memory.
+        out: the run's folder, created if missing.
+        config: settings.
+        resume: resume from the folder's checkpoint, or complete the results of a finished model. The result equals that
+            of an uninterrupted run.
+        overwrite: replace an earlier run in the folder. Without it, nothing is replaced, not even a file that appears
+            during training: a result then gets a free name beside it; `TrainResult.model` has that of the model.
+        cache: cache of decoded photos; by default a quarter of the memory.
         device: where to train, see `hyrfpack.device.choose_device`. A run may be resumed on another one. On a GPU
             sums of gradients vary in their last bits from run to run, which may tip the measured budget.
         quiet: print nothing.
-        report: told after each step its number, the loss and mean squared error of its view (NaN where all of it is
-            masked) and how many Gaussians there are, in place of the line that is shown otherwise; 0 for its number
-            while pilots run.
-        phase: told of all other work, in place of the line that is shown otherwise: what is being done ("scoring
-            held-out photos"), how many items are done, and how many there are (0 where that is not known).
+        report: called after each step with its number (0 during pilot runs), the loss and mean squared error of its
+            view (NaN where all of it is masked) and the number of Gaussians. It replaces the progress line.
+        phase: called during all other work with its name ("scoring held-out photos"), the number of items done, and of
+            all items (0 if unknown). It replaces the progress line.
         observer: called after each step with the trainer, whose model it may read and must not change. On several
             processes rank 0's is called. Its time does not count as training time.
-        log: a file that gets a line of JSON every few steps, and TensorBoard's files beside it where that is
-            installed; see `hyrfpack.train.log.TrainingLog`. A resumed run adds to it.
+        log: a file that gets a line of JSON every few steps, and TensorBoard files beside it if that is installed; see
+            `hyrfpack.train.log.TrainingLog`. A resumed run adds to it.
         ranks: processes that train together, from `hyrfpack.parallel.ranks.join_processes`: all call this with the
             same scene and settings. Only rank 0 writes, prints and returns metrics. When the launcher restarts the
             processes, as torchrun does after one has ended, they resume from the checkpoint if there is one.
@@ -176,7 +175,7 @@ def _train_in_folder(
     log: Path | str | None,
     ranks: Ranks,
 ) -> TrainResult:
-    """As `train`, in a folder that this call holds."""
+    """Train in a folder that this call has locked; see `train`."""
     checkpoint = out / CHECKPOINT_FILE
     device = choose_own_device(device, ranks)
     resume = ranks.broadcast(resume or (ranks.restarts > 0 and is_begun(out)))
@@ -269,7 +268,7 @@ def _train_in_folder(
 
 
 def _with_saved_decisions(config: TrainConfig, checkpoint: Path) -> TrainConfig:
-    """The settings, with what they leave open as the interrupted run has it."""
+    """Return the settings, completed by the decisions of the interrupted run."""
     factor, exposure = saved_decisions(checkpoint)
     if is_budget_open(config):
         config = dataclasses.replace(config, budget_factor=factor)
@@ -277,14 +276,14 @@ def _with_saved_decisions(config: TrainConfig, checkpoint: Path) -> TrainConfig:
 
 
 def _open_questions(scene: Scene, config: TrainConfig) -> str:
-    """What pilot runs decide, as the beginning of a sentence; "" where nothing is open."""
+    """Return what pilot runs decide, as the start of a sentence; "" if nothing is open."""
     questions = ["choosing exposure compensation"] * measures_exposure(scene, config)
     questions += ["estimating the Gaussian budget"] * measures_budget(scene, config)
     return " and ".join(questions)
 
 
 def is_begun(out: Path) -> bool:
-    """Whether a run's folder has something that `resume` continues from: a checkpoint, or a model to be scored."""
+    """Return whether `resume` can continue in a folder, from a checkpoint or with a model to be scored."""
     return (out / CHECKPOINT_FILE).is_file() or read_record(out) is not None
 
 
@@ -299,7 +298,7 @@ def _complete(
     log: Path | str | None,
     ranks: Ranks,
 ) -> TrainResult:
-    """Compute and write what is missing beside a finished model; rank 0 does."""
+    """Compute and write missing results of a finished model, on rank 0."""
     if not ranks.is_main:
         return TrainResult(True, record.step, out / MODEL_FILE, {})
     with PhaseLine(silent) as phases, ExitStack() as stack:
@@ -335,7 +334,7 @@ def _log_end(log: TrainingLog, step: int, results: Results) -> None:
 
 
 def _ignore_step(step: int, loss: float, mse: float, gaussians: int) -> None:
-    """Pilot runs tell how far they are as phases."""
+    """Ignore a step of a pilot run, whose progress is reported as a phase."""
 
 
 def _as_step_nought(report: Report, step: int, loss: float, mse: float, gaussians: int) -> None:
@@ -343,12 +342,12 @@ def _as_step_nought(report: Report, step: int, loss: float, mse: float, gaussian
 
 
 def resuming(overwrite: bool) -> str:
-    """The command that goes on with a run which was started with or without --overwrite."""
+    """Return how to resume a run that was started with or without `overwrite`."""
     return f"the same command with `resume=True`{' instead of `overwrite=True`' if overwrite else ''}"
 
 
 def _shorter(device: torch.device) -> str:
-    """What makes a run take less time."""
+    """Return what would shorten a run, as words of a sentence."""
     ways = ["fewer steps", "smaller photos", "fewer Gaussians"]
     if device.type == "cpu":
         ways.append("a GPU")
@@ -357,7 +356,7 @@ def _shorter(device: torch.device) -> str:
 
 @contextmanager
 def _naming_the_checkpoint(trainer: Trainer, overwrite: bool) -> Iterator[None]:
-    """Add to an error of reading or writing what is there to go on from."""
+    """Add the checkpoint to resume from to an error of reading or writing."""
     try:
         yield
     except HyrfError as error:
@@ -371,7 +370,7 @@ def _naming_the_checkpoint(trainer: Trainer, overwrite: bool) -> Iterator[None]:
 def _prepare(
     out: Path, scene: Scene, config: TrainConfig, record: TrainingRecord | None, resume: bool, overwrite: bool
 ) -> None:
-    """Refuse what may not be written or continued; `record` is that of a finished model to be completed."""
+    """Check that the run may be written or resumed; `record` is that of a finished model to be completed."""
     if record is not None:
         if different := changed_settings(record, scene, config):
             raise HyrfTrainingError(
@@ -395,8 +394,10 @@ def _check_outputs(out: Path, scene: Scene, *, overwrite: bool) -> None:
 
 
 def _check_photos(scene: Scene, cache: PictureCache, phase: Phase) -> None:
-    """Refuse now what would else end the run after its last step: held-out photos that cannot be read, and masks that
-    leave nothing. Photos to train on are read in the first steps anyway, so that one that can be used is enough."""
+    """Check that held-out photos can be read and that masks leave pixels, before that ends the run after its last step.
+
+    Training photos are read in the first steps, so that one usable photo is enough here.
+    """
     held_out = []
     for done, view in enumerate(scene.test):
         phase("reading held-out photos", done, len(scene.test))
@@ -417,10 +418,10 @@ def _nothing_left(scene: Scene, views: list[View], purpose: str) -> HyrfTraining
 
 @contextmanager
 def _stop_requests() -> Iterator:
-    """Turns the first Ctrl-C, SIGTERM or SIGHUP into a request to stop; a second one interrupts at once.
+    """Turn the first Ctrl-C, SIGTERM or SIGHUP into a request to stop; a second one interrupts at once.
 
-    What whoever started us has ignored stays ignored: SIGHUP under nohup, Ctrl-C in the background of a script. A
-    second SIGHUP is no news: a terminal that closes sends it by way of the shell and once more itself.
+    Signals that the parent process ignores stay ignored: SIGHUP under nohup, Ctrl-C in the background of a script. A
+    second SIGHUP has no effect, because a terminal that closes sends it twice: by the shell, and itself.
     """
     requested = threading.Event()
     if threading.current_thread() is not threading.main_thread():  # signals belong to the main thread

@@ -15,7 +15,7 @@ _IMPLEMENTATIONS = ("reference", "cpu", "gpu")
 
 
 def ssim(image: Tensor, reference: Tensor, *, implementation: str = "auto") -> Tensor:
-    """Compute the mean structural similarity (Wang et al. 2004) of two images over all image_values and channels.
+    """Compute the mean structural similarity (Wang et al. 2004) of two images over all pixels and channels.
 
         SSIM = (2 m_x m_y + C1) (2 s_xy + C2) / ((m_x^2 + m_y^2 + C1) (s_x^2 + s_y^2 + C2))
 
@@ -62,7 +62,7 @@ def photometric_loss(
 
     Args:
         image, target: (H, W, 3) in [0, 1], at least one pixel.
-        mask: (H, W) bool, True for image_values to include; None includes all.
+        mask: (H, W) bool, True for pixels to include; None includes all.
         ssim_weight: w, in [0, 1].
         implementation: "auto", "reference", "cpu" or "gpu" (the last two take float32 only).
 
