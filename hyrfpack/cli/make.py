@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 MAX_LISTED_PHOTOS = 5
 
 
-@click.command(short_help="Photos in, scene out: the whole way.")
+@click.command(short_help="Make a scene from photos, end to end.")
 @click.argument("photos", type=PATH)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="What to make; its ending says what.")
 @click.option("--quality", type=click.Choice(QUALITIES), help="How long to work.  [default: normal]")
@@ -102,7 +102,7 @@ def make(
     What FILE is follows from its ending: .hyrf, .html or whatever else 'hyrfpack export' writes; a name without ending
     is a folder with a player.
 
-    Every stage's product is kept, and after an interruption (Ctrl-C, exit code 1) the same command goes on.
+    Every stage's product is kept, and after an interruption (Ctrl-C, exit code 1) the same command resumes.
 
     \b
     Examples:
@@ -146,7 +146,7 @@ def make(
                 observer=observer,
             )
     except Stopped as stop:
-        note(f"stopped in {stop.stage}; the same command goes on")
+        note(f"stopped in {stop.stage}; the same command resumes")
         click.get_current_context().exit(1)
     note_rename(output, result.output)
     if as_json:

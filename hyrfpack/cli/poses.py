@@ -31,7 +31,7 @@ _MAX_NAMED_PHOTOS = 5
     "decides by what the photos are and how many.",
 )
 @click.option("--masks", type=PATH, metavar="FOLDER", help="Masks, named as the photos; black is ignored.")
-@click.option("--seed", type=SEED, default=0, show_default=True, help="Of everything random.")
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Random seed.")
 @click.option("--overwrite", is_flag=True, help="Replace poses that an earlier run left in SCENE.")
 @json_option
 def poses(
@@ -40,7 +40,7 @@ def poses(
     """Find the poses of PHOTOS, a folder of photos, its .zip, or a video, and make a scene that `hyrfpack train` reads.
 
     SCENE gets images/ (copies of the photos), sparse/0 (a COLMAP model) and poses.json (what came out). PHOTOS may be
-    SCENE itself if its photos are in images/. Ctrl-C keeps what is done, and the same command goes on with it.
+    SCENE itself if its photos are in images/. Ctrl-C keeps what is done, and the same command resumes from it.
 
     \b
     Examples:
@@ -67,7 +67,7 @@ def poses(
                 say=display.say,
             )
     except KeyboardInterrupt:
-        note("stopped; the same command goes on from here")
+        note("stopped; the same command resumes from here")
         click.get_current_context().exit(1)
     note_if_verbose("seconds: " + ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in result.seconds.items()))
     if as_json:

@@ -75,7 +75,7 @@ BACKGROUND_COLORS = ("black", "white", "random")
 )
 @view_options
 @click.option("--poses", is_flag=True, help="Where DATA has no poses, estimate them first, into RUN/scene.")
-@click.option("--resume", is_flag=True, help="Go on from the run's checkpoint.")
+@click.option("--resume", is_flag=True, help="Resume from the run's checkpoint.")
 @click.option("--overwrite", is_flag=True, help="Replace what an earlier run left in the folder.")
 @processes_option
 @device_options
@@ -107,7 +107,7 @@ def train(
     where there are any; --steps counts photos, and --cache-mb is for all of a machine.
 
     RUN gets model.hyrf, metrics.json, the training curve and pictures of held-out views. Ctrl-C saves a checkpoint
-    and exits with code 1, as SIGTERM and a terminal that is closed do; --resume goes on with it and ends with the same
+    and exits with code 1, as SIGTERM and a terminal that is closed do; --resume continues it and ends with the same
     model as an uninterrupted run.
 
     \b
@@ -121,7 +121,7 @@ def train(
       hyrfpack train photos/garden -o runs/garden --processes 4
     """
     if resume and overwrite:
-        raise click.UsageError("--resume goes on with a run and --overwrite replaces it; give one of them")
+        raise click.UsageError("--resume continues a run and --overwrite replaces it; give one of them")
     if None not in (settings["max_gaussians"], settings["target_bytes"]):
         raise click.UsageError("--max-gaussians and --target-size each decide how large the model is; give one of them")
     if poses and not ranks.is_single:
@@ -155,7 +155,7 @@ def train(
         except KeyboardInterrupt:
             if not is_begun(out):
                 raise
-            note(f"stopped; {resuming(overwrite)} goes on")
+            note(f"stopped; {resuming(overwrite)} resumes")
             click.get_current_context().exit(1)
     note_if_verbose(
         "seconds: " + ", ".join(f"{part} {t:.1f}" for part, t in result.metrics.get("stage_seconds", {}).items())
@@ -163,7 +163,7 @@ def train(
     if not result.complete and result.step == 0:
         note("stopped before the first step; the same command begins anew")
     elif not result.complete:
-        note(f"stopped after step {result.step:,}; {resuming(overwrite)} goes on from there")
+        note(f"stopped after step {result.step:,}; {resuming(overwrite)} resumes from there")
     if result.model is not None:
         note_rename(out / MODEL_FILE, result.model)
     if result.missing:
@@ -196,5 +196,5 @@ def _estimate_poses(photos: Path, run: Path, images: str | None, resume: bool, o
                 photos, run, images=images, resume=resume, overwrite=overwrite, report=display.show, say=display.say
             )
     except KeyboardInterrupt:
-        note(f"stopped in poses; the same command goes on with {run / SCENE_FOLDER}")
+        note(f"stopped in poses; the same command resumes with {run / SCENE_FOLDER}")
         click.get_current_context().exit(1)

@@ -178,9 +178,9 @@ def pose_commands(path: str | os.PathLike[str]) -> str:
 
     Example:
         >>> pose_commands("a.mp4")
-        "'hyrfpack poses a.mp4 -o SCENE' estimates them, and 'hyrfpack make a.mp4 -o scene.html' goes the whole way"
+        "'hyrfpack poses a.mp4 -o SCENE' estimates them, and 'hyrfpack make a.mp4 -o scene.html' runs all stages"
     """
     name = shlex.quote(os.fspath(path))
     return (
-        f"'hyrfpack poses {name} -o SCENE' estimates them, and 'hyrfpack make {name} -o scene.html' goes the whole way"
+        f"'hyrfpack poses {name} -o SCENE' estimates them, and 'hyrfpack make {name} -o scene.html' runs all stages"
     )

@@ -283,7 +283,7 @@ class _PoseEstimation:
         self.has_products = self.output.claim_work_folder([self.matching, self.seed])
         self.has_work_folder = True
         if self.has_products and self.say is not None:
-            self.say("an interrupted estimation goes on")
+            self.say("resuming an interrupted estimation")
 
     def _take_frames(self) -> Path:
         """Write the chosen frames of the video; return their folder."""

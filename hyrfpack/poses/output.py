@@ -198,7 +198,7 @@ def explain_disk_errors(out: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise HyrfError(
-                f"{out}: the disk is full; free some space and run the same command again, which goes on here"
+                f"{out}: the disk is full; free some space and run the same command again, which resumes here"
             ) from error
         if isinstance(error, FileNotFoundError):
             raise HyrfError(

@@ -135,15 +135,15 @@ def _explain_crash(stage: str, code: int, log: Path) -> str:
     doing = _STAGE_DESCRIPTIONS.get(stage, _FINISH_DESCRIPTION)
     text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
     if "disk is full" in text or "No space left" in text or "disk I/O error" in text:
-        return f"{log.parent}: the disk is full; free some space and run the same command again, which goes on here"
+        return f"{log.parent}: the disk is full; free some space and run the same command again, which resumes here"
     if "MemoryError" in text or "bad_alloc" in text or code == -signal.SIGKILL:
         return (
             f"{log.parent}: {doing} took more memory than there is; close other programs and run the same command "
-            "again, which goes on here"
+            "again, which resumes here"
         )
     how = f"by signal {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
     last = next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "it said nothing")
     return (
-        f"{log.parent}: {doing} ended {how} ({last[-160:]}); run the same command again, which goes on here, and "
+        f"{log.parent}: {doing} ended {how} ({last[-160:]}); run the same command again, which resumes here, and "
         f"report it with {log.name} if it ends so again"
     )

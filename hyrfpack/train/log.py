@@ -137,7 +137,7 @@ class TrainingLog:
             self.file.write(json.dumps(numbers, allow_nan=False) + "\n")
             self.file.flush()
         except OSError as error:
-            self.warn(f"{self.path}: the log cannot be written ({error.strerror}); training goes on without it")
+            self.warn(f"{self.path}: the log cannot be written ({error.strerror}); training continues without it")
             with suppress(OSError):  # closing tries to write the rest once more
                 self.file.close()
 

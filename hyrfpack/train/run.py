@@ -363,7 +363,7 @@ def _naming_the_checkpoint(trainer: Trainer, overwrite: bool) -> Iterator[None]:
         if isinstance(error, HyrfTrainingError) or trainer.saved is None:
             raise
         raise type(error)(
-            f"{error}; the checkpoint of step {trainer.saved:,} is kept, {resuming(overwrite)} goes on from there"
+            f"{error}; the checkpoint of step {trainer.saved:,} is kept, {resuming(overwrite)} resumes from there"
         ) from error
 
 
@@ -381,7 +381,7 @@ def _prepare(
         raise HyrfError(f"{out}: there is no checkpoint to resume; leave out `resume=True` to start a run")
     left = [name for name in (MODEL_FILE, CHECKPOINT_FILE) if (out / name).exists()]
     if left and not (resume or overwrite or record is not None):
-        hint = "`resume=True` goes on with it, " if CHECKPOINT_FILE in left else ""
+        hint = "`resume=True` resumes it, " if CHECKPOINT_FILE in left else ""
         raise HyrfError(f"{out}: the folder holds an earlier run ({left[-1]}); {hint}`overwrite=True` replaces it")
     _check_outputs(out, scene, overwrite=resume or overwrite or record is not None)
 

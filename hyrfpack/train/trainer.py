@@ -171,7 +171,7 @@ class Trainer:
                     except HyrfError as error:
                         if stopped:
                             raise
-                        warn(f"{error}; training goes on, without the checkpoint of step {self.step:,}")
+                        warn(f"{error}; training continues, without the checkpoint of step {self.step:,}")
                 if stopped:
                     # The launcher ends all processes once one has left, so all wait until the checkpoint is written.
                     self.ranks.all_gather(None)

@@ -1,4 +1,4 @@
-"""Interrupted at any stage, by Ctrl-C or a kill, the same call goes on and ends with the same bytes."""
+"""Interrupted at any stage, by Ctrl-C or a kill, the same call resumes and ends with the same bytes."""
 
 from __future__ import annotations
 

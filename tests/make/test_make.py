@@ -467,7 +467,7 @@ def test_the_command_says_where_it_was_stopped(posed, tmp_path, monkeypatch):
         patch.setattr("hyrfpack.make.stages.evaluate", stop)
         result = hyrfpack("make", posed, "-o", tmp_path / "scene.html", "--quality", "draft")
     assert result.exit_code == 1 and result.stdout == ""
-    assert result.stderr.splitlines()[-1] == "stopped in scoring; the same command goes on"
+    assert result.stderr.splitlines()[-1] == "stopped in scoring; the same command resumes"
 
 
 # -- train --poses ---------------------------------------------------------------------------------------------------

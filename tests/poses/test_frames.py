@@ -280,7 +280,7 @@ def test_poses_of_a_video_that_go_on_still_say_how_many_frames_were_taken(wall, 
     for sentences in said:
         with pytest.raises(KeyboardInterrupt):
             hyrfpack.estimate_poses(video, tmp_path / "scene", report=stop, say=sentences.append)
-    assert said[1] == ["an interrupted estimation goes on", *said[0]]
+    assert said[1] == ["resuming an interrupted estimation", *said[0]]
     assert "frames were taken" in said[0][0]
 
 

@@ -84,10 +84,10 @@ def test_a_scene_of_ones_own_gets_poses_in_place_also_after_its_worker_was_kille
         if "matching pair" in doing:
             started[-1].kill()
 
-    with pytest.raises(hyrfpack.HyrfError, match="more memory than there is.*goes on here"):
+    with pytest.raises(hyrfpack.HyrfError, match="more memory than there is.*resumes here"):
         hyrfpack.estimate_poses(tmp_path, tmp_path, overwrite=True, report=kill)
     result = succeeded("poses", tmp_path, "-o", tmp_path, "--overwrite", "--json")
-    assert "an interrupted estimation goes on" in result.stderr
+    assert "resuming an interrupted estimation" in result.stderr
     assert json.loads(result.stdout)["registered"] == len(before)
     assert {path.name: path.stat().st_mtime_ns for path in (tmp_path / "images").iterdir()} == before
     assert sorted(os.listdir(tmp_path)) == ["images", "poses.json", "sparse"]
@@ -127,7 +127,7 @@ def test_the_command_takes_its_worker_along(number, code, taken, tmp_path, signa
     assert parent.returncode == code
     assert "Traceback" not in errors
     if number == signal.SIGINT:
-        assert "the same command goes on from here" in errors
+        assert "the same command resumes from here" in errors
     deadline = time.monotonic() + 5
     while time.monotonic() < deadline and Path(f"/proc/{worker}").exists():
         time.sleep(0.05)

@@ -81,7 +81,7 @@ def test_photos_beside_the_copies_of_them_go_on_where_they_were(tmp_path):
     scene, said = photos(tmp_path / "scene"), []
     begin(scene, scene)
     begin(scene, scene, say=said.append)
-    assert said[0] == "an interrupted estimation goes on"
+    assert said[0] == "resuming an interrupted estimation"
     begin(scene, scene, seed=1)
     finished(scene, scene, seed=1)
     assert pictures(scene) == pictures(scene / "images") == ["0.png", "1.png", "2.png", "3.png"]
@@ -124,7 +124,7 @@ def test_a_call_that_fails_leaves_old_poses_with_their_own_photos(tmp_path, monk
 
 @pytest.mark.parametrize("moment", range(7))
 def test_old_poses_never_lie_beside_new_photos(moment, tmp_path, monkeypatch):
-    """Killed at any moment of the end: what lies there then is of one estimation, and the same call goes on."""
+    """Killed at any moment of the end: what lies there then is of one estimation, and the same call resumes."""
     scene, replace = tmp_path / "scene", os.replace
     finished(photos(tmp_path / "photos"), scene)
     photos(tmp_path / "others", 1)
@@ -198,7 +198,7 @@ def test_poses_that_another_program_puts_there_meanwhile_are_kept_and_the_work_t
     shutil.rmtree(scene / "sparse")
     said = []
     finished(tmp_path / "photos", scene, say=said.append)
-    assert said[0] == "an interrupted estimation goes on" and (scene / "sparse" / "0").is_dir()
+    assert said[0] == "resuming an interrupted estimation" and (scene / "sparse" / "0").is_dir()
 
 
 def test_masks_that_lie_there_are_not_taken_for_those_that_were_named(tmp_path):

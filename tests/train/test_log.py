@@ -131,7 +131,7 @@ def test_a_full_disk_ends_the_log_and_not_the_run() -> None:
         for step in (1, 2, 3):
             written.step(step, 1.0, 0.1, 7)
         written.end(complete=True, step=3)
-    assert len(said) == 1 and "training goes on without it" in said[0]
+    assert len(said) == 1 and "training continues without it" in said[0]
 
 
 def test_scalars_go_to_tensorboard_where_it_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
