@@ -1,0 +1,69 @@
+"""The queue of long training runs: what is finished is kept, what another call trains is left alone."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+from scenes import ball_scene
+
+from hyrfpack.lock import exclusive_folder
+from hyrfpack.train import TrainResult
+from tools.studies import long_runs
+
+
+@pytest.fixture
+def call(monkeypatch, tmp_path, capsys):
+    """Run the tool on a made-up scene and return what it prints."""
+    scene = ball_scene(views=10, points=60, side=24)
+    scene = replace(scene, train=scene.train[2:], test=scene.train[:2])
+    monkeypatch.setattr(long_runs, "load_variant", lambda data, name: scene)
+
+    def run(*options: str) -> str:
+        arguments = ["long_runs", "--steps", "20", "10", "--sets", "ball", "--out", str(tmp_path), *options]
+        monkeypatch.setattr("sys.argv", arguments)
+        long_runs.main()
+        return capsys.readouterr().out
+
+    return run
+
+
+def test_the_queue_trains_short_runs_first_and_each_run_once(call, tmp_path):
+    first = call()
+    trained = [line.rsplit("/", 3)[1] for line in first.splitlines() if " to " in line]
+    assert trained == ["10", "20"]
+
+    path = tmp_path / "10/seed0/ball/measured.json"
+    row = json.loads(path.read_text())
+    assert row["compact"]["bytes"] == (path.parent / "compact.hyrf").stat().st_size
+    assert row["compact"]["psnr"] == pytest.approx(row["psnr"], abs=1)
+    again = call()
+    assert " to " not in again and again == first[first.index("| set") :]
+
+
+def test_a_run_that_another_call_trains_is_left_out(call, tmp_path):
+    with exclusive_folder(tmp_path / "10/seed0/ball.queue"):
+        printed = call()
+    assert not (tmp_path / "10/seed0/ball").exists()
+    assert (tmp_path / "20/seed0/ball/measured.json").exists()
+    assert "another" in printed
+
+
+def test_a_stopped_run_resumes_from_its_checkpoint(call, monkeypatch):
+    train, resumed = long_runs.hyrfpack.train, []
+
+    def stop_once(scene, folder, config, *, resume, **options):
+        resumed.append(resume)
+        if len(resumed) == 1:
+            folder.mkdir(parents=True)
+            (folder / "checkpoint.pt").touch()
+            return TrainResult(False, 5, None, {})
+        (folder / "checkpoint.pt").unlink(missing_ok=True)
+        return train(scene, folder, config, quiet=True)
+
+    monkeypatch.setattr(long_runs.hyrfpack, "train", stop_once)
+    with pytest.raises(SystemExit, match="resumes"):
+        call()
+    call()
+    assert resumed == [False, True, False]

@@ -1,0 +1,166 @@
+"""Trains sets at several lengths, over as many calls as it takes, and prints one table of all finished runs.
+
+    python -m tools.studies.long_runs --steps 1000 3000 7000 30000 --sets drone_brighton_beach mipnerf360_bonsai@12
+    python -m tools.studies.long_runs --steps 30000 --table                     only print what is finished
+
+The queue takes short runs first. A call that is stopped loses nothing: the next one resumes from the checkpoint, and
+what is finished is not trained again. Several calls share one queue, because each run's folder is locked while it is
+trained and measured. Scores are of the raw file on held-out photos; the gap is the PSNR on (at most 16) training photos
+minus that. Files are measured as decoded from disk.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import hyrfpack
+from hyrfpack.errors import HyrfError
+from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
+from hyrfpack.lock import exclusive_folder
+from hyrfpack.scene import Scene, evenly_spaced
+from hyrfpack.train import TrainConfig
+from tools.studies.train_sets import DATA
+from tools.studies.variants import load_variant
+from tools.tables import markdown
+
+MEASURED = "measured.json"
+MAX_TRAINING_VIEWS_SCORED = 16
+COLUMNS = (
+    "set", "steps", "seed", "gains", "PSNR", "SSIM", "gap", "Gaussians", "raw", "paper", "compact", "compact PSNR",
+    "compact SSIM", "fine-tuned", "fine-tuned PSNR", "training s",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training run of the queue."""
+
+    name: str
+    steps: int
+    seed: int
+    exposure: bool | None
+
+    def folder(self, out: Path) -> Path:
+        """Return where it is kept below `out`."""
+        gains = {None: "", True: "-gains", False: "-no-gains"}[self.exposure]
+        return out / f"{self.steps}{gains}" / f"seed{self.seed}" / self.name
+
+
+def measure(run: Run, data: Path, out: Path, finetune_steps: int) -> None:
+    """Train a run, from its checkpoint if there is one, and write its row into its folder.
+
+    Raises:
+        HyrfError: the set cannot be read, or a file cannot be written.
+    """
+    folder = run.folder(out)
+    scene = load_variant(data, run.name)
+    if not (folder / METRICS_FILE).exists():
+        config = TrainConfig(steps=run.steps, seed=run.seed, exposure=run.exposure)
+        resume = (folder / CHECKPOINT_FILE).exists()
+        if not hyrfpack.train(scene, folder, config, resume=resume, overwrite=not resume, quiet=True).complete:
+            raise SystemExit("stopped; the same command resumes from the checkpoint")
+    metrics = json.loads((folder / METRICS_FILE).read_text())
+    model = hyrfpack.load(folder / MODEL_FILE)
+    training = hyrfpack.evaluate(model, evenly_spaced(scene.train, MAX_TRAINING_VIEWS_SCORED))
+    row = {
+        **asdict(run),
+        "gains": metrics["settings"]["exposure"],
+        "psnr": metrics["evaluation"]["psnr"],
+        "ssim": metrics["evaluation"]["ssim"],
+        "training_psnr": training.psnr,
+        "gaussians": metrics["gaussians"],
+        "seconds": metrics["seconds"],
+        "raw": {"bytes": (folder / MODEL_FILE).stat().st_size},
+        "paper": _packed(folder, scene, "paper"),
+        "compact": _packed(folder, scene, "compact"),
+    }
+    if finetune_steps:
+        row["finetuned"] = _packed(folder, scene, "compact", finetune_steps)
+    (folder / MEASURED).write_text(json.dumps(row, indent=1))
+
+
+def _packed(folder: Path, scene: Scene, profile: str, finetune_steps: int = 0) -> dict:
+    """Compress the run's model and score the file on the held-out photos."""
+    path = folder / f"{'finetuned' if finetune_steps else profile}.hyrf"
+    settings = {"data": scene, "finetune_steps": finetune_steps} if finetune_steps else {}
+    hyrfpack.compress(folder / MODEL_FILE, path, profile=profile, **settings)
+    scores = hyrfpack.evaluate(hyrfpack.load(path), scene.test)
+    return {"bytes": path.stat().st_size, "psnr": scores.psnr, "ssim": scores.ssim}
+
+
+def finished(out: Path) -> Iterator[dict]:
+    """Yield the rows of all finished runs."""
+    for path in sorted(out.glob(f"*/seed*/*/{MEASURED}")):
+        yield json.loads(path.read_text())
+
+
+def table(rows: list[dict]) -> str:
+    """Return the rows as Markdown, by set, length and seed."""
+    lines = []
+    for row in sorted(rows, key=lambda row: (row["name"], row["steps"], row["seed"], str(row["exposure"]))):
+        tuned = row.get("finetuned")
+        lines.append(
+            [
+                row["name"],
+                f"{row['steps']:,}",
+                str(row["seed"]),
+                "yes" if row["gains"] else "no",
+                f"{row['psnr']:.2f}",
+                f"{row['ssim']:.3f}",
+                f"{row['training_psnr'] - row['psnr']:.1f}",
+                f"{row['gaussians']:,}",
+                *(f"{row[profile]['bytes']:,}" for profile in ("raw", "paper", "compact")),
+                f"{row['compact']['psnr']:.2f}",
+                f"{row['compact']['ssim']:.3f}",
+                f"{tuned['bytes']:,}" if tuned else "",
+                f"{tuned['psnr']:.2f}" if tuned else "",
+                f"{row['seconds']:.0f}",
+            ]
+        )
+    return markdown(COLUMNS, lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, nargs="+", default=[1000, 3000, 7000, 15000, 30000])
+    parser.add_argument("--sets", nargs="+", help="below --data, or variants (`variants.py`); default all")
+    parser.add_argument("--seeds", type=int, default=1, help="runs of each set and length, with seeds from 0 (1)")
+    parser.add_argument(
+        "--exposure", action=argparse.BooleanOptionalAction, help="learn per-image gains, or not (default: pilot runs)"
+    )
+    parser.add_argument("--finetune", type=int, default=0, help="steps of a fine-tuned file; 0 (default) for none")
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--out", type=Path, default=Path("runs/long"))
+    parser.add_argument("--table", action="store_true", help="print the table and train nothing")
+    args = parser.parse_args()
+    names = args.sets or sorted(
+        folder.name for folder in args.data.iterdir() if (folder / "images").exists() or (folder / "train").exists()
+    )
+    queue = [
+        Run(name, steps, seed, args.exposure)
+        for steps in sorted(args.steps)
+        for seed in range(args.seeds)
+        for name in names
+    ]
+    for run in [] if args.table else queue:
+        folder = run.folder(args.out)
+        lock = folder.with_name(f"{folder.name}.queue")  # not the folder itself, which training locks
+        try:
+            with exclusive_folder(lock):
+                if (folder / MEASURED).exists():
+                    continue
+                began = time.strftime("%H:%M")
+                measure(run, args.data, args.out, args.finetune)
+                print(f"{began} to {time.strftime('%H:%M')}  {folder}", flush=True)
+        except HyrfError as error:  # another call trains it, or the set cannot be read
+            print(f"{folder}: {error}", flush=True)
+    print(table(list(finished(args.out))))
+
+
+if __name__ == "__main__":
+    main()
