@@ -79,8 +79,8 @@ def talk(ranks: Ranks) -> dict:
         "agreed": ranks.run_on_all(lambda: ranks.rank * 10),
         "refused by the last": sentence_of(lambda: ranks.run_on_all(refuse(ranks.size - 1))),
         "refused by all": sentence_of(lambda: ranks.run_on_all(refuse(0))),
-        "average_gradients": weight.grad.tolist(),
-        "average_gradients of idle": None if idle.grad is None else idle.grad.tolist(),
+        "averaged": weight.grad.tolist(),
+        "averaged of idle": None if idle.grad is None else idle.grad.tolist(),
         "sums": sums.tolist(),
         "threads": os.environ["HYRFPACK_THREADS"],
     }

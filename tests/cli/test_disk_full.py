@@ -288,7 +288,7 @@ class FullLog(io.StringIO):
 
 
 def test_log_on_a_full_disk_does_not_end_the_training(monkeypatch, tmp_path):
-    monkeypatch.setattr("hyrfpack.train.progress.LOG_EVERY", 0.0)
+    monkeypatch.setattr("hyrfpack.train.progress.LOG_INTERVAL_SECONDS", 0.0)
     monkeypatch.setattr("sys.stderr", FullLog())
 
     result = train(balls(), tmp_path, dataclasses.replace(CONFIG, steps=2))
