@@ -54,7 +54,7 @@ def bench(
     """Measure each operation and each setting that trades accuracy for time, and print time beside error.
 
     MODEL is the folder of a run, or a .hyrf file; without it a small one is trained on a made-up scene first (about
-    a minute). Losses are told in PSNR and SSIM against held-out photos of --data, or without photos against the
+    a minute). Losses are given in PSNR and SSIM against held-out photos of --data, or without photos against the
     model's own exact pictures. --json prints all numbers, some of which the tables leave out.
 
     \b

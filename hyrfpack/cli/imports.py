@@ -76,8 +76,8 @@ def import_(
 
     No photos are needed: the model learns from pictures of SOURCE itself, from all around or, where its Gaussians
     surround, from inside. With --cameras, which reads what `hyrfpack render --cameras` and `--data` read, it learns
-    what is seen from there; a cameras.json that 3DGS training left beside SOURCE is found by itself. The dB told are
-    of viewpoints that were held out.
+    what is seen from there; a cameras.json that 3DGS training left beside SOURCE is found by itself. Its scores are
+    those of held-out viewpoints.
 
     \b
     Examples:

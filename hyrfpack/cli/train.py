@@ -155,7 +155,7 @@ def train(
         except KeyboardInterrupt:
             if not is_begun(out):
                 raise
-            note(f"stopped; {resuming(overwrite)} resumes")
+            note(f"stopped; {resuming(overwrite)} continues")
             click.get_current_context().exit(1)
     note_if_verbose(
         "seconds: " + ", ".join(f"{part} {t:.1f}" for part, t in result.metrics.get("stage_seconds", {}).items())
@@ -163,7 +163,7 @@ def train(
     if not result.complete and result.step == 0:
         note("stopped before the first step; the same command begins anew")
     elif not result.complete:
-        note(f"stopped after step {result.step:,}; {resuming(overwrite)} resumes from there")
+        note(f"stopped after step {result.step:,}; {resuming(overwrite)} continues from there")
     if result.model is not None:
         note_rename(out / MODEL_FILE, result.model)
     if result.missing:

@@ -46,7 +46,7 @@ def encode_comparison(
         "tables": "\n".join(_tables(runs, names, ranked=not doubts)),
         "legend": _legend(names),
         "curves": _curves(runs, names),
-        "told": _escape(_curves_note(runs, names)),
+        "curves_note": _escape(_curves_note(runs, names)),
         "views": _read_asset("views.html") if views else "",
         "texts": json_element("compared", _view_data(runs, names, views)) if views else "",
         "script": script,

@@ -34,7 +34,7 @@ def find_coarsest(
 
     Args:
         attempt: makes the trial of a distortion; if a trial fits, those of smaller distortions fit too.
-        fits: tells whether a trial is good enough.
+        fits: returns whether a trial is good enough.
         start: distortion of the first trial.
         trials: maximum number of trials, at least 2.
         bounds: smallest and largest distortion.

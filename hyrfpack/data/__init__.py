@@ -181,6 +181,4 @@ def pose_commands(path: str | os.PathLike[str]) -> str:
         "'hyrfpack poses a.mp4 -o SCENE' estimates them, and 'hyrfpack make a.mp4 -o scene.html' runs all stages"
     """
     name = shlex.quote(os.fspath(path))
-    return (
-        f"'hyrfpack poses {name} -o SCENE' estimates them, and 'hyrfpack make {name} -o scene.html' runs all stages"
-    )
+    return f"'hyrfpack poses {name} -o SCENE' estimates them, and 'hyrfpack make {name} -o scene.html' runs all stages"

@@ -406,8 +406,8 @@ def _zoom_problems(facts: list[PhotoFacts]) -> list[str]:
         return []
     device = max(lengths, key=lambda name: len(lengths[name]))
     return [
-        f"photos of {most} zooms or lenses are mixed{f' ({device})' if device else ''}, which are told apart but posed "
-        "less surely; keep one, and do not zoom"
+        f"photos of {most} zooms or lenses are mixed{f' ({device})' if device else ''}, which are distinguished but "
+        "posed less surely; keep one, and do not zoom"
     ]
 
 

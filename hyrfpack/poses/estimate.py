@@ -233,7 +233,9 @@ class _PoseEstimation:
             self._add_notes(raw_photos_notes(self._list_photos(root if in_place else self.photos, list_raw_photos)))
         devices, device_of = group_by_device(photos, in_place=not copies_photos)
         if len(devices) > 1:
-            self._add_note(f"{len(devices)} cameras or zooms are told apart by folder, device, size and focal length")
+            self._add_note(
+                f"{len(devices)} cameras or zooms are distinguished by folder, device, size and focal length"
+            )
         ordered = is_video or (len(photos) > MAX_EXHAUSTIVE_PHOTOS and is_ordered_sequence(photos))
         job = Job(
             root.resolve(),

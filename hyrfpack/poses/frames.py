@@ -23,7 +23,7 @@ __all__ = ["FrameReport", "choose_frames", "is_video", "survey_frames"]
 
 Report = Callable[[str, float], None]
 
-RECORD_NAME = "frames.json"  # lies beside the frames and tells from which video and settings they come
+RECORD_NAME = "frames.json"  # A file beside the frames, with their video and settings.
 
 # Spacings are the motion of the picture between two taken frames, as a ratio of its longer side.
 _DEFAULT_SPACING_RATIO = 0.05

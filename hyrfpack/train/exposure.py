@@ -252,5 +252,7 @@ def exposures_for(
     gains = gains_from(observed, len(scene.train))
     known = len(np.unique(observed.photo))
     spread = float(gains.mean(1).std()) * STOPS_PER_LOG_GAIN
-    found = f"by their tracks the photos differ by {spread:.2f} stops" if known else "no tracks tell of the photos"
+    found = (
+        f"by their tracks the photos differ by {spread:.2f} stops" if known else "no tracks show the photos' exposures"
+    )
     return Exposures(scene.train, gains, device), f"per-image gains; {found}"

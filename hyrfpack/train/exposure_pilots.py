@@ -21,7 +21,7 @@ MAX_EXPOSURE_PILOT_STEPS = 500
 # exposure of a single photo has a large error.
 EXPOSURE_VALIDATION_EVERY = 4
 MAX_EXPOSURE_VALIDATION_VIEWS = 16  # in one fold
-MIN_EXPOSURE_VALIDATION_VIEWS = 6  # in all folds together
+MIN_EXPOSURE_VALIDATION_VIEWS = 6  # in all folds together, for any decision but the safe default
 MIN_EXPOSURE_ROUNDS = 2
 MIN_EXPOSURE_SPREAD_STOPS = 0.05  # Photos whose exposures have a smaller standard deviation need no gains.
 MIN_EXPOSURE_GAIN_DB = 0.1
@@ -29,9 +29,8 @@ MIN_EXPOSURE_GAIN_DB = 0.1
 # gain 0.8 dB, because long runs gain more than pilots.
 MIN_GAIN_STANDARD_ERRORS = 0.5
 CLEAR_GAIN_STANDARD_ERRORS = 2.0  # A gain of so many needs no further round.
-MAX_VIEW_GAIN_DB = (
-    3.0  # One photo counts no more, either way: one whose exposure nothing predicts must not decide alone.
-)
+# The gain of one photo counts no more, either way, so that a photo of unpredictable exposure cannot decide alone.
+MAX_VIEW_GAIN_DB = 3.0
 
 
 def exposure_pilot_steps(steps: int) -> int:
@@ -57,8 +56,9 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
 
     Each round trains a pilot with gains and one without on the same fold. Gains are learnt where the mean gain in plain
     PSNR over the validation photos of all rounds is at least `MIN_EXPOSURE_GAIN_DB` and at least
-    `MIN_GAIN_STANDARD_ERRORS` times its standard error. Otherwise the safe default stands: no gains. The rounds end
-    early if the mean gain is clear or not positive. The gain of each photo counts up to `MAX_VIEW_GAIN_DB` either way.
+    `MIN_GAIN_STANDARD_ERRORS` times its standard error. Otherwise, or if masks leave fewer than
+    `MIN_EXPOSURE_VALIDATION_VIEWS` photos to score, the safe default stands: no gains. The rounds end early if the mean
+    gain is clear or not positive. The gain of each photo counts up to `MAX_VIEW_GAIN_DB` either way.
 
     Returns:
         Whether gains are to be learnt, and the reason in words.
@@ -73,19 +73,30 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
     gains: list[float] = []  # of each validation photo, dB
     for number in range(rounds):
         gains += _gain_per_view(pilots, number, rounds, steps)
-        gain, error = float(np.mean(gains)), float(np.std(gains, ddof=1) / np.sqrt(len(gains)))
-        is_clear = len(gains) >= MIN_EXPOSURE_VALIDATION_VIEWS and gain >= CLEAR_GAIN_STANDARD_ERRORS * error
-        if is_clear or gain <= 0:
+        if gains and np.mean(gains) <= 0:
             break
-    return gain >= max(MIN_EXPOSURE_GAIN_DB, MIN_GAIN_STANDARD_ERRORS * error), (
+        if len(gains) >= MIN_EXPOSURE_VALIDATION_VIEWS:
+            gain, error = _mean_and_standard_error(gains)
+            if gain >= CLEAR_GAIN_STANDARD_ERRORS * error:
+                break
+    if len(gains) < 2:
+        return False, f"masks leave {len(gains)} of the validation photos, too few to measure whether gains help"
+    gain, error = _mean_and_standard_error(gains)
+    has_enough_photos = len(gains) >= MIN_EXPOSURE_VALIDATION_VIEWS
+    return has_enough_photos and gain >= max(MIN_EXPOSURE_GAIN_DB, MIN_GAIN_STANDARD_ERRORS * error), (
         f"in {steps} steps gains and exposure map scored {gain:+.2f} dB of plain PSNR (standard error {error:.2f}) on "
         f"{len(gains)} validation photos"
     )
 
 
 def _gain_per_view(pilots: ScenePilots, number: int, rounds: int, steps: int) -> list[float]:
-    """Return what gains bring to each validation photo in round `number` of `rounds`, dB, limited either way."""
+    """Return what gains bring to each validation photo in round `number` of `rounds`, dB, limited either way.
+
+    The list is empty if masks leave no validation photo.
+    """
     fold = pilots.fold(EXPOSURE_VALIDATION_EVERY, MAX_EXPOSURE_VALIDATION_VIEWS, number)
+    if not fold.validation:
+        return []
     without, compensated = (
         pilots.run(
             f"pilot run {2 * number + position} of {2 * rounds} for exposure",
@@ -97,3 +108,8 @@ def _gain_per_view(pilots: ScenePilots, number: int, rounds: int, steps: int) ->
         for position, exposure in enumerate((False, True), 1)
     )
     return np.clip(np.subtract(compensated, without), -MAX_VIEW_GAIN_DB, MAX_VIEW_GAIN_DB).tolist()
+
+
+def _mean_and_standard_error(values: list[float]) -> tuple[float, float]:
+    """Return the mean of two values or more, and its standard error."""
+    return float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(len(values)))

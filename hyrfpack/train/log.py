@@ -30,12 +30,12 @@ class TrainingLog:
 
     Each line is a JSON object with the key "event". Its value is "step" for a step of which `is_recorded` is true, and
     for the first step that ends `MAX_RECORD_INTERVAL_SECONDS` after the last record. Its value is "end" for the end of
-    the run, where "complete" tells whether the run is complete, and "error" why it failed. A step has
+    the run, where "complete" is whether the run is complete, and "error" is why it failed. A step has
 
         step, steps         taken and to be taken
         loss, psnr          means over the steps since the last record, psnr in dB; null where masks left no pixel
         gaussians           of the model
-        memory_bytes        peak memory of the process so far; null where the system does not tell it
+        memory_bytes        peak memory of the process so far; null where the system has no such number
         gpu_memory_bytes    the same of the GPU; null on a CPU
         steps_per_second    current speed
         seconds             since training started or was resumed
@@ -151,7 +151,7 @@ def _open_new(path: Path) -> TextIO:
 
 
 def peak_memory() -> int | None:
-    """Return the peak memory of this process in bytes; None where the system does not tell it.
+    """Return the peak memory of this process in bytes; None where the system has no such number.
 
     Example:
         >>> peak_memory() is None or peak_memory() > 1_000_000

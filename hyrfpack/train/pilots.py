@@ -19,7 +19,7 @@ from hyrfpack.train.setup import budget_for
 from hyrfpack.train.trainer import Trainer
 
 BUDGET_REFERENCE_STEPS = 500  # A pilot has the budget of a run of this length, unless it asks for another one.
-MAX_TRAINING_VIEWS = 150  # A pilot of 150 steps trains on no more photos.
+MAX_TRAINING_VIEWS = 150  # The shortest pilots have no steps for more photos.
 MAX_VALIDATION_VIEWS = 8
 MIN_TRAINING_VIEWS = 8  # With fewer photos, none can be spared for validation.
 
@@ -150,12 +150,12 @@ class ScenePilots:
         trainer = Trainer(fold.scene, settings, self.cache, self._device)
         before = self.steps
 
-        def tell(trainer: Trainer, loss: float, mse: float) -> None:
+        def report_step(trainer: Trainer, loss: float, mse: float) -> None:
             self.steps = before + trainer.step
             self._report(self.steps, loss, mse, len(trainer.model))
             self._phase(f"{name}: training", trainer.step, steps)
 
-        trainer.run(report=tell, stop=self._stop)
+        trainer.run(report=report_step, stop=self._stop)
         if self._stop():
             raise PilotsStopped
         count = len(fold.validation)

@@ -207,9 +207,9 @@ def _train_in_folder(
     elif questions := _open_questions(scene, config):
         with PhaseLine(silent) as phases, _stop_requests() as stop:
             phases.note(f"{questions} by short pilot runs, scored on training photos that they leave out")
-            tell: Report = _ignore_step if report is None else partial(_as_step_nought, report)
-            # Each does it for itself: none waits for another.
-            pilots = partial(decide, scene, config, cache, device, tell, stop, phase or phases.update)
+            report_pilot: Report = _ignore_step if report is None else partial(_as_step_nought, report)
+            # Every rank runs all pilots, so that none waits for another.
+            pilots = partial(decide, scene, config, cache, device, report_pilot, stop, phase or phases.update)
             answers = ranks.all_gather(ranks.run_on_all(pilots))
         if answers[0] is None or None in answers:
             return TrainResult(False, 0, None, {})
@@ -241,15 +241,17 @@ def _train_in_folder(
                 written = stack.enter_context(
                     TrainingLog(Path(log), trainer.steps, trainer.step, device, line.note, replace)
                 )
-            told = [report or line.update, *([written.step] if written else [])]
+            step_reports = [report or line.update, *([written.step] if written else [])]
 
-            def tell_all(trainer: Trainer, loss: float, mse: float) -> None:
-                for tell in told:
-                    tell(trainer.step, loss, mse, len(trainer.model))
+            def report_step(trainer: Trainer, loss: float, mse: float) -> None:
+                for report_to in step_reports:
+                    report_to(trainer.step, loss, mse, len(trainer.model))
                 if observer is not None and ranks.is_main:
                     observer(trainer)
 
-            complete = trainer.run(checkpoint=checkpoint, report=tell_all, stop=stop, warn=line.note, overwrite=replace)
+            complete = trainer.run(
+                checkpoint=checkpoint, report=report_step, stop=stop, warn=line.note, overwrite=replace
+            )
         if not complete or not ranks.is_main:
             if written:
                 written.end(complete=complete, step=trainer.step)
@@ -363,7 +365,7 @@ def _naming_the_checkpoint(trainer: Trainer, overwrite: bool) -> Iterator[None]:
         if isinstance(error, HyrfTrainingError) or trainer.saved is None:
             raise
         raise type(error)(
-            f"{error}; the checkpoint of step {trainer.saved:,} is kept, {resuming(overwrite)} resumes from there"
+            f"{error}; the checkpoint of step {trainer.saved:,} is kept, {resuming(overwrite)} continues from there"
         ) from error
 
 
@@ -381,7 +383,7 @@ def _prepare(
         raise HyrfError(f"{out}: there is no checkpoint to resume; leave out `resume=True` to start a run")
     left = [name for name in (MODEL_FILE, CHECKPOINT_FILE) if (out / name).exists()]
     if left and not (resume or overwrite or record is not None):
-        hint = "`resume=True` resumes it, " if CHECKPOINT_FILE in left else ""
+        hint = "`resume=True` continues it, " if CHECKPOINT_FILE in left else ""
         raise HyrfError(f"{out}: the folder holds an earlier run ({left[-1]}); {hint}`overwrite=True` replaces it")
     _check_outputs(out, scene, overwrite=resume or overwrite or record is not None)
 

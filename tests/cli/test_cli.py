@@ -230,8 +230,8 @@ def test_video_without_ffmpeg_is_a_note_beside_the_pictures(packed, tmp_path, mo
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ((), "the same command with --resume resumes"),
-        (("--overwrite",), "with --resume instead of --overwrite resumes"),
+        ((), "the same command with --resume continues"),
+        (("--overwrite",), "with --resume instead of --overwrite continues"),
     ],
     ids=["new", "overwriting"],
 )

@@ -183,8 +183,10 @@ def test_training_goes_on_without_checkpoints_that_do_not_fit(data, run, tmp_pat
         result = hyrfpack("train", data, "-o", tmp_path, *STEPS)
 
     assert result.exit_code == 0, result.output
-    told = [line for line in result.stderr.splitlines() if "training continues, without the checkpoint of step" in line]
-    assert len(told) == 19 and all(line.startswith(f"{tmp_path / 'checkpoint.pt'}: ") for line in told)
+    notes = [
+        line for line in result.stderr.splitlines() if "training continues, without the checkpoint of step" in line
+    ]
+    assert len(notes) == 19 and all(line.startswith(f"{tmp_path / 'checkpoint.pt'}: ") for line in notes)
     assert (tmp_path / "model.hyrf").read_bytes() == (run / "model.hyrf").read_bytes()
     assert {path.name for path in tmp_path.iterdir()} == {"model.hyrf", "metrics.json", "curve.png", "views"}
 
@@ -221,7 +223,7 @@ def test_disk_that_fills_in_training_keeps_the_checkpoint_and_resumes_to_the_sam
     out.mkdir()
     (out / "model.hyrf").write_bytes(b"old")
 
-    kept = r"checkpoint of step \d+ is kept, the same command with `resume=True` instead of `overwrite=True` resumes"
+    kept = r"checkpoint of step \d+ is kept, the same command with `resume=True` instead of `overwrite=True` continues"
     with pytest.raises(HyrfError, match=rf"model.hyrf: the disk is full.*{kept}") as e:
         train(balls(fill_from_the_30th), out, CONFIG, overwrite=True, cache=PictureCache(0), quiet=True)
 

@@ -355,7 +355,7 @@ def test_a_run_of_two_that_has_lost_one_says_so_and_can_be_resumed(data, uninter
     words = ("-m", "hyrfpack", "train", data, "-o", tmp_path / "run", *LONG, "--json", "--processes", 2)
     output, errors = ended(*words, folder=tmp_path, code=2)
     told, who = [line for line in errors.splitlines() if line.startswith("Error: ")]
-    assert "one of the 2 processes has ended" in told and "the same command with --resume resumes" in told
+    assert "one of the 2 processes has ended" in told and "the same command with --resume continues" in told
     assert "process 1 of 2 was ended by SIGKILL" in who
     assert json.loads(output)["error"] == told.removeprefix("Error: ") and "Traceback" not in errors
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["checkpoint.pt"]

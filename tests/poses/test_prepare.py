@@ -254,7 +254,7 @@ def test_a_set_of_two_cameras_some_on_their_side_becomes_one_scene(tmp_path):
     report = hyrfpack.estimate_poses(folder, tmp_path / "scene")
     assert report.registered == len(known)
     assert any("turned upright" in note for note in report.notes)
-    assert any("2 cameras or zooms are told apart" in note for note in report.notes)
+    assert any("2 cameras or zooms are distinguished" in note for note in report.notes)
     scene = hyrfpack.load_scene(tmp_path / "scene")
     assert {(view.camera.width, view.camera.height) for view in scene.views} == {SIZE, (4 * SIZE[0] // 5, SIZE[1])}
     assert len(json.loads((tmp_path / "scene" / "poses.json").read_text())["made"]) == len(known)

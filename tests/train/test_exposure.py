@@ -200,7 +200,7 @@ def test_gains_are_not_learnt_by_default_even_where_photos_differ_by_a_stop():
 
 def test_gains_of_photos_without_tracks_start_at_one():
     trainer = Trainer(dataclasses.replace(exposed_scene(alternating(6)), tracks={}), SHORT)
-    assert trainer.choices["exposure"] == "per-image gains; no tracks tell of the photos"
+    assert trainer.choices["exposure"] == "per-image gains; no tracks show the photos' exposures"
     assert torch.equal(trainer.exposures.values, torch.zeros(6, 3))
 
 

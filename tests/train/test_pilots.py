@@ -293,6 +293,17 @@ def test_pilots_take_a_sixth_of_the_run_within_limits(steps, pilot_steps):
     assert exposure_pilots.exposure_pilot_steps(steps) == pilot_steps
 
 
+@pytest.mark.parametrize("left", [0, 1, 3])
+def test_too_few_validation_photos_with_pixels_decide_nothing(scores, monkeypatch, left):
+    monkeypatch.setattr(exposure_pilots, "exposure_spread", lambda *_: 1.0)
+    scores |= {False: [20.0] * 2, True: [25.0] * 2, "apart": (0.0,) * left}
+    scene = a_scene(20)
+    usable = {view.name for view in pilots.split(scene.train, 4, 16)[1][:left]}
+    views = [view if view.name in usable else masked(view) for view in scene.train]
+    decision, reason = measure_exposure(ScenePilots(dataclasses.replace(scene, train=views), LONG, PictureCache(), CPU))
+    assert decision is False and f"{left} " in reason and "validation photos" in reason
+
+
 def test_photos_of_one_exposure_take_no_pilots():
     runs = ScenePilots(a_scene(20), LONG, PictureCache(), CPU)
     decision, reason = measure_exposure(runs)

@@ -146,7 +146,7 @@ def test_an_interruption_while_scoring_is_completed_without_training(no_training
 def test_a_model_that_does_not_fit_leaves_the_checkpoint_and_resuming_completes_the_run(full, undisturbed, tmp_path):
     full.add("model.hyrf")
     with pytest.raises(
-        HyrfError, match=r"model.hyrf: the disk is full.*checkpoint of step 19 is kept.*`resume=True` resumes"
+        HyrfError, match=r"model.hyrf: the disk is full.*checkpoint of step 19 is kept.*`resume=True` continues"
     ):
         train(a_scene(), tmp_path, CONFIG, quiet=True)
     assert names(tmp_path) == {"checkpoint.pt"}

@@ -4,7 +4,7 @@ import { elementText } from "./dom.js";
 
 const POLL_INTERVAL_MS = 4;
 
-// The graphics context was lost during an operation. An event of the canvas tells when it is restored.
+// The graphics context was lost during an operation. The canvas fires an event when it is restored.
 export class ContextLostError extends Error {}
 
 const contextChanges = new WeakMap(); // context -> how often it was lost or restored

@@ -8,7 +8,7 @@ export class SupersededError extends Error {}
 
 export class Loader {
   // `content(message)` is called with each content that was read (see worker_tasks.js), one after the other; its
-  // promise tells whether the content is shown. `progress({what, part})` is called with the fraction `part` of the step
+  // promise resolves to whether the content is shown. `progress({what, part})` is called with the fraction `part` of the step
   // `what`.
   constructor({ content, progress }) {
     if (!window.DecompressionStream) throw new Error("This browser is too old to unpack the scene; take a newer one.");

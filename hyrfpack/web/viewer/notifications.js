@@ -31,7 +31,7 @@ export function toast(sentence, address = "") {
   else toastTimer = setTimeout(() => (element("toast").hidden = true), TOAST_MS);
 }
 
-// Tells screen readers a sentence.
+// Announces a sentence to screen readers.
 export function announce(sentence) {
   element("status").textContent = sentence;
 }
