@@ -545,10 +545,10 @@ def test_a_file_of_a_kilobyte_takes_no_time(name):
 
 @pytest.mark.parametrize("make", [most_gaussians, largest_tables], ids=lambda make: make.__name__)
 def test_a_kilobyte_that_is_worth_all_that_the_format_allows_is_read_in_bounded_memory(make):
-    (verdict,) = in_javascript([(make(), False)])
+    small, largest = in_javascript([(GOLDEN[0].read_bytes(), False), (make(), False)])
 
-    assert verdict.groups and verdict.seconds < 10
-    assert verdict.peak < 4 * FREE
+    assert largest.groups and largest.seconds < 10
+    assert largest.peak - small.peak < 4 * FREE  # node itself takes more on one machine than on another
 
 
 def test_a_section_that_promises_nothing_and_an_unknown_one_change_nothing():
