@@ -1,4 +1,4 @@
-"""The command line, called as a person would; see also `scenes`."""
+"""Functions that run the command line as a user would."""
 
 from __future__ import annotations
 
@@ -8,17 +8,22 @@ from hyrfpack.cli import main
 
 
 def hyrfpack(*arguments: object) -> Result:
+    """Run `hyrfpack` with these arguments and return its exit code and output."""
     return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 def succeeded(*arguments: object) -> Result:
+    """Run a command and check that its exit code is 0."""
     result = hyrfpack(*arguments)
     assert result.exit_code == 0, result.output
     return result
 
 
 def refused(*arguments: object) -> str:
-    """Run a command that the user got wrong; returns its one sentence."""
+    """Run a command that ends in a user error and return its error line.
+
+    The exit code is 2, standard output is empty and there is no traceback.
+    """
     result = hyrfpack(*arguments)
     assert result.exit_code == 2, result.output
     assert result.stdout == ""

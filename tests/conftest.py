@@ -1,5 +1,7 @@
-"""Shared fixtures: photos, programs under node. Tests may also import what lies beside this (`scenes`, tiny made-up
-worlds; `commands`), and what `tools` has."""
+"""Fixtures shared by all tests: photos, scripts that run under node, signal handling.
+
+Tests may also import the helper modules in this folder (`scenes` with small synthetic scenes, `commands`) and `tools`.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +18,11 @@ from typing import Any
 
 import pytest
 
-# OpenMP's threads spin while they wait and take the cores from the kernels' own: tiny pictures train 3 times slower on
-# a quiet machine and 20 times on a busy one. Read once, when torch is loaded.
+# OpenMP's threads spin while they wait and take the cores from the kernels' own threads: tiny pictures train 3 times
+# slower on a quiet machine and 20 times slower on a busy one. OpenMP reads this once, when torch is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-# Tests side by side have all cores busy; those of threads ask for more. On such small pictures as theirs a second
+# Parallel test workers keep all cores busy. Tests of threads set their own number. On such small pictures a second
 # thread takes a fifth more time.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("HYRFPACK_THREADS", "1")
@@ -28,23 +30,23 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 import torch
 
-# Without a GPU its kernels run in Triton's interpreter. Read once, when they are defined.
+# Without a GPU the kernels run in Triton's interpreter. Triton reads this once, when the kernels are defined.
 os.environ.setdefault("TRITON_INTERPRET", "0" if torch.cuda.is_available() else "1")
 if os.environ["TRITON_INTERPRET"] == "1" and find_spec("triton"):
-    from interpreter import patch_once
+    from interpreter import speed_up_interpreter
 
-    patch_once()
+    speed_up_interpreter()
 
-from ops.device import needs_triton  # not before: it asks for Triton, which reads the environment
+from ops.device import needs_triton  # this import asks for Triton, which reads the environment set above
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
-    """Marks what runs kernels of the GPU, so that a machine with one can choose that alone."""
+    """Mark the tests that run GPU kernels, so that a machine with a GPU can select them with `-m gpu`."""
     if needs_triton.mark in item.iter_markers():
         item.add_marker("gpu")
 
 
-# Until all tests are collected, nothing becomes garbage, and looking for it takes a third of the time.
+# Until all tests are collected nothing becomes garbage, and the garbage collector takes a third of the time.
 gc.disable()
 
 
@@ -55,7 +57,7 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def no_warming() -> None:
-    """No test reads a clock, so none waits for the machine to warm up."""
+    """Skip the warm-up of timings, because no test reads a clock."""
     from hyrfpack.measure import timing
 
     timing.WARM_UP_SECONDS = 0
@@ -63,9 +65,9 @@ def no_warming() -> None:
 
 @pytest.fixture
 def signals() -> Iterator[None]:
-    """Signals do what they do in a terminal, here and in programs started from here.
+    """Set the default signal handlers of a terminal, in this process and in programs started from it.
 
-    Whoever started the tests may have had some ignored, as nohup and the background of a script do.
+    The process that started the tests may ignore some signals, as nohup and a script's background jobs do.
     """
     usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
     if hasattr(signal, "SIGHUP"):
@@ -78,7 +80,7 @@ def signals() -> Iterator[None]:
 
 @pytest.fixture
 def short_imports(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As little work of an import as still makes a model."""
+    """Reduce the optimisation of an import of splats to the least that still makes a model."""
     from hyrfpack.distill import initialize, pack
 
     monkeypatch.setattr(initialize, "MIN_STEPS", 100)
@@ -87,7 +89,7 @@ def short_imports(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten small photos of the demo's scene, with poses; not to be changed."""
+    """A folder of ten small photos of the demo scene, with poses. Tests must not change it."""
     from hyrfpack.demo.scene import write_demo_scene
 
     return write_demo_scene(tmp_path_factory.mktemp("data"), views=10, size=48)
@@ -95,7 +97,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of real multi-view sets; tests that need it skip where it is absent."""
+    """The folder of real multi-view sets. Tests that need it skip where it is absent."""
     folder = Path(os.environ.get("HYRFPACK_DATA") or Path(__file__).parents[2] / "shared" / "data")
     if not folder.is_dir():
         pytest.skip(f"real data sets not found at {folder} (set HYRFPACK_DATA)")
@@ -104,7 +106,7 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def node() -> Callable[..., Any]:
-    """Runs a script of tests/node with arguments; returns the last line it prints, which is JSON."""
+    """A function that runs a script of tests/node with arguments and returns its last output line, parsed as JSON."""
     program, folder = shutil.which("node"), Path(__file__).parent / "node"
     if program is None:
         pytest.skip("node is not on this machine")

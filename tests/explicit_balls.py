@@ -1,4 +1,4 @@
-"""Made-up explicit Gaussians for tests of distillation."""
+"""Synthetic explicit Gaussians for tests of distillation."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import numpy as np
 from hyrfpack.distill import DistillConfig
 from hyrfpack.splats.splats import Splats, normalized_quats
 
-LITTLE = DistillConfig(steps=6, size=24, train_views=6, test_views=2)
+TINY_DISTILL_CONFIG = DistillConfig(steps=6, size=24, train_views=6, test_views=2)
 
 
-def ball(count: int, degree: int = 1, seed: int = 0) -> Splats:
-    """Coloured splats on the unit sphere, of random shapes and turns."""
+def ball_splats(count: int, degree: int = 1, seed: int = 0) -> Splats:
+    """Return coloured splats on the unit sphere, with random shapes and rotations."""
     rng = np.random.default_rng(seed)
     positions = rng.normal(size=(count, 3))
     return Splats(

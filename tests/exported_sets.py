@@ -1,5 +1,8 @@
-"""Writers of the layouts that other programs export, from what their documents say and with other algebra than the
-readers': one function a layout, `write(root, cameras, points, colors)`. Photos are where `photo_path` says."""
+"""Writers of the capture layouts that other programs export.
+
+They follow the documents of those programs, and use other algebra than the readers. Each layout has one function,
+`write(root, cameras, points, colors)`. `photo_path` says where the photos lie.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +13,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-FLIP = np.diag([1.0, -1, -1, 1])  # OpenCV's camera axes to OpenGL's, and back
+# Converts OpenCV camera axes to OpenGL axes and back.
+OPENGL_FROM_OPENCV = np.diag([1.0, -1, -1, 1])
 
 
 @dataclass(frozen=True)
-class Taken:
-    """A photo's name and its pinhole camera, OpenCV."""
+class PhotoCamera:
+    """The name of a photo and its OpenCV pinhole camera."""
 
     name: str
     width: int
@@ -32,7 +36,7 @@ class Taken:
 
 
 def photo_path(layout: str, index: int, name: str) -> str:
-    """Where a photo lies in a set of a layout."""
+    """Return the path of a photo below the root of a set, for a layout."""
     if layout == "polycam":
         return f"keyframes/corrected_images/{Path(name).stem}.jpg"
     if layout == "record3d":
@@ -40,7 +44,7 @@ def photo_path(layout: str, index: int, name: str) -> str:
     return f"images/{name}"
 
 
-def write_llff(root: Path, cameras: list[Taken], points: np.ndarray, colors: np.ndarray) -> None:
+def write_llff(root: Path, cameras: list[PhotoCamera], points: np.ndarray, colors: np.ndarray) -> None:
     rows = []
     for camera in cameras:
         right, down, forward, position = camera.world_from_camera[:3].T
@@ -49,10 +53,10 @@ def write_llff(root: Path, cameras: list[Taken], points: np.ndarray, colors: np.
     np.save(root / "poses_bounds.npy", np.array(rows))
 
 
-def write_bundler(root: Path, cameras: list[Taken], points: np.ndarray, colors: np.ndarray) -> None:
+def write_bundler(root: Path, cameras: list[PhotoCamera], points: np.ndarray, colors: np.ndarray) -> None:
     lines = ["# Bundle file v0.3", f"{len(cameras)} {len(points)}"]
     for camera in cameras:
-        seen = FLIP @ camera.camera_from_world
+        seen = OPENGL_FROM_OPENCV @ camera.camera_from_world
         lines.append(f"{camera.fx!r} 0 0")
         lines += [" ".join(map(repr, row)) for row in [*seen[:3, :3].tolist(), seen[:3, 3].tolist()]]
     for point, color in zip(points, colors, strict=True):
@@ -61,8 +65,8 @@ def write_bundler(root: Path, cameras: list[Taken], points: np.ndarray, colors: 
     (root / "list.txt").write_text("".join(f"./{camera.name} 0 {camera.fx:.3f}\n" for camera in cameras))
 
 
-def write_metashape(root: Path, cameras: list[Taken], points: np.ndarray, colors: np.ndarray) -> None:
-    """In a component that is turned, shifted and scaled against the world."""
+def write_metashape(root: Path, cameras: list[PhotoCamera], points: np.ndarray, colors: np.ndarray) -> None:
+    """Write a Metashape project whose component is rotated, shifted and scaled against the world."""
     rotation, scale, shift = (
         Rotation.from_euler("xyz", [10, 20, 30], degrees=True).as_matrix(),
         2.5,
@@ -95,10 +99,10 @@ def write_metashape(root: Path, cameras: list[Taken], points: np.ndarray, colors
     write_ply(root / "points.ply", points, colors)
 
 
-def write_realityscan(root: Path, cameras: list[Taken], points: np.ndarray, colors: np.ndarray) -> None:
+def write_realityscan(root: Path, cameras: list[PhotoCamera], points: np.ndarray, colors: np.ndarray) -> None:
     lines = ["#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
     for camera in cameras:
-        pose = camera.world_from_camera @ FLIP
+        pose = camera.world_from_camera @ OPENGL_FROM_OPENCV
         angles = Rotation.from_matrix(pose[:3, :3]).as_euler("ZXY", degrees=True)
         side = max(camera.width, camera.height)
         lens = (camera.fx * 36 / side, (camera.cx - camera.width / 2) / side, (camera.cy - camera.height / 2) / side)
@@ -108,18 +112,18 @@ def write_realityscan(root: Path, cameras: list[Taken], points: np.ndarray, colo
     write_ply(root / "sparse.ply", points, colors)
 
 
-def write_polycam(root: Path, cameras: list[Taken], points: np.ndarray, colors: np.ndarray) -> None:
+def write_polycam(root: Path, cameras: list[PhotoCamera], points: np.ndarray, colors: np.ndarray) -> None:
     folder = root / "keyframes" / "corrected_cameras"
     folder.mkdir(parents=True, exist_ok=True)
     for camera in cameras:
-        pose = camera.world_from_camera @ FLIP
+        pose = camera.world_from_camera @ OPENGL_FROM_OPENCV
         content = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
         content |= {key: getattr(camera, key) for key in ("fx", "fy", "cx", "cy", "width", "height")}
         (folder / f"{Path(camera.name).stem}.json").write_text(json.dumps(content | {"blur_score": 100.0}))
 
 
-def write_record3d(root: Path, cameras: list[Taken], points: np.ndarray, colors: np.ndarray) -> None:
-    poses = [camera.world_from_camera @ FLIP for camera in cameras]
+def write_record3d(root: Path, cameras: list[PhotoCamera], points: np.ndarray, colors: np.ndarray) -> None:
+    poses = [camera.world_from_camera @ OPENGL_FROM_OPENCV for camera in cameras]
     first = cameras[0]
     content = {
         "w": first.width,
@@ -139,7 +143,7 @@ def write_ply(file: Path, points: np.ndarray, colors: np.ndarray) -> None:
     file.write_text("\n".join((*header, *lines)) + "\n")
 
 
-WRITERS = {
+WRITERS_BY_LAYOUT = {
     "llff": write_llff,
     "metashape": write_metashape,
     "bundler": write_bundler,

@@ -13,7 +13,7 @@ from hyrfpack.scene import Camera
 
 
 def random_map(seed: int, centers: int | None = None) -> ExposureMap:
-    """A map of random numbers, as a file could hold them."""
+    """Return a valid map of random numbers."""
     rng = np.random.default_rng(seed)
     count = int(rng.integers(0, 12)) if centers is None else centers
     corners = rng.normal(size=(2, 3))
@@ -29,8 +29,11 @@ def random_map(seed: int, centers: int | None = None) -> ExposureMap:
     )
 
 
-def map_through(cameras: Sequence[Camera], frame: Frame, gains: np.ndarray) -> ExposureMap:
-    """A map that predicts gains (N, 3) or (N, 1) at so many cameras, which see different directions, to about 1 %."""
+def map_with_gains(cameras: Sequence[Camera], frame: Frame, gains: np.ndarray) -> ExposureMap:
+    """Return a map that predicts the gains (N, 3) or (N, 1) of N cameras to about 1 %.
+
+    The cameras must look in different directions.
+    """
     logs = np.log(np.broadcast_to(gains, (len(cameras), 3)))
     poses = [frame.local_pose(camera) for camera in cameras]
     places, directions = np.array([-p[:3, :3].T @ p[:3, 3] for p in poses]), np.array([p[2, :3] for p in poses])
@@ -53,8 +56,8 @@ def map_through(cameras: Sequence[Camera], frame: Frame, gains: np.ndarray) -> E
     )
 
 
-def same_map(one: ExposureMap | None, other: ExposureMap | None) -> bool:
-    """Whether two maps hold the same numbers; None is not the same as any map."""
+def maps_equal(one: ExposureMap | None, other: ExposureMap | None) -> bool:
+    """Return whether two maps hold the same numbers. None differs from every map, and from None."""
     if one is None or other is None:
         return False
     return all(np.array_equal(getattr(one, f.name), getattr(other, f.name)) for f in dataclasses.fields(one))

@@ -1,4 +1,4 @@
-"""Cameras of any sort, for hypothesis to choose from."""
+"""Hypothesis strategies for cameras."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ places = st.floats(-1e7, 1e7)
 
 @st.composite
 def cameras(draw) -> Camera:
-    """A camera of any size, lens and pose."""
+    """Draw a camera of any size, lens and pose."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_rotvec(draw(st.tuples(*3 * [st.floats(-4, 4)]))).as_matrix()
     pose[:3, 3] = draw(st.tuples(places, places, places))

@@ -1,4 +1,4 @@
-"""Reconstructions made up: poses by photo, and the same in another frame."""
+"""Synthetic reconstructions: poses by file name, and the same poses in another world frame."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 
-def circle(count: int = 24, noise: float = 0.0, seed: int = 0) -> dict[str, np.ndarray]:
-    """Cameras around the origin, which look at it."""
+def circle_poses(count: int = 24, noise: float = 0.0, seed: int = 0) -> dict[str, np.ndarray]:
+    """Return poses of cameras on a circle around the origin, which they look at."""
     rng, poses = np.random.default_rng(seed), {}
     for number in range(count):
         angle = 2 * np.pi * number / count
@@ -20,13 +20,13 @@ def circle(count: int = 24, noise: float = 0.0, seed: int = 0) -> dict[str, np.n
     return poses
 
 
-def line(count: int = 12) -> dict[str, np.ndarray]:
-    """Cameras that drive straight ahead."""
+def line_poses(count: int = 12) -> dict[str, np.ndarray]:
+    """Return poses of cameras that move straight ahead."""
     return {f"{n:03d}.jpg": np.column_stack([np.eye(3), [0, 0, -float(n)]]) for n in range(count)}
 
 
-def moved(poses: dict[str, np.ndarray], scale: float = 2.5, seed: int = 1) -> dict[str, np.ndarray]:
-    """The same cameras in another world frame."""
+def transform_poses(poses: dict[str, np.ndarray], scale: float = 2.5, seed: int = 1) -> dict[str, np.ndarray]:
+    """Return the same poses in a world frame that is rotated, scaled and shifted."""
     rotation = Rotation.random(random_state=seed).as_matrix()
     result = {}
     for name, pose in poses.items():

@@ -1,4 +1,4 @@
-"""Made-up splats for tests of formats, and ways to damage their files."""
+"""Synthetic splats for tests of formats, and ways to damage their files."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from hypothesis import strategies as st
 
 from hyrfpack.splats.splats import Splats, normalized_quats
 
-# Pieces of bytes that take the place of one, at fractions of a file; and how much of the file is left.
-EDITS = st.lists(st.tuples(st.floats(0, 0.999), st.binary(min_size=0, max_size=3)), min_size=1, max_size=4)
-LENGTHS = st.sampled_from([1.0, 1.0, 0.9, 0.3])
+# Each edit is a position, as a fraction of the file, and the bytes that replace the byte there.
+FILE_EDITS = st.lists(st.tuples(st.floats(0, 0.999), st.binary(min_size=0, max_size=3)), min_size=1, max_size=4)
+# The fraction of the file that is kept.
+KEPT_FRACTIONS = st.sampled_from([1.0, 1.0, 0.9, 0.3])
 
 
-def made_up(count: int = 40, degree: int = 3, shift=(0.0, 0.0, 0.0)) -> Splats:
-    """Random splats about `shift`."""
+def random_splats(count: int = 40, degree: int = 3, shift=(0.0, 0.0, 0.0)) -> Splats:
+    """Return random splats around `shift`."""
     rng = np.random.default_rng(count)
     return Splats(
         rng.normal(size=(count, 3)) + shift,
@@ -24,8 +25,8 @@ def made_up(count: int = 40, degree: int = 3, shift=(0.0, 0.0, 0.0)) -> Splats:
     )
 
 
-def damaged(data: bytes, edits: list[tuple[float, bytes]], length: float) -> bytes:
-    """A file cut to a fraction of its length, with pieces of it replaced."""
+def damage_file(data: bytes, edits: list[tuple[float, bytes]], length: float) -> bytes:
+    """Return the file's bytes cut to a fraction of their length, with the edits applied."""
     data = data[: int(length * len(data))]
     for place, piece in edits:
         at = int(place * len(data))

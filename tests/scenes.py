@@ -1,4 +1,4 @@
-"""Tiny worlds for tests: coloured balls, ray-cast in numpy, and cameras around them. Nothing is read from disk."""
+"""Small synthetic scenes: coloured balls, ray-cast in numpy, and cameras around them. Nothing is read from disk."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from hyrfpack.scene import Camera, Picture, Scene, View
 BALL_CENTERS = np.array([[-0.5, 0.0, 0.0], [0.45, 0.3, 0.1], [0.1, -0.5, -0.2]])
 BALL_RADII = np.array([0.45, 0.35, 0.3])
 BALL_COLORS = np.array([[0.9, 0.2, 0.1], [0.1, 0.8, 0.3], [0.2, 0.3, 0.9]])
-SKY = np.array([0.5, 0.6, 0.7])
+SKY_COLOR = np.array([0.5, 0.6, 0.7])
 
 
 def look_at(position, target, up=(0.0, 0.0, 1.0)) -> np.ndarray:
-    """camera_from_world (4, 4) of a camera at `position` that looks at `target`."""
+    """Return camera_from_world (4, 4) of a camera at `position` that looks at `target`."""
     position = np.asarray(position, np.float64)
     forward = np.asarray(target, np.float64) - position
     forward /= np.linalg.norm(forward)
@@ -31,19 +31,19 @@ def look_at(position, target, up=(0.0, 0.0, 1.0)) -> np.ndarray:
 
 
 def camera_at(position, target=(0, 0, 0), up=(0, 0, 1), *, width=32, height=32, focal=None) -> Camera:
-    """A centred pinhole camera, 53 degrees wide unless a focal length in pixels is given."""
+    """Return a centred pinhole camera with a field of view of 53 degrees, or with this focal length in pixels."""
     focal = float(focal or width)
     return Camera(width, height, focal, focal, width / 2, height / 2, look_at(position, target, up))
 
 
 def ring(count: int, radius: float = 3.0, elevation: float = 1.0, **options) -> list[Camera]:
-    """Cameras on a circle around the z axis, all looking at the origin."""
+    """Return cameras on a circle around the z axis, all looking at the origin."""
     angles = 2 * np.pi * np.arange(count) / count
     return [camera_at((radius * np.cos(a), radius * np.sin(a), elevation), **options) for a in angles]
 
 
-def moved(cameras, offset) -> list[Camera]:
-    """The cameras, each as far away as `offset` (3,)."""
+def shift_cameras(cameras, offset) -> list[Camera]:
+    """Return the cameras shifted by `offset` (3,) in world units."""
     result = []
     for camera in cameras:
         pose = camera.camera_from_world.copy()
@@ -53,13 +53,13 @@ def moved(cameras, offset) -> list[Camera]:
 
 
 def photograph(camera: Camera, *, scale: float = 1.0, offset=(0, 0, 0), alpha: bool = False) -> Picture:
-    """Ray-cast the balls, lit from above, under an even sky (or with no coverage there)."""
+    """Ray-cast the balls, lit from above, under a uniform sky (with `alpha`: with no coverage there)."""
     columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(columns)], -1)
     rays = rays @ camera.rotation
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     nearest = np.full(columns.shape, np.inf)
-    rgb = np.broadcast_to(SKY, (*columns.shape, 3)).copy()
+    rgb = np.broadcast_to(SKY_COLOR, (*columns.shape, 3)).copy()
     for center, radius, color in zip(BALL_CENTERS * scale + offset, BALL_RADII * scale, BALL_COLORS, strict=True):
         along = rays @ (center - camera.position)
         inside = along**2 - np.sum((center - camera.position) ** 2) + radius**2
@@ -73,7 +73,7 @@ def photograph(camera: Camera, *, scale: float = 1.0, offset=(0, 0, 0), alpha: b
 
 
 def ball_points(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 3) on the balls and their colours (N, 3)."""
+    """Return points (N, 3) on the balls and their colours (N, 3)."""
     generator = np.random.default_rng(seed)
     which = generator.integers(len(BALL_RADII), size=count)
     normals = generator.normal(size=(count, 3))
@@ -83,14 +83,14 @@ def ball_points(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def view_of(name: str, camera: Camera, picture: Picture) -> View:
-    """A view of a picture that is already there."""
+    """Return a view whose picture is already in memory."""
     return View(name, camera, lambda: picture)
 
 
 def ball_scene(
     views: int = 8, points: int = 100, *, side: int = 32, scale: float = 1.0, offset=(0, 0, 0), alpha: bool = False
 ) -> Scene:
-    """The balls seen from a ring; the whole world `scale` times larger and then moved by `offset`."""
+    """Return a scene of the balls seen from a ring, scaled by `scale` and then shifted by `offset`."""
     named = []
     for number, camera in enumerate(ring(views, width=side, height=side)):
         pose = camera.camera_from_world.copy()
@@ -112,7 +112,7 @@ def small_model(
     seed: int = 0,
     **settings,
 ) -> HybridModel:
-    """A model with little tables. `fields` scales what the two fields say: 0 silences them exactly."""
+    """Return a model with small hash tables. `fields` scales the output of both fields; 0 makes it exactly 0."""
     positions = torch.as_tensor(np.asarray(positions), dtype=torch.float32).reshape(-1, 3)
     count = len(positions)
     frame = frame or Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
@@ -135,11 +135,13 @@ def small_model(
     return model
 
 
-def tracks_of(scene: Scene, facing: float = 0.5) -> dict[str, np.ndarray]:
-    """The points of balls that each training photo sees, on the sides that face it: by this cosine at least."""
-    centers = np.argmin(
-        np.abs(np.linalg.norm(scene.points[:, None] - BALL_CENTERS, axis=2) - BALL_RADII), axis=1
-    )  # of the ball that each lies on
+def visible_points_by_photo(scene: Scene, facing: float = 0.5) -> dict[str, np.ndarray]:
+    """Return, by training photo, the indices of the points on balls that it sees.
+
+    A point counts where the cosine between its normal and the direction to the camera exceeds `facing`.
+    """
+    # Index of the ball that each point lies on.
+    centers = np.argmin(np.abs(np.linalg.norm(scene.points[:, None] - BALL_CENTERS, axis=2) - BALL_RADII), axis=1)
     normals = (scene.points - BALL_CENTERS[centers]) / BALL_RADII[centers, None]
     tracks = {}
     for view in scene.train:
@@ -155,20 +157,20 @@ def tracks_of(scene: Scene, facing: float = 0.5) -> dict[str, np.ndarray]:
     return tracks
 
 
-def shown(picture: Picture, gains) -> Picture:
-    """A photo whose odds y / (1 - y) are `gains` (one, or three) times as large."""
+def expose_picture(picture: Picture, gains) -> Picture:
+    """Return the photo with its odds y / (1 - y) multiplied by `gains` (one or three)."""
     odds = picture.rgb / np.maximum(255.0 - picture.rgb, 1e-9) * gains
     return dataclasses.replace(picture, rgb=(255 * odds / (1 + odds)).round().astype(np.uint8))
 
 
 def exposed_scene(gains: np.ndarray, side: int = 64, points: int = 300) -> Scene:
-    """Balls in photos of these gains (N, 1) or (N, 3), with tracks."""
+    """Return the scene of the balls in photos with these gains (N, 1) or (N, 3), with tracks."""
     scene = ball_scene(len(gains), points, side=side)
-    views = [view_of(v.name, v.camera, shown(v.load(), g)) for v, g in zip(scene.train, gains, strict=True)]
-    return dataclasses.replace(scene, train=views, tracks=tracks_of(scene))
+    views = [view_of(v.name, v.camera, expose_picture(v.load(), g)) for v, g in zip(scene.train, gains, strict=True)]
+    return dataclasses.replace(scene, train=views, tracks=visible_points_by_photo(scene))
 
 
-def alternating(count: int, stops: float = 0.5) -> np.ndarray:
-    """(N, 1) gains that turn middle grey, of which light is the 2.2th power, so many stops lighter and darker."""
+def alternating_gains(count: int, stops: float = 0.5) -> np.ndarray:
+    """Return (N, 1) gains that make middle grey alternately `stops` lighter and darker (light = value ** 2.2)."""
     lighter = 0.5 * 2 ** (np.where(np.arange(count) % 2, -stops, stops) / 2.2)
     return (lighter / (1 - lighter))[:, None]

@@ -25,7 +25,7 @@ def files_in(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("old", [b"old", None])
-def test_write_puts_the_bytes_there_and_leaves_nothing_else(tmp_path, old):
+def test_write_creates_the_file_and_leaves_no_other_file(tmp_path, old):
     path = tmp_path / "model.hyrf"
     if old is not None:
         path.write_bytes(old)
@@ -54,7 +54,7 @@ def test_write_follows_a_link(tmp_path):
     assert (tmp_path / "link").is_symlink() and files_in(tmp_path / "there") == {"model.hyrf": b"new"}
 
 
-def test_write_takes_the_longest_name_the_folder_can_hold(tmp_path):
+def test_write_accepts_the_longest_name_that_the_folder_can_hold(tmp_path):
     name = "n" * 255
 
     write_atomic(tmp_path / name, b"new")
@@ -90,7 +90,7 @@ def test_failure_leaves_the_old_file_and_no_temporary_one(tmp_path, monkeypatch,
         (errno.EROFS, "the file cannot be written (Read-only file system); choose another place or repair this one"),
     ],
 )
-def test_disk_that_takes_no_more_is_one_sentence(tmp_path, monkeypatch, number, sentence):
+def test_a_full_or_failing_disk_is_a_clear_error(tmp_path, monkeypatch, number, sentence):
     def fail(_):
         raise OSError(number, os.strerror(number))
 
@@ -102,8 +102,8 @@ def test_disk_that_takes_no_more_is_one_sentence(tmp_path, monkeypatch, number, 
     assert files_in(tmp_path) == {}
 
 
-def test_write_that_stops_half_way_leaves_the_old_file(tmp_path):
-    # A real short write: the process may not make files over 4096 bytes.
+def test_an_incomplete_write_leaves_the_old_file(tmp_path):
+    # The limit causes a real short write: the process may not create files of more than 4096 bytes.
     resource = pytest.importorskip("resource")
     path = tmp_path / "model.hyrf"
     path.write_bytes(b"old")
@@ -120,7 +120,7 @@ def test_write_that_stops_half_way_leaves_the_old_file(tmp_path):
 
 @pytest.mark.skipif(os.name == "nt", reason="needs SIGKILL")
 @pytest.mark.parametrize(("step", "expected"), [("fsync", b"old"), ("replace", b"old"), ("_sync_folder", b"new" * 999)])
-def test_process_killed_at_a_step_leaves_one_whole_file(tmp_path, step, expected):
+def test_a_process_killed_at_any_step_leaves_one_complete_file(tmp_path, step, expected):
     path = tmp_path / "model.hyrf"
     path.write_bytes(b"old")
     script = (
@@ -140,7 +140,7 @@ def test_process_killed_at_a_step_leaves_one_whole_file(tmp_path, step, expected
     assert path.read_bytes() == expected
     litter = [name for name in files_in(tmp_path) if name != "model.hyrf"]
     assert len(litter) == (expected == b"old") and all(re.fullmatch(r"\.hyrfpack-\w+\.tmp", name) for name in litter)
-    write_atomic(tmp_path / "another", b"next")  # the next one to write into the folder cleans up
+    write_atomic(tmp_path / "another", b"next")  # the next writer in the folder removes the temporary file
     assert files_in(tmp_path) == {"model.hyrf": expected, "another": b"next"}
 
 
@@ -150,7 +150,7 @@ needs_locks = pytest.mark.skipif(atomic.fcntl is None, reason="needs the locks o
 
 
 @needs_locks
-def test_file_of_a_living_writer_is_not_litter(tmp_path):
+def test_the_temporary_file_of_a_live_writer_is_kept(tmp_path):
     with replace_file(tmp_path / "slow") as temporary:
         temporary.write_bytes(b"half")
         write_atomic(tmp_path / "quick", b"whole")
@@ -160,7 +160,7 @@ def test_file_of_a_living_writer_is_not_litter(tmp_path):
 
 
 @needs_locks
-def test_folder_without_locks_keeps_litter_and_takes_files(tmp_path, monkeypatch):
+def test_a_folder_without_locks_keeps_temporary_files_and_can_be_written(tmp_path, monkeypatch):
     def unsupported(*_):
         raise OSError(errno.ENOLCK, "No locks available")
 
@@ -172,7 +172,7 @@ def test_folder_without_locks_keeps_litter_and_takes_files(tmp_path, monkeypatch
     assert files_in(tmp_path) == {".hyrfpack-0.tmp": b"perhaps somebody's", "model.hyrf": b"new"}
 
 
-def test_system_without_locks_keeps_litter_and_takes_files(tmp_path, monkeypatch):
+def test_a_system_without_locks_keeps_temporary_files_and_can_be_written(tmp_path, monkeypatch):
     (tmp_path / ".hyrfpack-0.tmp").write_bytes(b"perhaps somebody's")
     monkeypatch.setattr(atomic, "fcntl", None)
 
@@ -182,7 +182,7 @@ def test_system_without_locks_keeps_litter_and_takes_files(tmp_path, monkeypatch
 
 
 @needs_locks
-def test_file_taken_for_litter_before_it_was_locked_is_made_anew(tmp_path, monkeypatch):
+def test_a_temporary_file_removed_before_it_was_locked_is_created_again(tmp_path, monkeypatch):
     taken = []
 
     def steal_the_first(descriptor, operation):
@@ -200,8 +200,8 @@ def test_file_taken_for_litter_before_it_was_locked_is_made_anew(tmp_path, monke
 
 
 @needs_locks
-def test_writers_of_one_file_at_once_never_mix(tmp_path):
-    """Four processes, which also look for each other's litter; whoever reads finds the whole of one of them."""
+def test_simultaneous_writers_of_one_file_never_mix_their_bytes(tmp_path):
+    """Four processes write one file and look for temporary files. A reader always finds one complete version."""
     path, rounds, length = tmp_path / "model.hyrf", 60, 100_000
     path.write_bytes(b"0" * length)
     script = (
@@ -226,14 +226,14 @@ def test_writers_of_one_file_at_once_never_mix(tmp_path):
     assert len(seen) > 1 and files_in(tmp_path).keys() == {"model.hyrf"}
 
 
-# -- nothing is replaced without being asked ---------------------------------------------------------------------------
+# -- nothing is replaced unless overwriting is allowed ----------------------------------------------------------------
 
-ROUNDS = 50
+RACE_ROUNDS = 50
 
 
 @pytest.fixture(params=["hard links", "no hard links"])
 def file_system(request, monkeypatch) -> None:
-    """With hard links and without, as on FAT."""
+    """The file system with hard links, and without them as on FAT."""
 
     def unsupported(*_, **__):
         raise PermissionError(errno.EPERM, "Operation not permitted")
@@ -243,14 +243,14 @@ def file_system(request, monkeypatch) -> None:
 
 
 @pytest.mark.usefixtures("file_system")
-def test_without_overwrite_a_new_file_gets_its_name(tmp_path):
+def test_without_overwrite_a_new_file_gets_the_requested_name(tmp_path):
     assert write_atomic(tmp_path / "model.hyrf", b"new", overwrite=False) == tmp_path / "model.hyrf"
 
     assert files_in(tmp_path) == {"model.hyrf": b"new"}
 
 
 @pytest.mark.usefixtures("file_system")
-def test_without_overwrite_a_file_that_is_there_is_kept_and_the_first_free_name_is_taken(tmp_path):
+def test_without_overwrite_an_existing_file_is_kept_and_the_first_free_name_is_used(tmp_path):
     (tmp_path / "model.hyrf").write_bytes(b"old")
     (tmp_path / "model-2.hyrf").write_bytes(b"older")
 
@@ -285,7 +285,7 @@ def test_without_overwrite_and_rename_a_file_created_while_writing_is_an_error(t
 
 @pytest.mark.usefixtures("file_system")
 @pytest.mark.parametrize("kind", ["folder", "dangling link", "link to a file"])
-def test_without_overwrite_whatever_has_the_name_is_kept(kind, tmp_path):
+def test_without_overwrite_anything_with_the_same_name_is_kept(kind, tmp_path):
     (tmp_path / "other").write_bytes(b"old")
     path = tmp_path / "model.hyrf"
     if kind == "folder":
@@ -300,7 +300,7 @@ def test_without_overwrite_whatever_has_the_name_is_kept(kind, tmp_path):
     assert not (tmp_path / "nowhere").exists()
 
 
-def test_without_overwrite_the_path_that_is_returned_is_written_as_it_was_asked_for(tmp_path, monkeypatch):
+def test_without_overwrite_a_relative_path_is_returned_as_a_relative_path(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "model.hyrf").write_bytes(b"old")
 
@@ -317,7 +317,7 @@ def test_without_overwrite_the_path_that_is_returned_is_written_as_it_was_asked_
         ("no suffix", "no suffix-2"),
         (".hidden", ".hidden-2"),
         (".hidden.hyrf", ".hidden-2.hyrf"),
-        ("\u00fc" * 125 + ".hyrf", "\u00fc" * 124 + "-2.hyrf"),  # 255 bytes, of two for each letter
+        ("\u00fc" * 125 + ".hyrf", "\u00fc" * 124 + "-2.hyrf"),  # 255 bytes, because each letter takes two
     ],
 )
 def test_a_free_name_keeps_the_whole_suffix_and_fits_into_a_folder(name, second, tmp_path):
@@ -328,8 +328,8 @@ def test_a_free_name_keeps_the_whole_suffix_and_fits_into_a_folder(name, second,
     assert write_atomic(tmp_path / name, b"new", overwrite=False) == tmp_path / second
 
 
-def test_a_claimed_name_is_given_up_when_the_file_cannot_take_it(tmp_path, monkeypatch):
-    """On file systems without hard links."""
+def test_a_claimed_name_is_released_when_the_file_cannot_be_moved_there(tmp_path, monkeypatch):
+    """File systems without hard links claim a name by an empty file."""
 
     def fail(*_):
         raise OSError(errno.EIO, os.strerror(errno.EIO))
@@ -345,7 +345,7 @@ def test_a_claimed_name_is_given_up_when_the_file_cannot_take_it(tmp_path, monke
 
 @pytest.mark.skipif(os.name == "nt", reason="needs SIGKILL")
 @pytest.mark.parametrize(("step", "whole"), [("fsync", False), ("link", False), ("after link", True)])
-def test_process_killed_while_it_names_a_file_leaves_a_whole_file_or_none(tmp_path, step, whole):
+def test_a_process_killed_while_naming_a_file_leaves_a_complete_file_or_none(tmp_path, step, whole):
     script = (
         "import os, signal, sys\n"
         "from hyrfpack.atomic import write_atomic\n"
@@ -360,39 +360,39 @@ def test_process_killed_while_it_names_a_file_leaves_a_whole_file_or_none(tmp_pa
     done = subprocess.run([sys.executable, "-c", script, tmp_path / "model.hyrf"], env=environment, check=False)
 
     assert done.returncode == -9
-    write_atomic(tmp_path / "another", b"next")  # the next one to write into the folder removes the temporary file
+    write_atomic(tmp_path / "another", b"next")  # the next writer in the folder removes the temporary file
     assert files_in(tmp_path) == {"another": b"next", **({"model.hyrf": b"new" * 999} if whole else {})}
 
 
-def race(folder: Path, letter: bytes, start, answers) -> None:
-    """One of the processes that all write the same names, round by round."""
-    for number in range(ROUNDS):
+def write_in_race(folder: Path, letter: bytes, start, answers) -> None:
+    """Write the same names as the other process, round by round."""
+    for number in range(RACE_ROUNDS):
         start.wait()
         answers.put((number, write_atomic(folder / f"{number}.hyrf", letter * 1000, overwrite=False).name))
 
 
-def test_of_two_processes_that_write_one_name_without_overwrite_neither_result_is_lost_50_times(tmp_path):
+def test_two_processes_that_write_one_name_without_overwrite_keep_both_results_in_50_races(tmp_path):
     spawn = get_context("spawn")
     start, answers = spawn.Barrier(2), spawn.Queue()
-    racers = [spawn.Process(target=race, args=(tmp_path, letter, start, answers)) for letter in (b"a", b"b")]
+    racers = [spawn.Process(target=write_in_race, args=(tmp_path, letter, start, answers)) for letter in (b"a", b"b")]
     for racer in racers:
         racer.start()
-    told = sorted(answers.get() for _ in range(2 * ROUNDS))
+    told = sorted(answers.get() for _ in range(2 * RACE_ROUNDS))
     for racer in racers:
         racer.join()
 
-    assert told == sorted((number, f"{number}{end}.hyrf") for number in range(ROUNDS) for end in ("", "-2"))
+    assert told == sorted((number, f"{number}{end}.hyrf") for number in range(RACE_ROUNDS) for end in ("", "-2"))
     files = files_in(tmp_path)
     assert files.keys() == {name for _, name in told}
-    for number in range(ROUNDS):
+    for number in range(RACE_ROUNDS):
         assert {files[f"{number}.hyrf"], files[f"{number}-2.hyrf"]} == {b"a" * 1000, b"b" * 1000}
 
 
-# -- places that take no file ----------------------------------------------------------------------------------------
+# -- places that cannot hold a file ----------------------------------------------------------------------------------
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
-def test_pipe_is_refused_also_behind_a_link(tmp_path):
+def test_a_pipe_is_rejected_also_behind_a_link(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "link").symlink_to(tmp_path / "pipe")
 
@@ -404,14 +404,14 @@ def test_pipe_is_refused_also_behind_a_link(tmp_path):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")
-def test_device_is_refused_and_stays():
+def test_a_device_is_rejected_and_stays_in_place():
     with pytest.raises(HyrfError, match="/dev/full: this is a device or a pipe; name a file"):
         write_atomic("/dev/full", b"new")
 
     assert stat.S_ISCHR(os.stat("/dev/full").st_mode)
 
 
-def test_working_folder_that_was_removed_is_one_sentence(tmp_path, monkeypatch):
+def test_working_folder_that_was_removed_is_a_clear_error(tmp_path, monkeypatch):
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
@@ -420,30 +420,30 @@ def test_working_folder_that_was_removed_is_one_sentence(tmp_path, monkeypatch):
         write_atomic("model.hyrf", b"new")
 
 
-def test_a_failed_write_lets_go_of_the_bytes(tmp_path):
+def test_a_failed_write_releases_its_bytes(tmp_path):
     buffer = io.BytesIO(b"new")
 
-    with pytest.raises(HyrfError) as kept:  # with its traceback, and what its frames hold
+    with pytest.raises(HyrfError) as kept:  # the traceback's frames hold references to the bytes
         write_atomic(tmp_path, buffer.getbuffer())
 
     buffer.close()  # BufferError while there is a view of it
     assert kept.value
 
 
-def test_missing_folders_are_made(tmp_path):
+def test_missing_folders_are_created(tmp_path):
     write_atomic(tmp_path / "absent" / "too" / "model.hyrf", b"new")
 
     assert (tmp_path / "absent" / "too" / "model.hyrf").read_bytes() == b"new"
 
 
-def test_file_in_place_of_a_folder_is_named(tmp_path):
+def test_a_file_in_place_of_a_folder_is_named_in_the_error(tmp_path):
     (tmp_path / "photos").write_bytes(b"")
 
     with pytest.raises(HyrfError, match="photos: the folder cannot be made"):
         write_atomic(tmp_path / "photos" / "model.hyrf", b"new")
 
 
-def test_folder_in_the_way_is_named(tmp_path):
+def test_a_folder_with_the_name_of_the_file_is_named_in_the_error(tmp_path):
     (tmp_path / "model.hyrf").mkdir()
 
     with pytest.raises(HyrfError, match="model.hyrf: this is a folder"):
@@ -453,7 +453,7 @@ def test_folder_in_the_way_is_named(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
-def test_folder_without_permission_is_one_sentence(tmp_path):
+def test_folder_without_permission_is_a_clear_error(tmp_path):
     tmp_path.chmod(0o555)
     try:
         with pytest.raises(HyrfError, match="Permission denied"):

@@ -1,4 +1,4 @@
-"""The words that settings take are those that the rooms know."""
+"""The words that settings accept are those of the packages that define them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hyrfpack.make import QUALITIES
 from hyrfpack.train.config import PRECISIONS
 
 
-def test_the_words_are_those_of_the_rooms():
+def test_the_choices_are_those_of_the_packages_that_define_them():
     assert choices.LAYOUTS == tuple(LAYOUTS)
     assert choices.QUALITIES == tuple(QUALITIES)
     assert choices.PRECISIONS == PRECISIONS

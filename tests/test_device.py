@@ -1,4 +1,4 @@
-"""Choosing a device, bringing photos there, and a GPU that is not there."""
+"""Choice of a device, upload of photos, and the fake GPU itself."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from pretend_gpu import CUDA, OnGpu, pretended_gpu
+from fake_gpu import CUDA_DEVICE, FakeGpuTensor, use_fake_gpu
 
 from hyrfpack import device as devices
 from hyrfpack.device import choose_device, describe_device, make_current, upload
@@ -26,15 +26,15 @@ def test_auto_is_the_cpu_where_there_is_no_gpu():
 
 
 def test_auto_is_cuda_where_there_is_a_gpu_with_triton(monkeypatch):
-    with pretended_gpu():
+    with use_fake_gpu():
         assert choose_device() == torch.device("cuda")
         monkeypatch.setattr(devices, "has_triton", lambda: False)
         assert choose_device() == torch.device("cpu")
 
 
-def test_each_thread_takes_the_gpu_it_works_on(monkeypatch):
+def test_each_thread_selects_the_gpu_that_it_works_on(monkeypatch):
     taken = []
-    with pretended_gpu():
+    with use_fake_gpu():
         monkeypatch.setattr(torch.cuda, "set_device", taken.append)
         for name in ("cpu", "cuda", "cuda:0", "cuda:1"):
             make_current(torch.device(name))
@@ -43,52 +43,52 @@ def test_each_thread_takes_the_gpu_it_works_on(monkeypatch):
 
 @needs_no_gpu
 @pytest.mark.parametrize("name", ["cuda", "cuda:0", "mps"])
-def test_a_device_that_is_not_there_is_refused_in_one_sentence(name):
+def test_a_device_that_is_not_there_is_rejected_with_a_clear_error(name):
     with pytest.raises(HyrfError, match=f"'{name}' is not there.*`device='cpu'`"):
         choose_device(name)
 
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "cuda:-1", "cpu:0", "", "auto:1"])
-def test_what_is_no_device_is_refused_in_one_sentence(name):
+def test_a_text_that_names_no_device_is_rejected(name):
     with pytest.raises(HyrfError, match="is not a device"):
         choose_device(name)
 
 
-def test_a_gpu_beyond_the_last_is_refused():
-    with pretended_gpu(), pytest.raises(HyrfError, match="cuda:1.*sees 1 of them"):
+def test_a_gpu_beyond_the_last_is_rejected():
+    with use_fake_gpu(), pytest.raises(HyrfError, match="cuda:1.*sees 1 of them"):
         choose_device("cuda:1")
 
 
 @pytest.mark.parametrize("name", ["auto", "cuda", "cuda:0"])
-def test_a_child_forked_from_a_process_that_uses_the_gpu_is_told_so_at_once(name, monkeypatch):
+def test_a_child_forked_from_a_process_that_uses_the_gpu_is_a_clear_error(name, monkeypatch):
     monkeypatch.setattr(torch.cuda, "_is_in_bad_fork", lambda: True)
-    with pretended_gpu(), pytest.raises(HyrfError, match="was forked.*'spawn'"):
+    with use_fake_gpu(), pytest.raises(HyrfError, match="was forked.*'spawn'"):
         choose_device(name)
     assert choose_device("cpu").type == "cpu"
 
 
 @needs_no_gpu
-def test_a_forked_child_takes_the_cpu_where_there_is_no_gpu(monkeypatch):
+def test_a_forked_child_uses_the_cpu_where_there_is_no_gpu(monkeypatch):
     monkeypatch.setattr(torch.cuda, "_is_in_bad_fork", lambda: True)
     assert choose_device("auto").type == "cpu"
 
 
 @needs_no_gpu
-def test_devices_may_be_given_as_torch_has_them():
+def test_a_device_may_be_given_as_a_torch_device():
     assert choose_device(torch.device("cpu", 0)) == torch.device("cpu")
     with pytest.raises(HyrfError, match="'cuda:0' is not there"):
         choose_device(torch.device("cuda", 0))
 
 
-def test_kernels_refuse_tensors_of_another_gpu_than_the_current_one(monkeypatch):
-    with pretended_gpu() as gpu:
+def test_kernels_reject_tensors_on_a_gpu_that_is_not_the_current_one(monkeypatch):
+    with use_fake_gpu() as gpu:
         monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
         with pytest.raises(ValueError, match=r"set_device\(0\)"):
             hash_encode(torch.zeros(1, 3, device=gpu), torch.zeros(8, 2, device=gpu), (2,), 3)
 
 
-def test_cuda_is_called_by_the_number_of_the_current_one(monkeypatch):
-    with pretended_gpu():
+def test_cuda_without_a_number_is_described_as_the_current_gpu(monkeypatch):
+    with use_fake_gpu():
         monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
         assert describe_device(torch.device("cuda")) == "cuda:1 (a GPU that is not there)"
         assert describe_device(torch.device("cuda", 0)) == "cuda:0 (a GPU that is not there)"
@@ -96,8 +96,8 @@ def test_cuda_is_called_by_the_number_of_the_current_one(monkeypatch):
 
 
 @pytest.mark.parametrize(("has", "package"), [(has_numba, "numba"), (has_triton, "triton")])
-def test_kernels_are_there_only_where_their_compiler_can_be_imported(has, package, monkeypatch):
-    """Numba is installed and raises ImportError where numpy is newer than it knows."""
+def test_kernels_are_available_only_where_their_compiler_can_be_imported(has, package, monkeypatch):
+    """Numba may be installed and raise ImportError, where numpy is newer than Numba supports."""
 
     class Refuses:
         def find_spec(self, name, path=None, target=None):
@@ -110,15 +110,15 @@ def test_kernels_are_there_only_where_their_compiler_can_be_imported(has, packag
     assert not has.__wrapped__()
 
 
-def test_a_slow_choice_is_told(monkeypatch):
+def test_a_slow_device_is_reported(monkeypatch):
     said = []
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
     monkeypatch.setattr(devices, "has_triton", lambda: False)
     assert choose_device("mps", said.append).type == "mps"
-    with pretended_gpu():
+    with use_fake_gpu():
         assert choose_device("cuda", said.append).type == "cuda"
     monkeypatch.setattr(devices, "has_triton", lambda: True)
-    with pretended_gpu():
+    with use_fake_gpu():
         choose_device("cuda", said.append)
         monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _: (7, 5))
         choose_device("cuda", said.append)
@@ -135,15 +135,15 @@ def test_a_photo_is_the_same_on_any_device(has_alpha, solid):
     picture = Picture(np.ascontiguousarray(rgb), alpha, generator.random((5, 7)) > 0.5)
 
     here, mask_here = upload(picture, solid, torch.device("cpu"))
-    with pretended_gpu():
-        there, mask_there = upload(picture, solid, CUDA)
+    with use_fake_gpu():
+        there, mask_there = upload(picture, solid, CUDA_DEVICE)
 
-    assert isinstance(there, OnGpu) and isinstance(mask_there, OnGpu)
-    torch.testing.assert_close(there.here, here, rtol=0, atol=1e-7)
-    assert torch.equal(mask_there.here, mask_here) and torch.equal(mask_here, torch.from_numpy(picture.mask))
+    assert isinstance(there, FakeGpuTensor) and isinstance(mask_there, FakeGpuTensor)
+    torch.testing.assert_close(there.cpu_tensor, here, rtol=0, atol=1e-7)
+    assert torch.equal(mask_there.cpu_tensor, mask_here) and torch.equal(mask_here, torch.from_numpy(picture.mask))
 
 
-def test_photos_stay_on_a_gpu_as_far_as_they_fit(monkeypatch):
+def test_photos_are_cached_on_a_gpu_up_to_a_limit(monkeypatch):
     rgb = np.random.default_rng(0).integers(0, 256, (2, 4, 5, 3), dtype=np.uint8)
     first, second = (Picture(one, None, None) for one in rgb)
     solid = np.zeros(3, np.float32)
@@ -151,12 +151,12 @@ def test_photos_stay_on_a_gpu_as_far_as_they_fit(monkeypatch):
     monkeypatch.setattr(
         devices, "_upload_bytes", lambda *args, send=devices._upload_bytes: sent.append(args[0]) or send(*args)
     )
-    with pretended_gpu() as gpu:
+    with use_fake_gpu() as gpu:
         photos = devices.Photos(gpu)
         assert photos.limit_bytes == 1 << 30
         photos.limit_bytes = first.nbytes + second.nbytes - 1
         drawn = [
-            photos.get(name, picture, solid)[0].here
+            photos.get(name, picture, solid)[0].cpu_tensor
             for name, picture in [("first", first), ("second", second), ("first", first), ("second", second)]
         ]
     assert [picture is first for picture in sent] == [True, False, False]
@@ -173,11 +173,11 @@ def test_photos_on_the_cpu_are_those_of_upload():
     assert mask.all() and photos.nbytes == 0
 
 
-# -- the pretended GPU finds what a real one would -----------------------------------------------------------------
+# -- the fake GPU fails where a real one would --------------------------------------------------------------------
 
 
 def test_mixing_devices_fails():
-    with pretended_gpu() as gpu:
+    with use_fake_gpu() as gpu:
         there = torch.ones(3, device=gpu)
         with pytest.raises(RuntimeError, match="same device"):
             there + torch.ones(3)
@@ -189,10 +189,10 @@ def test_mixing_devices_fails():
             np.asarray(there)
 
 
-def test_results_stay_where_their_inputs_are():
-    with pretended_gpu() as gpu:
+def test_results_stay_on_the_device_of_their_inputs():
+    with use_fake_gpu() as gpu:
         there = torch.arange(6.0, device=gpu).requires_grad_()
         made = [there * 2, there.new_zeros(2), there.new_tensor([1.0]), torch.zeros_like(there), there.sum()]
         (there.square().sum() * torch.tensor(2.0)).backward()
         assert all(tensor.device == gpu for tensor in [*made, there.grad])
-        assert torch.equal(there.grad.cpu(), 4 * torch.arange(6.0)) and not isinstance(there.cpu(), OnGpu)
+        assert torch.equal(there.grad.cpu(), 4 * torch.arange(6.0)) and not isinstance(there.cpu(), FakeGpuTensor)

@@ -1,4 +1,4 @@
-"""Every public function has an example in its docstring, and it says what happens."""
+"""Every public function has an example in its docstring, and the example gives what it shows."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from made_up_photos import write_photos
 import hyrfpack
 from hyrfpack import quant
 
-OPERATIONS = (
+DOCUMENTED_OPERATIONS = (
     "activate", "adam", "background", "composite", "contraction", "hash_encode", "mlp", "rasterize", "shade", "ssim",
 )  # fmt: skip
-# Not for users: `background_grid` and `shade` take a whole decoder, which no short example makes.
-WITHOUT = {
+# These functions are not for users. `background_grid` and `shade` take a whole decoder, which no short example makes.
+FUNCTIONS_WITHOUT_EXAMPLE = {
     "background_colors", "background_grid", "check_inputs", "check_shading", "choose_shading_implementation", "shade",
 }  # fmt: skip
 
 
-def public_functions() -> Iterator[tuple[str, object]]:
+def list_public_functions() -> Iterator[tuple[str, object]]:
     for name in hyrfpack.__all__:
         if inspect.isfunction(getattr(hyrfpack, name)):
             yield f"hyrfpack.{name}", getattr(hyrfpack, name)
     for name in ("gallery", "player"):
         yield f"hyrfpack.export.{name}", getattr(hyrfpack.export, name)
     yield "hyrfpack.train.photos_of", hyrfpack.train.photos_of
-    modules = [importlib.import_module(f"hyrfpack.ops.{name}") for name in OPERATIONS]
+    modules = [importlib.import_module(f"hyrfpack.ops.{name}") for name in DOCUMENTED_OPERATIONS]
     operations = {f"{m.__name__}.{name}": value for m in modules for name, value in vars(m).items()}
     coders = {f"{quant.__name__}.{name}": getattr(quant, name) for name in quant.__all__}
     for name, value in {**operations, **coders}.items():
         module, _, short = name.rpartition(".")
         here = value.__module__ == module or module == quant.__name__ if inspect.isfunction(value) else False
-        if here and not short.startswith("_") and short not in WITHOUT:
+        if here and not short.startswith("_") and short not in FUNCTIONS_WITHOUT_EXAMPLE:
             yield name, value
 
 
-FUNCTIONS = dict(public_functions())
+PUBLIC_FUNCTIONS = dict(list_public_functions())
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, data: Path) -> Path:
-    """Where the examples run: photos with and without poses, a short run, its compressed file and its splats."""
+    """The folder in which the examples run, with photos, photos with poses, a short run, its packed file and splats."""
     root = tmp_path_factory.mktemp("examples")
     (root / "photos").mkdir()
     (root / "photos" / "bonsai").symlink_to(data)
@@ -61,14 +61,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory, data: Path) -> Path:
     return root
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("name", PUBLIC_FUNCTIONS)
 def test_the_example_of_a_public_function_runs(name, folder, monkeypatch, capsys):
-    function = FUNCTIONS[name]
+    function = PUBLIC_FUNCTIONS[name]
     known = {**vars(inspect.getmodule(function)), "np": np, "torch": torch}
     found = doctest.DocTestFinder(recurse=False).find(function, name, globs=known)
     examples = [example for test in found for example in test.examples]
     partner = name.replace("decode", "encode").replace("unpack", "pack")
-    assert examples or (partner != name and ">>>" in FUNCTIONS[partner].__doc__), f"{name} has no example"
+    assert examples or (partner != name and ">>>" in PUBLIC_FUNCTIONS[partner].__doc__), f"{name} has no example"
     monkeypatch.chdir(folder)
     runner = doctest.DocTestRunner(verbose=False)
     for test in found:

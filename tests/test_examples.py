@@ -1,4 +1,4 @@
-"""The scripts in examples/ do what they say, on photos and Gaussians of a few pixels."""
+"""The scripts in examples/ run, on photos and Gaussians of a few pixels."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from explicit_balls import ball
+from explicit_balls import ball_splats
 from PIL import Image
 
 from hyrfpack.format import describe
 from hyrfpack.splats.formats import ply
 
-ROOT = Path(__file__).parents[1]
+REPOSITORY_ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -21,10 +21,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("examples")
 
 
-def test_the_scripts_go_from_photos_to_a_file_to_pictures_and_back_from_splats(folder, data, monkeypatch, capsys):
+def test_the_example_scripts_train_compress_render_and_import(folder, data, monkeypatch, capsys):
     def run(script: str, *arguments: object) -> str:
         monkeypatch.setattr(sys, "argv", [script, *map(str, arguments)])
-        runpy.run_path(str(ROOT / "examples" / script), run_name="__main__")
+        runpy.run_path(str(REPOSITORY_ROOT / "examples" / script), run_name="__main__")
         return capsys.readouterr().out
 
     monkeypatch.chdir(folder)
@@ -35,15 +35,15 @@ def test_the_scripts_go_from_photos_to_a_file_to_pictures_and_back_from_splats(f
     assert said.startswith("frames: 2 pictures of ")
     assert [Image.open(folder / "frames" / f"{number:04d}.png").size for number in (0, 1)] == [(48, 48)] * 2
 
-    (folder / "scene.ply").write_bytes(ply.encode(ball(40)))
+    (folder / "scene.ply").write_bytes(ply.encode(ball_splats(40)))
     files = ("scene.ply", "scene.hyrf", "compare.png")
     run("import_and_compare.py", *files, "--steps", 4, "--psnr", 15, "--size", 48)
     width, height = Image.open(folder / "compare.png").size
     assert describe(folder / "scene.hyrf")["gaussians"] > 0 and (width, height) == (2 * 48, 3 * 48)
 
 
-def test_every_script_says_how_it_is_used():
-    scripts = sorted(path.name for path in (ROOT / "examples").glob("*.py"))
+def test_every_script_states_its_usage():
+    scripts = sorted(path.name for path in (REPOSITORY_ROOT / "examples").glob("*.py"))
     assert scripts == ["import_and_compare.py", "read_and_render.py", "train_and_compress.py"]
     for script in scripts:
-        assert f"python examples/{script} " in (ROOT / "examples" / script).read_text()
+        assert f"python examples/{script} " in (REPOSITORY_ROOT / "examples" / script).read_text()

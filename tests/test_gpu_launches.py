@@ -1,7 +1,7 @@
-"""What a step of training asks of a GPU, counted on a pretended one (see `pretend_gpu`).
+"""Counts the work that a training step gives a GPU, on a fake one (see `fake_gpu`).
 
-Small scenes take as long as a GPU needs to be told what to do: every launch is a few microseconds, and after every wait
-it stands idle until more arrives.
+For small scenes this work decides the time: each launch costs a few microseconds, and after each wait the GPU is idle
+until it receives more.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from fake_gpu import listen_to_gpu, use_fake_gpu
 from ops.device import INTERPRETED, needs_triton
-from pretend_gpu import listening, pretended_gpu
 from scenes import ball_scene
 from torch import Tensor
 
@@ -28,75 +28,81 @@ pytestmark = [
     pytest.mark.skipif(not INTERPRETED, reason="kernels are built for the GPU that is there"),
 ]
 
-PACKAGE = Path(hyrfpack.__file__).parent
-LAUNCHES, WAITS = 110, 4
-SECOND = 2  # the step that is counted: in the first, tables are made that last
+PACKAGE_FOLDER = Path(hyrfpack.__file__).parent
+MAX_STEP_LAUNCHES = 110
+STEP_WAITS = 4
+# The second step is counted, because the first one also fills caches.
+COUNTED_STEP = 2
 
-Asked = Counter[tuple[str, str, str]]  # kind, name, and the line of the package
+# Counts by kind, name and the line of the package.
+WorkCounts = Counter[tuple[str, str, str]]
 
 
-def line() -> str:
-    """The innermost line of the package that runs now."""
+def current_package_line() -> str:
+    """Return the innermost line of the package that runs now."""
     frame = sys._getframe(1)
     while frame is not None:
         path = Path(frame.f_code.co_filename)
-        if path.is_relative_to(PACKAGE):
-            return f"{path.relative_to(PACKAGE)}:{frame.f_lineno}"
+        if path.is_relative_to(PACKAGE_FOLDER):
+            return f"{path.relative_to(PACKAGE_FOLDER)}:{frame.f_lineno}"
         frame = frame.f_back
     return "elsewhere"
 
 
-def asked_in_a_step(points: int, side: int) -> Asked:
-    """What the second step asks, of so many Gaussians and photos of so many pixels a side."""
+def count_step_work(points: int, side: int) -> WorkCounts:
+    """Count the work of the second step, for a number of Gaussians and photos of `side` pixels a side."""
     scene = ball_scene(views=3, points=points, side=side)
     scene = dataclasses.replace(scene, test=scene.train[:1])
-    # The round of density control comes after the last step, so that gradients are collected for it.
+    # Density control acts after the last step, so that gradients are collected for it.
     density = DensityConfig(start=1.0, stop=1.0, rounds=1)
     config = TrainConfig(
         steps=3, max_gaussians=points, density=density, log2_table_size=5, background=True, exposure=False
     )
-    asked: Asked = Counter()
+    asked: WorkCounts = Counter()
 
     def listen(kind: str, name: str) -> None:
-        if trainer.step == SECOND:
-            asked[kind, name, line()] += 1
+        if trainer.step == COUNTED_STEP:
+            asked[kind, name, current_package_line()] += 1
 
-    with pytest.MonkeyPatch.context() as patch, pretended_gpu() as gpu:
-        # Few levels, for the interpreter is slow; the coarser with fewer rows than there are points, as in real scenes.
+    with pytest.MonkeyPatch.context() as patch, use_fake_gpu() as gpu:
+        # Few levels, because the interpreter is slow. The coarser level has fewer rows than there are points, as in
+        # real scenes.
         patch.setattr(
             "hyrfpack.train.setup.HashGridConfig",
             lambda log2_table_size, **sizes: HashGridConfig(log2_table_size, **(sizes | {"levels": 2, "base": 2})),
         )
         trainer = Trainer(scene, config, device=gpu)
-        with listening(listen):
-            trainer.run(stop=lambda: trainer.step == SECOND)
-    assert trainer.step == SECOND and len(trainer.model) == points
+        with listen_to_gpu(listen):
+            trainer.run(stop=lambda: trainer.step == COUNTED_STEP)
+    assert trainer.step == COUNTED_STEP and len(trainer.model) == points
     return asked
 
 
-def of_kind(asked: Asked, kind: str) -> int:
+def count_kind(asked: WorkCounts, kind: str) -> int:
     return sum(count for (its, *_), count in asked.items() if its == kind)
 
 
-def listed(asked: Asked) -> str:
+def format_counts(asked: WorkCounts) -> str:
     return "\n".join(f"{count:4} {kind:7} {name:24} {place}" for (kind, name, place), count in sorted(asked.items()))
 
 
 @pytest.fixture(scope="module")
-def asked() -> Asked:
-    return asked_in_a_step(points=20, side=8)
+def asked() -> WorkCounts:
+    return count_step_work(points=20, side=8)
 
 
-def test_a_step_is_few_launches(asked: Asked) -> None:
-    assert of_kind(asked, "launch") <= LAUNCHES, f"{of_kind(asked, 'launch')} launches:\n{listed(asked)}"
+def test_a_step_has_at_most_110_launches(asked: WorkCounts) -> None:
+    assert count_kind(asked, "launch") <= MAX_STEP_LAUNCHES, (
+        f"{count_kind(asked, 'launch')} launches:\n{format_counts(asked)}"
+    )
 
 
-def test_a_step_waits_four_times(asked: Asked) -> None:
-    """For what is in view, how many pairs it makes, the nodes of the background, and the loss."""
-    assert of_kind(asked, "wait") == WAITS, f"{of_kind(asked, 'wait')} waits:\n{listed(asked)}"
+def test_a_step_waits_four_times(asked: WorkCounts) -> None:
+    """The waits are for what is in view, the number of tile-Gaussian pairs, the background nodes and the loss."""
+    assert count_kind(asked, "wait") == STEP_WAITS, f"{count_kind(asked, 'wait')} waits:\n{format_counts(asked)}"
 
 
-def test_all_parts_of_a_step_are_counted(asked: Asked) -> None:
+def test_all_parts_of_a_step_are_counted(asked: WorkCounts) -> None:
     names = {name for kind, name, _ in asked if kind == "launch"}
     kernels = {
         "frustum_kernel",
@@ -109,16 +115,16 @@ def test_all_parts_of_a_step_are_counted(asked: Asked) -> None:
     kernels |= {"composite_kernel", "grad_grid_kernel", "adam_step_kernel"}
     assert names >= kernels | {"index_add_", "searchsorted", "zeros", "arange"}
     assert {name for kind, name, _ in asked if kind == "wait"} == {"tolist", "nonzero"}
-    assert of_kind(asked, "copy") > 0  # the photo, at least
+    assert count_kind(asked, "copy") > 0  # the photo, at least
 
 
-def test_a_step_of_a_bigger_scene_asks_for_no_more(asked: Asked) -> None:
-    """Beyond a block of every kernel, and beyond a tile of the picture."""
-    bigger = asked_in_a_step(points=130, side=17)
-    assert bigger == asked, f"more:\n{listed(bigger - asked)}\nfewer:\n{listed(asked - bigger)}"
+def test_a_step_of_a_larger_scene_gives_the_gpu_the_same_work(asked: WorkCounts) -> None:
+    """The scene exceeds one block of every kernel, and one tile of the picture."""
+    bigger = count_step_work(points=130, side=17)
+    assert bigger == asked, f"more:\n{format_counts(bigger - asked)}\nfewer:\n{format_counts(asked - bigger)}"
 
 
-# -- the count itself ------------------------------------------------------------------------------------------------
+# -- the counting itself ---------------------------------------------------------------------------------------------
 
 
 def set_first(x: Tensor) -> None:
@@ -154,11 +160,11 @@ def set_first(x: Tensor) -> None:
         (set_first, ["copy", "wait"]),
     ],
 )
-def test_what_is_a_launch_a_wait_or_a_copy(act: Callable[[Tensor], object], expected: list[str]) -> None:
+def test_each_operation_counts_as_launch_wait_or_copy(act: Callable[[Tensor], object], expected: list[str]) -> None:
     heard = []
-    with pretended_gpu() as gpu:
+    with use_fake_gpu() as gpu:
         x = torch.ones(3).to(gpu)
-        with listening(lambda kind, name: heard.append(kind)):
+        with listen_to_gpu(lambda kind, name: heard.append(kind)):
             act(x)
         act(x)
     assert heard == expected

@@ -1,6 +1,6 @@
-"""Training and rendering on a GPU, from end to end: on a pretended one where there is none (see `pretend_gpu`).
+"""Training and rendering on a GPU from end to end; on a fake one where there is none (see `fake_gpu`).
 
-Wrong devices and hidden copies fail here as they would there; the numbers agree with the CPU's.
+Wrong devices and hidden copies fail as on a real GPU, and the values agree with the CPU's.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from contextlib import nullcontext
 import pytest
 import torch
 from commands import succeeded
-from explicit_balls import ball
+from explicit_balls import ball_splats
+from fake_gpu import use_fake_gpu
 from ops.device import needs_triton
-from pretend_gpu import pretended_gpu
 from scenes import ball_points, ball_scene, camera_at, small_model
 
 import hyrfpack
@@ -27,14 +27,14 @@ from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 
 pytestmark = needs_triton
 
-# A round of density control after steps 1 and 3.
-DENSITY = DensityConfig(start=0.1, stop=1.0, rounds=2, gradient=1e-5, resets=1)
-CONFIG = TrainConfig(steps=3, max_gaussians=30, density=DENSITY, precision="float32", log2_table_size=5)
+# Density control acts after steps 1 and 3.
+DENSITY_CONFIG = DensityConfig(start=0.1, stop=1.0, rounds=2, gradient=1e-5, resets=1)
+TRAIN_CONFIG = TrainConfig(steps=3, max_gaussians=30, density=DENSITY_CONFIG, precision="float32", log2_table_size=5)
 
 
 @pytest.fixture(autouse=True)
 def few_levels(monkeypatch):
-    """Models of 2 levels: the interpreter is slow."""
+    """Models have 2 levels, because the interpreter is slow."""
     monkeypatch.setattr(
         "hyrfpack.train.setup.HashGridConfig",
         lambda log2_table_size, **sizes: HashGridConfig(log2_table_size, levels=2, **sizes),
@@ -43,64 +43,64 @@ def few_levels(monkeypatch):
 
 @pytest.fixture
 def gpu():
-    """A CUDA device, for the time of a test."""
-    with nullcontext(torch.device("cuda", 0)) if torch.cuda.is_available() else pretended_gpu() as device:
+    """A CUDA device for the duration of a test."""
+    with nullcontext(torch.device("cuda", 0)) if torch.cuda.is_available() else use_fake_gpu() as device:
         yield device
 
 
-def a_scene():
+def make_scene():
     scene = ball_scene(views=3, points=20, side=16)
     return dataclasses.replace(scene, test=scene.train[:1])
 
 
-def curve(trainer: Trainer) -> list[tuple[float, float, int]]:
-    """Loss, mean squared error and number of Gaussians of each step."""
+def record_curve(trainer: Trainer) -> list[tuple[float, float, int]]:
+    """Return loss, mean squared error and number of Gaussians of each step."""
     found = []
     trainer.run(report=lambda trainer, loss, mse: found.append((loss, mse, len(trainer.model))))
     return found
 
 
-def numbers(trainer: Trainer) -> dict[str, torch.Tensor]:
+def parameter_values(trainer: Trainer) -> dict[str, torch.Tensor]:
     return {name: p.detach().cpu() for name, p in trainer.model.named_parameters()}
 
 
-def test_training_takes_the_same_course_as_on_the_cpu(gpu):
-    here, there = Trainer(a_scene(), CONFIG), Trainer(a_scene(), CONFIG, device=gpu)
+def test_training_agrees_with_the_cpu(gpu):
+    here, there = Trainer(make_scene(), TRAIN_CONFIG), Trainer(make_scene(), TRAIN_CONFIG, device=gpu)
 
-    torch.testing.assert_close(curve(there), curve(here), rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(record_curve(there), record_curve(here), rtol=1e-4, atol=1e-6)
 
     assert all(p.device == gpu for p in there.model.parameters())
-    for (name, value), expected in zip(numbers(there).items(), numbers(here).values(), strict=True):
+    for (name, value), expected in zip(parameter_values(there).items(), parameter_values(here).values(), strict=True):
         # Adam's first steps are as long for a rounded gradient as for a large one.
         assert (value - expected).abs().median() < 1e-4, name
 
 
-def test_mixed_precision_starts_where_float32_does(gpu):
-    config = dataclasses.replace(CONFIG, steps=1)
-    mixed = curve(Trainer(a_scene(), dataclasses.replace(config, precision="mixed"), device=gpu))
-    ((loss, *_),), ((expected, *_),) = mixed, curve(Trainer(a_scene(), config))
+def test_mixed_precision_starts_near_the_loss_of_float32(gpu):
+    config = dataclasses.replace(TRAIN_CONFIG, steps=1)
+    mixed = record_curve(Trainer(make_scene(), dataclasses.replace(config, precision="mixed"), device=gpu))
+    ((loss, *_),), ((expected, *_),) = mixed, record_curve(Trainer(make_scene(), config))
     assert loss == pytest.approx(expected, rel=1e-2) and loss != expected
 
 
-def test_a_run_goes_on_on_another_device(gpu, tmp_path):
-    first = Trainer(a_scene(), CONFIG, device=gpu)
+def test_a_run_resumes_on_another_device(gpu, tmp_path):
+    first = Trainer(make_scene(), TRAIN_CONFIG, device=gpu)
     assert not first.run(checkpoint=tmp_path / "c.pt", stop=lambda: first.step == 2)
-    second, whole = Trainer(a_scene(), CONFIG), Trainer(a_scene(), CONFIG)
+    second, whole = Trainer(make_scene(), TRAIN_CONFIG), Trainer(make_scene(), TRAIN_CONFIG)
 
     second.load(tmp_path / "c.pt")
 
     assert second.step == 2
-    torch.testing.assert_close(curve(second), curve(whole)[2:], rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(record_curve(second), record_curve(whole)[2:], rtol=1e-4, atol=1e-6)
 
 
 def test_a_gradient_that_is_not_finite_is_named(gpu):
-    trainer = Trainer(a_scene(), CONFIG, device=gpu)
+    trainer = Trainer(make_scene(), TRAIN_CONFIG, device=gpu)
     trainer.model.gaussians.scale_logits.register_hook(lambda grad: grad * float("nan"))
     with pytest.raises(hyrfpack.HyrfTrainingError, match="gradient is not finite.*: scale_logits"):
         trainer.run()
 
 
-def a_model(**settings):
+def make_model(**settings):
     points, colors = ball_points(40)
     colors = torch.from_numpy(colors) * 4 - 2
     return small_model(points, color_logits=colors, scale_logits=-2.0, fields=1.0, **settings)
@@ -108,9 +108,9 @@ def a_model(**settings):
 
 @pytest.mark.parametrize("kept", [False, True])
 @pytest.mark.parametrize("encoding", ["frequency", "sh"])
-def test_pictures_are_those_of_the_cpu(gpu, kept, encoding):
+def test_renders_agree_with_the_cpu(gpu, kept, encoding):
     camera = camera_at((0.3, -2.2, 0.6), (0.2, 0, 0), width=30, height=20)
-    model = a_model(background=True, direction_encoding=encoding)
+    model = make_model(background=True, direction_encoding=encoding)
     model.precision = "float32"
     with torch.no_grad():
         expected = render(model, camera, depth=True)
@@ -125,13 +125,13 @@ def test_pictures_are_those_of_the_cpu(gpu, kept, encoding):
 
 @pytest.mark.parametrize("kept", [False, True])
 @pytest.mark.parametrize("part", ["positions", "color_logits", "opacity_logits", "table", "background"])
-def test_numbers_that_are_not_finite_are_refused(gpu, part, kept):
-    model = a_model(background=part == "background")
+def test_numbers_that_are_not_finite_are_rejected(gpu, part, kept):
+    model = make_model(background=part == "background")
     with torch.no_grad():
         if part == "table":
             model.geometry.grid.table.fill_(float("nan"))
         elif part == "background":
-            model.gaussians.positions.mul_(1e-3)  # cells of their own, away from those of the sphere
+            model.gaussians.positions.mul_(1e-3)  # it then uses cells that the background sphere does not
             model.radiance.grid.table[model.config.radiance.offsets[-2] :: 2] = float("inf")
         else:
             getattr(model.gaussians, part)[3, 0] = float("nan")
@@ -152,7 +152,7 @@ def test_the_command_line_trains_and_renders_on_a_gpu(gpu, tmp_path):
 
 @pytest.fixture
 def few_pictures(monkeypatch):
-    """Calibration that compares as little as it can."""
+    """Calibration compares as few views as possible."""
     for name, value in (("MAX_CORRECTION_ROUNDS", 1), ("MIN_COMPARISON_VIEWS", 2), ("MAX_COMPARISON_VIEWS", 2)):
         monkeypatch.setattr(f"hyrfpack.compress.calibrate.{name}", value)
 
@@ -168,12 +168,12 @@ def test_a_model_is_measured_packed_and_fine_tuned_on_a_gpu(gpu, few_pictures, t
     assert sizes["cuda"] == pytest.approx(sizes["cpu"], rel=0.02)
 
 
-def test_gaussians_from_elsewhere_are_learnt_on_a_gpu(gpu, few_pictures, tmp_path, monkeypatch):
+def test_splats_of_other_programs_are_distilled_on_a_gpu(gpu, few_pictures, tmp_path, monkeypatch):
     monkeypatch.setattr("hyrfpack.distill.initialize.MIN_STEPS", 3)
     monkeypatch.setattr(
         "hyrfpack.distill.initialize.HashGridConfig", lambda log2, finest: HashGridConfig(log2, levels=2)
     )
-    # One thread: the interpreter runs one kernel at a time.
+    # One thread, because the interpreter runs one kernel at a time.
     monkeypatch.setattr(
         "hyrfpack.data.PictureCache.stream", lambda cache, views: ((view, cache.get(view)) for view in views)
     )
@@ -183,7 +183,7 @@ def test_gaussians_from_elsewhere_are_learnt_on_a_gpu(gpu, few_pictures, tmp_pat
     cameras = [camera_at(place, width=12, height=12) for place in ((0.0, -3, 0.5), (0.0, 3, 0.5), (3.0, 0, -0.5))]
     quick = DistillConfig(steps=1, test_views=2, psnr=12)
     reports = [
-        distill_splats(ball(12), tmp_path / f"{device}.hyrf", quick, cameras=cameras, device=device)
+        distill_splats(ball_splats(12), tmp_path / f"{device}.hyrf", quick, cameras=cameras, device=device)
         for device in ("cpu", "cuda")
     ]
     places = [(t.model.gaussians.positions.device, t.test.pictures[0].device) for t in taught]

@@ -1,4 +1,4 @@
-"""Folder locks: one call at a time works in a folder, whoever else tries."""
+"""Folder locks let one call at a time work in a folder, across threads and processes."""
 
 from __future__ import annotations
 
@@ -18,49 +18,51 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.lock import exclusive_folder
 
 pytest.importorskip("fcntl", reason="locks are of Unix")
-ROUNDS = 50
-BUSY = "another hyrfpack command is at work in this folder; wait until it has ended, or name another folder"
+RACE_ROUNDS = 50
+BUSY_FOLDER_ERROR = (
+    "another hyrfpack command is at work in this folder; wait until it has ended, or name another folder"
+)
 
 
-def refusal(folder: Path) -> str:
-    """What a second call is told."""
+def second_call_error(folder: Path) -> str:
+    """Try to enter a locked folder and return the error."""
     with pytest.raises(HyrfError) as caught, exclusive_folder(folder):
         raise AssertionError("it was let in")
     return str(caught.value)
 
 
-def race(folder: Path, start, end, answers) -> None:
-    """One of the processes that all want the same folders, round by round."""
-    for number in range(ROUNDS):
+def lock_in_race(folder: Path, start, end, answers) -> None:
+    """Compete for the same folders with the other process, round by round."""
+    for number in range(RACE_ROUNDS):
         start.wait()
         try:
             with exclusive_folder(folder / str(number)):
                 (folder / str(number) / "result").write_bytes(b"of one")
-                end.wait()  # every other process has tried
+                end.wait()  # every other process has tried by then
             answers.put((number, "worked"))
         except HyrfError:
             end.wait()
             answers.put((number, "refused"))
 
 
-def test_of_two_processes_that_race_for_a_folder_one_works_and_one_is_refused_50_times(tmp_path):
+def test_of_two_processes_that_race_for_a_folder_one_works_and_one_is_rejected_in_50_races(tmp_path):
     spawn = get_context("spawn")
     start, end, answers = spawn.Barrier(2), spawn.Barrier(2), spawn.Queue()
-    racers = [spawn.Process(target=race, args=(tmp_path, start, end, answers)) for _ in range(2)]
+    racers = [spawn.Process(target=lock_in_race, args=(tmp_path, start, end, answers)) for _ in range(2)]
     for racer in racers:
         racer.start()
-    found = sorted(answers.get() for _ in range(2 * ROUNDS))
+    found = sorted(answers.get() for _ in range(2 * RACE_ROUNDS))
     for racer in racers:
         racer.join()
 
-    assert found == [(number, outcome) for number in range(ROUNDS) for outcome in ("refused", "worked")]
+    assert found == [(number, outcome) for number in range(RACE_ROUNDS) for outcome in ("refused", "worked")]
 
 
-def test_second_call_is_refused_with_one_sentence_and_changes_nothing(tmp_path):
+def test_a_second_call_is_a_clear_error_and_changes_nothing(tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "model.hyrf").write_bytes(b"a model")
     with exclusive_folder(tmp_path / "run"):
-        assert refusal(tmp_path / "run") == f"{tmp_path / 'run'}: {BUSY}"
+        assert second_call_error(tmp_path / "run") == f"{tmp_path / 'run'}: {BUSY_FOLDER_ERROR}"
         assert (tmp_path / "run" / "model.hyrf").read_bytes() == b"a model"
 
 
@@ -79,17 +81,17 @@ def test_folder_is_free_again_after_the_call_and_after_its_failure(tmp_path):
 def test_two_threads_of_one_process_exclude_each_other(tmp_path):
     told = []
     with exclusive_folder(tmp_path):
-        thread = threading.Thread(target=lambda: told.append(refusal(tmp_path)))
+        thread = threading.Thread(target=lambda: told.append(second_call_error(tmp_path)))
         thread.start()
         thread.join()
-    assert told == [f"{tmp_path}: {BUSY}"]
+    assert told == [f"{tmp_path}: {BUSY_FOLDER_ERROR}"]
 
 
 def test_another_name_of_the_same_folder_is_locked_too(tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "link").symlink_to("run")
     with exclusive_folder(tmp_path / "link"):
-        assert BUSY in refusal(tmp_path / "run")
+        assert BUSY_FOLDER_ERROR in second_call_error(tmp_path / "run")
 
 
 def test_folders_in_a_locked_folder_are_free(tmp_path):
@@ -107,7 +109,7 @@ def test_killed_process_leaves_no_lock(tmp_path):
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout.readline() == "locked\n"
-            assert BUSY in refusal(tmp_path)
+            assert BUSY_FOLDER_ERROR in second_call_error(tmp_path)
         finally:
             process.send_signal(signal.SIGKILL)
     with exclusive_folder(tmp_path):
@@ -143,7 +145,7 @@ def test_folders_with_a_result_and_folders_of_others_stay(tmp_path):
 
 
 @pytest.mark.parametrize("why", ["system", "file system"])
-def test_where_locks_are_not_supported_both_calls_work(why, tmp_path, monkeypatch):
+def test_without_support_for_locks_both_calls_work(why, tmp_path, monkeypatch):
     def unsupported(*_):
         raise OSError(errno.ENOLCK, "No locks available")
 

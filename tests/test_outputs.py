@@ -1,4 +1,4 @@
-"""The rule that keeps what a person has, asked directly; `test_every_command` holds each command to it."""
+"""The checks that protect a user's files, called directly; `test_every_command` checks each command."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 from hyrfpack.train import TrainConfig, train
 
-CONFIG = TrainConfig(steps=2, max_gaussians=50)
+TINY_TRAIN_CONFIG = TrainConfig(steps=2, max_gaussians=50)
 
 
 @pytest.fixture
 def photos(tmp_path: Path) -> Path:
-    """A set of three photos, read as one of nerfstudio's."""
+    """A set of three photos, in nerfstudio's layout."""
     return write_demo_scene(tmp_path / "photos", views=3, size=16)
 
 
@@ -30,7 +30,7 @@ def model(tmp_path: Path) -> Path:
     return path
 
 
-def test_new_files_and_folders_are_allowed_and_nothing_is_made(tmp_path, model):
+def test_new_files_and_folders_are_allowed_and_not_yet_created(tmp_path, model):
     Outputs(model).file(tmp_path / "new" / "small.hyrf", ".hyrf")
     Outputs(model).folder(tmp_path / "pictures", ["0000.png", "left/0001.png"])
 
@@ -39,7 +39,7 @@ def test_new_files_and_folders_are_allowed_and_nothing_is_made(tmp_path, model):
 
 @pytest.mark.parametrize("name", ["model.hyrf", "soft.hyrf", "hard.hyrf", "sub/../model.hyrf"])
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_an_input_is_never_replaced_by_whatever_name(name, overwrite, tmp_path, model):
+def test_an_input_is_never_replaced_under_any_of_its_names(name, overwrite, tmp_path, model):
     (tmp_path / "sub").mkdir()
     (tmp_path / "soft.hyrf").symlink_to(model)
     os.link(model, tmp_path / "hard.hyrf")
@@ -52,7 +52,7 @@ def test_an_input_is_never_replaced_by_whatever_name(name, overwrite, tmp_path, 
 
 @pytest.mark.parametrize("place", [".", "images", "elsewhere/..", "images/left"])
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_nothing_is_put_beside_the_photos_and_poses_that_are_read(place, overwrite, photos):
+def test_nothing_is_written_into_a_folder_whose_photos_and_poses_are_read(place, overwrite, photos):
     (photos / "elsewhere").mkdir()
     (photos / "images" / "left").mkdir()
     first, poses = photos / "images" / "0000.png", photos / "transforms.json"
@@ -67,7 +67,7 @@ def test_nothing_is_put_beside_the_photos_and_poses_that_are_read(place, overwri
     outputs.folder(photos / "run", ["new.png"])
 
 
-def test_files_that_are_there_are_replaced_only_when_told(tmp_path, model):
+def test_existing_files_are_replaced_only_with_overwrite(tmp_path, model):
     (tmp_path / "old.spz").write_bytes(b"of another program")
     (tmp_path / "dangling.spz").symlink_to(tmp_path / "nowhere")
 
@@ -81,7 +81,7 @@ def test_files_that_are_there_are_replaced_only_when_told(tmp_path, model):
 
 
 @pytest.mark.parametrize("place", ["", "images"])
-def test_sets_of_photos_that_are_not_read_are_left_alone_too(place, photos, model):
+def test_folders_of_other_photos_are_protected_too(place, photos, model):
     with pytest.raises(HyrfError, match="photos or poses lie in this folder"):
         Outputs(model).file(photos / place / "new.hyrf")
     with pytest.raises(HyrfError, match="photos or poses lie in this folder"):
@@ -89,7 +89,7 @@ def test_sets_of_photos_that_are_not_read_are_left_alone_too(place, photos, mode
     Outputs(model, overwrite=True).file(photos / place / "new.hyrf")
 
 
-def test_tables_of_a_reconstruction_are_poses(tmp_path, model):
+def test_tables_of_a_reconstruction_count_as_poses(tmp_path, model):
     table = tmp_path / "sparse" / "0" / "cameras.bin"
     table.parent.mkdir(parents=True)
     table.write_bytes(b"")
@@ -99,7 +99,7 @@ def test_tables_of_a_reconstruction_are_poses(tmp_path, model):
             Outputs(model).folder(refused, ["new.png"])
 
 
-def test_a_folder_is_poses_by_its_files_not_by_its_name(tmp_path, model):
+def test_a_folder_counts_as_poses_by_its_files_and_not_by_its_name(tmp_path, model):
     for name in ("sparse", "colmap"):
         (tmp_path / name).mkdir()
     (tmp_path / "screenshot.png").write_bytes(b"")
@@ -108,7 +108,7 @@ def test_a_folder_is_poses_by_its_files_not_by_its_name(tmp_path, model):
 
 
 def test_pictures_beside_a_single_new_file_do_not_matter(tmp_path, model):
-    """A desktop with screenshots is no set of photos, and a run that lies in one has pictures of its own."""
+    """A desktop with screenshots is no set of photos. A run folder inside a set has pictures of its own."""
     (tmp_path / "screenshot.png").write_bytes(b"")
     (tmp_path / "photos").mkdir()
     run = write_demo_scene(tmp_path / "photos", views=2, size=16) / "run"
@@ -133,7 +133,7 @@ def test_pictures_beside_a_single_new_file_do_not_matter(tmp_path, model):
         ("\N{CJK UNIFIED IDEOGRAPH-6F22}" * 90 + ".hyrf", "longer than 255 bytes"),
     ],
 )
-def test_what_cannot_be_written_is_told_before_the_work(name, words, tmp_path):
+def test_an_output_that_cannot_be_written_is_an_error_before_the_work(name, words, tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_bytes(b"")
 
@@ -141,7 +141,7 @@ def test_what_cannot_be_written_is_told_before_the_work(name, words, tmp_path):
         Outputs().file(tmp_path / name, ".hyrf")
 
 
-def test_a_working_folder_that_was_removed_is_one_sentence(tmp_path, monkeypatch):
+def test_a_working_folder_that_was_removed_is_a_clear_error(tmp_path, monkeypatch):
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
@@ -153,49 +153,49 @@ def test_a_working_folder_that_was_removed_is_one_sentence(tmp_path, monkeypatch
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/null"), reason="there is no /dev/null")
-def test_devices_are_no_files():
+def test_a_device_is_rejected_as_an_output_file():
     with pytest.raises(HyrfError, match="device or a pipe"):
         Outputs(overwrite=True).file("/dev/null")
 
 
-def test_a_file_is_no_folder_for_pictures(model):
+def test_a_file_is_rejected_as_a_folder_for_pictures(model):
     with pytest.raises(HyrfError, match="this is a file; name a folder"):
         Outputs().folder(model, ["0000.png"])
 
 
-# -- training, which a library call guards as the command line does ---------------------------------------------------
+# -- training: the library call checks as the command line does -------------------------------------------------------
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_training_never_writes_among_its_photos(overwrite, photos):
+def test_training_never_writes_into_the_folder_of_its_photos(overwrite, photos):
     before = {path: path.read_bytes() for path in photos.rglob("*") if path.is_file()}
     scene = load_scene(photos, test_every=2)
 
     for place in (photos, photos / "images"):
         with pytest.raises(HyrfError, match="the same command reads"):
-            train(scene, place, CONFIG, overwrite=overwrite, quiet=True)
+            train(scene, place, TINY_TRAIN_CONFIG, overwrite=overwrite, quiet=True)
 
     assert {path: path.read_bytes() for path in photos.rglob("*") if path.is_file()} == before
 
 
-def test_training_never_replaces_photos_that_lie_where_its_pictures_go(photos):
+def test_training_never_replaces_photos_in_its_output_folder(photos):
     (photos / "images").rename(photos / "views")
     poses = photos / "transforms.json"
     poses.write_text(poses.read_text().replace("images/", "views/"))
 
     with pytest.raises(HyrfError, match="the same command reads"):
-        train(load_scene(photos, test_every=2), photos, CONFIG, overwrite=True, quiet=True)
+        train(load_scene(photos, test_every=2), photos, TINY_TRAIN_CONFIG, overwrite=True, quiet=True)
 
 
-def test_training_keeps_a_foreign_metrics_json_unless_told(photos, tmp_path):
+def test_training_keeps_a_foreign_metrics_json_without_overwrite(photos, tmp_path):
     out = tmp_path / "run"
     out.mkdir()
     (out / "metrics.json").write_text("mine")
     scene = dataclasses.replace(load_scene(photos), test=[])
 
     with pytest.raises(HyrfError, match="metrics.json of the files to be written is there"):
-        train(scene, out, CONFIG, quiet=True)
+        train(scene, out, TINY_TRAIN_CONFIG, quiet=True)
     assert (out / "metrics.json").read_text() == "mine"
 
-    train(scene, out, CONFIG, overwrite=True, quiet=True)
+    train(scene, out, TINY_TRAIN_CONFIG, overwrite=True, quiet=True)
     assert (out / "metrics.json").read_text() != "mine"

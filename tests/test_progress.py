@@ -1,4 +1,4 @@
-"""Reports of parts of the work add up to reports of the whole."""
+"""Progress reports of parts of the work combine into reports of the whole."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hyrfpack.parallel.pool import parallel_map
 from hyrfpack.progress import report_each_call, report_part, report_round
 
 
-def test_parts_of_parts_lie_where_they_belong_in_the_whole():
+def test_nested_parts_report_their_share_of_the_whole():
     told = []
     inner = report_part(report_part(lambda *said: told.append(said), 0.5, 1.0), 0.2, 0.4)
     for share in (0, 0.5, 1):
@@ -16,14 +16,14 @@ def test_parts_of_parts_lie_where_they_belong_in_the_whole():
     assert told == [("measuring", pytest.approx(value)) for value in (0.6, 0.65, 0.7)]
 
 
-def test_rounds_follow_one_another_and_never_reach_the_end():
+def test_progress_of_rounds_increases_and_stays_below_1():
     told = []
     for number in range(30):
         report = report_round(lambda doing, share: told.append(share), number)
         report("round", 0)
         report("round", 1)
     assert told[0] == 0 and told == sorted(told) and told[-1] < 1
-    assert told[1::2][:-1] == pytest.approx(told[2::2])  # each begins where the one before has ended
+    assert told[1::2][:-1] == pytest.approx(told[2::2])  # each begins where the previous one has ended
 
 
 def test_calls_of_several_threads_are_counted_once_each():

@@ -1,4 +1,4 @@
-"""What `import hyrfpack` gives: functions and classes, for people, editors, type checkers and other processes."""
+"""The names that `import hyrfpack` gives work for people, editors, type checkers and other processes."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from scenes import ball_scene, small_model
 
 import hyrfpack
 
-FUNCTIONS = [name for name in hyrfpack.__all__ if inspect.isfunction(getattr(hyrfpack, name))]
-# Calls that are refused at once, by the function itself.
-REFUSED = {
+PUBLIC_FUNCTIONS = [name for name in hyrfpack.__all__ if inspect.isfunction(getattr(hyrfpack, name))]
+# Arguments that each function rejects at once.
+REJECTED_ARGUMENTS = {
     "bench": ("missing.hyrf",),
     "compare": (["missing", "other"], "out.html"),
     "compress": ("missing.hyrf", "out.hyrf"),
@@ -38,16 +38,16 @@ REFUSED = {
 }
 
 
-def fresh(code: str) -> subprocess.CompletedProcess:
+def run_in_new_interpreter(code: str) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[1], capture_output=True, text=True)
 
 
-def test_what_does_something_is_a_function():
-    assert set(FUNCTIONS) == {*REFUSED, "evaluate", "render", "save", "train"}
+def test_every_public_function_is_covered_here():
+    assert set(PUBLIC_FUNCTIONS) == {*REJECTED_ARGUMENTS, "evaluate", "render", "save", "train"}
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_a_function_tells_its_arguments_and_what_it_does(name):
+@pytest.mark.parametrize("name", PUBLIC_FUNCTIONS)
+def test_a_public_function_documents_its_arguments_and_purpose(name):
     function = getattr(hyrfpack, name)
     parameters = inspect.signature(function).parameters.values()
     assert "args" not in [parameter.name for parameter in parameters]
@@ -64,13 +64,15 @@ def test_a_public_name_can_be_pickled(name):
 
 def test_functions_can_be_called_in_processes_that_are_spawned():
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        calls = {name: pool.submit(getattr(hyrfpack, name), *arguments) for name, arguments in REFUSED.items()}
+        calls = {
+            name: pool.submit(getattr(hyrfpack, name), *arguments) for name, arguments in REJECTED_ARGUMENTS.items()
+        }
         calls["evaluate"] = pool.submit(hyrfpack.evaluate, None, [])
         for name, call in calls.items():
             assert isinstance(call.exception(), (hyrfpack.HyrfError, TypeError)), name
 
 
-def test_sub_packages_can_be_imported_from_in_every_way():
+def test_sub_packages_support_every_form_of_import():
     code = (
         "import hyrfpack.train.progress as progress, hyrfpack.train as t, hyrfpack.evaluate\n"
         "from hyrfpack.train import Trainer, progress as again\n"
@@ -83,11 +85,11 @@ def test_sub_packages_can_be_imported_from_in_every_way():
         "try: hyrfpack.nothing\n"
         "except AttributeError: print('and nothing else')"
     )
-    assert fresh(code).stdout == "and nothing else\n", fresh(code).stderr
+    assert run_in_new_interpreter(code).stdout == "and nothing else\n", run_in_new_interpreter(code).stderr
 
 
-# What each call is given instead, and what its sentence says.
-MISTAKEN = [
+# A mistaken call, and its error message.
+MISTAKEN_CALLS = [
     (lambda model, scene: hyrfpack.train("photos", "run"), "scene must be a Scene, not a str; .*load_scene"),
     (lambda model, scene: hyrfpack.train(scene, "run", {"steps": 3}), "config must be a TrainConfig, not a dict"),
     (lambda model, scene: hyrfpack.compress("m.hyrf", "a.hyrf", data="photos"), "data must be a Scene.*load_scene"),
@@ -106,8 +108,8 @@ MISTAKEN = [
 ]
 
 
-@pytest.mark.parametrize("call, sentence", MISTAKEN)
-def test_a_wrong_call_is_a_type_error_that_says_what_to_do(call, sentence, tmp_path, monkeypatch):
+@pytest.mark.parametrize("call, sentence", MISTAKEN_CALLS)
+def test_a_mistaken_call_is_a_type_error_that_says_what_to_do(call, sentence, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(TypeError, match=sentence):
         call(small_model([(0, 0, 0)]), ball_scene(2, side=8))
@@ -115,13 +117,13 @@ def test_a_wrong_call_is_a_type_error_that_says_what_to_do(call, sentence, tmp_p
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_loading_to_a_device_that_is_not_there_is_one_sentence(tmp_path):
+def test_loading_to_a_missing_device_is_a_clear_error(tmp_path):
     hyrfpack.save(small_model([(0, 0, 0)]), tmp_path / "model.hyrf")
     with pytest.raises(hyrfpack.HyrfError, match="'cuda' is not there"):
         hyrfpack.load(tmp_path / "model.hyrf", device="cuda")
 
 
-def test_a_picture_of_a_loaded_model_is_plain_numbers(tmp_path):
+def test_a_render_of_a_loaded_model_converts_to_numpy(tmp_path):
     hyrfpack.save(small_model([(0, 0, 0)]), tmp_path / "model.hyrf")
     model, (view, _) = hyrfpack.load(tmp_path / "model.hyrf"), ball_scene(2, side=8).train
     assert hyrfpack.render(model, view.camera).rgb.numpy().shape == (8, 8, 3)

@@ -1,5 +1,9 @@
-"""pycolmap brings a zlib of its own, and the system's, loaded after it, corrupts memory and aborts the process. So all
-of this runs in fresh interpreters: whatever imports zlib before, as numpy does in some versions, would hide it."""
+"""hyrfpack loads zlib before pycolmap.
+
+pycolmap contains its own zlib. If the system's zlib is loaded after it, memory is corrupted and the process aborts.
+All of these tests run in fresh interpreters, because an earlier import of zlib (as by some versions of numpy) would
+hide the fault.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,7 @@ from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.format import save
 from hyrfpack.splats.splats import quaternion_from_matrix
 
-ORDER = """
+CHECK_IMPORT_ORDER_CODE = """
 import sys
 class Watch:
     def find_spec(self, name, path=None, target=None):
@@ -25,8 +29,9 @@ class Watch:
             print("in order")
 sys.meta_path.insert(0, Watch())
 """
-READ = "import hyrfpack\nscene = hyrfpack.load_scene('scene')\n"  # which loads pycolmap
-CALLS = {
+# Loading a scene imports pycolmap.
+READ_SCENE_CODE = "import hyrfpack\nscene = hyrfpack.load_scene('scene')\n"
+CODE_BY_CALL = {
     "load_scene": "import zlib\nassert zlib.decompress(zlib.compress(bytes(10**6))) == bytes(10**6)",
     "train": "assert hyrfpack.train(scene, 'run', hyrfpack.TrainConfig(steps=3), quiet=True).complete",
     "compress": "hyrfpack.compress('model.hyrf', 'a.hyrf', data=scene)",
@@ -47,7 +52,7 @@ CALLS = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """A COLMAP set as text, and a model of it."""
+    """A folder with a COLMAP set in text form and a model of it."""
     folder = tmp_path_factory.mktemp("colmap")
     scene = ball_scene(8, side=24)
     (folder / "scene" / "images").mkdir(parents=True)
@@ -67,35 +72,37 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
-def fresh(code: str, folder: Path) -> subprocess.CompletedProcess:
-    """Run code in an interpreter of its own; one that aborts may hang in doing so."""
+def run_in_new_interpreter(code: str, folder: Path) -> subprocess.CompletedProcess:
+    """Run code in a new interpreter. The timeout is for one that aborts and hangs while doing so."""
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "TRITON_INTERPRET": "0"}
     command = [sys.executable, "-c", code]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
 
 
 def test_importing_hyrfpack_alone_loads_zlib(tmp_path):
-    done = fresh(
+    done = run_in_new_interpreter(
         "import sys; before = 'zlib' in sys.modules; import hyrfpack; print(before, 'zlib' in sys.modules)", tmp_path
     )
     assert done.stdout.split() == ["False", "True"], done.stderr
 
 
 @pytest.fixture(scope="module")
-def called(folder) -> subprocess.CompletedProcess:
-    """All calls, one after the other; the first that aborts ends them."""
-    calls = "".join(f"{code}\nprint({name!r}, 'done', flush=True)\n" for name, code in CALLS.items())
-    return fresh(ORDER + READ + calls, folder)
+def calls_outcome(folder) -> subprocess.CompletedProcess:
+    """Run all calls in one interpreter; the first call that aborts ends it."""
+    calls = "".join(f"{code}\nprint({name!r}, 'done', flush=True)\n" for name, code in CODE_BY_CALL.items())
+    return run_in_new_interpreter(CHECK_IMPORT_ORDER_CODE + READ_SCENE_CODE + calls, folder)
 
 
-@pytest.mark.parametrize("call", CALLS)
-def test_zlib_comes_before_pycolmap_and_nothing_aborts(call, called):
-    assert f"{call} done" in called.stdout.splitlines(), called.stderr
-    assert "in order" in called.stdout
-    assert called.returncode == 0 or call != list(CALLS)[-1], called.stderr  # nor at its end
+@pytest.mark.parametrize("call", CODE_BY_CALL)
+def test_zlib_is_loaded_before_pycolmap_and_no_call_aborts(call, calls_outcome):
+    assert f"{call} done" in calls_outcome.stdout.splitlines(), calls_outcome.stderr
+    assert "in order" in calls_outcome.stdout
+    assert calls_outcome.returncode == 0 or call != list(CODE_BY_CALL)[-1], (
+        calls_outcome.stderr
+    )  # the interpreter does not abort at its exit either
 
 
-def test_pycolmap_before_hyrfpack_is_warned_of(tmp_path):
-    done = fresh("import pycolmap, hyrfpack", tmp_path)
+def test_importing_pycolmap_before_hyrfpack_gives_a_warning(tmp_path):
+    done = run_in_new_interpreter("import pycolmap, hyrfpack", tmp_path)
     assert ("import hyrfpack (or zlib) first" in done.stderr) == (sys.platform == "linux")
-    assert "Warning" not in fresh("import zlib, pycolmap, hyrfpack", tmp_path).stderr
+    assert "Warning" not in run_in_new_interpreter("import zlib, pycolmap, hyrfpack", tmp_path).stderr

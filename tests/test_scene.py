@@ -16,17 +16,17 @@ def test_camera_position_is_the_centre_of_projection():
     np.testing.assert_allclose(homogeneous[:3], 0, atol=1e-12)
 
 
-def test_camera_forward_points_at_what_is_ahead():
+def test_camera_forward_points_at_its_target():
     camera = camera_at((0.0, -5.0, 0.0), (0.0, 0.0, 0.0))
     np.testing.assert_allclose(camera.forward, (0, 1, 0), atol=1e-12)
 
 
-def test_camera_gives_intrinsics_in_the_order_of_the_kernels():
+def test_camera_intrinsics_have_the_order_fx_fy_cx_cy():
     assert Camera(8, 6, 1.0, 2.0, 3.0, 4.0, np.eye(4)).intrinsics == (1.0, 2.0, 3.0, 4.0)
 
 
 def test_look_at_is_a_rotation_with_y_down():
-    """The tests' own helper: wrong here, wrong everywhere."""
+    """The tests' own helper needs a test, because all others rely on it."""
     pose = look_at((4.0, 1.0, 2.0), (0, 0, 0))
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
     assert np.isclose(np.linalg.det(pose[:3, :3]), 1)
@@ -52,12 +52,12 @@ def test_a_straight_alpha_picture_is_laid_over_the_background():
     np.testing.assert_allclose(composite[0], expected, atol=1e-6)
 
 
-def test_without_a_background_coverage_fades_to_black():
+def test_a_picture_with_alpha_is_composited_over_black_by_default():
     picture = Picture(np.full((1, 1, 3), 255, np.uint8), np.full((1, 1), 51, np.uint8))
     np.testing.assert_allclose(picture.composite(), 0.2, atol=1e-6)
 
 
-def test_composite_leaves_the_stored_picture_alone():
+def test_composite_does_not_change_the_stored_picture():
     picture = Picture(np.full((2, 2, 3), 100, np.uint8), np.full((2, 2), 128, np.uint8))
     picture.composite(np.ones(3))
     assert (picture.rgb == 100).all() and (picture.alpha == 128).all()
@@ -77,7 +77,7 @@ def test_scene_views_are_both_splits_sorted_by_name():
 
 
 @pytest.mark.parametrize("rows", [[-1, 0], [0, 100]], ids=str)
-def test_tracks_of_points_that_are_not_there_are_refused(rows):
+def test_tracks_of_missing_points_are_rejected(rows):
     scene = ball_scene(2, points=100)
     with pytest.raises(ValueError, match=r"tracks of 000\.png: rows -?\d+ to \d+ of 100 points"):
         dataclasses.replace(scene, tracks={"000.png": np.array(rows)})
@@ -88,7 +88,7 @@ def test_tracks_of_points_that_are_not_there_are_refused(rows):
 # -- poses -----------------------------------------------------------------------------------------------------------
 
 
-def posed(pose) -> Camera:
+def camera_with_pose(pose) -> Camera:
     return Camera(8, 6, 1.0, 2.0, 3.0, 4.0, pose)
 
 
@@ -110,24 +110,24 @@ def posed(pose) -> Camera:
     ],
     ids=str,
 )
-def test_a_pose_that_is_not_rigid_is_refused(pose, says):
+def test_a_pose_that_is_not_rigid_is_rejected(pose, says):
     with pytest.raises(ValueError, match=says):
-        posed(pose)
+        camera_with_pose(pose)
 
 
-def test_a_pose_that_was_rounded_is_taken():
+def test_a_rounded_pose_is_accepted():
     pose = look_at((4.0, 1.0, 2.0), (0, 0, 0)).round(4)
-    np.testing.assert_array_equal(posed(pose).camera_from_world, pose)
+    np.testing.assert_array_equal(camera_with_pose(pose).camera_from_world, pose)
 
 
 @pytest.mark.parametrize("rows", [3, 4])
-def test_nested_lists_become_an_array_of_the_cameras_own(rows):
+def test_a_camera_copies_its_pose_from_lists_and_arrays(rows):
     pose = look_at((4.0, 1.0, 2.0), (0, 0, 0))
-    camera = posed(pose[:rows].tolist())
+    camera = camera_with_pose(pose[:rows].tolist())
     assert camera.camera_from_world.dtype == np.float64
     np.testing.assert_array_equal(camera.camera_from_world, pose)
     np.testing.assert_allclose(camera.position, (4, 1, 2), atol=1e-12)
-    kept = posed(pose)
+    kept = camera_with_pose(pose)
     pose[0, 3] += 1
     assert kept == camera
 
@@ -136,19 +136,26 @@ def test_nested_lists_become_an_array_of_the_cameras_own(rows):
 
 
 def test_cameras_are_equal_if_all_their_numbers_are():
-    camera, other = posed(np.eye(4)), posed(np.where(np.eye(4) == 0, -0.0, 1.0))
+    camera, other = camera_with_pose(np.eye(4)), camera_with_pose(np.where(np.eye(4) == 0, -0.0, 1.0))
     assert camera == other and hash(camera) == hash(other) and len({camera, other}) == 1
     moved = np.eye(4)
     moved[0, 3] = 1e-9
-    assert camera != posed(moved) and camera != Camera(8, 6, 1.0, 2.0, 3.0, 5.0, np.eye(4)) and camera != "camera"
+    assert (
+        camera != camera_with_pose(moved)
+        and camera != Camera(8, 6, 1.0, 2.0, 3.0, 5.0, np.eye(4))
+        and camera != "camera"
+    )
 
 
 def test_views_of_one_photo_are_equal_and_can_be_looked_up():
     def load():
         return Picture(np.zeros((6, 8, 3), np.uint8))
 
-    view, same = (View("a.png", posed(np.eye(4)), load) for _ in range(2))
-    others = [View("b.png", posed(np.eye(4)), load), View("a.png", posed(np.eye(4)), lambda: None)]
+    view, same = (View("a.png", camera_with_pose(np.eye(4)), load) for _ in range(2))
+    others = [
+        View("b.png", camera_with_pose(np.eye(4)), load),
+        View("a.png", camera_with_pose(np.eye(4)), lambda: None),
+    ]
     assert view == same and hash(view) == hash(same) and others.count(view) == 0
     assert [*others, same].index(view) == 2
 
@@ -160,7 +167,7 @@ def test_pictures_and_scenes_are_equal_to_themselves_alone():
     assert picture == picture and picture != Picture(picture.rgb) and hash(picture)
 
 
-def test_a_scene_prints_in_a_line():
+def test_a_scene_is_printed_on_one_line():
     assert repr(ball_scene(3)) == "Scene('balls', 'colmap': 3 views to train on, 0 held out, 100 points)"
 
 
@@ -174,7 +181,7 @@ def test_a_scene_holds_out_the_views_that_are_named_and_trains_on_the_others():
 
 
 @pytest.mark.parametrize("names, words", [(["nobody.jpg"], "no photo is named nobody.jpg"), (None, "none is left")])
-def test_holding_out_a_view_that_is_not_there_or_all_views_is_refused(names, words):
+def test_holding_out_a_missing_view_or_all_views_is_rejected(names, words):
     scene = ball_scene(3)
     with pytest.raises(ValueError, match=words):
         scene.with_held_out([view.name for view in scene.views] if names is None else names)

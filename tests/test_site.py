@@ -1,4 +1,4 @@
-"""The documentation builds as a site, in which no link is broken and every page has its place."""
+"""The documentation builds as a site without broken links, and every page is in its navigation."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+REPOSITORY_ROOT = Path(__file__).parents[1]
 pytest.importorskip("mkdocs", reason="mkdocs is not installed")
 pytest.importorskip("mkdocstrings", reason="mkdocstrings is not installed")
 
 
 def build(folder: Path, config: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "-f", str(config), "-d", str(folder)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    return subprocess.run(command, cwd=REPOSITORY_ROOT, capture_output=True, text=True)
 
 
 @pytest.mark.slow
-def test_the_site_builds_with_every_public_name_on_it(tmp_path):
+def test_the_site_builds_with_every_public_name(tmp_path):
     import hyrfpack
 
-    done = build(tmp_path, ROOT / "mkdocs.yml")
+    done = build(tmp_path, REPOSITORY_ROOT / "mkdocs.yml")
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "api" / "index.html").read_text()
     missing = [name for name in hyrfpack.__all__ if name != "__version__" and f'.{name}"' not in page]

@@ -1,6 +1,6 @@
-"""Bytes that fixed models take in each profile, held to within 1 % of what is recorded.
+"""File sizes of fixed models in each profile stay within 1 % of the recorded ones.
 
-python -m tests.test_size_regression     records the sizes anew (after a change that is meant to change them)
+python -m tests.test_size_regression     records the sizes again (after a change that is meant to change them)
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from tools.safety.plans import encode
 
-RECORD = Path(__file__).parent / "golden" / "sizes.json"
+RECORDED_SIZES_PATH = Path(__file__).parent / "golden" / "sizes.json"
 PROFILES = ("raw", "paper", "compact")
-# Gaussians and table sizes of a capture with surroundings, of an object on its own, and of next to nothing.
-MODELS = {"scene": (20_000, 12, 13), "object": (4_000, 10, 11), "one": (1, 4, 4)}
+# Number of Gaussians and log2 table sizes of a scene with surroundings, of a single object and of a minimal model.
+MODEL_SIZES = {"scene": (20_000, 12, 13), "object": (4_000, 10, 11), "one": (1, 4, 4)}
 
 
 def make_model(count: int, geometry_size: int, radiance_size: int) -> HybridModel:
-    """A model with the statistics of a trained one.
+    """Return a model with the statistics of a trained one.
 
-    Positions lie in clusters on surfaces; colour logits share their brightness; opacity logits have two humps; tables
-    are Laplace-distributed, wider on finer levels, and most rows of the coarse levels were never touched.
+    Positions lie in clusters on surfaces. Colour logits share their brightness. Opacity logits have two modes. Hash
+    tables are Laplace-distributed, wider on finer levels, and most rows of the coarse levels are untouched.
     """
     rng = np.random.default_rng(7)
     config = ModelConfig(
@@ -58,20 +58,20 @@ def make_model(count: int, geometry_size: int, radiance_size: int) -> HybridMode
     return model
 
 
-def measure(name: str, profile: str) -> int:
-    return len(encode(make_model(*MODELS[name]), profile))
+def measure_bytes(name: str, profile: str) -> int:
+    return len(encode(make_model(*MODEL_SIZES[name]), profile))
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", MODEL_SIZES)
 def test_fixed_models_keep_their_size(name, profile):
-    recorded = json.loads(RECORD.read_text())["bytes"][name][profile]
+    recorded = json.loads(RECORDED_SIZES_PATH.read_text())["bytes"][name][profile]
 
-    assert measure(name, profile) == pytest.approx(recorded, rel=0.01)
+    assert measure_bytes(name, profile) == pytest.approx(recorded, rel=0.01)
 
 
 if __name__ == "__main__":
-    sizes = {name: {profile: measure(name, profile) for profile in PROFILES} for name in MODELS}
+    sizes = {name: {profile: measure_bytes(name, profile) for profile in PROFILES} for name in MODEL_SIZES}
     record = {"command": "python tests/test_size_regression.py", "bytes": sizes}
-    RECORD.write_text(json.dumps(record, indent=2) + "\n")
-    print(RECORD.read_text())
+    RECORDED_SIZES_PATH.write_text(json.dumps(record, indent=2) + "\n")
+    print(RECORDED_SIZES_PATH.read_text())

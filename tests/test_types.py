@@ -1,4 +1,4 @@
-"""What a type checker says to programs that use the library: nothing when they are right, and the line when not."""
+"""A type checker accepts correct programs that use the library, and reports each line of a wrong one."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("mypy", reason="mypy is not installed")
-ROOT = Path(__file__).parents[1]
-RIGHT = """
+REPOSITORY_ROOT = Path(__file__).parents[1]
+CORRECT_PROGRAM = """
 import numpy as np
 import hyrfpack
 
@@ -29,8 +29,8 @@ camera = hyrfpack.Camera(640, 480, 500.0, 500.0, 320.0, 240.0, np.eye(4))
 facts = hyrfpack.describe("small.hyrf")["profile"]
 hyrfpack.save(model, "copy.hyrf")
 """
-# One mistake a line: what the checker must say of it.
-WRONG = {
+# Each line has one mistake, with the error code that the checker must report.
+ERROR_CODES_BY_LINE = {
     'hyrfpack.load_scene("photos", every=8)': "call-arg",
     'hyrfpack.train("photos", "run")': "arg-type",
     "hyrfpack.TrainConfig(step=10)": "call-arg",
@@ -44,12 +44,12 @@ WRONG = {
 
 
 @pytest.mark.slow
-def test_a_right_program_passes_and_each_line_of_a_wrong_one_is_told(tmp_path):
-    (tmp_path / "right.py").write_text(RIGHT)
-    (tmp_path / "wrong.py").write_text("\n".join(["import hyrfpack", *WRONG]))
-    command = [sys.executable, "-m", "mypy", "--config-file", ROOT / "pyproject.toml", "--no-pretty"]
+def test_a_correct_program_passes_and_each_mistaken_line_is_reported(tmp_path):
+    (tmp_path / "right.py").write_text(CORRECT_PROGRAM)
+    (tmp_path / "wrong.py").write_text("\n".join(["import hyrfpack", *ERROR_CODES_BY_LINE]))
+    command = [sys.executable, "-m", "mypy", "--config-file", REPOSITORY_ROOT / "pyproject.toml", "--no-pretty"]
     command += [tmp_path / "right.py", tmp_path / "wrong.py"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(command, cwd=REPOSITORY_ROOT, capture_output=True, text=True)
     told = re.findall(r"(right|wrong)\.py:(\d+): error: .*\[([\w-]+)\]$", done.stdout, re.MULTILINE)
-    expected = [("wrong", str(line), code) for line, code in enumerate(WRONG.values(), start=2)]
+    expected = [("wrong", str(line), code) for line, code in enumerate(ERROR_CODES_BY_LINE.values(), start=2)]
     assert told == expected, done.stdout + done.stderr

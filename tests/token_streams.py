@@ -1,4 +1,4 @@
-"""Decoders of token and integer streams written from docs/format.md alone, one token at a time, and tokens to code."""
+"""Reference decoders of token and integer streams, written from docs/format.md alone, and tokens to encode."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hyrfpack.quant.integers import MIN_VALUE_BY_TOKEN
 
 
 def laplace_tokens(count: int, scales: list[float] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tokens of Laplace-distributed integers of several scales, and the scale's number as the context of each."""
+    """Return tokens of Laplace-distributed integers, and the index of each one's scale as its context."""
     rng = np.random.default_rng(count)
     contexts = rng.integers(0, len(scales), count).astype(np.uint8)
     values = np.rint(rng.laplace(scale=np.asarray(scales, float)[contexts])).astype(np.int64)
@@ -16,8 +16,8 @@ def laplace_tokens(count: int, scales: list[float] | np.ndarray) -> tuple[np.nda
     return (np.searchsorted(MIN_VALUE_BY_TOKEN, folded, side="right") - 1).astype(np.uint8), contexts
 
 
-def decode_by_the_book(data: bytes, contexts: list[int]) -> tuple[list[int], int]:
-    """The tokens, and how many bytes they took."""
+def decode_tokens_by_spec(data: bytes, contexts: list[int]) -> tuple[list[int], int]:
+    """Decode a token stream; return the tokens and the number of bytes that they took."""
     count = len(contexts)
     if count == 0:
         return [], 0
@@ -30,9 +30,12 @@ def decode_by_the_book(data: bytes, contexts: list[int]) -> tuple[list[int], int
     place = 1 + classes
     models = size_of_contexts * classes
     if static:
-        folded, size = decode_by_the_book(data[place:], [0] * models * alphabet)
+        folded, size = decode_tokens_by_spec(data[place:], [0] * models * alphabet)
         place += size
-        frequencies = [_frequencies([_weight(q) for q in row]) for row in _levels(folded, models, alphabet)]
+        frequencies = [
+            _normalize_weights([_weight_of_level(q) for q in row])
+            for row in _undo_differences(folded, models, alphabet)
+        ]
     steps = -(-count // lanes_asked)
     steps += steps % 2 == 0
     lanes = -(-count // steps)
@@ -46,7 +49,9 @@ def decode_by_the_book(data: bytes, contexts: list[int]) -> tuple[list[int], int
             update += 1 + update // 8
             pooled = [1 + 2 * sum(row[j] for row in counts) for j in range(alphabet)]
             prior = [1048576 * g // sum(pooled) + 1 for g in pooled]
-            frequencies = [_frequencies([65536 * n + p for n, p in zip(row, prior, strict=True)]) for row in counts]
+            frequencies = [
+                _normalize_weights([65536 * n + p for n, p in zip(row, prior, strict=True)]) for row in counts
+            ]
         seen = []
         for lane in range(lanes):
             i = lane * steps + step
@@ -72,9 +77,9 @@ def decode_by_the_book(data: bytes, contexts: list[int]) -> tuple[list[int], int
     return tokens, place
 
 
-def integers_by_the_book(data: bytes, contexts: list[int], signed: bool) -> list[int]:
-    """The integers."""
-    tokens, size = decode_by_the_book(data, contexts)
+def decode_integers_by_spec(data: bytes, contexts: list[int], signed: bool) -> list[int]:
+    """Decode a stream of integers."""
+    tokens, size = decode_tokens_by_spec(data, contexts)
     bits, values = int.from_bytes(data[size:], "little"), []
     total = 0
     for token in tokens:
@@ -97,18 +102,18 @@ def unfold(v: int) -> int:
     return v // 2 if v % 2 == 0 else -(v + 1) // 2
 
 
-def _frequencies(weights: list[int]) -> list[int]:
+def _normalize_weights(weights: list[int]) -> list[int]:
     total = sum(weights)
     frequencies = [max(1, 4096 * w // total) if w else 0 for w in weights]
     frequencies[weights.index(max(weights))] += 4096 - sum(frequencies)
     return frequencies
 
 
-def _weight(level: int) -> int:
+def _weight_of_level(level: int) -> int:
     return (4 + (level - 1) % 4) * 2 ** ((level - 1) // 4) if level else 0
 
 
-def _levels(folded: list[int], models: int, alphabet: int) -> list[list[int]]:
+def _undo_differences(folded: list[int], models: int, alphabet: int) -> list[list[int]]:
     rows: list[list[int]] = []
     for model in range(models):
         row: list[int] = []

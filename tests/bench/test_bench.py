@@ -300,7 +300,7 @@ def test_time_to_compile_kernels_is_nobodys_time(monkeypatch, measure, module, o
     assert compiled and all(row.time.ms < 10 and row.time.repeats == 2 for row in rows)
 
 
-def test_without_numba_there_is_one_sentence(monkeypatch):
+def test_without_numba_there_is_a_clear_error(monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
     with pytest.raises(HyrfError, match="pip install numba"):
         bench()
@@ -335,13 +335,13 @@ def test_coding_a_quantised_model_again_is_remarked(tmp_path):
     assert any("quantised already" in sentence for sentence in notes)
 
 
-def test_a_model_without_gaussians_is_refused(tmp_path):
+def test_a_model_without_gaussians_is_rejected(tmp_path):
     save(small_model(np.zeros((0, 3))), tmp_path / "empty.hyrf")
     with pytest.raises(HyrfError, match="no Gaussians"):
         bench(tmp_path / "empty.hyrf")
 
 
-def test_a_scene_without_held_out_photos_is_refused(tmp_path):
+def test_a_scene_without_held_out_photos_is_rejected(tmp_path):
     save(model_of(), tmp_path / "tiny.hyrf")
     with pytest.raises(HyrfError, match="balls: no held-out photo"):
         bench(tmp_path / "tiny.hyrf", ball_scene(views=2))

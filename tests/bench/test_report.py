@@ -78,7 +78,7 @@ def test_a_page_gets_its_tables_and_keeps_its_words():
     assert "Error of each group of parameters, max / rms:\n\n| setting | value | positions |" in filled
 
 
-def test_a_page_without_a_place_is_refused():
+def test_a_page_without_a_place_is_rejected():
     with pytest.raises(HyrfError, match="page.md: there is no place for render"):
         fill_page(
             "<!-- bench machine -->\n<!-- end -->\n<!-- bench codec -->\n<!-- end -->",
@@ -143,7 +143,7 @@ def test_one_run_leaves_the_table_the_page_and_the_plot(model, tmp_path):
     assert "My own words." in (tmp_path / "b.md").read_text()
 
 
-def test_what_the_user_got_wrong_is_one_sentence(model, tmp_path):
+def test_what_the_user_got_wrong_is_a_clear_error(model, tmp_path):
     assert "no such file" in refused("bench", tmp_path / "missing.hyrf")
     (tmp_path / "bad.hyrf").write_bytes(b"not a model")
     assert "not a .hyrf file" in refused("bench", tmp_path / "bad.hyrf")
@@ -153,7 +153,7 @@ def test_what_the_user_got_wrong_is_one_sentence(model, tmp_path):
     assert "plot is written as" in refused("bench", model, "-o", tmp_path / "plot.txt")
 
 
-def test_a_page_without_places_is_refused_before_anything_is_measured(model, tmp_path):
+def test_a_page_without_places_is_rejected_before_anything_is_measured(model, tmp_path):
     (tmp_path / "page.md").write_text("# Nothing here")
     sentence = refused("bench", model, "--only", "mlp", "--markdown", tmp_path / "page.md", "-o", tmp_path / "b.png")
     assert "no place for machine" in sentence and (tmp_path / "page.md").read_text() == "# Nothing here"

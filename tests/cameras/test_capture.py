@@ -117,7 +117,7 @@ def test_a_viewpoint_that_is_not_asked_for_is_not_looked_at():
 
 
 @pytest.mark.parametrize("cameras", [7, [[1, 2, 3]], [[32, 32, 0, 1, 1, 1, *range(12)]], {"a": 1}])
-def test_cameras_without_sense_are_one_sentence(cameras):
+def test_cameras_without_sense_are_a_clear_error(cameras):
     with pytest.raises(HyrfDataError, match=r"cameras that the file keeps are not valid [^\n]*`data`$"):
         _ = Capture(facts(cameras=cameras)).cameras
 

@@ -131,7 +131,7 @@ GOOD = {"width": 40, "height": 30, "fx": 25, "camera_from_world": np.eye(4).toli
         (json.dumps({"frames": [{"transform_matrix": np.eye(4).tolist()}]}), "camera 0 has no 'w'"),
     ],
 )
-def test_a_broken_camera_file_is_one_sentence(content, complaint, tmp_path):
+def test_a_broken_camera_file_is_a_clear_error(content, complaint, tmp_path):
     (tmp_path / "c.json").write_text(content)
     with pytest.raises(HyrfDataError, match=complaint):
         cameras_from_json(tmp_path / "c.json")
@@ -167,6 +167,6 @@ def test_numbers_are_rounded_once(camera):
 
 
 @pytest.mark.parametrize("count", [0, 5, 17, 19])
-def test_too_few_numbers_or_too_many_are_refused(count):
+def test_too_few_numbers_or_too_many_are_rejected(count):
     with pytest.raises(ValueError):
         camera_from_numbers([*camera_to_numbers(Camera(4, 3, 2.0, 2.0, 2.0, 1.5, POSE)), 0.0][:count])

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import camera_at, moved, ring
+from scenes import camera_at, ring, shift_cameras
 
 from hyrfpack.cameras.paths import Viewpoint, look_at, orbit
 from hyrfpack.scene import Camera
@@ -62,7 +62,7 @@ def test_a_real_capture_is_orbited_among_its_cameras(shared_data):
 
 def test_orbit_looks_at_the_centre_from_the_typical_distance_and_height():
     center = np.array([5.0, -7.0, 11.0])
-    path = orbit(Viewpoint.from_cameras(moved(ring(10, radius=3, height=1), center)), 24)
+    path = orbit(Viewpoint.from_cameras(shift_cameras(ring(10, radius=3, height=1), center)), 24)
     for camera in path:
         local = camera.camera_from_world @ [*center, 1]
         np.testing.assert_allclose(local[:3], (0, 0, math.sqrt(10)), atol=1e-9)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from made_up_cameras import cameras
-from scenes import camera_at, moved, ring
+from scenes import camera_at, ring, shift_cameras
 
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.paths import Viewpoint, common_direction, orbit
@@ -15,7 +15,7 @@ from hyrfpack.cameras.paths import Viewpoint, common_direction, orbit
 
 @pytest.mark.parametrize("offset", [(0, 0, 0), (1e6, -2e6, 3e5)])
 def test_cameras_around_an_object_are_summed_up_by_what_they_look_at(offset):
-    hint = Viewpoint.from_cameras(moved(ring(12), offset))
+    hint = Viewpoint.from_cameras(shift_cameras(ring(12), offset))
     np.testing.assert_allclose(hint.center, offset, atol=1e-6)
     np.testing.assert_allclose(hint.up, (0, 0, 1), atol=1e-9)
     assert hint.arc == (0.0, 360.0)
@@ -75,7 +75,7 @@ def test_a_viewpoint_survives_json_exactly(camera):
 
 
 @pytest.mark.parametrize("center", [[1e38, 0, 0], [0, -1e160, 0]])
-def test_what_no_camera_could_be_placed_about_is_refused(center):
+def test_what_no_camera_could_be_placed_about_is_rejected(center):
     with pytest.raises(ValueError, match="not finite"):
         Viewpoint.from_json({**STORED, "center": center})
     (camera,) = orbit(Viewpoint.from_json({**STORED, "center": [9e36, 0, 0]}), 1)

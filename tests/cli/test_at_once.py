@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from commands import hyrfpack as run_command
 from commands import refused, succeeded
-from explicit_balls import ball
+from explicit_balls import ball_splats
 from scenes import ring
 
 import hyrfpack
@@ -48,7 +48,7 @@ def template(data, tmp_path_factory) -> Path:
     shutil.copytree(folder / "first", folder / "second")
     shutil.copy(folder / "first" / "model.hyrf", folder / "model.hyrf")
     succeeded("compress", folder / "model.hyrf", "-o", folder / "packed.hyrf", "--profile", "paper")
-    (folder / "ball.ply").write_bytes(ply.encode(ball(20)))
+    (folder / "ball.ply").write_bytes(ply.encode(ball_splats(20)))
     return folder
 
 
@@ -194,7 +194,7 @@ def test_a_log_that_appears_meanwhile_is_kept(world, monkeypatch):
     assert json.loads(Path("log-2.jsonl").read_text().splitlines()[-1])["complete"] is True
 
 
-def test_a_checkpoint_of_another_program_is_kept_and_training_goes_on(world, monkeypatch):
+def test_a_checkpoint_of_another_program_is_kept_and_training_continues(world, monkeypatch):
     appears("out/checkpoint.pt", monkeypatch)
     result = succeeded("train", "data", "--steps", 3, "--max-gaussians", 40, "-o", "out")
 
@@ -251,7 +251,7 @@ def test_a_library_call_without_overwrite_keeps_what_appears_meanwhile_and_repor
 
 
 @pytest.mark.parametrize("name", [name for name in WRITERS if name != "save"])
-def test_a_library_call_without_overwrite_refuses_a_file_that_is_there_at_the_start(name, world):
+def test_a_library_call_without_overwrite_rejects_a_file_that_is_there_at_the_start(name, world):
     ending = {"export": "ply", "compare": "html"}.get(name, "hyrf")
     Path(f"out.{ending}").write_bytes(FOREIGN)
     before = files_in(world)
@@ -283,7 +283,7 @@ FOLDERS = [
 
 
 @pytest.mark.parametrize("command", FOLDERS)
-def test_a_command_is_refused_where_another_one_is_at_work_and_nothing_changes(command, world):
+def test_a_command_is_rejected_where_another_one_is_at_work_and_nothing_changes(command, world):
     with exclusive_folder("out"):
         before = files_in(world)
         assert refused(*command.split()).startswith(f"Error: out: {BUSY}")
@@ -314,7 +314,7 @@ def ring_of_two() -> list:
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_a_library_call_is_refused_where_another_one_is_at_work_and_nothing_changes(name, world):
+def test_a_library_call_is_rejected_where_another_one_is_at_work_and_nothing_changes(name, world):
     with exclusive_folder("out"):
         before = files_in(world)
         with pytest.raises(HyrfError, match=f"out: {BUSY}"):

@@ -115,7 +115,7 @@ def test_compress_of_a_runs_folder_uses_its_photos_unless_told_not_to(run, data,
     assert "trained on" not in without.stderr and "psnr" not in json.loads(without.stdout)
 
 
-def test_compress_goes_on_without_photos_that_are_gone(run, tmp_path):
+def test_compress_continues_without_photos_that_are_gone(run, tmp_path):
     shutil.copytree(run, tmp_path / "run")
     metrics = json.loads((run / "metrics.json").read_text())
     metrics["scene"]["reading"]["path"] = str(tmp_path / "moved")
@@ -315,7 +315,7 @@ def test_demo_ends_with_a_table_and_a_picture(tmp_path):
         ("train", "data", "-o", "run", "--resume"),
     ],
 )
-def test_a_wrong_input_is_one_sentence_that_names_it(arguments, tmp_path, monkeypatch):
+def test_a_wrong_input_is_a_clear_error_that_names_it(arguments, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "junk.hyrf").write_bytes(b"no model at all" * 20)
     (tmp_path / "empty").mkdir()
@@ -368,7 +368,7 @@ REFUSED_OPTIONS = {
 
 
 @pytest.mark.parametrize("case", REFUSED_OPTIONS)
-def test_options_of_compress_that_cannot_be_met_are_one_sentence(case, run, data, tmp_path):
+def test_options_of_compress_that_cannot_be_met_are_a_clear_error(case, run, data, tmp_path):
     options, words = REFUSED_OPTIONS[case]
     (tmp_path / "old.hyrf").write_bytes(b"old")
     options = [data if option == "DATA" else option for option in options]

@@ -127,7 +127,7 @@ def old_outputs(out: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("command", WRITERS)
-def test_full_disk_is_one_sentence_and_the_old_files_stay(command, data, run, packed, disk):
+def test_full_disk_is_a_clear_error_and_the_old_files_stay(command, data, run, packed, disk):
     out = disk / "out"
     before = old_outputs(out)
     fill(disk, leave=0)
@@ -138,7 +138,7 @@ def test_full_disk_is_one_sentence_and_the_old_files_stay(command, data, run, pa
 
 
 @pytest.mark.parametrize("command", WRITERS)
-def test_file_limit_is_one_sentence_and_the_old_files_stay(command, data, run, packed, tmp_path):
+def test_file_limit_is_a_clear_error_and_the_old_files_stay(command, data, run, packed, tmp_path):
     before = old_outputs(tmp_path)
     arguments = WRITERS[command](data, run / "model.hyrf", packed, tmp_path)
 
@@ -149,7 +149,7 @@ def test_file_limit_is_one_sentence_and_the_old_files_stay(command, data, run, p
 
 
 @pytest.mark.parametrize("command", WRITERS)
-def test_read_only_disk_is_one_sentence(command, data, run, packed, disk):
+def test_read_only_disk_is_a_clear_error(command, data, run, packed, disk):
     out = disk / "out"
     before = old_outputs(out)
     subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
@@ -176,7 +176,7 @@ def test_disk_that_fills_while_rendering_keeps_the_whole_pictures(packed, disk):
 # -- training --------------------------------------------------------------------------------------------------------
 
 
-def test_training_goes_on_without_checkpoints_that_do_not_fit(data, run, tmp_path):
+def test_training_continues_without_checkpoints_that_do_not_fit(data, run, tmp_path):
     """The model fits on the disk and the checkpoint, three times as large, does not."""
     size = (run / "model.hyrf").stat().st_size
     with file_limit(2 * size):
@@ -271,7 +271,7 @@ def test_folder_removed_while_training_is_made_again_for_the_model(tmp_path):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")
-def test_standard_output_on_a_full_disk_is_one_sentence(packed):
+def test_standard_output_on_a_full_disk_is_a_clear_error(packed):
     command = [sys.executable, "-m", "hyrfpack", "info", packed]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     with open("/dev/full", "w") as full:

@@ -193,7 +193,7 @@ CASES = _cases()
 
 def make_world(folder: Path) -> Path:
     """A folder with a set of photos of each layout, models, splats and files of others, as small as they work."""
-    from explicit_balls import ball
+    from explicit_balls import ball_splats
 
     from hyrfpack.cameras.files import cameras_to_json
     from hyrfpack.data import load_scene
@@ -228,9 +228,9 @@ def make_world(folder: Path) -> Path:
     shutil.copytree(nerfstudio / "images", folder / "photos")
     (folder / "lpips.pth").write_bytes(b"weights")
     for name in ("ball.ply", "ball.hyrf.ply"):
-        (folder / name).write_bytes(ply.encode(ball(20)))
+        (folder / name).write_bytes(ply.encode(ball_splats(20)))
     (folder / "loose").mkdir()
-    for name, data in sog.encode_files(ball(20)).items():
+    for name, data in sog.encode_files(ball_splats(20)).items():
         (folder / "loose" / name).write_bytes(data)
     _make_foreign(folder, named[0][0])
     (folder / "soft.hyrf").symlink_to("packed.hyrf")

@@ -103,7 +103,7 @@ def test_cameras_and_points_are_counted(model, tmp_path):
     assert succeeded("export", model, "-o", tmp_path / "colmap", "--colmap").stdout.endswith(" bytes, 4 cameras\n")
 
 
-def test_the_degree_is_chosen_and_the_choice_is_told(model, tmp_path):
+def test_the_degree_is_chosen_and_the_choice_is_reported(model, tmp_path):
     result = succeeded("export", model, "-o", tmp_path / "a.ply")
     assert [line.split()[0] for line in result.stderr.splitlines()] == [
         *("choosing", "degree", "fitting", "writing", "measuring")
@@ -168,7 +168,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("what", WRONG)
-def test_wrong_requests_are_one_sentence_and_leave_no_file(what, model, tmp_path, monkeypatch):
+def test_wrong_requests_are_a_clear_error_and_leave_no_file(what, model, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     arguments, words = WRONG[what]
     assert words in refused("export", model, *arguments)
@@ -176,7 +176,7 @@ def test_wrong_requests_are_one_sentence_and_leave_no_file(what, model, tmp_path
 
 
 @pytest.mark.parametrize("command", ["export", "view"])
-def test_models_that_cannot_be_read_are_one_sentence(command, model, tmp_path, monkeypatch):
+def test_models_that_cannot_be_read_are_a_clear_error(command, model, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     data = bytearray(model.read_bytes())
     data[len(data) // 2] ^= 1
@@ -191,7 +191,7 @@ def test_models_that_cannot_be_read_are_one_sentence(command, model, tmp_path, m
     assert not (tmp_path / "a.ply").exists()
 
 
-def test_a_file_without_a_model_is_one_sentence(tmp_path):
+def test_a_file_without_a_model_is_a_clear_error(tmp_path):
     assert "no MODEL" in refused("export", "-o", tmp_path / "a.ply")
     assert list(tmp_path.iterdir()) == []
 
@@ -241,14 +241,14 @@ def test_view_decodes_nothing_and_loads_no_torch(model):
     assert done.stdout.endswith("['scene.hyrf']\nFalse\n")
 
 
-def test_view_refuses_a_port_in_use_and_no_port(model):
+def test_view_rejects_a_port_in_use_and_no_port(model):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert f"port {port} of 127.0.0.1 is taken" in refused("view", model, "--port", port, "--no-browser")
     assert hyrfpack("view", model, "--port", 70000).exit_code == 2
 
 
-def test_view_refuses_an_address_that_is_none(model):
+def test_view_rejects_an_address_that_is_none(model):
     assert "not an address to listen at" in refused("view", model, "--host", "", "--no-browser")
 
 

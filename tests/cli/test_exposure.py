@@ -76,7 +76,7 @@ def test_without_an_exposure_map_both_exposures_give_the_same_pictures(subject, 
 
 
 @pytest.mark.parametrize("words", [("render", "-o", "out"), ("evaluate", "--data", "photos")], ids=" ".join)
-def test_another_exposure_is_refused_and_the_choices_are_named(words):
+def test_another_exposure_is_rejected_and_the_choices_are_named(words):
     sentence = refused(words[0], "model.hyrf", *words[1:], "--exposure", "bright")
     assert "'bright' is not one of 'as-photographed', 'consistent'" in sentence
 

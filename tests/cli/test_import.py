@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from commands import refused, succeeded
-from explicit_balls import ball
+from explicit_balls import ball_splats
 
 from hyrfpack.cameras.files import cameras_to_json
 from hyrfpack.demo.scene import write_demo_scene
@@ -22,14 +22,14 @@ pytestmark = pytest.mark.usefixtures("short_imports")
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
     path = tmp_path / "ball.ply"
-    path.write_bytes(ply.encode(ball(40)))
+    path.write_bytes(ply.encode(ball_splats(40)))
     return path
 
 
 @pytest.fixture
 def cameras(tmp_path: Path) -> Path:
-    weighted = WeightedSplats.from_splats(ball(40), "ball")
-    made = sample_viewpoints(weighted, Drawable.from_splats(ball(40), weighted.frame), 9, 48, 3)
+    weighted = WeightedSplats.from_splats(ball_splats(40), "ball")
+    made = sample_viewpoints(weighted, Drawable.from_splats(ball_splats(40), weighted.frame), 9, 48, 3)
     path = tmp_path / "cameras.json"
     path.write_text(cameras_to_json([(str(number), camera) for number, camera in enumerate(made)]))
     return path
@@ -47,7 +47,7 @@ def test_import_learns_what_cameras_see_and_tells_numbers(source: Path, cameras:
     assert f"{numbers['psnr']:.2f} dB against the original" in words
 
 
-def test_a_device_that_is_not_there_is_refused_before_any_work(source: Path, tmp_path: Path) -> None:
+def test_a_device_that_is_not_there_is_rejected_before_any_work(source: Path, tmp_path: Path) -> None:
     target = tmp_path / "ball.hyrf"
     target.write_bytes(b"kept")
     told = refused("import", source, "-o", target, *QUICK, "--device", "cuda:9", "--overwrite")
@@ -86,7 +86,7 @@ def test_import_makes_folders_that_are_missing(source: Path, tmp_path: Path) -> 
     assert (tmp_path / "not" / "yet" / "ball.hyrf").is_file()
 
 
-def test_import_refuses_in_one_sentence(source: Path, tmp_path: Path) -> None:
+def test_import_rejects_with_a_clear_error(source: Path, tmp_path: Path) -> None:
     target = tmp_path / "x.hyrf"
     assert "nothing.ply" in refused("import", tmp_path / "nothing.ply", "-o", target)
     assert "name another file" in refused("import", source, "-o", source)

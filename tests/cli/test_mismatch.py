@@ -37,7 +37,7 @@ def moved(data, tmp_path) -> Path:
     return folder
 
 
-def test_evaluate_tells_of_poses_in_another_frame_in_one_sentence_and_scores(model, data, moved):
+def test_evaluate_tells_of_poses_in_another_frame_with_a_clear_error_and_scores(model, data, moved):
     assert SENTENCE not in succeeded("evaluate", model, "--data", data).stderr
     told = succeeded("evaluate", model, "--data", moved, "--json")
     assert told.stderr.count(SENTENCE) == 1

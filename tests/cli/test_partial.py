@@ -151,7 +151,7 @@ def attempts(path: Path, data: Path, output: Path, *, part: bool) -> list[tuple]
     ]
 
 
-def test_a_file_cut_short_is_refused_unless_asked_for(cut, data, tmp_path):
+def test_a_file_cut_short_is_rejected_unless_asked_for(cut, data, tmp_path):
     for arguments in attempts(cut, data, tmp_path / "out", part=False):
         assert f"{cut}: " in (sentence := refused(*arguments)) and "truncated" in sentence
     assert "truncated" in refused("compress", cut, "-o", tmp_path / "out.hyrf")
@@ -159,7 +159,7 @@ def test_a_file_cut_short_is_refused_unless_asked_for(cut, data, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_too_little_of_a_file_is_refused_in_a_sentence_that_says_how_much_it_takes(whole, stump, data, tmp_path):
+def test_too_little_of_a_file_is_rejected_with_a_clear_error_that_says_how_much_it_takes(whole, stump, data, tmp_path):
     needed, size = stump.stat().st_size + 1, whole.stat().st_size
     for arguments in attempts(stump, data, tmp_path / "out", part=True):
         assert f"{stump}: the first {needed:,} of {size:,} bytes make a model" in refused(*arguments)
@@ -170,7 +170,7 @@ def test_too_little_of_a_file_is_refused_in_a_sentence_that_says_how_much_it_tak
 
 
 @pytest.mark.parametrize("profile", ["raw", "paper"])
-def test_files_without_layers_are_refused_in_part(profile, whole, data, tmp_path):
+def test_files_without_layers_are_rejected_in_part(profile, whole, data, tmp_path):
     full, part = tmp_path / "full.hyrf", tmp_path / "part.hyrf"
     succeeded("compress", whole, "-o", full, "--profile", profile)
     part.write_bytes(full.read_bytes()[:-8])
@@ -183,7 +183,7 @@ def test_files_without_layers_are_refused_in_part(profile, whole, data, tmp_path
 
 
 @pytest.mark.parametrize("fraction", ["-0.1", "1.01", "60%", "nan", "inf", ""])
-def test_a_fraction_that_is_none_is_refused(fraction, whole, tmp_path):
+def test_a_fraction_that_is_none_is_rejected(fraction, whole, tmp_path):
     result = hyrfpack("decompress", whole, "-o", tmp_path / "out.hyrf", "--fraction", fraction)
 
     assert result.exit_code == 2, result.output

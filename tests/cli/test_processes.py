@@ -17,7 +17,7 @@ import torch.distributed as dist
 from commands import refused, succeeded
 from hypothesis import given
 from hypothesis import strategies as st
-from ranked import Ended, commanded, needs_ranks, told_by_torchrun
+from rank_processes import ProcessOutcome, needs_ranks, run_command_on_ranks, torchrun_environment
 
 from hyrfpack.cli.processes import remove_option
 from hyrfpack.demo.scene import write_demo_scene
@@ -38,7 +38,7 @@ def model_of(run: Path) -> bytes:
     return (run / "model.hyrf").read_bytes()
 
 
-def spoken_for(ends: list[Ended], code: int = 0) -> Ended:
+def spoken_for(ends: list[ProcessOutcome], code: int = 0) -> ProcessOutcome:
     """All ended alike, and rank 0 alone has said something."""
     assert [end.exit_code for end in ends] == [code] * len(ends), [end.errors for end in ends]
     assert [(end.output, end.errors) for end in ends[1:]] == [("", "")] * (len(ends) - 1)
@@ -57,10 +57,10 @@ def logs(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def trained(data, logs, tmp_path_factory) -> tuple[Path, list[Ended]]:
+def trained(data, logs, tmp_path_factory) -> tuple[Path, list[ProcessOutcome]]:
     """A run of two processes, and how they ended."""
     out = tmp_path_factory.mktemp("runs") / "two"
-    return out, commanded("train", data, "-o", out, *STEPS, "--json", folder=logs)
+    return out, run_command_on_ranks("train", data, "-o", out, *STEPS, "--json", folder=logs)
 
 
 @pytest.fixture(scope="module")
@@ -96,18 +96,18 @@ def test_all_other_words_stay_in_their_order(words, number, joined):
 
 
 def test_processes_cannot_be_asked_for_within_one_of_several(monkeypatch, tmp_path):
-    for name, value in told_by_torchrun(0, 2, 1).items():
+    for name, value in torchrun_environment(0, 2, 1).items():
         monkeypatch.setenv(name, value)
     sentence = refused("train", tmp_path, "-o", tmp_path / "run", "--processes", 2)
     assert "started 2 processes; leave out --processes" in sentence
 
 
 @pytest.mark.parametrize("number", ["0", "-1", "two", "1.5"])
-def test_a_number_of_processes_that_is_none_is_refused(number, tmp_path):
+def test_a_number_of_processes_that_is_none_is_rejected(number, tmp_path):
     assert "--processes" in refused("train", tmp_path, "-o", tmp_path / "run", "--processes", number)
 
 
-def test_an_environment_that_makes_no_sense_is_one_sentence(monkeypatch, tmp_path):
+def test_an_environment_that_makes_no_sense_is_a_clear_error(monkeypatch, tmp_path):
     monkeypatch.setenv("RANK", "3")
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert "process 3 of 2" in refused("train", tmp_path, "-o", tmp_path / "run")
@@ -120,7 +120,7 @@ def test_one_process_of_torchrun_gives_the_bytes_of_none_and_touches_no_network(
     words = ("train", data, *("--steps", 12, "--max-gaussians", 200))
     succeeded(*words, "-o", tmp_path / "none")
     monkeypatch.setattr(dist, "init_process_group", lambda *_, **__: pytest.fail("the network was touched"))
-    for name, value in told_by_torchrun(0, 1, 1).items():
+    for name, value in torchrun_environment(0, 1, 1).items():
         monkeypatch.setenv(name, value)
     succeeded(*words, "-o", tmp_path / "torchrun")
     succeeded(*words, "-o", tmp_path / "asked", "--processes", 1)
@@ -146,7 +146,7 @@ def test_rank_0_alone_speaks_and_says_how_many_they_are(trained):
 def test_scores_are_those_of_one_process(size, data, model, logs, tmp_path):
     """With three, one has no photo."""
     words = ("evaluate", model, "--data", data, "--json", "--pictures")
-    said = json.loads(spoken_for(commanded(*words, tmp_path / "many", folder=logs, size=size)).output)
+    said = json.loads(spoken_for(run_command_on_ranks(*words, tmp_path / "many", folder=logs, size=size)).output)
     expected = json.loads(succeeded(*words, tmp_path / "one").stdout)
     assert len(said["views"]) == 2 and said.pop("seconds_per_frame") > 0 and expected.pop("seconds_per_frame") > 0
     assert said == expected
@@ -156,7 +156,7 @@ def test_scores_are_those_of_one_process(size, data, model, logs, tmp_path):
 @needs_ranks
 def test_pictures_are_those_of_one_process(model, logs, tmp_path):
     words = ("render", model, "--orbit", 5, "--depth", "--json", "-o")
-    said = json.loads(spoken_for(commanded(*words, tmp_path / "two", folder=logs)).output)
+    said = json.loads(spoken_for(run_command_on_ranks(*words, tmp_path / "two", folder=logs)).output)
     expected = json.loads(succeeded(*words, tmp_path / "one").stdout)
     assert [Path(path).name for path in said["pictures"]] == [Path(path).name for path in expected["pictures"]]
     assert files_in(tmp_path / "two") == files_in(tmp_path / "one") and len(files_in(tmp_path / "one")) == 10
@@ -166,7 +166,8 @@ def test_pictures_are_those_of_one_process(model, logs, tmp_path):
 def test_fine_tuning_together_gives_the_same_bytes_twice(data, model, logs, tmp_path):
     words = ("compress", model, "--data", data, "--finetune", 6, "--json", "-o")
     reports = [
-        json.loads(spoken_for(commanded(*words, tmp_path / f"{name}.hyrf", folder=logs)).output) for name in "ab"
+        json.loads(spoken_for(run_command_on_ranks(*words, tmp_path / f"{name}.hyrf", folder=logs)).output)
+        for name in "ab"
     ]
     assert (tmp_path / "a.hyrf").read_bytes() == (tmp_path / "b.hyrf").read_bytes()
     assert {**reports[0], "file": ""} == {**reports[1], "file": ""}
@@ -176,15 +177,15 @@ def test_fine_tuning_together_gives_the_same_bytes_twice(data, model, logs, tmp_
 @needs_ranks
 def test_a_profile_that_has_nothing_to_share_gives_what_one_process_does(model, logs, tmp_path):
     words = ("compress", model, "--profile", "paper", "-o")
-    spoken_for(commanded(*words, tmp_path / "two.hyrf", folder=logs))
+    spoken_for(run_command_on_ranks(*words, tmp_path / "two.hyrf", folder=logs))
     succeeded(*words, tmp_path / "one.hyrf")
     assert (tmp_path / "two.hyrf").read_bytes() == (tmp_path / "one.hyrf").read_bytes()
 
 
 @needs_ranks
-def test_a_file_that_is_there_is_refused_once(model, logs):
-    end = spoken_for(commanded("compress", model, "-o", model, folder=logs), 2)
-    assert str(model) in end.sentence
+def test_a_file_that_is_there_is_rejected_once(model, logs):
+    end = spoken_for(run_command_on_ranks("compress", model, "-o", model, folder=logs), 2)
+    assert str(model) in end.error_line
 
 
 @needs_ranks
@@ -204,8 +205,8 @@ def test_a_file_that_is_there_is_refused_once(model, logs):
 )
 def test_what_the_user_got_wrong_is_said_once(words, told, data, tmp_path):
     named = [data if word == "data" else tmp_path / word if word in NAMES else word for word in words]
-    end = spoken_for(commanded(*named, folder=tmp_path / "logs"), 2)
-    assert told in end.sentence and end.output == ""
+    end = spoken_for(run_command_on_ranks(*named, folder=tmp_path / "logs"), 2)
+    assert told in end.error_line and end.output == ""
     assert [path.name for path in tmp_path.iterdir()] == ["logs"]
 
 
@@ -345,7 +346,7 @@ def test_processes_stop_when_their_launcher_is_killed(data, tmp_path):
 @pytest.fixture(scope="module")
 def uninterrupted(data, logs, tmp_path_factory) -> bytes:
     out = tmp_path_factory.mktemp("uninterrupted")
-    spoken_for(commanded("train", data, "-o", out, *LONG, folder=logs))
+    spoken_for(run_command_on_ranks("train", data, "-o", out, *LONG, folder=logs))
     return model_of(out)
 
 
@@ -360,12 +361,12 @@ def test_a_run_of_two_that_has_lost_one_says_so_and_can_be_resumed(data, uninter
     assert json.loads(output)["error"] == told.removeprefix("Error: ") and "Traceback" not in errors
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["checkpoint.pt"]
 
-    spoken_for(commanded(*words[2:-2], "--resume", folder=logs))
+    spoken_for(run_command_on_ranks(*words[2:-2], "--resume", folder=logs))
     assert model_of(tmp_path / "run") == uninterrupted
 
 
 @needs_ranks
-def test_torchrun_starts_a_run_anew_that_lost_a_process_and_it_goes_on(data, uninterrupted, tmp_path):
+def test_torchrun_starts_a_run_again_that_lost_a_process_and_it_continues(data, uninterrupted, tmp_path):
     torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", 2, "--max-restarts", 1)
     words = ("-m", "hyrfpack", "train", data, "-o", tmp_path / "run", *LONG)
     output, errors = ended(*torchrun, *words, folder=tmp_path, code=0)

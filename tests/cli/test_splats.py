@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import refused, succeeded
-from explicit_balls import ball
+from explicit_balls import ball_splats
 from PIL import Image
 from scenes import ring, small_model
 
@@ -24,7 +24,7 @@ from hyrfpack.splats.formats.hints import NO_HINTS
 from hyrfpack.splats.names import SPLATS_SUFFIXES, is_splats
 from hyrfpack.splats.table import FORMATS
 
-SPLATS = ball(60)
+SPLATS = ball_splats(60)
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def test_evaluate_writes_pictures_of_splats_too(files, data, tmp_path):
 
 
 @pytest.mark.parametrize("command", ["render", "evaluate"])
-def test_part_of_a_splats_file_is_refused(command, files, data, tmp_path):
+def test_part_of_a_splats_file_is_rejected(command, files, data, tmp_path):
     output = ("-o", tmp_path / "out") if command == "render" else ()
     told = refused(command, files[".ply"], "--data", data, "--allow-partial", *output)
     assert "splats are read whole; leave out --allow-partial" in told

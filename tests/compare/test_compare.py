@@ -244,7 +244,7 @@ def test_runs_without_held_out_photos_are_compared_by_the_rest(which, runs, tmp_
     assert page.rows["Gaussians"] == ["60", "60"] and "training" in page.words
 
 
-def test_other_held_out_photos_are_refused(runs, tmp_path):
+def test_other_held_out_photos_are_rejected(runs, tmp_path):
     changed(runs[1], lambda values: values["evaluation"]["views"].pop())
     with pytest.raises(HyrfError, match=r"held out of 'b' \(1\) than of 'a' \(2; '001.png' of one of them alone\)"):
         hyrfpack.compare(runs, tmp_path / "page.html")
@@ -262,7 +262,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("kind", BROKEN)
-def test_metrics_that_are_no_metrics_are_one_sentence(kind, runs, tmp_path):
+def test_metrics_that_are_no_metrics_are_a_clear_error(kind, runs, tmp_path):
     text, reason = BROKEN[kind]
     (runs[1] / "metrics.json").write_bytes(text if isinstance(text, bytes) else text.encode())
     sentence = refused("compare", *runs, "-o", tmp_path / "page.html")
@@ -285,12 +285,12 @@ def test_metrics_that_are_no_metrics_are_one_sentence(kind, runs, tmp_path):
         (lambda values: values["evaluation"]["views"][0].pop("name"), "name"),
     ],
 )  # fmt: skip
-def test_metrics_that_lack_something_are_one_sentence_that_names_it(change, named, runs):
+def test_metrics_that_lack_something_are_a_clear_error_that_names_it(change, named, runs):
     with pytest.raises(HyrfError, match=f"metrics are damaged .*'{named}'.*train the run anew"):
         read_run(changed(runs[0], change))
 
 
-def test_what_is_no_finished_run_is_refused_with_what_to_do(runs, tmp_path):
+def test_what_is_no_finished_run_is_rejected_with_what_to_do(runs, tmp_path):
     page = tmp_path / "page.html"
     assert "there is no such folder" in refused("compare", runs[0], tmp_path / "none", "-o", page)
     assert "name two folders" in refused("compare", runs[0], "-o", page)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exposures import map_through
-from scenes import alternating, ball_scene, exposed_scene, shown, view_of
+from exposures import map_with_gains
+from scenes import alternating_gains, ball_scene, expose_picture, exposed_scene, view_of
 
 from hyrfpack.cameras.capture import has_mean_exposure
 from hyrfpack.compress import compress, packer
@@ -21,7 +21,7 @@ from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Scene, View
 from hyrfpack.train import TrainConfig, train
 
-GAINS = alternating(8, stops=1.0)
+GAINS = alternating_gains(8, stops=1.0)
 MEAN = np.exp(np.log(GAINS).mean())
 
 
@@ -33,7 +33,7 @@ def scene() -> Scene:
 @pytest.fixture(scope="module")
 def truth() -> list[View]:
     """What photos of the mean exposure would show."""
-    return [view_of(v.name, v.camera, shown(v.load(), MEAN)) for v in ball_scene(len(GAINS), 300).train]
+    return [view_of(v.name, v.camera, expose_picture(v.load(), MEAN)) for v in ball_scene(len(GAINS), 300).train]
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def unaware(trained, tmp_path_factory) -> Path:
 def with_map(source: Path, scene: Scene, gains: np.ndarray, path: Path) -> Path:
     """A model in a file with a map of these gains of the training photos."""
     model, provenance = load_with_provenance(source)
-    model.exposure = map_through([view.camera for view in scene.train], model.config.frame, gains)
+    model.exposure = map_with_gains([view.camera for view in scene.train], model.config.frame, gains)
     save(model, path, provenance=provenance)
     return path
 

@@ -48,7 +48,7 @@ def test_an_archive_reads_as_its_folder(zipped):
     assert scene.notes[0].startswith("set.zip was unpacked into ")
 
 
-def test_it_is_unpacked_once_and_anew_where_a_file_is_gone_or_the_archive_is_another(zipped, cache):
+def test_it_is_unpacked_once_and_again_where_a_file_is_gone_or_the_archive_is_another(zipped, cache):
     folder = archive.unpack(zipped)
     first = folder / "images" / "000.png"
     about = os.stat(first)
@@ -126,7 +126,7 @@ def test_what_a_killed_process_left_is_removed_after_a_day(zipped, cache):
     ],
 )
 @pytest.mark.filterwarnings("ignore:Duplicate name")
-def test_archives_with_such_names_are_refused_and_leave_nothing(names, says, tmp_path, cache):
+def test_archives_with_such_names_are_rejected_and_leave_nothing(names, says, tmp_path, cache):
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as content:
         for name in names:
             content.writestr(name, "x")
@@ -138,7 +138,7 @@ def test_archives_with_such_names_are_refused_and_leave_nothing(names, says, tmp
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x05\x06" + bytes(10), b"no archive at all"])
-def test_a_file_that_is_only_called_an_archive_is_refused(content, tmp_path):
+def test_a_file_that_is_only_called_an_archive_is_rejected(content, tmp_path):
     (tmp_path / "a.zip").write_bytes(content)
 
     with pytest.raises(HyrfDataError, match="the archive is damaged"):
@@ -173,7 +173,7 @@ def test_no_name_writes_outside_the_folder(names, tmp_path_factory):
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_damaged_archives_are_read_or_refused(zipped, tmp_path_factory, data):
+def test_damaged_archives_are_read_or_rejected(zipped, tmp_path_factory, data):
     content = bytearray(zipped.read_bytes())
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(content) - 1))

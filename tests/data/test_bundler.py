@@ -135,7 +135,7 @@ def test_points_that_are_not_finite_are_dropped(folder):
     assert "1 of 4 points are not finite and were dropped" in load_scene(folder).notes
 
 
-def test_copies_of_a_size_that_is_not_said_are_refused(folder):
+def test_copies_of_a_size_that_is_not_said_are_rejected(folder):
     (folder / "images").rename(folder / "images_4")
 
     with pytest.raises(HyrfDataError, match="does not say how large its photos are"):
@@ -163,7 +163,7 @@ def test_smaller_copies_are_taken_where_the_list_says_that_they_were_posed(folde
 
 
 @pytest.mark.parametrize("inside", ["", "left/"])
-def test_smaller_copies_are_refused_otherwise_for_sizes_are_not_said(folder, pictures, inside):
+def test_smaller_copies_are_rejected_otherwise_for_sizes_are_not_said(folder, pictures, inside):
     names = [f"{inside}{index}.png" for index in range(4)]
     shutil.rmtree(folder / "images")
     pictures(folder / "images_2", names, size=(200, 150))

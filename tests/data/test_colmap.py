@@ -232,7 +232,7 @@ def test_broken_model_gives_one_sentence(tmp_path, colmap_folder, damage, says):
 
 
 @pytest.mark.parametrize("table", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_every_truncation_of_a_table_is_refused(tmp_path, colmap_folder, table):
+def test_every_truncation_of_a_table_is_rejected(tmp_path, colmap_folder, table):
     folder = colmap_folder(tmp_path, count=2)
     content = folder.tables()[table]
 
@@ -242,7 +242,7 @@ def test_every_truncation_of_a_table_is_refused(tmp_path, colmap_folder, table):
             load_scene(tmp_path)
 
 
-def test_text_table_with_lost_lines_is_refused(tmp_path, colmap_folder):
+def test_text_table_with_lost_lines_is_rejected(tmp_path, colmap_folder):
     folder = colmap_folder(tmp_path)
     pycolmap.Reconstruction(str(folder.model)).write_text(str(folder.model))
     for table in folder.model.glob("*.bin"):
@@ -254,7 +254,7 @@ def test_text_table_with_lost_lines_is_refused(tmp_path, colmap_folder):
         load_scene(tmp_path)
 
 
-def test_garbage_in_text_tables_is_refused(tmp_path, colmap_folder):
+def test_garbage_in_text_tables_is_rejected(tmp_path, colmap_folder):
     folder = colmap_folder(tmp_path)
     pycolmap.Reconstruction(str(folder.model)).write_text(str(folder.model))
     for table in folder.model.glob("*.bin"):

@@ -186,7 +186,7 @@ def test_whole_panoramas_are_held_out(tmp_path):
     assert {view.name[0] for view in scene.train} == {"b"} and {view.name[0] for view in scene.test} == {"a"}
 
 
-def test_a_mask_of_another_shape_is_refused(tmp_path):
+def test_a_mask_of_another_shape_is_rejected(tmp_path):
     posed(tmp_path, 64)
     (tmp_path / "masks").mkdir()
     Image.new("L", (64, 64)).save(tmp_path / "masks" / "a.png")
@@ -195,7 +195,7 @@ def test_a_mask_of_another_shape_is_refused(tmp_path):
         load_scene(tmp_path)
 
 
-def test_a_panorama_that_changed_is_refused(tmp_path):
+def test_a_panorama_that_changed_is_rejected(tmp_path):
     posed(tmp_path, 64)
     view = load_scene(tmp_path).views[0]
     Image.new("RGB", (64, 32)).save(tmp_path / "images" / "a.png")

@@ -161,7 +161,7 @@ def test_another_model_can_be_named(tmp_path, colmap_folder):
     assert "there are 2 COLMAP models: 0 (2 photos), 1 (11 photos); 0 was taken, as asked for" in scene.notes
 
 
-def test_a_model_that_is_not_there_is_refused_with_those_that_are(tmp_path, colmap_folder):
+def test_a_model_that_is_not_there_is_rejected_with_those_that_are(tmp_path, colmap_folder):
     split_model(tmp_path, colmap_folder, {"0": 2, "1": 11})
 
     says = "there is no COLMAP model '7'; name one of those that are there: 0 (2 photos), 1 (11 photos)"
@@ -169,7 +169,7 @@ def test_a_model_that_is_not_there_is_refused_with_those_that_are(tmp_path, colm
     assert says in refused("train", tmp_path, "-o", tmp_path / "run", "--model", 7)
 
 
-def test_a_model_for_a_layout_without_models_is_refused(nerfstudio_folder):
+def test_a_model_for_a_layout_without_models_is_rejected(nerfstudio_folder):
     assert "leave out '0'" in sentence(nerfstudio_folder(), model="0")
 
 
@@ -229,7 +229,7 @@ def test_a_tidy_set_has_nothing_to_note(nerfstudio_folder, pictures):
 
 
 @pytest.mark.parametrize("name", ["x" * 300, "x/" * 3000 + "x", "a\0b"])
-def test_names_that_no_folder_can_have_are_refused(tmp_path, name):
+def test_names_that_no_folder_can_have_are_rejected(tmp_path, name):
     assert "no such folder" in sentence(tmp_path / name)
 
 
@@ -275,7 +275,7 @@ def test_folders_of_masks_may_be_links(tmp_path, colmap_folder, pictures):
 
 @pytest.mark.parametrize("name", ["", "images", "masks", "sparse", "sparse/0"])
 @pytest.mark.parametrize("mode", [0o000, 0o444])
-def test_folders_that_may_not_be_read_are_one_sentence(tmp_path, colmap_folder, pictures, name, mode):
+def test_folders_that_may_not_be_read_are_a_clear_error(tmp_path, colmap_folder, pictures, name, mode):
     folder = colmap_folder(tmp_path / "set", count=4)
     pictures(tmp_path / "set" / "masks", folder.names)
     place = tmp_path / "set" / name

@@ -55,7 +55,7 @@ def test_links_in_a_circle_end(tmp_path):
     assert listed(tmp_path) == ["a/1.png"]
 
 
-def test_no_folder_is_one_sentence(tmp_path):
+def test_no_folder_is_a_clear_error(tmp_path):
     with pytest.raises(HyrfDataError, match="no such folder; name the folder"):
         list_photos(tmp_path / "missing")
     with pytest.raises(HyrfDataError, match="is a file, not a folder"):
@@ -102,7 +102,7 @@ def test_device_and_time(tmp_path):
     assert (bare.device, bare.taken) == ("", None)
 
 
-def test_no_picture_is_one_sentence(tmp_path):
+def test_no_picture_is_a_clear_error(tmp_path):
     (tmp_path / "1.jpg").write_bytes(b"no picture at all")
     with pytest.raises(HyrfDataError, match="not a picture that can be read"):
         read_photo_facts(tmp_path / "1.jpg")

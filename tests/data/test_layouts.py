@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exported_sets import WRITERS, Taken, photo_path, write_ply
+from exported_sets import WRITERS_BY_LAYOUT, PhotoCamera, photo_path, write_ply
 from PIL import Image
 
 from hyrfpack.cli.common import LAYOUTS as NAMES
@@ -18,16 +18,16 @@ from hyrfpack.outputs import Outputs
 BARE = ("llff", "polycam", "record3d")  # layouts without points
 
 
-def made_up(pictures, poses_of, root: Path, layout: str, count: int = 5) -> list[Taken]:
+def made_up(pictures, poses_of, root: Path, layout: str, count: int = 5) -> list[PhotoCamera]:
     """A set of a layout, 32 x 24; its points lie in front of its first camera."""
     cameras = []
     for index, (rotation, translation) in enumerate(poses_of(count)):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotation, translation
-        cameras.append(Taken(f"{index:03d}.jpg", 32, 24, 30.0, 30.0, 16.0, 12.0, pose))
+        cameras.append(PhotoCamera(f"{index:03d}.jpg", 32, 24, 30.0, 30.0, 16.0, 12.0, pose))
     pictures(root, [photo_path(layout, index, camera.name) for index, camera in enumerate(cameras)])
     points = np.array([[0.1, 0.2, 2, 1], [-0.1, 0, 3, 1], [0, 0.1, 4, 1]]) @ cameras[0].world_from_camera.T
-    WRITERS[layout](root, cameras, points[:, :3], np.eye(3))
+    WRITERS_BY_LAYOUT[layout](root, cameras, points[:, :3], np.eye(3))
     return cameras
 
 
@@ -39,10 +39,10 @@ def write(pictures, random_poses, tmp_path):
 
 def test_the_command_line_knows_every_layout():
     assert tuple(LAYOUTS) == NAMES
-    assert set(WRITERS) | {"colmap", "blender", "nerfstudio"} == set(LAYOUTS)
+    assert set(WRITERS_BY_LAYOUT) | {"colmap", "blender", "nerfstudio"} == set(LAYOUTS)
 
 
-@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)
 def test_cameras_and_points_come_back(tmp_path, write, layout):
     cameras = write(layout)
 
@@ -58,7 +58,7 @@ def test_cameras_and_points_come_back(tmp_path, write, layout):
         np.testing.assert_allclose(scene.point_colors, np.eye(3), atol=1e-6)
 
 
-@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)
 def test_photos_that_are_not_there_are_counted(tmp_path, write, layout):
     cameras = write(layout)
     (tmp_path / photo_path(layout, 3, cameras[3].name)).unlink()
@@ -71,8 +71,8 @@ def test_photos_that_are_not_there_are_counted(tmp_path, write, layout):
         assert len(scene.views) == 4 and any("1 of 5 photos listed in" in note for note in scene.notes)
 
 
-@pytest.mark.parametrize("layout", [layout for layout in WRITERS if layout != "llff"])
-def test_no_photo_at_all_is_one_sentence(tmp_path, write, layout):
+@pytest.mark.parametrize("layout", [layout for layout in WRITERS_BY_LAYOUT if layout != "llff"])
+def test_no_photo_at_all_is_a_clear_error(tmp_path, write, layout):
     cameras = write(layout)
     for index, camera in enumerate(cameras):
         (tmp_path / photo_path(layout, index, camera.name)).unlink()
@@ -81,7 +81,7 @@ def test_no_photo_at_all_is_one_sentence(tmp_path, write, layout):
         load_scene(tmp_path)
 
 
-@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)
 def test_masks_beside_the_photos_count(tmp_path, write, layout):
     cameras = write(layout)
     name = Path(photo_path(layout, 1, cameras[1].name)).name
@@ -93,7 +93,7 @@ def test_masks_beside_the_photos_count(tmp_path, write, layout):
     assert [view.load().mask is not None for view in views] == [False, True, False, False, False]
 
 
-@pytest.mark.parametrize("layout", [layout for layout in WRITERS if layout != "bundler"])  # knows no sizes
+@pytest.mark.parametrize("layout", [layout for layout in WRITERS_BY_LAYOUT if layout != "bundler"])  # knows no sizes
 def test_smaller_files_scale_the_intrinsics(tmp_path, write, layout):
     cameras = write(layout, 2)
     for index, camera in enumerate(cameras):
@@ -103,7 +103,7 @@ def test_smaller_files_scale_the_intrinsics(tmp_path, write, layout):
     assert load_scene(tmp_path).views[0].camera.intrinsics == pytest.approx((15, 15, 8, 6))
 
 
-@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)
 def test_nothing_is_written_where_a_set_is_read_from(tmp_path, write, layout):
     from hyrfpack.errors import HyrfError
 
@@ -156,7 +156,7 @@ def test_photos_may_lie_in_another_place(tmp_path, tmp_path_factory, write, layo
 
 @pytest.mark.parametrize("layout", ["llff", "metashape", "realityscan"])
 @pytest.mark.parametrize("images", ["images_9", "x" * 300, "a\0b"])
-def test_a_folder_that_is_not_there_is_one_sentence(tmp_path, write, layout, images):
+def test_a_folder_that_is_not_there_is_a_clear_error(tmp_path, write, layout, images):
     write(layout)
 
     with pytest.raises(HyrfDataError, match="no photo folder"):
@@ -185,19 +185,19 @@ def test_points_of_another_frame_are_not_used(tmp_path, write, layout):
     assert any(f"the points of {file.name} are not where the cameras look" in note for note in scene.notes)
 
 
-@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)
 def test_real_photos_show_the_points_colours(tmp_path, shared_data, layout):
     """COLMAP's model of real photos, told in another layout: its points project to pixels of their colours."""
     known = load_scene(shared_data / "llff_fern", test_every=0)
     cameras = [
-        Taken(v.name, v.camera.width, v.camera.height, *v.camera.intrinsics, v.camera.camera_from_world)
+        PhotoCamera(v.name, v.camera.width, v.camera.height, *v.camera.intrinsics, v.camera.camera_from_world)
         for v in known.views
     ]
     for index, camera in enumerate(cameras):
         place = tmp_path / photo_path(layout, index, camera.name)
         place.parent.mkdir(parents=True, exist_ok=True)
         place.symlink_to(shared_data / "llff_fern" / "images" / camera.name)
-    WRITERS[layout](tmp_path, cameras, known.points, known.point_colors)
+    WRITERS_BY_LAYOUT[layout](tmp_path, cameras, known.points, known.point_colors)
 
     scene = load_scene(tmp_path, test_every=0)
     shown, expected = [], []

@@ -4,7 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
-from exported_sets import WRITERS, Taken
+from exported_sets import WRITERS_BY_LAYOUT, PhotoCamera
 
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfDataError
@@ -16,8 +16,8 @@ def folder(tmp_path, pictures):
     pictures(tmp_path / "images", ["a.png", "b.png", "c.png"])
     pose = np.eye(4)
     pose[:3, 3] = -1, -2, -3
-    cameras = [Taken(name, 32, 24, 30.0, 30.0, 16.0, 12.0, pose if name == "b" else np.eye(4)) for name in "abc"]
-    WRITERS["llff"](tmp_path, cameras, np.zeros((0, 3)), np.zeros((0, 3)))
+    cameras = [PhotoCamera(name, 32, 24, 30.0, 30.0, 16.0, 12.0, pose if name == "b" else np.eye(4)) for name in "abc"]
+    WRITERS_BY_LAYOUT["llff"](tmp_path, cameras, np.zeros((0, 3)), np.zeros((0, 3)))
     return tmp_path
 
 

@@ -49,14 +49,14 @@ def test_a_name_of_no_photo_cannot_be_held_out(tmp_path, colmap_folder):
         load_scene(tmp_path, held_out=["999.png"])
 
 
-def test_holding_out_everything_is_refused(tmp_path, colmap_folder):
+def test_holding_out_everything_is_rejected(tmp_path, colmap_folder):
     colmap_folder(tmp_path)
 
     with pytest.raises(HyrfDataError, match="none is left to train on"):
         load_scene(tmp_path, test_every=1)
 
 
-def test_paths_that_are_no_scene_are_refused(tmp_path):
+def test_paths_that_are_no_scene_are_rejected(tmp_path):
     (tmp_path / "file").write_text("")
 
     for path, says in (
@@ -68,7 +68,7 @@ def test_paths_that_are_no_scene_are_refused(tmp_path):
             load_scene(path)
 
 
-def test_forced_layout_that_is_not_there_is_refused(tmp_path, colmap_folder):
+def test_forced_layout_that_is_not_there_is_rejected(tmp_path, colmap_folder):
     colmap_folder(tmp_path)
 
     with pytest.raises(HyrfDataError, match="no blender poses"):

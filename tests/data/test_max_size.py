@@ -192,7 +192,7 @@ def test_a_note_says_how_many_photos_are_shrunk_and_from_what(tmp_path, colmap_f
     assert [view.camera.width for view in scene.views] == [20, 20, 16]
 
 
-def test_a_photo_replaced_by_one_of_another_size_is_refused(tmp_path, colmap_folder):
+def test_a_photo_replaced_by_one_of_another_size_is_rejected(tmp_path, colmap_folder):
     folder = colmap_folder(tmp_path, count=1)
     view = load_scene(tmp_path, test_every=0, max_size=16).views[0]
     Image.new("RGB", (64, 32)).save(tmp_path / "images" / folder.names[0])
@@ -201,6 +201,6 @@ def test_a_photo_replaced_by_one_of_another_size_is_refused(tmp_path, colmap_fol
         view.load()
 
 
-def test_a_negative_limit_is_refused(tmp_path):
+def test_a_negative_limit_is_rejected(tmp_path):
     with pytest.raises(ValueError, match="max_size must be 0"):
         load_scene(tmp_path, max_size=-1)

@@ -123,7 +123,7 @@ def test_heic_photos_are_read_whatever_they_are_called(tmp_path):
         assert read_header(tmp_path / name).size == (64, 48)
 
 
-def test_heic_photos_without_the_package_are_one_sentence(tmp_path, monkeypatch):
+def test_heic_photos_without_the_package_are_a_clear_error(tmp_path, monkeypatch):
     (tmp_path / "a.HEIC").write_bytes(b"\0\0\0\x18ftypheic" + bytes(40))
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
 
@@ -134,7 +134,7 @@ def test_heic_photos_without_the_package_are_one_sentence(tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("ending", ["NEF", "dng", "CR2"])
-def test_raw_files_are_refused_although_pillow_would_read_their_preview(tmp_path, ending):
+def test_raw_files_are_rejected_although_pillow_would_read_their_preview(tmp_path, ending):
     Image.fromarray(RAMP).save(tmp_path / "preview.tif")
     (tmp_path / f"a.{ending}").write_bytes((tmp_path / "preview.tif").read_bytes())
 

@@ -53,12 +53,12 @@ def test_trimesh_is_not_needed(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("properties", ["", "property float x\nproperty float y\n"])
-def test_a_file_without_points_is_refused_by_name(tmp_path, properties):
+def test_a_file_without_points_is_rejected_by_name(tmp_path, properties):
     (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 0\n{properties}end_header\n")
     with pytest.raises(HyrfDataError, match="a.ply: it has no points"):
         read_ply_points(tmp_path / "a.ply")
 
 
-def test_what_cannot_be_opened_is_refused_by_name(tmp_path):
+def test_what_cannot_be_opened_is_rejected_by_name(tmp_path):
     with pytest.raises(HyrfDataError, match="a.ply: the points cannot be read"):
         read_ply_points(tmp_path / "a.ply")

@@ -62,7 +62,7 @@ def test_pictures_with_nothing_in_them_are_not_sharp():
     assert measure_sharpness(np.ones((4, 100))) == 0
 
 
-def test_what_is_no_picture_is_refused():
+def test_what_is_no_picture_is_rejected():
     with pytest.raises(ValueError, match="shape"):
         measure_sharpness(np.zeros((4, 4, 3)))
     with pytest.raises(ValueError, match="finite"):

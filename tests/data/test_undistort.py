@@ -123,6 +123,6 @@ def test_colour_under_zero_alpha_never_leaks():
     assert np.abs(picture.rgb[picture.alpha > 20].astype(int) - 50).max() <= 1
 
 
-def test_unsupported_camera_model_is_refused():
+def test_unsupported_camera_model_is_rejected():
     with pytest.raises(HyrfDataError, match="FOV"):
         lens_from_colmap("FOV", 10, 10, np.ones(5))

@@ -48,7 +48,7 @@ def save_raw_photos(folder: Path, *names: str) -> Path:
     ids=lambda command: command[0],
 )
 @pytest.mark.parametrize("names, words", [(("1.CR3", "a/2.nef"), "all 2 photos here are raw files (.CR3, .NEF)")])
-def test_each_command_refuses_a_folder_of_raw_photos_alike(command, names, words, tmp_path):
+def test_each_command_rejects_a_folder_of_raw_photos_alike(command, names, words, tmp_path):
     folder = save_raw_photos(tmp_path / "photos", *names)
     sentence = refused(*(part.format(folder) for part in command))
     assert sentence == (
@@ -61,14 +61,14 @@ def test_each_command_refuses_a_folder_of_raw_photos_alike(command, names, words
 @pytest.mark.parametrize(
     "ending", ["CR2", "CR3", "NEF", "ARW", "DNG", "RAF", "ORF", "RW2", "PEF", "SRW", "X3F", "3FR", "IIQ"]
 )
-def test_one_raw_file_is_refused_as_such(ending, tmp_path):
+def test_one_raw_file_is_rejected_as_such(ending, tmp_path):
     save_raw_photos(tmp_path, f"a.{ending}")
     for read in (hyrfpack.load_scene, hyrfpack.describe_photos):
         with pytest.raises(HyrfDataError, match=f"a.{ending}: raw files are not supported; export them as JPEG"):
             read(tmp_path / f"a.{ending}")
 
 
-def test_raw_photos_of_an_archive_are_told_by_its_name(tmp_path, monkeypatch):
+def test_raw_photos_of_an_archive_are_reported_by_its_name(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     with zipfile.ZipFile(tmp_path / "set.zip", "w") as archive:
         archive.writestr("a.arw", b"raw")
@@ -117,7 +117,7 @@ def test_a_heic_photo_without_the_package_does_not_stop_a_survey(tmp_path, monke
     )
 
 
-def test_photos_that_are_all_heic_are_one_sentence_without_the_package(tmp_path, monkeypatch):
+def test_photos_that_are_all_heic_are_a_clear_error_without_the_package(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     (tmp_path / "photos").mkdir()
     for number in range(5):

@@ -96,7 +96,7 @@ def test_the_plain_sets_are_what_was_rendered(plain):
 
 
 @pytest.mark.parametrize(("variant", "layout"), CASES, ids=[f"{variant.name}, {layout}" for variant, layout in CASES])
-def test_a_variant_reads_as_the_set_itself_or_is_refused(variant, layout, sources, plain, tmp_path, monkeypatch):
+def test_a_variant_reads_as_the_set_itself_or_is_rejected(variant, layout, sources, plain, tmp_path, monkeypatch):
     from PIL import features
 
     for ending, feature in NEEDS.items():

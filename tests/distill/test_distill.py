@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from explicit_balls import LITTLE, ball
+from explicit_balls import TINY_DISTILL_CONFIG, ball_splats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,12 +20,12 @@ from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 
 
 def test_report_says_what_is_in_the_file(tmp_path: Path) -> None:
-    splats, target = ball(200), tmp_path / "ball.hyrf"
-    report = distill_splats(splats, target, LITTLE)
+    splats, target = ball_splats(200), tmp_path / "ball.hyrf"
+    report = distill_splats(splats, target, TINY_DISTILL_CONFIG)
     model = hyrfpack.load(target)
     weighted = WeightedSplats.from_splats(splats, "ball")
     original = Drawable.from_splats(splats, weighted.frame)
-    held_out = sample_viewpoints(weighted, original, LITTLE.test_views, LITTLE.size, 1)
+    held_out = sample_viewpoints(weighted, original, TINY_DISTILL_CONFIG.test_views, TINY_DISTILL_CONFIG.size, 1)
     scores = ReferenceViews.from_splats(original, held_out).psnr_per_view(model)
     assert (report.psnr, report.psnr_worst) == (np.mean(scores), min(scores))
     assert (report.gaussians_before, report.gaussians_after) == (200, len(model))
@@ -35,29 +35,30 @@ def test_report_says_what_is_in_the_file(tmp_path: Path) -> None:
 
 
 def test_more_steps_bring_the_pictures_nearer(tmp_path: Path) -> None:
-    splats = ball(200)
+    splats = ball_splats(200)
     few, many = (
-        distill_splats(splats, tmp_path / "ball.hyrf", replace(LITTLE, steps=steps)).psnr_unpacked for steps in (1, 40)
+        distill_splats(splats, tmp_path / "ball.hyrf", replace(TINY_DISTILL_CONFIG, steps=steps)).psnr_unpacked
+        for steps in (1, 40)
     )
     assert many > few + 0.2
 
 
 def test_same_splats_and_seed_give_the_same_bytes(tmp_path: Path) -> None:
     for name in "ab":
-        distill_splats(ball(60), tmp_path / name, LITTLE)
+        distill_splats(ball_splats(60), tmp_path / name, TINY_DISTILL_CONFIG)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 def test_the_largest_seed_is_as_good_as_any(tmp_path: Path) -> None:
-    report = distill_splats(ball(40), tmp_path / "x.hyrf", replace(LITTLE, seed=2**64 - 1, steps=2))
+    report = distill_splats(ball_splats(40), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, seed=2**64 - 1, steps=2))
     assert hyrfpack.describe(tmp_path / "x.hyrf")["provenance"]["seed"] == 2**64 - 1 and report.psnr > 10
 
 
 @pytest.mark.parametrize("unit, offset", [(1, 1e6), (1e-6, 0)])
 def test_neither_origin_nor_unit_matters(tmp_path: Path, unit: float, offset: float) -> None:
-    splats = ball(100)
+    splats = ball_splats(100)
     moved = replace(splats, positions=splats.positions * unit + offset, scales=splats.scales * np.float32(unit))
-    here, there = (distill_splats(some, tmp_path / "x.hyrf", LITTLE) for some in (splats, moved))
+    here, there = (distill_splats(some, tmp_path / "x.hyrf", TINY_DISTILL_CONFIG) for some in (splats, moved))
     assert abs(here.psnr_unpacked - there.psnr_unpacked) < 0.05
     frame = hyrfpack.load(tmp_path / "x.hyrf").config.frame
     np.testing.assert_allclose(
@@ -68,7 +69,7 @@ def test_neither_origin_nor_unit_matters(tmp_path: Path, unit: float, offset: fl
 
 
 def test_model_of_degree_0_has_no_colours_by_direction(tmp_path: Path) -> None:
-    distill_splats(ball(100, degree=0), tmp_path / "x.hyrf", LITTLE)
+    distill_splats(ball_splats(100, degree=0), tmp_path / "x.hyrf", TINY_DISTILL_CONFIG)
     assert {s["type"]: s["after"] for s in hyrfpack.describe(tmp_path / "x.hyrf")["sections"]}["RTAB"] < 32
 
 
@@ -87,7 +88,7 @@ def test_model_of_degree_0_has_no_colours_by_direction(tmp_path: Path) -> None:
     ids=["one", "two", "coincident", "flat", "opaque", "clear", "outlier", "antialiased"],
 )
 def test_odd_splats_make_a_model(tmp_path: Path, change) -> None:
-    report = distill_splats(change(ball(30)), tmp_path / "x.hyrf", LITTLE)
+    report = distill_splats(change(ball_splats(30)), tmp_path / "x.hyrf", TINY_DISTILL_CONFIG)
     assert report.gaussians_after >= 1
     assert report.psnr > 15
 
@@ -97,23 +98,27 @@ def test_odd_splats_make_a_model(tmp_path: Path, change) -> None:
     [lambda s: s[:0], lambda s: replace(s, opacities=np.zeros(len(s))), lambda s: replace(s, scales=s.scales * 0)],
     ids=["none", "clear", "points"],
 )
-def test_splats_that_cannot_be_seen_are_one_sentence(tmp_path: Path, change) -> None:
+def test_splats_that_cannot_be_seen_are_a_clear_error(tmp_path: Path, change) -> None:
     with pytest.raises(HyrfDataError, match="^ball.ply: there is no Gaussian in it that could be seen"):
-        distill_splats(change(ball(20)), tmp_path / "x.hyrf", LITTLE, name="ball.ply")
+        distill_splats(change(ball_splats(20)), tmp_path / "x.hyrf", TINY_DISTILL_CONFIG, name="ball.ply")
 
 
-def test_cameras_that_look_away_are_one_sentence(tmp_path: Path) -> None:
+def test_cameras_that_look_away_are_a_clear_error(tmp_path: Path) -> None:
     pose = np.eye(4)
     pose[2, 3] = -100  # all splats are behind
     with pytest.raises(HyrfDataError, match="no view shows anything"):
-        distill_splats(ball(20), tmp_path / "x.hyrf", LITTLE, cameras=[Camera(32, 32, 32, 32, 16, 16, pose)])
+        distill_splats(
+            ball_splats(20), tmp_path / "x.hyrf", TINY_DISTILL_CONFIG, cameras=[Camera(32, 32, 32, 32, 16, 16, pose)]
+        )
 
 
-def test_folder_that_cannot_be_made_is_told_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_that_cannot_be_made_is_reported_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "file").write_bytes(b"")
     monkeypatch.setattr(distill_model, "_choose_cameras", lambda *arguments: pytest.fail("the work began"))
     with pytest.raises(HyrfError, match="file is a file, not a folder"):
-        distill_splats(ball(20), tmp_path / "file" / "x.hyrf", LITTLE)
+        distill_splats(ball_splats(20), tmp_path / "file" / "x.hyrf", TINY_DISTILL_CONFIG)
 
 
 def test_interrupt_while_packing_leaves_the_file_that_was_there(
@@ -124,7 +129,7 @@ def test_interrupt_while_packing_leaves_the_file_that_was_there(
     monkeypatch.setattr(pack, "PLANNED_ERROR_SHARE", 100.0)  # the first try will not do
     monkeypatch.setattr(pack.Packer, "encode", _interrupted_at_the_second(pack.Packer.encode))
     with pytest.raises(KeyboardInterrupt):
-        distill_splats(ball(20), target, LITTLE)
+        distill_splats(ball_splats(20), target, TINY_DISTILL_CONFIG)
     assert [path.name for path in tmp_path.iterdir()] == ["x.hyrf"]
     assert target.read_bytes() == b"before"
 
@@ -156,11 +161,11 @@ def test_nothing_is_measured_or_drawn_twice_however_often_packing_is_tried(
     tried = counting(monkeypatch, pack.Packer, "encode")
     drawn = counting(monkeypatch, reference, "render_reference")
 
-    distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, steps=12))
+    distill_splats(ball_splats(60), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, steps=12))
 
     assert len(tried) > 2 and len(measured) == 1
     assert len({noise for _, noise, *_ in tried}) == len(tried)
-    assert len(drawn) == LITTLE.train_views
+    assert len(drawn) == TINY_DISTILL_CONFIG.train_views
 
 
 def test_a_short_import_looks_from_fewer_places_and_regresses_less(
@@ -172,7 +177,7 @@ def test_a_short_import_looks_from_fewer_places_and_regresses_less(
     monkeypatch.setattr(fit, "pack", _interrupt)
     for steps in (1, DistillConfig.steps):
         with pytest.raises(KeyboardInterrupt):
-            distill_splats(ball(20), tmp_path / "x.hyrf", DistillConfig(steps=steps, size=16))
+            distill_splats(ball_splats(20), tmp_path / "x.hyrf", DistillConfig(steps=steps, size=16))
     (_, _, few, *_), _, _, (_, _, many, *_), _, _ = looked  # the others decide, or are held out
     (*_, less, _), (*_, whole, _) = started
     assert few <= 64 < many == DistillConfig.train_views
@@ -185,13 +190,15 @@ def _interrupt(*args):
 
 def test_a_file_less_like_the_original_than_asked_for_says_so(tmp_path: Path) -> None:
     said: list[str] = []
-    report = distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, psnr=60), say=said.append)
+    report = distill_splats(
+        ball_splats(60), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, psnr=60), say=said.append
+    )
     assert report.psnr_asked == 60
     assert said[-1].startswith(f"asked for 60 dB and reached {report.psnr:.1f} at held-out viewpoints")
     assert f"`steps={DistillConfig.steps}`" in said[-1] and "`cameras`" in said[-1]
 
     said.clear()
-    distill_splats(ball(60), tmp_path / "x.hyrf", replace(LITTLE, psnr=10), say=said.append)
+    distill_splats(ball_splats(60), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, psnr=10), say=said.append)
     assert not any("asked for" in sentence for sentence in said)
 
 
@@ -202,7 +209,7 @@ def test_what_packing_took_is_asked_for_and_not_learned() -> None:
     assert not fit._falls_short(36.96, 37) and fit._falls_short(36.94, 37)
 
 
-def test_settings_out_of_range_are_refused() -> None:
+def test_settings_out_of_range_are_rejected() -> None:
     for wrong in (
         *({"steps": 0}, {"steps": 2.5}, {"size": 0}, {"train_views": True}, {"test_views": "3"}),
         *({"psnr": float("nan")}, {"psnr": 61}, {"psnr": "high"}, {"seed": -1}, {"seed": 2**64}),
@@ -212,7 +219,7 @@ def test_settings_out_of_range_are_refused() -> None:
 
 
 def test_teacher_shows_what_is_drawn() -> None:
-    splats = ball(40)
+    splats = ball_splats(40)
     weighted = WeightedSplats.from_splats(splats, "ball")
     original = Drawable.from_splats(splats, weighted.frame)
     (camera,) = sample_viewpoints(weighted, original, 1, 32, 0)

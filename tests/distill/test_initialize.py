@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from explicit_balls import ball
+from explicit_balls import ball_splats
 from scipy.spatial.transform import Rotation
 
 from hyrfpack.distill import initialize
@@ -36,7 +36,7 @@ def test_rotations_are_those_of_scipy() -> None:
 @pytest.mark.parametrize("degree", [0, 1])
 def test_fields_learn_shapes_and_colours(degree: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(initialize, "MIN_STEPS", 200)
-    splats = ball(100, degree)
+    splats = ball_splats(100, degree)
     drawable, cameras = drawable_of(splats)
     model = initial_model(drawable, torch.ones(100), cameras, 0)
     with torch.no_grad():
@@ -65,7 +65,7 @@ def test_many_gaussians_take_fewer_steps_of_larger_batches(monkeypatch: pytest.M
     monkeypatch.setattr(initialize, "_batches", watched)
     monkeypatch.setattr(initialize, "MIN_BATCH_GAUSSIANS", 8)
     monkeypatch.setattr(initialize, "TARGET_EPOCHS", 16)
-    drawable, cameras = drawable_of(ball(100))
+    drawable, cameras = drawable_of(ball_splats(100))
     for work, steps, batch in ((10**9, 200, 8), (100 * 40, 40, 40), (100, 1, 100)):
         taken.clear()
         monkeypatch.setattr(initialize, "MAX_STEPS_TIMES_GAUSSIANS", work)
@@ -73,8 +73,8 @@ def test_many_gaussians_take_fewer_steps_of_larger_batches(monkeypatch: pytest.M
         assert len(taken) in (steps, steps + 1) and max(taken) == batch
 
 
-def test_trainer_goes_on_with_a_model_that_is_given() -> None:
-    splats = ball(50)
+def test_trainer_continues_with_a_model_that_is_given() -> None:
+    splats = ball_splats(50)
     drawable, cameras = drawable_of(splats)
     model = initial_model(drawable, torch.ones(50), cameras, 0)
     before = model.gaussians.color_logits.detach().clone()

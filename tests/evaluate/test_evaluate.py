@@ -180,7 +180,7 @@ def test_lpips_equals_the_straightforward_computation(name, tmp_path):
 
 
 @pytest.mark.parametrize(("name", "side"), [("alex", 31), ("vgg", 16)])
-def test_lpips_takes_the_smallest_picture_and_refuses_a_smaller_one(name, side):
+def test_lpips_takes_the_smallest_picture_and_rejects_a_smaller_one(name, side):
     distance = LPIPS(lpips_network(name).state_dict())
     assert np.isfinite(distance(torch.zeros(side, side, 3), torch.ones(side, side, 3)))
     with pytest.raises(HyrfError, match="pixels a side"):
@@ -210,7 +210,7 @@ def broken_weights(kind: str):
 @pytest.mark.parametrize(
     "kind", ["a layer is missing", "a layer has another shape", "another network", "code", "a list"]
 )
-def test_lpips_refuses_other_files_and_executes_nothing(kind, tmp_path, capsys):
+def test_lpips_rejects_other_files_and_executes_nothing(kind, tmp_path, capsys):
     torch.save(broken_weights(kind), tmp_path / "weights.pt")
     with pytest.raises(HyrfError, match="these are no LPIPS weights") as refusal:
         LPIPS.load(tmp_path / "weights.pt")
@@ -219,7 +219,7 @@ def test_lpips_refuses_other_files_and_executes_nothing(kind, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("content", [b"", b"not weights at all", b"PK\x03\x04 cut"])
-def test_lpips_refuses_garbage(content, tmp_path):
+def test_lpips_rejects_garbage(content, tmp_path):
     (tmp_path / "weights.pt").write_bytes(content)
     with pytest.raises(HyrfError, match="LPIPS"):
         LPIPS.load(tmp_path / "weights.pt")

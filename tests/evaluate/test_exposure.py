@@ -69,7 +69,7 @@ def test_a_picture_of_one_colour_is_corrected_to_the_mean_of_its_photo(shape):
 
 
 @pytest.mark.parametrize("function", [fit_gains, correct_colors])
-def test_pictures_that_are_not_finite_are_refused(function):
+def test_pictures_that_are_not_finite_are_rejected(function):
     picture, broken = a_picture(), a_picture()
     broken[3, 4, 1] = torch.nan
     for pair in ((picture, broken), (broken, picture)):

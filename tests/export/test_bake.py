@@ -115,7 +115,7 @@ def test_a_model_without_gaussians_bakes_to_nothing():
 
 
 @pytest.mark.parametrize("broken", ["positions", "opacity_logits", "color_logits"])
-def test_numbers_that_are_not_finite_are_refused(broken):
+def test_numbers_that_are_not_finite_are_rejected(broken):
     model = small_model(POSITIONS)
     with torch.no_grad():
         getattr(model.gaussians, broken)[3, 0] = torch.nan

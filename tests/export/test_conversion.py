@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from explicit_balls import ball
+from explicit_balls import ball_splats
 
 import hyrfpack
 from hyrfpack.errors import HyrfDataError, HyrfError
@@ -38,7 +38,7 @@ def written(folder: Path, ending: str, splats: Splats) -> Path:
 def test_every_pair_of_formats_keeps_places_and_looks(before, after, tmp_path):
     if FORMATS[after].package:
         pytest.importorskip(FORMATS[after].package[0])
-    source, target = written(tmp_path, before, ball(COUNT)), tmp_path / f"after{after}"
+    source, target = written(tmp_path, before, ball_splats(COUNT)), tmp_path / f"after{after}"
     report = hyrfpack.convert(source, target)
     kept, back = FORMATS[before].decode(source.read_bytes(), "it"), FORMATS[after].decode(target.read_bytes(), "it")
     assert (report.bytes_before, report.bytes_after) == (source.stat().st_size, target.stat().st_size)
@@ -53,14 +53,14 @@ def test_every_pair_of_formats_keeps_places_and_looks(before, after, tmp_path):
 
 
 def test_a_format_that_holds_all_loses_nothing(tmp_path):
-    report = hyrfpack.convert(written(tmp_path, ".ply", ball(COUNT)), tmp_path / "after.usdc")
+    report = hyrfpack.convert(written(tmp_path, ".ply", ball_splats(COUNT)), tmp_path / "after.usdc")
     assert report.psnr == report.psnr_worst == 100
 
 
 def test_a_loose_sog_is_bundled_and_all_its_bytes_are_counted(tmp_path):
     folder = tmp_path / "loose"
     folder.mkdir()
-    for name, data in sog.encode_files(ball(COUNT)).items():
+    for name, data in sog.encode_files(ball_splats(COUNT)).items():
         (folder / name).write_bytes(data)
     report = hyrfpack.convert(folder, tmp_path / "bundled.sog")
     assert report.bytes_before == sum(path.stat().st_size for path in folder.iterdir())
@@ -68,7 +68,7 @@ def test_a_loose_sog_is_bundled_and_all_its_bytes_are_counted(tmp_path):
 
 
 def test_choices_leave_out_gaussians_and_harmonics(tmp_path):
-    splats = ball(COUNT, degree=2)
+    splats = ball_splats(COUNT, degree=2)
     source = written(tmp_path, ".ply", splats)
     box = (-9, -9, -9, 9, 9, 0)
     report = hyrfpack.convert(source, tmp_path / "a.ply", degree=1, crop=box, min_opacity=0.6)
@@ -79,7 +79,7 @@ def test_choices_leave_out_gaussians_and_harmonics(tmp_path):
 
 
 def test_a_crop_alone_is_no_loss_and_what_is_left_out_by_opacity_is(tmp_path):
-    source = written(tmp_path, ".ply", ball(COUNT))
+    source = written(tmp_path, ".ply", ball_splats(COUNT))
     cropped = hyrfpack.convert(source, tmp_path / "a.ply", crop=(-9, -9, -9, 9, 9, 0))
     thinned = hyrfpack.convert(source, tmp_path / "b.ply", min_opacity=0.6)
     assert cropped.psnr == 100 and thinned.psnr < 40
@@ -87,13 +87,13 @@ def test_a_crop_alone_is_no_loss_and_what_is_left_out_by_opacity_is(tmp_path):
 
 def test_what_the_format_cannot_hold_is_told(tmp_path):
     told: list[str] = []
-    hyrfpack.convert(written(tmp_path, ".ply", ball(COUNT, degree=3)), tmp_path / "a.splat", say=told.append)
+    hyrfpack.convert(written(tmp_path, ".ply", ball_splats(COUNT, degree=3)), tmp_path / "a.splat", say=told.append)
     assert told == [".splat holds no harmonics above degree 0; those of degree 3 are lost"]
 
 
 def test_progress_is_reported_in_order(tmp_path):
     told: list[tuple[str, float]] = []
-    source = written(tmp_path, ".ply", ball(COUNT))
+    source = written(tmp_path, ".ply", ball_splats(COUNT))
     hyrfpack.convert(source, tmp_path / "a.spz", report=lambda *said: told.append(said))
     shares = [share for _, share in told]
     assert shares == sorted(shares) and 0 <= shares[0] and shares[-1] <= 1
@@ -113,20 +113,20 @@ def test_progress_is_reported_in_order(tmp_path):
 )
 def test_what_cannot_be_converted_is_refused_with_what_to_do(source, target, sentence, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    written(tmp_path, ".ply", ball(5)).rename("a.ply")
+    written(tmp_path, ".ply", ball_splats(5)).rename("a.ply")
     with pytest.raises(HyrfError, match="(?s)" + sentence.replace("(", r"\(")):
         hyrfpack.convert(source, target)
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
 def test_the_source_is_never_replaced(tmp_path):
-    source = written(tmp_path, ".ply", ball(5))
+    source = written(tmp_path, ".ply", ball_splats(5))
     with pytest.raises(HyrfError, match="the output is an input itself"):
         hyrfpack.convert(source, source)
 
 
 def test_splats_that_a_format_cannot_reach_are_refused_before_anything_is_written(tmp_path):
-    splats = ball(5)
+    splats = ball_splats(5)
     positions = splats.positions + [2 * FORMATS[".spz"].max_coordinate, 0, 0]
     far = Splats(positions, splats.scales, splats.quats, splats.opacities, splats.harmonics)
     with pytest.raises(HyrfError, match="name another format"):
@@ -135,7 +135,7 @@ def test_splats_that_a_format_cannot_reach_are_refused_before_anything_is_writte
 
 
 def test_splats_that_cannot_be_seen_are_refused(tmp_path):
-    splats = ball(5)
+    splats = ball_splats(5)
     unseen = Splats(splats.positions, splats.scales * 0, splats.quats, splats.opacities, splats.harmonics)
     with pytest.raises(HyrfDataError, match="no Gaussian in it that could be seen"):
         hyrfpack.convert(written(tmp_path, ".splat", unseen), tmp_path / "a.spz")

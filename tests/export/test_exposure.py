@@ -250,7 +250,7 @@ def test_what_holds_the_model_itself_refuses_another_exposure(target, written, t
     assert not (tmp_path / target).exists()
 
 
-def test_an_unknown_exposure_is_refused(written, tmp_path):
+def test_an_unknown_exposure_is_rejected(written, tmp_path):
     with pytest.raises(ValueError, match="local"):
         hyrfpack.export(written, tmp_path / "a.ply", exposure="mean")
 

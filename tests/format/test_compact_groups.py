@@ -93,7 +93,7 @@ def test_bytes_made_by_hand_are_read() -> None:
         (written([192, 192], [0, 0], [1, -(2**54), 1], [0, 0, 0]), "steps"),
     ],
 )
-def test_numbers_out_of_range_are_refused(data: bytes, claim: str) -> None:
+def test_numbers_out_of_range_are_rejected(data: bytes, claim: str) -> None:
     with pytest.raises(DamagedDataError, match=claim):
         decode_groups(memoryview(data), TWO)
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from commands import refused, succeeded
-from exposures import random_map, same_map
+from exposures import maps_equal, random_map
 from scenes import ball_points, small_model
 
 from hyrfpack.compress import plan
@@ -76,12 +76,12 @@ def test_a_copy_of_a_model_has_a_map_of_its_own():
     model.exposure.predict_log_gains(np.zeros(3), np.array([0.0, 0.0, 1.0]))  # which it keeps something of
     copied = copy.deepcopy(model)
 
-    assert same_map(copied.exposure, EXPOSURE) and copied.exposure is not model.exposure
+    assert maps_equal(copied.exposure, EXPOSURE) and copied.exposure is not model.exposure
 
 
 @pytest.mark.parametrize("target", ["cpu", "meta", torch.float64])
 def test_a_model_that_is_moved_keeps_its_map(target):
-    assert same_map(exposed_model().to(target).exposure, EXPOSURE)
+    assert maps_equal(exposed_model().to(target).exposure, EXPOSURE)
 
 
 def test_a_planned_model_keeps_its_map_also_after_its_gaussians_have_moved():
@@ -89,8 +89,8 @@ def test_a_planned_model_keeps_its_map_also_after_its_gaussians_have_moved():
     decided = drawn(model).plan
     planned = decided.apply(model)
 
-    assert same_map(planned.exposure, EXPOSURE)
-    assert same_map(replan_moved(decided, planned)[1].exposure, EXPOSURE)
+    assert maps_equal(planned.exposure, EXPOSURE)
+    assert maps_equal(replan_moved(decided, planned)[1].exposure, EXPOSURE)
 
 
 # --- files ---
@@ -101,7 +101,7 @@ def test_repacking_from_profile_to_profile_keeps_the_map(raw, tmp_path):
     repack(raw, tmp_path / "paper.hyrf", "paper")
     for name in ("compact", "paper"):
         repack(tmp_path / f"{name}.hyrf", tmp_path / "again.hyrf", "raw")
-        assert same_map(load(tmp_path / "again.hyrf").exposure, EXPOSURE)
+        assert maps_equal(load(tmp_path / "again.hyrf").exposure, EXPOSURE)
 
 
 @pytest.mark.parametrize("profile", ["raw", "paper"])
@@ -109,17 +109,17 @@ def test_compress_and_decompress_keep_the_map(profile, raw, tmp_path):
     succeeded("compress", raw, "-o", tmp_path / "packed.hyrf", "--profile", profile)
     succeeded("decompress", tmp_path / "packed.hyrf", "-o", tmp_path / "unpacked.hyrf")
 
-    assert same_map(load(tmp_path / "unpacked.hyrf").exposure, EXPOSURE)
+    assert maps_equal(load(tmp_path / "unpacked.hyrf").exposure, EXPOSURE)
 
 
 def test_the_start_of_a_file_that_makes_a_model_has_the_map(in_layers, tmp_path):
     first = in_layers[: read_container(in_layers).entries["RTAB"].end]
     (tmp_path / "first.hyrf").write_bytes(first)
 
-    assert same_map(decode_model(first, fraction=1.0).exposure, EXPOSURE)
+    assert maps_equal(decode_model(first, fraction=1.0).exposure, EXPOSURE)
     model = load(tmp_path / "first.hyrf", fraction=1.0)
-    assert same_map(model.exposure, EXPOSURE) and len(model) < 600
-    assert same_map(decode_model(in_layers, fraction=1.0).exposure, EXPOSURE)
+    assert maps_equal(model.exposure, EXPOSURE) and len(model) < 600
+    assert maps_equal(decode_model(in_layers, fraction=1.0).exposure, EXPOSURE)
 
 
 def test_the_start_of_a_file_without_the_bytes_of_the_map_is_a_model_without_one(in_layers, tmp_path):
@@ -127,7 +127,7 @@ def test_the_start_of_a_file_without_the_bytes_of_the_map_is_a_model_without_one
     (tmp_path / "whole.hyrf").write_bytes(data)
     (tmp_path / "cut.hyrf").write_bytes(data[:-1])
 
-    assert same_map(decode_model(data).exposure, EXPOSURE)
+    assert maps_equal(decode_model(data).exposure, EXPOSURE)
     model = load(tmp_path / "cut.hyrf", fraction=1.0)
     assert model.exposure is None and len(model) == len(decode_model(data))
     assert describe(tmp_path / "cut.hyrf", fraction=1.0)["exposure"] is None

@@ -11,7 +11,7 @@ from random import Random
 
 import numpy as np
 import pytest
-from exported_sets import WRITERS, Taken, photo_path
+from exported_sets import WRITERS_BY_LAYOUT, PhotoCamera, photo_path
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -58,8 +58,8 @@ def sets(tmp_path_factory) -> Path:
     for index in range(3):
         pose = np.eye(4)
         pose[:3, 3] = index, 0, 5
-        cameras.append(Taken(f"{index}.jpg", 32, 24, 30.0, 30.0, 16.0, 12.0, pose))
-    for layout, write in WRITERS.items():
+        cameras.append(PhotoCamera(f"{index}.jpg", 32, 24, 30.0, 30.0, 16.0, 12.0, pose))
+    for layout, write in WRITERS_BY_LAYOUT.items():
         for index, camera in enumerate(cameras):
             place = root / layout / photo_path(layout, index, camera.name)
             place.parent.mkdir(parents=True, exist_ok=True)
@@ -118,7 +118,7 @@ def read_mutant(sets: Path, layout: str, seed: int) -> str:
     return outcome
 
 
-@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)
 def test_mutated_tables_are_read_or_refused_in_a_line(sets, layout):
     @settings(max_examples=80, deadline=None)
     @given(st.integers(0, 2**32 - 1))
@@ -128,7 +128,7 @@ def test_mutated_tables_are_read_or_refused_in_a_line(sets, layout):
     search()
 
 
-@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)
 @pytest.mark.parametrize("content", [b"", b"\0" * 100, b"\xff" * 100, b"\n" * 100])
 def test_tables_of_nothing(sets, tmp_path, layout, content):
     for table in TABLES[layout]:

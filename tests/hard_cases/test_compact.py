@@ -136,7 +136,7 @@ def test_one_gaussian_is_kept_and_compressed(tmp_path):
     assert np.abs(cube(decoded) - cube(model)).max() < 1e-3
 
 
-def test_a_model_without_gaussians_is_refused_in_one_sentence(tmp_path):
+def test_a_model_without_gaussians_is_rejected_with_a_clear_error(tmp_path):
     save(small_model(np.zeros((0, 3))), tmp_path / "none.hyrf", "raw")
 
     with pytest.raises(HyrfError, match="none.hyrf: there is no Gaussian in it.*use profile 'paper'$"):
@@ -145,7 +145,7 @@ def test_a_model_without_gaussians_is_refused_in_one_sentence(tmp_path):
     assert not (tmp_path / "small.hyrf").exists()
 
 
-def test_a_model_that_cannot_be_rendered_is_refused_in_one_sentence(tmp_path):
+def test_a_model_that_cannot_be_rendered_is_rejected_with_a_clear_error(tmp_path):
     """Positions whose squares overflow: nothing can be measured on pictures of NaN."""
     save(small_model([(0.0, 0.0, 0.0), (1e30, 0.0, 0.0)], fields=0.3), tmp_path / "far.hyrf", "raw")
 

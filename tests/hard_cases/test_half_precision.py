@@ -76,7 +76,7 @@ def test_stored_positions_are_the_nearest_halves(local):
 
 @given(frames, st.floats(FLOAT16_MAX * (1 + 1e-6), 3e38), st.booleans(), st.integers(0, 2))
 @settings(max_examples=40, deadline=None)
-def test_positions_past_half_precision_are_refused_in_one_sentence_in_any_frame(frame, distance, negative, axis):
+def test_positions_past_half_precision_are_rejected_with_a_clear_error_in_any_frame(frame, distance, negative, axis):
     local = np.zeros((3, 3))
     local[1, axis] = -distance if negative else distance
 
@@ -186,7 +186,7 @@ def test_logits_up_to_the_end_of_half_precision_stay_finite_and_near(name, large
 
 
 @pytest.mark.parametrize("name", ["color_logits", "scale_logits", "opacity_logits"])
-def test_logits_past_half_precision_are_refused_by_name(name):
+def test_logits_past_half_precision_are_rejected_by_name(name):
     model = small_model(np.zeros((4, 3)))
     with torch.no_grad():
         getattr(model.gaussians, name)[2] = 65540.0
@@ -214,7 +214,7 @@ def test_decoder_weights_are_the_nearest_halves_down_to_zero(log_size, seed):
 
 
 @pytest.mark.parametrize("part", ["geometry", "radiance"])
-def test_decoder_weights_past_half_precision_are_refused_by_name(part):
+def test_decoder_weights_past_half_precision_are_rejected_by_name(part):
     model = small_model(np.zeros((1, 3)))
     with torch.no_grad():
         getattr(model, part).weights[1][3, 3] = -65505.0
@@ -223,7 +223,7 @@ def test_decoder_weights_past_half_precision_are_refused_by_name(part):
         encode_model(model, "paper")
 
 
-def test_a_geometry_field_that_overflows_is_refused_in_one_sentence():
+def test_a_geometry_field_that_overflows_is_rejected_with_a_clear_error():
     """Tables and weights are finite each, their products are not: opacities are inf - inf."""
     model = small_model(np.random.default_rng(4).normal(size=(5, 3)))
     with torch.no_grad():

@@ -104,7 +104,7 @@ def test_the_longest_codes_round_trip_at_every_bit_of_a_byte(dtype):
     np.testing.assert_array_equal(decoded, symbols)
 
 
-def test_a_histogram_one_bit_past_the_longest_code_is_refused():
+def test_a_histogram_one_bit_past_the_longest_code_is_rejected():
     with pytest.raises(ValueError, match="so skewed that a code is longer than 57 bits"):
         HuffmanCode.from_frequencies(fibonacci(MAX_CODE_BITS + 1))
 
@@ -366,7 +366,7 @@ def test_models_of_hardly_any_gaussians_survive_and_render(profile, fill, count)
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("profile", PROFILES)
-def test_one_number_that_is_not_finite_is_refused_in_every_group(profile, value):
+def test_one_number_that_is_not_finite_is_rejected_in_every_group(profile, value):
     for name in small_model(np.zeros((2, 3))).state_dict():
         model = small_model(np.zeros((2, 3)))
         write = even(model, STEP).plan.apply if profile == "compact" else partial(encode_model, profile=profile)

@@ -156,7 +156,7 @@ def test_a_parameter_that_is_not_finite_is_never_rendered(name: str, poison: flo
         assert name not in ("gaussians.positions", "radiance.weights.0", "geometry.weights.0")
 
 
-def test_one_nan_position_among_many_is_refused_though_it_is_culled() -> None:
+def test_one_nan_position_among_many_is_rejected_though_it_is_culled() -> None:
     model = _balls()
     with torch.no_grad():
         model.gaussians.positions[7, 1] = math.nan
@@ -164,7 +164,7 @@ def test_one_nan_position_among_many_is_refused_though_it_is_culled() -> None:
         hyrfpack.render(model, _camera(FRONT))
 
 
-def test_kept_geometry_and_solid_colours_that_are_not_finite_are_refused() -> None:
+def test_kept_geometry_and_solid_colours_that_are_not_finite_are_rejected() -> None:
     model, camera = _balls(background=False), _camera(FRONT)
     decoded = model.decode()
     decoded.geometry.opacities[:] = math.nan
@@ -174,7 +174,7 @@ def test_kept_geometry_and_solid_colours_that_are_not_finite_are_refused() -> No
         render(model, camera, solid=torch.tensor([0.0, math.nan, 0.0]))
 
 
-def test_a_pose_beyond_float32_is_refused() -> None:
+def test_a_pose_beyond_float32_is_rejected() -> None:
     camera, model = _camera(FRONT), _balls()
     pose = camera.camera_from_world.copy()
     pose[2, 3] = 3e38  # in local units it is more than float32 holds
@@ -183,7 +183,7 @@ def test_a_pose_beyond_float32_is_refused() -> None:
         render(model, Camera(40, 30, *camera.intrinsics, pose))
 
 
-def test_positions_whose_squares_overflow_are_refused() -> None:
+def test_positions_whose_squares_overflow_are_rejected() -> None:
     """Finite, and so accepted by a file's reader; S(p) = |u| is not."""
     model = _balls()
     with torch.no_grad():

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 import torch
-from scenes import ball_scene, camera_at, photograph, ring, tracks_of, view_of
+from scenes import ball_scene, camera_at, photograph, ring, view_of, visible_points_by_photo
 
 from hyrfpack import TrainConfig, evaluate, load_scene, train
 from hyrfpack.compress import compress
@@ -242,7 +242,7 @@ def scene_with_jumps(*gains: float) -> tuple[Scene, list[View]]:
 @pytest.mark.parametrize(("gains", "without"), [((1.0, 0.8), 7), ((1.0, 0.5), 0)])
 def test_exposure_that_jumps_between_photos_is_kept_out_of_the_model(gains, without):
     scene, between = scene_with_jumps(*gains)
-    scene = dataclasses.replace(scene, tracks=tracks_of(scene, facing=0.0))
+    scene = dataclasses.replace(scene, tracks=visible_points_by_photo(scene, facing=0.0))
 
     trainer = trained(scene, 150, exposure=True)
     plain = trained(scene, 150)
@@ -319,7 +319,7 @@ def test_real_photos_in_millimetres_and_kilometres_give_the_same_quality(shared_
 # -- refused ---------------------------------------------------------------------------------------------------------
 
 
-def test_photos_that_are_all_masked_are_refused_in_one_sentence(tmp_path):
+def test_photos_that_are_all_masked_are_rejected_with_a_clear_error(tmp_path):
     with pytest.raises(
         HyrfTrainingError,
         match="balls: the masks of all [0-9]+ photos to train on leave no pixel, 000.png for one; check",

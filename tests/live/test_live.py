@@ -191,7 +191,7 @@ def test_make_shows_its_training_where_it_is_asked_to(data, observed, monkeypatc
     assert observed == [1, 2, 3] and "the training can be seen at http://127.0.0.1:" in result.stderr
 
 
-def test_a_port_that_is_taken_is_one_sentence_before_any_work(data, tmp_path):
+def test_a_port_that_is_taken_is_a_clear_error_before_any_work(data, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         sentence = refused("train", data, "-o", tmp_path / "run", "--view", "--view-port", port)
@@ -199,6 +199,6 @@ def test_a_port_that_is_taken_is_one_sentence_before_any_work(data, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_port_without_a_view_is_refused(data, tmp_path):
+def test_a_port_without_a_view_is_rejected(data, tmp_path):
     for command in (("train", data, "-o", tmp_path / "run"), ("make", data, "-o", tmp_path / "scene.hyrf")):
         assert "give both of them" in refused(*command, "--view-port", 8000)

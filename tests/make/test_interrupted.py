@@ -67,7 +67,7 @@ def test_an_interrupt_in_each_stage_costs_nothing(after, whole, posed, tmp_path,
     assert list(result.kept) == done[:-1]
 
 
-def test_an_interrupt_amid_training_goes_on_from_the_checkpoint(whole, posed, tmp_path, signals):
+def test_an_interrupt_amid_training_continues_from_the_checkpoint(whole, posed, tmp_path, signals):
     def stop(progress):
         if progress.words[:1] == ("5/9",):
             signal.raise_signal(signal.SIGTERM)
@@ -81,7 +81,7 @@ def test_an_interrupt_amid_training_goes_on_from_the_checkpoint(whole, posed, tm
     assert products(result.work) == whole
 
 
-def test_an_interrupt_in_poses_goes_on(photos, poses, tmp_path, monkeypatch):
+def test_an_interrupt_in_poses_continues(photos, poses, tmp_path, monkeypatch):
     def stop(progress):
         raise KeyboardInterrupt
 
@@ -139,7 +139,7 @@ def file_limit(size: int) -> Iterator[None]:
         ({"output": "scene.html"}, 20_000, "scene.html: "),  # the copy of what is there
     ],
 )
-def test_no_room_in_any_stage_is_one_sentence_and_the_same_call_goes_on(
+def test_no_room_in_any_stage_is_a_clear_error_and_the_same_call_continues(
     changes, limit, sentence, whole_work, posed, tmp_path
 ):
     work = tmp_path / "work"

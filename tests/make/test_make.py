@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from commands import hyrfpack, refused, succeeded
-from explicit_balls import ball
+from explicit_balls import ball_splats
 from exposures import random_map
 from PIL import Image
 
@@ -73,7 +73,7 @@ def test_scores_and_pictures_after_the_last_step_are_a_part_of_the_training():
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_every_ending_is_made_and_nothing_else_anew(ending, made, posed, tmp_path):
+def test_every_ending_is_made_and_nothing_else_again(ending, made, posed, tmp_path):
     result = make(posed, tmp_path / f"out{ending}", work=copy_of(made, tmp_path))
     assert result.kept == ("training", "compression", "scoring")
     files = [path for path in result.output.rglob("*") if path.is_file()] or [result.output]
@@ -119,7 +119,7 @@ def test_a_video_gets_poses(poses, tmp_path):
 
 @pytest.mark.usefixtures("short_imports")
 def test_splats_of_other_programs_are_imported(tmp_path):
-    (tmp_path / "ball.ply").write_bytes(ply.encode(ball(40)))
+    (tmp_path / "ball.ply").write_bytes(ply.encode(ball_splats(40)))
     result = make(tmp_path / "ball.ply", tmp_path / "scene.html", quality="draft")
     assert list(result.seconds) == ["import", "export"] and result.export["import"]["gaussians_before"] == 40
     again = make(tmp_path / "ball.ply", tmp_path / "scene.spz", quality="draft")
@@ -184,7 +184,9 @@ def test_the_number_of_gaussians_and_the_preset_are_passed_to_the_training(posed
 
 
 @pytest.mark.parametrize("size, meant", [("10", "10MB"), ("500", "500kB")])
-def test_an_impossible_target_size_is_refused_before_any_work(size, meant, posed, photos, poses, tmp_path, monkeypatch):
+def test_an_impossible_target_size_is_rejected_before_any_work(
+    size, meant, posed, photos, poses, tmp_path, monkeypatch
+):
     monkeypatch.setattr("hyrfpack.make.stages.train", None)
     for given in (posed, photos):
         sentence = refused("make", given, "-o", tmp_path / "scene.html", "--target-size", size)
@@ -194,7 +196,7 @@ def test_an_impossible_target_size_is_refused_before_any_work(size, meant, posed
     assert not poses and not (tmp_path / "scene.work").exists()
 
 
-def test_another_target_size_packs_the_trained_model_anew_and_says_how_to_train_anew(made, posed, tmp_path):
+def test_another_target_size_packs_the_trained_model_again_and_says_how_to_train_again(made, posed, tmp_path):
     work, said = copy_of(made, tmp_path), []
     target = (made / "model.hyrf").stat().st_size * 3 // 4
     result = make(posed, tmp_path / "a.hyrf", work=work, target_bytes=target, say=said.append)
@@ -204,7 +206,7 @@ def test_another_target_size_packs_the_trained_model_anew_and_says_how_to_train_
     assert (tmp_path / "b.hyrf").read_bytes() == (made / "model.hyrf").read_bytes()
 
 
-def test_a_training_that_was_stopped_goes_on_as_it_was_begun_whatever_target_size_is_asked_for_then(
+def test_a_training_that_was_stopped_continues_as_it_was_begun_whatever_target_size_is_asked_for_then(
     posed, tmp_path, monkeypatch
 ):
     configs = []
@@ -243,7 +245,7 @@ def test_a_target_size_that_the_trained_model_cannot_have_names_one_that_it_can(
     succeeded(*arguments, "--target-size", possible.replace(",", ""))
 
 
-def test_a_work_folder_of_an_earlier_version_is_trained_anew_once(made, posed, tmp_path):
+def test_a_work_folder_of_an_earlier_version_is_trained_again_once(made, posed, tmp_path):
     work, said = copy_of(made, tmp_path), []
     table = json.loads((work / "make.json").read_text())
     training = table["stages"]["training"]
@@ -332,7 +334,7 @@ def test_made_again_it_is_all_there_and_made_otherwise_it_is_not_replaced_unaske
 # -- what is refused -------------------------------------------------------------------------------------------------
 
 
-def test_what_cannot_be_is_refused_before_any_work(posed, photos, made, tmp_path, monkeypatch):
+def test_what_cannot_be_is_rejected_before_any_work(posed, photos, made, tmp_path, monkeypatch):
     monkeypatch.setattr("hyrfpack.make.stages.train", None)
     (tmp_path / "there.html").write_bytes(b"mine")
     (tmp_path / "full").mkdir()
@@ -415,7 +417,7 @@ def test_a_failure_after_poses_keeps_them_and_says_so(photos, poses, tmp_path, m
         ('{"version": 0, "stages": {}}', "another version"),
     ],
 )
-def test_a_record_that_is_damaged_is_refused(record, reason, posed, tmp_path):
+def test_a_record_that_is_damaged_is_rejected(record, reason, posed, tmp_path):
     (tmp_path / "work").mkdir()
     (tmp_path / "work" / "make.json").write_text(record)
     with pytest.raises(HyrfError, match=f"cannot be read .*{reason}.*`work`"):
@@ -430,7 +432,7 @@ def test_two_calls_in_one_work_folder_are_kept_apart(made, posed, tmp_path):
     assert len(make(posed, tmp_path / "scene.hyrf", work=work).kept) == 4
 
 
-def test_an_output_without_a_name_of_its_own_is_refused_or_the_present_folder(made, tmp_path, monkeypatch):
+def test_an_output_without_a_name_of_its_own_is_rejected_or_the_present_folder(made, tmp_path, monkeypatch):
     assert "the top of all folders" in refused("make", made / "model.hyrf", "-o", "/")
     (tmp_path / "player").mkdir()
     monkeypatch.chdir(tmp_path / "player")
@@ -495,6 +497,6 @@ def test_training_estimates_poses_where_asked_and_once(photos, poses, tmp_path):
     assert len(poses) == 2
 
 
-def test_a_run_among_photos_without_poses_is_refused(photos, poses, tmp_path):
+def test_a_run_among_photos_without_poses_is_rejected(photos, poses, tmp_path):
     assert "among the photos" in refused("train", photos, "-o", photos / "run", "--poses")
     assert not poses

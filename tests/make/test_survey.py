@@ -59,7 +59,7 @@ def problem(survey: PhotoSurvey, word: str) -> str:
     return found[0]
 
 
-def test_photos_without_poses_are_told_how_to_go_on_and_nothing_else(photos):
+def test_photos_without_poses_are_told_how_to_continue_and_nothing_else(photos):
     survey = describe_photos(photos)
     assert (survey.kind, survey.photos, survey.posed, survey.layout) == ("photos", 24, 0, "")
     assert survey.sizes == {"160 x 120": 24}
@@ -207,7 +207,7 @@ def test_info_of_a_video_says_how_many_frames_would_be_taken(tmp_path):
     assert "frames would be" in succeeded("info", tmp_path / "clip.mp4").stdout
 
 
-def test_info_of_what_is_no_photo_is_one_sentence(tmp_path):
+def test_info_of_what_is_no_photo_is_a_clear_error(tmp_path):
     (tmp_path / "clip.mp4").write_bytes(b"no video")
     assert "cannot be read as a video" in refused("info", tmp_path / "clip.mp4")
     (tmp_path / "set.zip").write_bytes(b"no archive")

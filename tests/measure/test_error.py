@@ -27,7 +27,7 @@ def test_relative_difference_from_all_zeros_is_absolute():
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
 @pytest.mark.parametrize("side", [0, 1])
-def test_a_result_that_is_not_finite_is_refused_by_name(wrong, side):
+def test_a_result_that_is_not_finite_is_rejected_by_name(wrong, side):
     tensors = [torch.zeros(3), torch.zeros(3)]
     tensors[side][1] = wrong
     with pytest.raises(HyrfError, match="mlp, forward, cpu: .*NaN or infinity"):

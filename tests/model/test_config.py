@@ -51,13 +51,13 @@ def test_by_default_grids_rise_from_8_to_512_vertices_and_directions_have_24_inp
         ("surprise", 1),
     ],
 )
-def test_config_refuses_wrong_fields(name, value):
+def test_config_rejects_wrong_fields(name, value):
     with pytest.raises((KeyError, TypeError, ValueError)):
         ModelConfig.from_dict({**CONFIG.to_dict(), name: value})
 
 
 @pytest.mark.parametrize("name", ["frame", "geometry", "radiance"])
-def test_config_refuses_missing_fields(name):
+def test_config_rejects_missing_fields(name):
     values = CONFIG.to_dict()
     del values[name]
     with pytest.raises((KeyError, TypeError, ValueError)):

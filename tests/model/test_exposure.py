@@ -84,12 +84,12 @@ def test_far_from_the_cameras_the_exposure_is_that_of_the_nearest_viewpoint_amon
         ("weights", np.zeros((2, 3), np.int16)),
     ],
 )
-def test_numbers_out_of_range_are_refused(field, values):
+def test_numbers_out_of_range_are_rejected(field, values):
     with pytest.raises(ValueError, match="exposure map"):
         dataclasses.replace(random_map(0, centers=5), **{field: values})
 
 
-def test_too_many_centers_are_refused():
+def test_too_many_centers_are_rejected():
     with pytest.raises(ValueError, match=str(MAX_CENTERS)):
         random_map(0, centers=MAX_CENTERS + 1)
 
@@ -121,7 +121,7 @@ def test_render_differentiates_through_the_map():
     assert grad is not None and grad.isfinite().all() and grad.abs().sum() > 0
 
 
-def test_an_unknown_exposure_is_refused():
+def test_an_unknown_exposure_is_rejected():
     with pytest.raises(ValueError, match="as-photographed"):
         RenderSettings(exposure="bright")
 

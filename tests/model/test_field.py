@@ -111,7 +111,7 @@ def test_field_is_the_same_for_the_same_seed_only():
         {"log2_table_size": 8, "finest": 65537},
     ],
 )
-def test_hash_grid_refuses_impossible_shapes(settings):
+def test_hash_grid_rejects_impossible_shapes(settings):
     with pytest.raises(ValueError):
         HashGridConfig(**settings)
 

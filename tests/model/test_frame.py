@@ -95,13 +95,13 @@ def test_from_box_widens_flat_axes():
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("corner", ["low", "high"])
-def test_from_box_refuses_corners_that_are_not_finite(bad, corner):
+def test_from_box_rejects_corners_that_are_not_finite(bad, corner):
     low, high = np.zeros(3), np.ones(3)
     (low if corner == "low" else high)[1] = bad
     with pytest.raises(HyrfDataError, match="not finite"):
         Frame.from_box(low, high)
 
 
-def test_from_box_refuses_a_box_without_size():
+def test_from_box_rejects_a_box_without_size():
     with pytest.raises(HyrfDataError, match="no size"):
         Frame.from_box(np.full(3, 2.5), np.full(3, 2.5))

@@ -18,7 +18,7 @@ def test_logit_clamps_zero_and_one_to_the_limit():
 
 
 @pytest.mark.parametrize("wrong", range(4))
-def test_gaussians_refuse_rows_that_do_not_match(wrong):
+def test_gaussians_reject_rows_that_do_not_match(wrong):
     shapes = [(5, 3), (5, 3), (5, 1), (5, 1)]
     shapes[wrong] = (5, 2)
     with pytest.raises(ValueError, match=Gaussians.PARAMETER_NAMES[wrong]):

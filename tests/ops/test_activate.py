@@ -276,13 +276,13 @@ def test_the_kernel_is_not_taken_where_positions_want_a_gradient() -> None:
         [(5, 8), (5, 3), (5, 1), (5,)],
     ],
 )
-def test_shapes_that_do_not_fit_together_are_refused(shapes: list[tuple[int, ...]], implementation: str) -> None:
+def test_shapes_that_do_not_fit_together_are_rejected(shapes: list[tuple[int, ...]], implementation: str) -> None:
     tensors = [placed(torch.zeros(shape), implementation) for shape in shapes]
     with pytest.raises(ValueError, match="logits are"):
         activate_geometry(*tensors, implementation=implementation)
 
 
-def test_types_rules_and_implementations_that_there_are_not_are_refused() -> None:
+def test_types_rules_and_implementations_that_there_are_not_are_rejected() -> None:
     stored, *rest = inputs(3)
     raw = stored[:, :8]
     with pytest.raises(ValueError, match="the rule 'mean'"):

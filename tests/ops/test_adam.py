@@ -117,7 +117,7 @@ def test_cpu_has_the_bits_of_torch_fused() -> None:
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e30, -1e30])
 @pytest.mark.parametrize("place", [(0, 0), (0, 2999), (1, 4)])
-def test_an_element_with_a_broken_gradient_is_told_and_left_alone(implementation: str, bad: float, place) -> None:
+def test_an_element_with_a_broken_gradient_is_reported_and_left_alone(implementation: str, bad: float, place) -> None:
     group = a_group([(3000,), (5,)], step=6)
     tensor, index = place
     healthy, broken = stepped(group, implementation, step=6)
@@ -179,7 +179,7 @@ def test_auto_takes_the_fused_kernel_on_the_cpu() -> None:
     assert all(map(torch.equal, *(sum(stepped(group, name, step=4)[0], []) for name in ("auto", "cpu"))))
 
 
-def test_refuses_what_does_not_fit() -> None:
+def test_rejects_what_does_not_fit() -> None:
     group = a_group([(4, 3)])
     with pytest.raises(ValueError, match="steps count from 1"):
         adam_step(*group, step=0, rate=RATE)

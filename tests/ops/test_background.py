@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from fake_gpu import use_fake_gpu
 from ops.device import INTERPRETED, gpu, needs_triton
-from pretend_gpu import pretended_gpu
 from scenes import look_at
 
 from hyrfpack.ops.background import (
@@ -261,7 +261,7 @@ def test_the_field_is_learnt_by_kernels_alone(encoding: str, mixed: bool) -> Non
     """Where tensors say that they are on CUDA, hash features and the decoder are the gpu's, too."""
     case = Case(height=7, width=9, levels=2, encoding=encoding)
     if INTERPRETED:
-        with pretended_gpu() as device:
+        with use_fake_gpu() as device:
             arguments = case.arguments() | {"mixed": mixed}
             for name in ("weights", "biases"):
                 arguments[name] = [tensor.to(device) for tensor in arguments[name]]
@@ -342,7 +342,7 @@ def test_the_kernels_are_not_taken_where_the_field_does_not_fit(case: Case, lear
     ],
     ids=["no stride", "pose", "another encoding's width", "unknown encoding", "four outputs"],
 )
-def test_refuses_what_does_not_fit(change: dict) -> None:
+def test_rejects_what_does_not_fit(change: dict) -> None:
     with pytest.raises(ValueError):
         background_grid(Case().transmittance(), **(Case().arguments() | change))
 

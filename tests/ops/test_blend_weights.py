@@ -83,7 +83,7 @@ def test_same_bytes_with_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) 
     assert len(found) == 1
 
 
-def test_shapes_that_do_not_fit_are_refused() -> None:
+def test_shapes_that_do_not_fit_are_rejected() -> None:
     means, quats, scales, opacities = scene("a cloud")
     with pytest.raises(ValueError, match="scales"):
         sum_blend_weights(means, quats, scales[:9], opacities, torch.eye(4), *SIZE)

@@ -202,13 +202,13 @@ def test_a_gradient_that_is_nan_reaches_the_nodes_around_it(implementation: str)
         ((5, 8, 3), (5, 8), (3,), 0),
     ],
 )
-def test_what_does_not_fit_together_is_refused(rgb, transmittance, grid, stride, implementation: str) -> None:
+def test_what_does_not_fit_together_is_rejected(rgb, transmittance, grid, stride, implementation: str) -> None:
     tensors = placed([torch.zeros(shape) for shape in (rgb, transmittance, grid)], implementation)
     with pytest.raises(ValueError):
         composite(*tensors, stride, implementation=implementation)
 
 
-def test_types_and_implementations_that_do_not_fit_are_refused() -> None:
+def test_types_and_implementations_that_do_not_fit_are_rejected() -> None:
     rgb, transmittance, grid = inputs(5, 8, 2)
     with pytest.raises(ValueError, match="tensors disagree"):
         composite(rgb, transmittance, grid.float(), 2)

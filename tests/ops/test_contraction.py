@@ -176,14 +176,14 @@ def test_the_kernel_is_not_taken_where_a_gradient_is_wanted():
         assert not contract(points, implementation="gpu").requires_grad
 
 
-def test_types_and_implementations_that_there_are_not_are_refused():
+def test_types_and_implementations_that_there_are_not_are_rejected():
     with pytest.raises(ValueError, match="float32"):
         contract(torch.ones(2, 3).double(), implementation="gpu")
     with pytest.raises(ValueError, match="no implementation 'cpu'"):
         contract(torch.ones(2, 3), implementation="cpu")
 
 
-def test_points_of_other_than_three_coordinates_are_refused():
+def test_points_of_other_than_three_coordinates_are_rejected():
     for shape in ((6, 2), (3, 4), ()):
         with pytest.raises(ValueError, match="3 coordinates"):
             contract(torch.zeros(shape))

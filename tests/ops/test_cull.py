@@ -126,7 +126,7 @@ def test_the_kernel_loses_nothing_of_a_pose_in_float64():
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("place", [0, 128, 129])
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
-def test_cull_refuses_points_that_are_not_finite(number, place, implementation):
+def test_cull_rejects_points_that_are_not_finite(number, place, implementation):
     for axis in range(3):
         points = np.array([AHEAD] * 130)
         points[place, axis] = number
@@ -141,7 +141,7 @@ def test_cull_refuses_points_that_are_not_finite(number, place, implementation):
 @INFINITY_TIMES_ZERO
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("number", [np.nan, np.inf])
-def test_cull_refuses_the_only_point(number, implementation):
+def test_cull_rejects_the_only_point(number, implementation):
     with pytest.raises(FloatingPointError):
         cull([[0, 0, number]], implementation=implementation)
 
@@ -164,7 +164,7 @@ def test_layouts_and_gradients_of_positions_do_not_matter(implementation):
         assert torch.equal(frustum_cull(other, *rest, implementation=implementation), expected)
 
 
-def test_types_and_implementations_that_there_are_not_are_refused():
+def test_types_and_implementations_that_there_are_not_are_rejected():
     rest = torch.eye(4), INTRINSICS, WIDTH, HEIGHT, 0.01, 0.3
     with pytest.raises(ValueError, match="float32"):
         frustum_cull(torch.zeros(2, 3).double(), *rest, implementation="gpu")

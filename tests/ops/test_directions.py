@@ -129,7 +129,7 @@ def test_the_kernel_is_not_taken_where_a_gradient_is_wanted(learnt: int) -> None
         assert not encode_views(*leaves, "sh", implementation="gpu").requires_grad
 
 
-def test_types_and_implementations_that_do_not_fit_are_refused() -> None:
+def test_types_and_implementations_that_do_not_fit_are_rejected() -> None:
     points = made(4, 3)
     with pytest.raises(ValueError, match="tensors disagree"):
         encode_views(points, VIEWPOINT.float(), "sh")
@@ -142,7 +142,7 @@ def test_types_and_implementations_that_do_not_fit_are_refused() -> None:
 @pytest.mark.parametrize(
     ("points", "viewpoint", "encoding"), [((4, 3), (3,), "none"), ((4, 2), (3,), "sh"), ((4, 3), (5, 3), "sh")]
 )
-def test_what_does_not_fit_together_is_refused(points: tuple, viewpoint: tuple, encoding: str) -> None:
+def test_what_does_not_fit_together_is_rejected(points: tuple, viewpoint: tuple, encoding: str) -> None:
     with pytest.raises(ValueError, match="encoding '"):
         encode_views(torch.zeros(points), torch.zeros(viewpoint), encoding)
 

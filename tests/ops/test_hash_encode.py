@@ -259,12 +259,12 @@ def test_bytes_do_not_depend_on_threads_or_on_the_run(monkeypatch: pytest.Monkey
     [((5, 2), 64, 2, "auto"), ((5, 3), 63, 2, "auto"), ((5, 3), 64, 4, "cpu"), ((5, 3), 64, 2, "cuda")],
     ids=["coords of two columns", "too few rows", "four features on cpu", "unknown implementation"],
 )
-def test_refuses_what_does_not_fit(coords: tuple, rows: int, features: int, implementation: str) -> None:
+def test_rejects_what_does_not_fit(coords: tuple, rows: int, features: int, implementation: str) -> None:
     with pytest.raises(ValueError):
         hash_encode(torch.rand(coords), torch.rand(rows, features), (4,), 10, implementation=implementation)
 
 
-def test_level_resolutions_refuses_a_finest_level_below_the_base() -> None:
+def test_level_resolutions_rejects_a_finest_level_below_the_base() -> None:
     with pytest.raises(ValueError, match="finest=8"):
         level_resolutions(4, 16, 8)
 

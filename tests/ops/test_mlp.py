@@ -227,6 +227,6 @@ def test_auto_takes_the_reference_for_float64() -> None:
     ],
     ids=["width of x", "length of a bias", "width between layers", "no layer"],
 )
-def test_refuses_what_does_not_form_layers(x: tuple, weights: list, biases: list) -> None:
+def test_rejects_what_does_not_form_layers(x: tuple, weights: list, biases: list) -> None:
     with pytest.raises(ValueError, match="do not form layers"):
         mlp(torch.rand(x), [torch.rand(shape) for shape in weights], [torch.rand(shape) for shape in biases])

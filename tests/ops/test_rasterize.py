@@ -474,7 +474,7 @@ def test_tiles_counted_otherwise_than_listed_change_nothing_else(monkeypatch: py
 
 
 @needs_triton
-def test_more_pairs_than_can_be_numbered_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_pairs_than_can_be_numbered_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     from hyrfpack.ops.rasterize import gpu_bin
 
     monkeypatch.setattr(gpu_bin, "MAX_PAIRS", 3)
@@ -552,7 +552,7 @@ def test_frustum_of_the_gpu_is_the_picture_and_a_band_around_it(tolerance: float
     assert torch.equal(inside[:400].cpu() > 0, expected)
 
 
-def test_unfit_arguments_are_refused() -> None:
+def test_unfit_arguments_are_rejected() -> None:
     inputs = list(_gaussians(3).values())
     camera, intrinsics = torch.eye(4), (10.0, 10.0, 5.0, 5.0)
     with pytest.raises(ValueError, match="quats is"):

@@ -153,7 +153,7 @@ def test_memory_layout_does_not_matter(implementation: str) -> None:
 
 
 @pytest.mark.parametrize("wrong", ["first_layer", "direction_weight", "color_logits", "encoding"])
-def test_what_does_not_fit_together_is_refused(wrong: str) -> None:
+def test_what_does_not_fit_together_is_rejected(wrong: str) -> None:
     positions, viewpoint, widths = CASES["random"]
     shading = shading_of(*decoder(len(positions), "sh", widths), "sh")
     value = "no such" if wrong == "encoding" else getattr(shading, wrong)[:-1]

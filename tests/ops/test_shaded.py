@@ -105,7 +105,7 @@ def test_mixed_precision_stays_near() -> None:
 
 
 @pytest.mark.parametrize("index", range(4))
-def test_shapes_that_disagree_are_refused_before_a_kernel_reads_past_an_end(index: int) -> None:
+def test_shapes_that_disagree_are_rejected_before_a_kernel_reads_past_an_end(index: int) -> None:
     splats, colors = gaussians(20), shading(20)
     with pytest.raises(ValueError):
         drawn(splats, shading(19), camera())

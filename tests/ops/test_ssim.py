@@ -204,7 +204,7 @@ def test_bytes_do_not_depend_on_threads_or_on_the_run(monkeypatch: pytest.Monkey
     ],
     ids=["unequal", "four channels", "empty", "mask turned"],
 )
-def test_refuses_what_does_not_fit(image: tuple, target: tuple, mask: tuple | None) -> None:
+def test_rejects_what_does_not_fit(image: tuple, target: tuple, mask: tuple | None) -> None:
     chosen = None if mask is None else torch.ones(mask, dtype=torch.bool)
     with pytest.raises(ValueError):
         photometric_loss(torch.rand(image), torch.rand(target), chosen)

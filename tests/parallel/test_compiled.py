@@ -1,4 +1,4 @@
-"""A kernel is compiled and runs wherever its machine code can or cannot be kept."""
+"""A kernel compiles and runs whether or not its machine code can be cached on disk."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def kept(folder):
+def cached_suffixes(folder):
     return sorted(path.suffix for path in folder.rglob("*") if path.is_file())
 
 
-def test_machine_code_is_kept_and_found_again(folder):
+def test_machine_code_is_cached_and_loaded_again(folder):
     assert compiled()(twice)(21) == 42
-    assert kept(folder) == [".nbc", ".nbi"]
+    assert cached_suffixes(folder) == [".nbc", ".nbi"]
     again = compiled()(twice)
     assert again(21) == 42 and sum(again.stats.cache_hits.values()) == 1
 
 
-def test_full_disk_is_no_reason_to_stop_and_leaves_no_index_without_its_code(folder):
-    """The index is small and is written first; the code after it does not fit any more."""
+def test_a_kernel_runs_on_a_full_disk_and_leaves_no_index_without_its_code(folder):
+    """The small index is written first; the code that follows exceeds the limit."""
     resource = pytest.importorskip("resource")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
@@ -39,9 +39,9 @@ def test_full_disk_is_no_reason_to_stop_and_leaves_no_index_without_its_code(fol
         assert compiled()(twice)(21) == 42
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert kept(folder) == []
+    assert cached_suffixes(folder) == []
 
 
-def test_nowhere_to_keep_machine_code_is_no_reason_to_stop(monkeypatch):
+def test_a_kernel_runs_without_a_cache_folder(monkeypatch):
     monkeypatch.setattr(CompileResultCacheImpl, "_locator_classes", [])
     assert compiled()(twice)(21) == 42

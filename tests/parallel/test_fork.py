@@ -1,4 +1,4 @@
-"""multiprocessing and PyTorch's DataLoader fork on Linux: what worked before the fork works in the child."""
+"""What worked before a fork works in the child; multiprocessing and PyTorch's DataLoader fork on Linux."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import pytest
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
 
-# Everything is used in the parent, then each in a child of its own, which is killed when it hangs.
-CODE = """
+# The parent calls every function. Then a new child calls each of them, and is killed if it hangs.
+FORK_SCRIPT = """
 import json, sys, warnings
 from dataclasses import replace
 from multiprocessing import get_context
@@ -61,7 +61,7 @@ def export():
     hyrfpack.export("model.hyrf", "model.spz", degree=1)
     return Path("model.spz").read_bytes()
 
-def told(function, sender):
+def send_result(function, sender):
     sender.send(function())
 
 fork, outcome = get_context("fork"), {}
@@ -69,7 +69,7 @@ functions = [load_scene, load, save, render, evaluate, train, compress, export]
 before = [function() for function in functions]
 for function, expected in zip(functions, before):
     receiver, sender = fork.Pipe(duplex=False)
-    child = fork.Process(target=told, args=(function, sender))
+    child = fork.Process(target=send_result, args=(function, sender))
     child.start()
     sender.close()
     receiver.poll(60) or child.kill()
@@ -84,10 +84,10 @@ print(json.dumps(outcome))
 
 @pytest.fixture(scope="module")
 def outcome(tmp_path_factory) -> dict[str, bool]:
-    """For each function, whether a forked child got what its parent had got."""
+    """For each function, whether a forked child returned the same as its parent."""
     tests = Path(__file__).parents[1]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (tests.parent, tests)))}
-    command, folder = [sys.executable, "-c", CODE], tmp_path_factory.mktemp("fork")
+    command, folder = [sys.executable, "-c", FORK_SCRIPT], tmp_path_factory.mktemp("fork")
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])

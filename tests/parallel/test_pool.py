@@ -1,4 +1,4 @@
-"""The pool of threads: order, errors, and tasks that have tasks of their own."""
+"""The thread pool: order of results, errors, and nested tasks."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ def two_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HYRFPACK_THREADS", "2")
 
 
-def test_results_come_in_the_order_of_the_items_and_by_the_names_of_the_jobs() -> None:
+def test_results_have_the_order_of_the_items_and_the_names_of_the_jobs() -> None:
     assert parallel_map(lambda number: number**2, list(range(50))) == [number**2 for number in range(50)]
     assert run_jobs({name: name.upper for name in "cab"}) == {"c": "C", "a": "A", "b": "B"}
     assert parallel_map(abs, []) == []
 
 
-def test_two_items_are_worked_on_at_once() -> None:
+def test_two_items_are_processed_at_the_same_time() -> None:
     both = threading.Barrier(2, timeout=30)
     parallel_map(lambda _: both.wait(), [0, 1])
 
 
-def test_a_gpu_takes_one_item_after_the_other() -> None:
+def test_items_for_a_gpu_are_processed_one_after_the_other() -> None:
     threads = []
     parallel_map(lambda _: threads.append(threading.current_thread()), [0, 1, 2], torch.device("cuda"))
     assert threads == 3 * [threading.current_thread()]
 
 
-def test_tasks_of_tasks_run_where_they_are_and_wait_for_no_one() -> None:
-    """With both threads waiting for a third there would be no end to it."""
+def test_nested_tasks_run_in_the_thread_of_their_task() -> None:
+    """A pool that made both threads wait for a third one would never end."""
 
     def nested(number: int) -> set[str]:
         names: list[str] = []
@@ -55,12 +55,12 @@ def test_the_first_error_is_raised() -> None:
         parallel_map(fail, list(range(6)))
 
 
-def test_torch_does_not_fan_out_inside_of_a_task() -> None:
+def test_torch_uses_one_thread_inside_a_task() -> None:
     assert parallel_map(lambda _: torch.get_num_threads(), [0, 1]) == [1, 1]
 
 
-def test_torch_keeps_its_threads_outside_of_tasks() -> None:
-    """In a fresh process, where the pool's threads are the first that torch hears of."""
+def test_torch_keeps_its_number_of_threads_outside_tasks() -> None:
+    """The process is new, so that the pool's threads are the first that use torch."""
     script = (
         "import torch\nfrom hyrfpack.parallel.pool import run_tasks\n"
         "run_tasks(lambda _: None, 8)\nprint(torch.get_num_threads())"

@@ -4,39 +4,39 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from made_up_poses import circle, line, moved
+from made_up_poses import circle_poses, line_poses, transform_poses
 from scipy.spatial.transform import Rotation
 
 from hyrfpack.poses.alignment import align_poses, camera_extent, camera_positions
 
 
-@pytest.mark.parametrize("poses", [circle(), line()])
+@pytest.mark.parametrize("poses", [circle_poses(), line_poses()])
 def test_the_same_cameras_in_another_frame_agree_all(poses):
-    found = align_poses(poses, moved(poses))
+    found = align_poses(poses, transform_poses(poses))
     assert found.agreeing == set(poses)
     assert found.distance.max() < 1e-9
     assert found.scale == pytest.approx(2.5)
 
 
 def test_small_errors_agree_and_large_ones_do_not():
-    exact = circle()
-    rough = moved(circle(noise=0.02))
+    exact = circle_poses()
+    rough = transform_poses(circle_poses(noise=0.02))
     assert align_poses(rough, exact).agreeing == set(exact)
-    assert len(align_poses(moved(circle(noise=1.0, seed=2)), exact).agreeing) < 12
+    assert len(align_poses(transform_poses(circle_poses(noise=1.0, seed=2)), exact).agreeing) < 12
 
 
 def test_a_third_that_is_folded_onto_the_rest_is_found():
-    exact = circle()
+    exact = circle_poses()
     folded = dict(exact)
     names = sorted(exact)
     for name, onto in zip(names[16:], names[:8], strict=True):  # a wall taken for another
         folded[name] = exact[onto]
-    assert align_poses(moved(folded), exact).agreeing == set(names[:16])
-    assert align_poses(exact, moved(folded)).agreeing == set(names[:16])
+    assert align_poses(transform_poses(folded), exact).agreeing == set(names[:16])
+    assert align_poses(exact, transform_poses(folded)).agreeing == set(names[:16])
 
 
 def test_cameras_in_the_right_places_that_look_elsewhere_do_not_agree():
-    exact = circle()
+    exact = circle_poses()
     turned = dict(exact)
     for name in sorted(exact)[:5]:
         about = Rotation.from_euler("y", 30, degrees=True).as_matrix() @ exact[name][:, :3]
@@ -45,7 +45,7 @@ def test_cameras_in_the_right_places_that_look_elsewhere_do_not_agree():
 
 
 def test_a_mirrored_scene_does_not_agree():
-    exact = circle()
+    exact = circle_poses()
     mirror = np.diag([1.0, 1.0, -1.0])
     flipped = {}
     for name, pose in exact.items():
@@ -55,7 +55,7 @@ def test_a_mirrored_scene_does_not_agree():
 
 
 def test_only_photos_of_both_are_compared_and_two_never_agree():
-    exact = circle()
+    exact = circle_poses()
     half = {name: pose for name, pose in exact.items() if name < "012"}
     assert align_poses(half, exact).agreeing == set(half)
     two = dict(list(exact.items())[:2])
@@ -67,6 +67,6 @@ def test_only_photos_of_both_are_compared_and_two_never_agree():
 
 
 def test_the_extent_is_the_diagonal_of_the_box_around_the_cameras():
-    assert camera_extent(line(12)) == pytest.approx(11)
-    far = {**circle(100), "astray.jpg": np.column_stack([np.eye(3), [1e6, 0, 0]])}
+    assert camera_extent(line_poses(12)) == pytest.approx(11)
+    far = {**circle_poses(100), "astray.jpg": np.column_stack([np.eye(3), [1e6, 0, 0]])}
     assert camera_extent(far) < 12

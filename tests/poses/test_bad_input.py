@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import refused
-from made_up_photos import FOCAL, SIZE, picture, place, walls
+from made_up_photos import FOCAL_PIXELS, PHOTO_SIZE, arc_pose, render_photo, wall_textures
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -89,11 +89,11 @@ def test_photos_without_overlap(tmp_path):
 
 
 def test_a_panorama_from_one_place(tmp_path):
-    textures, pose = walls(), place(0.5)
+    textures, pose = wall_textures(), arc_pose(0.5)
     pictures = []
     for number in range(5):
         turned = Rotation.from_euler("y", 8 * (number - 2), degrees=True).as_matrix() @ pose
-        pictures.append(picture(turned, textures, SIZE, FOCAL))
+        pictures.append(render_photo(turned, textures, PHOTO_SIZE, FOCAL_PIXELS))
     sentence = refused("poses", save(tmp_path / "photos", pictures), "-o", tmp_path / "scene")
     assert "all taken from one place" in sentence and "a step to the side" in sentence
 
@@ -101,7 +101,7 @@ def test_a_panorama_from_one_place(tmp_path):
 def test_masks_that_fit_nothing(taken, tmp_path):
     (tmp_path / "masks").mkdir()
     for name in ("one", "two"):
-        Image.new("L", SIZE, 255).save(tmp_path / "masks" / f"{name}.png")
+        Image.new("L", PHOTO_SIZE, 255).save(tmp_path / "masks" / f"{name}.png")
     with pytest.raises(hyrfpack.HyrfDataError, match="no mask is named as a photo is"):
         hyrfpack.estimate_poses(taken[0], tmp_path / "scene", masks=tmp_path / "masks")
 

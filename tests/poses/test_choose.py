@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from made_up_poses import circle, moved
+from made_up_poses import circle_poses, transform_poses
 
 from hyrfpack.poses.choose import Candidate, choose_candidate, confirmed_photos, describe_doubt
 
@@ -12,7 +12,7 @@ def candidate(mapper: str, poses: dict, explained: int, track: float = 5.0, othe
 
 
 def test_the_one_that_explains_more_is_taken_though_it_has_fewer_photos_or_shorter_tracks():
-    poses = circle()
+    poses = circle_poses()
     fewer = {name: pose for name, pose in poses.items() if name < "020"}
     right = candidate("incremental", fewer, 900, track=4.0)
     folded = candidate("global", poses, 700, track=6.0)
@@ -22,7 +22,7 @@ def test_the_one_that_explains_more_is_taken_though_it_has_fewer_photos_or_short
 
 
 def test_among_equals_more_photos_and_then_longer_tracks_decide():
-    poses = circle()
+    poses = circle_poses()
     fewer = {name: pose for name, pose in poses.items() if name < "020"}
     a, b = candidate("incremental", fewer, 901), candidate("global", poses, 900)
     assert choose_candidate([a, b], 1000)[0] is b
@@ -31,22 +31,22 @@ def test_among_equals_more_photos_and_then_longer_tracks_decide():
 
 
 def test_all_is_well_where_both_agree_and_said_where_they_do_not():
-    poses = circle()
+    poses = circle_poses()
     names = sorted(poses)
     folded = {**poses, **{name: poses[onto] for name, onto in zip(names[16:], names[:8], strict=True)}}
-    assert describe_doubt(poses, candidate("global", moved(poses), 1000)) == ""
-    said = describe_doubt(poses, candidate("global", moved(folded), 800))
+    assert describe_doubt(poses, candidate("global", transform_poses(poses), 1000)) == ""
+    said = describe_doubt(poses, candidate("global", transform_poses(folded), 800))
     assert said.startswith("16 of 24 posed photos are sure; the global mapper poses 8 of them differently")
     lacking = {name: poses[name] for name in names[:10]}
-    assert "has no pose for 14" in describe_doubt(poses, candidate("incremental", moved(lacking), 400))
+    assert "has no pose for 14" in describe_doubt(poses, candidate("incremental", transform_poses(lacking), 400))
     assert "nothing confirms the poses of these 24 photos" in describe_doubt(poses, None)
 
 
 def test_of_the_other_mappers_pieces_the_largest_that_agrees_confirms():
-    poses = circle()
+    poses = circle_poses()
     names = sorted(poses)
-    first = moved({name: poses[name] for name in names[:9]}, seed=3)
-    second = moved({name: poses[name] for name in names[9:]}, scale=0.2, seed=4)
+    first = transform_poses({name: poses[name] for name in names[:9]}, seed=3)
+    second = transform_poses({name: poses[name] for name in names[9:]}, scale=0.2, seed=4)
     other = candidate("incremental", first, 500, other_pieces=(second,))
     assert confirmed_photos(poses, other) == set(names[9:])
     assert describe_doubt(poses, other).startswith("15 of 24 posed photos are sure")

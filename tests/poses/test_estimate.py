@@ -79,7 +79,7 @@ def test_the_command_ends_with_what_came_out_and_the_next_one(posed, monkeypatch
 
 
 @pytest.mark.parametrize("wrong", [{"matching": "guess"}, {"seed": -1}])
-def test_a_wrong_setting_is_refused_at_once(wrong, taken, tmp_path):
+def test_a_wrong_setting_is_rejected_at_once(wrong, taken, tmp_path):
     with pytest.raises(ValueError, match="matching is 'guess'|seed is -1"):
         hyrfpack.estimate_poses(taken[0], tmp_path / "scene", **wrong)
     assert not (tmp_path / "scene").exists()

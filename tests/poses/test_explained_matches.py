@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from made_up_poses import circle, moved
+from made_up_poses import circle_poses, transform_poses
 
 from hyrfpack.poses.explained_matches import RayMatches, count_explained_matches, explained_mask
 
@@ -22,14 +22,16 @@ def pairs_of(poses: dict[str, np.ndarray], noise: float = 0.0) -> list[RayMatche
 
 
 def test_the_right_poses_explain_all_in_any_frame():
-    poses = circle()
+    poses = circle_poses()
     pairs = pairs_of(poses, noise=0.0003)
     total = sum(len(pair.rays1) for pair in pairs)
-    assert count_explained_matches(poses, pairs) == count_explained_matches(moved(poses), pairs) >= 0.999 * total
+    assert (
+        count_explained_matches(poses, pairs) == count_explained_matches(transform_poses(poses), pairs) >= 0.999 * total
+    )
 
 
 def test_a_folded_half_and_lacking_photos_explain_less():
-    poses = circle()
+    poses = circle_poses()
     pairs = pairs_of(poses)
     names = sorted(poses)
     folded = {**poses, **{name: poses[onto] for name, onto in zip(names[16:], names[:8], strict=True)}}
@@ -39,7 +41,7 @@ def test_a_folded_half_and_lacking_photos_explain_less():
 
 
 def test_a_match_behind_a_camera_or_off_its_line_is_not_explained():
-    poses = circle(8)
+    poses = circle_poses(8)
     pair = pairs_of(poses)[0]
     assert explained_mask(poses, pair).all()
     off = RayMatches(pair.first, pair.second, pair.rays1, pair.rays2 + np.array([0.0, 0.01]), pair.pixel)

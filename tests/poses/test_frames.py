@@ -129,7 +129,7 @@ def test_motion_is_measured_right_and_a_shaking_camera_goes_nowhere(wall):
     assert motion_distances(found, 0, slice(0, 9)) == pytest.approx(expected, abs=0.006)
 
 
-def test_the_same_call_again_does_nothing_and_an_interrupted_one_goes_on(wall, tmp_path):
+def test_the_same_call_again_does_nothing_and_an_interrupted_one_continues(wall, tmp_path):
     video = write(tmp_path / "clip.mp4", [seen(wall, 4.0 * number) for number in range(60)])
     folder = tmp_path / "frames"
     first = choose_frames(video, folder)
@@ -202,7 +202,7 @@ def refusal(video: Path, folder: Path) -> str:
     return str(caught.value)
 
 
-def test_what_gives_no_photos_is_refused_in_one_sentence(wall, tmp_path):
+def test_what_gives_no_photos_is_rejected_with_a_clear_error(wall, tmp_path):
     moving = [seen(wall, 4.0 * number) for number in range(60)]
     whole = write(tmp_path / "whole.mp4", moving)
     out = tmp_path / "frames"
@@ -224,7 +224,7 @@ def test_what_gives_no_photos_is_refused_in_one_sentence(wall, tmp_path):
     assert "folder" in refusal(tmp_path, out)
 
 
-def test_a_file_of_sound_alone_is_refused(tmp_path):
+def test_a_file_of_sound_alone_is_rejected(tmp_path):
     with av.open(str(tmp_path / "sound.wav"), "w") as container:
         stream = container.add_stream("pcm_s16le", rate=8000)
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.int16), "s16", "mono")
@@ -269,7 +269,7 @@ def test_high_dynamic_range_clips_nothing():
         assert (np.diff(shown) >= 0).all() and shown[0] == 0 and (shown == 255).sum() < 60
 
 
-def test_poses_of_a_video_that_go_on_still_say_how_many_frames_were_taken(wall, tmp_path):
+def test_poses_of_a_video_that_continue_still_say_how_many_frames_were_taken(wall, tmp_path):
     video = write(tmp_path / "clip.mp4", [seen(wall, 4.0 * number) for number in range(60)])
 
     def stop(doing: str, share: float) -> None:

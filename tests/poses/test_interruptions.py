@@ -65,7 +65,7 @@ def stopped(taken, tmp_path_factory) -> Path:
     return out
 
 
-def test_what_is_stopped_goes_on_where_it_was(taken, stopped, tmp_path):
+def test_what_is_stopped_continues_where_it_was(taken, stopped, tmp_path):
     out, kept = tmp_path / "scene", (stopped / ".poses" / "matches.json").stat().st_mtime_ns
     shutil.copytree(stopped, out)
     assert os.listdir(out) == [".poses"]
@@ -93,7 +93,7 @@ def test_a_scene_of_ones_own_gets_poses_in_place_also_after_its_worker_was_kille
     assert sorted(os.listdir(tmp_path)) == ["images", "poses.json", "sparse"]
 
 
-def test_a_crash_of_the_library_is_one_sentence(taken, tmp_path, monkeypatch):
+def test_a_crash_of_the_library_is_a_clear_error(taken, tmp_path, monkeypatch):
     (tmp_path / "sitecustomize.py").write_text(CRASH.format(stage="matches"))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     with pytest.raises(hyrfpack.HyrfError, match="matching photos ended by signal SIGABRT.*run the same command again"):

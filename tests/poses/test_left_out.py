@@ -58,7 +58,7 @@ def test_each_kind_of_unusable_photo_is_counted_in_one_note(report):
     assert notes.count("2 raw files (.CR3) are ignored") == 1
 
 
-def test_photos_of_an_archive_are_refused_by_the_archives_name(tmp_path, monkeypatch):
+def test_photos_of_an_archive_are_rejected_by_the_archives_name(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     write_photos(tmp_path / "photos", 2)
     with zipfile.ZipFile(tmp_path / "set.zip", "w") as archive:

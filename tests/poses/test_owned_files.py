@@ -77,7 +77,7 @@ def test_copies_that_are_all_that_is_left_of_the_photos_are_posed_again_in_place
         assert pictures(tmp_path / "scene" / "images") == ["0.png", "1.png", "2.png", "3.png"]
 
 
-def test_photos_beside_the_copies_of_them_go_on_where_they_were(tmp_path):
+def test_photos_beside_the_copies_of_them_continue_where_they_were(tmp_path):
     scene, said = photos(tmp_path / "scene"), []
     begin(scene, scene)
     begin(scene, scene, say=said.append)
@@ -100,7 +100,7 @@ def test_other_photos_take_the_place_of_those_that_we_put_there_and_of_no_others
     assert pictures(images) == ["0.png", "1.png", "2.png", "3.png", "mine.png"]
 
 
-def test_photos_that_are_refused_leave_what_is_there(tmp_path):
+def test_photos_that_are_rejected_leave_what_is_there(tmp_path):
     finished(photos(tmp_path / "photos"), tmp_path / "scene")
     (tmp_path / "none").mkdir()
     with pytest.raises(hyrfpack.HyrfDataError, match="no photos here"):
@@ -152,7 +152,7 @@ def test_old_poses_never_lie_beside_new_photos(moment, tmp_path, monkeypatch):
     assert sorted(os.listdir(scene)) == ["images", "poses.json", "sparse"]
 
 
-def test_what_is_refused_or_fails_before_anything_is_done_leaves_nothing(tmp_path, monkeypatch):
+def test_what_is_rejected_or_fails_before_anything_is_done_leaves_nothing(tmp_path, monkeypatch):
     out = tmp_path / "new" / "scene"
     with pytest.raises(hyrfpack.HyrfDataError, match="2 photos are too few"):
         hyrfpack.estimate_poses(photos(tmp_path / "two", count=2), out)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from made_up_photos import panorama, place, walls
+from made_up_photos import arc_pose, render_panorama, wall_textures
 from PIL import Image
 
 import hyrfpack
@@ -18,10 +18,10 @@ COUNT, HEIGHT = 3, 320
 @pytest.fixture(scope="module")
 def panoramas(tmp_path_factory):
     """A folder of panoramas, and the pose of each one's middle."""
-    folder, textures = tmp_path_factory.mktemp("panoramas"), walls()
-    truth = {f"p{number}": place(number / (COUNT - 1)) for number in range(COUNT)}
+    folder, textures = tmp_path_factory.mktemp("panoramas"), wall_textures()
+    truth = {f"p{number}": arc_pose(number / (COUNT - 1)) for number in range(COUNT)}
     for name, pose in truth.items():
-        Image.fromarray(panorama(pose, textures, HEIGHT, finer=2)).save(folder / f"{name}.jpg", quality=95)
+        Image.fromarray(render_panorama(pose, textures, HEIGHT, finer=2)).save(folder / f"{name}.jpg", quality=95)
     return folder, truth
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up_photos import SIZE, write_photos
+from made_up_photos import PHOTO_SIZE, write_photos
 from PIL import Image
 
 import hyrfpack
@@ -213,16 +213,18 @@ def test_masked_parts_have_no_features_and_photos_without_a_mask_have_theirs(tmp
     from hyrfpack.poses.features import find_features
 
     names = list(write_photos(tmp_path / "images", 3))
-    mask = np.full(SIZE[::-1], 255, np.uint8)
-    mask[:, : SIZE[0] // 2] = 0
+    mask = np.full(PHOTO_SIZE[::-1], 255, np.uint8)
+    mask[:, : PHOTO_SIZE[0] // 2] = 0
     Image.fromarray(mask).save(tmp_path / "mask.png")
     (tmp_path / "work").mkdir()
     masks = {names[0]: str(tmp_path / "mask.png")}
-    job = Job(tmp_path / "images", tmp_path / "work", tuple(names), (Device(SIZE),), (0, 0, 0), masks, "exhaustive", 0)
+    job = Job(
+        tmp_path / "images", tmp_path / "work", tuple(names), (Device(PHOTO_SIZE),), (0, 0, 0), masks, "exhaustive", 0
+    )
     find_features(job, lambda doing, share: None)
     with pycolmap.Database.open(job.database) as database:
         masked, free = (np.asarray(database.read_keypoints(number))[:, 0] for number in (1, 2))
-    assert masked.min() >= SIZE[0] // 2 - 1 > free.min()
+    assert masked.min() >= PHOTO_SIZE[0] // 2 - 1 > free.min()
     assert len(masked) > 50 and len(free) > 50
 
 
@@ -250,12 +252,15 @@ def test_a_set_of_two_cameras_some_on_their_side_becomes_one_scene(tmp_path):
         if number % 2:
             save(folder / name.replace(".png", ".jpg"), pixels, 6, device="One")
         else:
-            save(folder / "right" / name, pixels[:, : 4 * SIZE[0] // 5], device="Two")  # another principal point
+            save(folder / "right" / name, pixels[:, : 4 * PHOTO_SIZE[0] // 5], device="Two")  # another principal point
     report = hyrfpack.estimate_poses(folder, tmp_path / "scene")
     assert report.registered == len(known)
     assert any("turned upright" in note for note in report.notes)
     assert any("2 cameras or zooms are distinguished" in note for note in report.notes)
     scene = hyrfpack.load_scene(tmp_path / "scene")
-    assert {(view.camera.width, view.camera.height) for view in scene.views} == {SIZE, (4 * SIZE[0] // 5, SIZE[1])}
+    assert {(view.camera.width, view.camera.height) for view in scene.views} == {
+        PHOTO_SIZE,
+        (4 * PHOTO_SIZE[0] // 5, PHOTO_SIZE[1]),
+    }
     assert len(json.loads((tmp_path / "scene" / "poses.json").read_text())["made"]) == len(known)
-    assert read_photo_facts(tmp_path / "scene" / "images" / "photo01.jpg").size == SIZE
+    assert read_photo_facts(tmp_path / "scene" / "images" / "photo01.jpg").size == PHOTO_SIZE

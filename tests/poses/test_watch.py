@@ -65,7 +65,7 @@ def test_rows_are_counted_while_another_connection_writes(tmp_path):
     writer.close()
 
 
-def test_rows_that_a_long_call_writes_are_told_while_it_runs(tmp_path, monkeypatch):
+def test_rows_that_a_long_call_writes_are_reported_while_it_runs(tmp_path, monkeypatch):
     monkeypatch.setattr(watch, "POLL_INTERVAL_SECONDS", 0.01)
     job, told, seen = job_with_pairs(tmp_path, 5), [], threading.Event()
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from token_streams import integers_by_the_book
+from token_streams import decode_integers_by_spec
 
 from hyrfpack.parallel import has_numba
 from hyrfpack.quant import DamagedDataError, decode_integers, encode_integers
@@ -38,7 +38,7 @@ def test_integers_round_trip(name: str, implementation: str) -> None:
 
     decoded = decode_integers(data, len(values), signed=signed, implementation=implementation)
     np.testing.assert_array_equal(decoded, values)
-    assert integers_by_the_book(data, [0] * len(values), signed) == values.tolist()
+    assert decode_integers_by_spec(data, [0] * len(values), signed) == values.tolist()
 
 
 @pytest.mark.skipif(not has_numba(), reason="no numba")
@@ -67,7 +67,7 @@ def test_any_integers_of_any_dtype_round_trip(implementation: str, data: st.Data
     decoded = decode_integers(coded, len(values), contexts, signed=signed, implementation=implementation)
     assert decoded.tolist() == values.tolist()
     listed = [0] * len(values) if contexts is None else contexts.tolist()
-    assert integers_by_the_book(coded, listed, signed) == values.tolist()
+    assert decode_integers_by_spec(coded, listed, signed) == values.tolist()
 
 
 def _contexts(count: int, number: int) -> np.ndarray:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import gammaln
-from token_streams import decode_by_the_book, laplace_tokens
+from token_streams import decode_tokens_by_spec, laplace_tokens
 
 from hyrfpack.parallel import has_numba
 from hyrfpack.quant import rans
@@ -86,7 +86,7 @@ def test_a_decoder_written_from_the_specification_agrees(name: str) -> None:
     data = encode_tokens(tokens, contexts)
 
     listed = [0] * len(tokens) if contexts is None else contexts.tolist()
-    assert decode_by_the_book(data, listed) == (tokens.tolist(), len(data))
+    assert decode_tokens_by_spec(data, listed) == (tokens.tolist(), len(data))
 
 
 def test_cases_cover_all_kinds_of_models() -> None:
@@ -107,7 +107,7 @@ def test_any_number_of_lanes_decodes(lanes_log2: int, implementation: str, monke
     data = encode_tokens(tokens, contexts, implementation)
 
     assert data[0] & 15 == lanes_log2
-    assert decode_by_the_book(data, contexts.tolist()) == (tokens.tolist(), len(data))
+    assert decode_tokens_by_spec(data, contexts.tolist()) == (tokens.tolist(), len(data))
     np.testing.assert_array_equal(decode_tokens(data, 777, contexts, implementation).tokens, tokens)
 
 

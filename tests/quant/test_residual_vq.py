@@ -198,7 +198,7 @@ def test_values_that_cannot_be_stored_are_refused(bad: float, codebook_dtype: st
     "settings_",
     [{"stages": 0}, {"codebook_size": 0}, {"codebook_size": 65537}, {"iterations": -1}, {"codebook_dtype": "int8"}],
 )
-def test_impossible_settings_are_refused(settings_: dict) -> None:
+def test_impossible_settings_are_rejected(settings_: dict) -> None:
     with pytest.raises(ValueError, match="codebook_dtype|needs"):
         ResidualVectorQuantizer(**settings_)
 

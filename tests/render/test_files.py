@@ -45,7 +45,7 @@ def test_rendered_files_hold_the_rounded_render_and_exact_depth(tmp_path):
     assert expected.depth.max() > 0
 
 
-def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
+def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(HyrfError, match="cannot be made"):
         save_picture(tmp_path / "file" / "a.png", Image.new("RGB", (2, 2)))

@@ -295,7 +295,7 @@ def test_antialiasing_dims_small_gaussians_by_what_the_low_pass_adds():
     + [{"background_stride": 0}, {"background_stride": 1.5}, {"transmittance_min": 1.0}],
     ids=str,
 )
-def test_impossible_settings_are_refused(wrong):
+def test_impossible_settings_are_rejected(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         RenderSettings(**wrong)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up_splats import made_up
+from made_up_splats import random_splats
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats.hints import NO_HINTS
@@ -36,7 +36,7 @@ def encoded(row: SplatFormat, splats) -> bytes:
 @pytest.mark.parametrize("degree", range(MAX_DEGREE + 1))
 @pytest.mark.parametrize("ending", FORMATS)
 def test_what_is_encoded_decodes_to_the_same_within_the_formats_precision(ending, degree):
-    row, splats = FORMATS[ending], made_up(degree=degree)
+    row, splats = FORMATS[ending], random_splats(degree=degree)
     splats = replace(splats, harmonics=np.clip(splats.harmonics, -0.95, 0.95))  # the narrowest range, that of SPZ
     back = row.decode(encoded(row, splats), "it")
     assert len(back) == len(splats) and back.degree == min(degree, row.max_degree)
@@ -59,14 +59,14 @@ def test_what_is_encoded_decodes_to_the_same_within_the_formats_precision(ending
 def test_a_row_says_whether_files_say_antialiased(ending):
     row = FORMATS[ending]
     for said in (False, True):
-        assert row.decode(encoded(row, replace(made_up(), antialiased=said)), "it").antialiased == (
+        assert row.decode(encoded(row, replace(random_splats(), antialiased=said)), "it").antialiased == (
             said and row.stores_antialiased
         )
 
 
 @pytest.mark.parametrize("ending", FORMATS)
 def test_a_row_says_how_far_positions_and_scales_reach(ending):
-    row, splats = FORMATS[ending], made_up()
+    row, splats = FORMATS[ending], random_splats()
     reach = min(row.max_coordinate, 1e30)
     far = replace(splats, positions=np.where(np.arange(len(splats))[:, None] == 0, reach, splats.positions))
     assert row.decode(encoded(row, far), "it").positions.max() == pytest.approx(reach)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from explicit_balls import ball
+from explicit_balls import ball_splats
 
 from hyrfpack.splats import viewpoints as views
 from hyrfpack.splats.draw import Drawable
@@ -27,13 +27,13 @@ def seen(splats: Splats, count: int = 12, seed: int = 0):
 
 def solid_ball() -> Splats:
     """Splats all through the unit ball."""
-    splats, depths = ball(400), np.random.default_rng(1).random((400, 1)) ** (1 / 3)
+    splats, depths = ball_splats(400), np.random.default_rng(1).random((400, 1)) ** (1 / 3)
     return replace(splats, positions=splats.positions * depths)
 
 
 def room() -> Splats:
     """Large splats on a sphere of radius 5 that is empty inside."""
-    splats = ball(600)
+    splats = ball_splats(600)
     return replace(splats, positions=5 * splats.positions, scales=np.full((600, 3), 0.5), opacities=np.full(600, 0.9))
 
 
@@ -77,8 +77,8 @@ def test_sky_does_not_stretch_the_frame() -> None:
 
 def test_of_many_splats_some_tell_what_a_place_is_like(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each fourth, as if there were four of it: where many lie behind each other, that is nearly what all say."""
-    ball = solid_ball()
-    faint = replace(ball, opacities=ball.opacities * 0.1)
+    ball_splats = solid_ball()
+    faint = replace(ball_splats, opacities=ball_splats.opacities * 0.1)
     weighted, drawable, cameras = seen(faint)
     covered = [coverage(drawable, camera) for camera in cameras]
     cluttered = [weighted.clutter(camera.position, 1.0) for camera in cameras]

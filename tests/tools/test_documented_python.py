@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from made_up_photos import FOCAL, SIZE, write_photos
+from made_up_photos import FOCAL_PIXELS, PHOTO_SIZE, write_photos
 
 from tools.safety.run_docs import PAGES, python_of, run
 
@@ -30,7 +30,14 @@ def photos(tmp_path):
     frames = [
         {"file_path": f"images/{name}", "transform_matrix": opengl(pose).tolist()} for name, pose in poses.items()
     ]
-    camera = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": SIZE[0] / 2, "cy": SIZE[1] / 2, "w": SIZE[0], "h": SIZE[1]}
+    camera = {
+        "fl_x": FOCAL_PIXELS,
+        "fl_y": FOCAL_PIXELS,
+        "cx": PHOTO_SIZE[0] / 2,
+        "cy": PHOTO_SIZE[1] / 2,
+        "w": PHOTO_SIZE[0],
+        "h": PHOTO_SIZE[1],
+    }
     (tmp_path / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
     return tmp_path
 

@@ -227,7 +227,7 @@ def test_an_item_that_hangs_is_killed_at_the_time_limit_and_the_rest_is_named() 
     assert told["hangs"][-1] == told["two"][-1] == "failed: not done within the part's 2 s"
 
 
-def test_what_hung_is_told_by_what_it_printed_last() -> None:
+def test_what_hung_is_reported_by_what_it_printed_last() -> None:
     told = run_children("hangs in a test", "two", seconds=1.5)
     assert told["hangs in a test"][-1] == "failed: not done within the part's 2 s; last words: test_loop"
     assert told["two"] == ["failed: not done within the part's 2 s"]
@@ -324,7 +324,7 @@ def test_set_is_the_one_asked_for_or_one_of_the_data_folder(tmp_path: Path) -> N
 
 
 @pytest.mark.skipif(CUDA, reason="there is a GPU")
-def test_without_a_gpu_it_ends_with_one_sentence_and_code_2(capsys: pytest.CaptureFixture) -> None:
+def test_without_a_gpu_it_ends_with_a_clear_error_and_code_2(capsys: pytest.CaptureFixture) -> None:
     assert gpu_check.main([]) == 2
     assert capsys.readouterr().err == f"tools.gpu.check: {gpu_check.NO_GPU}\n"
 
@@ -360,7 +360,7 @@ def test_matrix_case_runs_through() -> None:
     assert "status" not in row, row
 
 
-def test_tests_marked_gpu_are_run_and_a_failure_is_told_with_its_reason(tmp_path: Path) -> None:
+def test_tests_marked_gpu_are_run_and_a_failure_is_reported_with_its_reason(tmp_path: Path) -> None:
     (tmp_path / "test_a.py").write_text("import pytest\npytestmark = pytest.mark.gpu\ndef test_good(): pass\n")
     (tmp_path / "test_b.py").write_text(
         "import pytest\n@pytest.mark.gpu\ndef test_good(): pass\n@pytest.mark.gpu\ndef test_bad(): assert 1 == 2\n"

@@ -80,18 +80,18 @@ def test_a_missing_checkpoint_is_said_to_be_missing(tmp_path):
     ("change", "named"),
     [({"steps": 41}, "steps"), ({"budget": 5}, "budget"), ({"rates": (1e-3, 1e-4)}, "rates"), ({"new": 1}, "new")],
 )
-def test_other_settings_are_refused_by_name(path, change, named):
+def test_other_settings_are_rejected_by_name(path, change, named):
     with pytest.raises(HyrfTrainingError, match=rf"other settings \({named}\)"):
         load_checkpoint(path, {**SETTINGS, **change})
 
 
-def test_a_setting_that_is_gone_is_refused_too(path):
+def test_a_setting_that_is_gone_is_rejected_too(path):
     with pytest.raises(HyrfTrainingError, match=r"other settings \(budget, views\)"):
         load_checkpoint(path, {name: SETTINGS[name] for name in ("steps", "rates")} | {"budget": 7})
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.5, 0.9, 0.99])
-def test_a_truncated_checkpoint_is_refused(path, share):
+def test_a_truncated_checkpoint_is_rejected(path, share):
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
     with pytest.raises(HyrfTrainingError, match="damaged"):
@@ -99,7 +99,7 @@ def test_a_truncated_checkpoint_is_refused(path, share):
 
 
 @pytest.mark.parametrize("length", [1, 7, 100, 5000])
-def test_random_bytes_are_refused(tmp_path, length):
+def test_random_bytes_are_rejected(tmp_path, length):
     path = tmp_path / "checkpoint.pt"
     for seed in range(20):
         path.write_bytes(random.Random(seed).randbytes(length))
@@ -135,7 +135,7 @@ def test_a_flipped_bit_anywhere_is_noticed(path):
     ],
     ids=str,
 )
-def test_other_files_of_torch_are_refused(tmp_path, content):
+def test_other_files_of_torch_are_rejected(tmp_path, content):
     path = tmp_path / "checkpoint.pt"
     path.write_bytes(sealed(content))
     with pytest.raises(HyrfTrainingError, match="damaged"):
@@ -145,7 +145,7 @@ def test_other_files_of_torch_are_refused(tmp_path, content):
         load_checkpoint(path, SETTINGS)
 
 
-def test_another_version_is_refused(tmp_path):
+def test_another_version_is_rejected(tmp_path):
     path = tmp_path / "checkpoint.pt"
     for version in (1, 99):  # 1 knew of no exposures, so that none of its runs can be gone on with
         path.write_bytes(sealed({"version": version, "settings": "{}", "progress": "{}", "tensors": {}}))

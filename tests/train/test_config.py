@@ -53,7 +53,7 @@ WRONG_RATES = ((0.0, 1e-3), (1e-3, 0.0), (-1e-3, 1e-3), (1e-3,), (1e-3, 1e-3, 1e
 @pytest.mark.parametrize(
     ("kind", "wrong"), [(TrainConfig, WRONG), (DensityConfig, WRONG_DENSITY)], ids=["TrainConfig", "DensityConfig"]
 )
-def test_each_setting_out_of_range_or_of_another_type_is_one_sentence_that_names_it(kind, wrong):
+def test_each_setting_out_of_range_or_of_another_type_is_a_clear_error_that_names_it(kind, wrong):
     assert set(wrong) == {field.name for field in dataclasses.fields(kind)}
     for name, values in wrong.items():
         for value in values:

@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-import ranked_work as work
+import rank_tasks as tasks
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from ranked import Ended, needs_ranks, together
+from rank_processes import ProcessOutcome, needs_ranks, run_on_ranks
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.ops.ssim import photometric_loss
@@ -97,7 +97,7 @@ def test_what_ranks_tell_is_means_over_views_and_whether_any_stops_or_has_a_prob
     assert found.stop is any(row[2] for row in rows) and found.problem is any(row[3] for row in rows)
 
 
-def test_a_loss_that_is_not_finite_is_told_as_such():
+def test_a_loss_that_is_not_finite_is_reported_as_such():
     told = torch.stack(
         [pack_step_stats(torch.tensor(loss), torch.tensor(1.0), stop=False, problem=False) for loss in (1, math.nan)]
     )
@@ -124,11 +124,14 @@ def test_a_digest_is_of_every_bit():
 
 
 @pytest.fixture(scope="module")
-def both() -> list[Ended]:
-    return together(work.train_both)
+def both() -> list[ProcessOutcome]:
+    return run_on_ranks(tasks.train_both_scenes)
 
 
-CASES = {"six photos": (0, work.even_scene, work.EVEN), "three photos, exposed": (1, work.three_photos, work.EXPOSED)}
+CASES = {
+    "six photos": (0, tasks.six_photo_scene, tasks.SIX_PHOTO_CONFIG),
+    "three photos, exposed": (1, tasks.three_photo_scene, tasks.EXPOSURE_CONFIG),
+}
 
 
 @pytest.fixture(scope="module", params=CASES)
@@ -177,36 +180,36 @@ def test_both_keep_the_same_curve_but_for_the_time(compared):
 
 @needs_ranks
 def test_exposures_are_learnt_together_also_where_both_have_the_same_photo(both):
-    names = [view.name for view in shuffled(work.three_photos().train, work.EXPOSED.seed, range(60))]
+    names = [view.name for view in shuffled(tasks.three_photo_scene().train, tasks.EXPOSURE_CONFIG.seed, range(60))]
     assert sum(names[place] == names[place + 1] for place in range(0, 60, 2)) > 1  # else it would say little
     gains = [end.result[1]["gains"] for end in both]
     np.testing.assert_array_equal(gains[0], gains[1])
-    untrained = Trainer(work.three_photos(), work.EXPOSED).exposures.values
+    untrained = Trainer(tasks.three_photo_scene(), tasks.EXPOSURE_CONFIG).exposures.values
     assert np.abs(gains[0] - untrained.detach().numpy()).max() > 1e-3
 
 
 @pytest.mark.parametrize(("size", "steps"), [(1, 7), (2, 4), (3, 3), (7, 1), (8, 1)])
 def test_steps_count_views_and_all_ranks_see_the_order_of_one(size, steps):
-    config = dataclasses.replace(work.EVEN, steps=7)
+    config = dataclasses.replace(tasks.SIX_PHOTO_CONFIG, steps=7)
     ranks = [dataclasses.replace(SINGLE_PROCESS, rank=rank, size=size) for rank in range(size)]
-    trainers = [Trainer(work.even_scene(), config, ranks=rank) for rank in ranks]
+    trainers = [Trainer(tasks.six_photo_scene(), config, ranks=rank) for rank in ranks]
     orders = [[view.name for view in trainer._order()] for trainer in trainers]
     assert {trainer.steps for trainer in trainers} == {steps}
-    together = [name for step in zip(*orders, strict=True) for name in step]
-    assert together == [view.name for view in shuffled(work.even_scene().train, config.seed, range(size * steps))]
+    names = [name for step in zip(*orders, strict=True) for name in step]
+    assert names == [view.name for view in shuffled(tasks.six_photo_scene().train, config.seed, range(size * steps))]
 
 
 # -- stopping and going on -------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def parts(tmp_path_factory) -> tuple[Path, list[Ended]]:
+def parts(tmp_path_factory) -> tuple[Path, list[ProcessOutcome]]:
     """A folder with a run of one piece and one of three, and what was said."""
     folder = tmp_path_factory.mktemp("parts")
-    alone = Trainer(work.run_scene(), work.RUN)
+    alone = Trainer(tasks.held_out_scene(), tasks.RUN_CONFIG)
     (folder / "alone").mkdir()
     alone.run(checkpoint=folder / "alone" / "checkpoint.pt", stop=lambda: alone.step == 3)
-    return folder, together(work.stop_and_resume, folder / "whole", folder / "parts", folder / "alone")
+    return folder, run_on_ranks(tasks.stop_and_resume, folder / "whole", folder / "parts", folder / "alone")
 
 
 def model_of(folder: Path) -> bytes:
@@ -227,7 +230,7 @@ def test_a_run_that_was_stopped_and_resumed_gives_the_bytes_of_the_uninterrupted
     folder, ends = parts
     resumed = tmp_path / "resumed"
     shutil.copytree(folder / "parts", resumed)
-    again = together(work.run, resumed, True)
+    again = run_on_ranks(tasks.train_run, resumed, True)
     assert (
         [end.result for end in again] == [end.result["whole"] for end in ends] == [(True, 30, True), (True, 30, False)]
     )
@@ -246,22 +249,22 @@ def test_only_rank_0_writes_and_what_it_writes_is_said_of_two(parts):
 def test_a_run_is_resumed_by_as_many_processes_only(parts):
     folder, ends = parts
     with pytest.raises(HyrfError, match=r"other settings \(processes\)"):
-        Trainer(work.run_scene(), work.RUN).load(folder / "parts" / "checkpoint.pt")
+        Trainer(tasks.held_out_scene(), tasks.RUN_CONFIG).load(folder / "parts" / "checkpoint.pt")
     assert all("other settings (processes)" in end.result["other size"] for end in ends)
     assert len({end.result["other size"] for end in ends}) == 1
 
 
 @needs_ranks
-def test_all_refuse_a_folder_that_holds_a_run(parts):
+def test_all_reject_a_folder_that_holds_a_run(parts):
     _, ends = parts
     assert {"the folder holds an earlier run" in end.result["there already"] for end in ends} == {True}
 
 
 @needs_ranks
-def test_processes_that_are_started_anew_go_on_from_the_checkpoint_if_there_is_one(parts, tmp_path):
+def test_processes_that_are_started_again_continue_from_the_checkpoint_if_there_is_one(parts, tmp_path):
     folder, _ = parts
     shutil.copytree(folder / "parts", tmp_path / "some")
-    for end in together(work.started_anew, tmp_path):
+    for end in run_on_ranks(tasks.train_after_restart, tmp_path):
         assert end.result == [2, list(range(18, 31))]
     assert model_of(tmp_path / "some") == model_of(folder / "whole")
 
@@ -269,14 +272,14 @@ def test_processes_that_are_started_anew_go_on_from_the_checkpoint_if_there_is_o
 @needs_ranks
 @pytest.mark.parametrize(("killed", "step"), [(0, 17), (1, 13)])
 def test_a_process_that_is_killed_ends_the_other_and_the_run_can_be_resumed(killed, step, parts, tmp_path):
-    ends = together(work.run_and_die, tmp_path, killed, step, patience=30)
+    ends = run_on_ranks(tasks.train_and_kill, tmp_path, killed, step, timeout_seconds=30)
     assert ends[killed].exit_code == -9
-    assert "one of the 2 processes has ended" in ends[1 - killed].refusal
-    assert f"the checkpoint of step {step // 5 * 5} is kept" in ends[1 - killed].refusal
-    assert "\n" not in ends[1 - killed].refusal
+    assert "one of the 2 processes has ended" in ends[1 - killed].error_text
+    assert f"the checkpoint of step {step // 5 * 5} is kept" in ends[1 - killed].error_text
+    assert "\n" not in ends[1 - killed].error_text
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
 
-    together(work.run, tmp_path, True)
+    run_on_ranks(tasks.train_run, tmp_path, True)
     assert model_of(tmp_path) == model_of(parts[0] / "whole")
 
 
@@ -285,7 +288,7 @@ def test_a_process_that_is_killed_ends_the_other_and_the_run_can_be_resumed(kill
 
 @pytest.fixture(scope="module")
 def refused() -> list[dict]:
-    return [end.result for end in together(work.refusals)]
+    return [end.result for end in run_on_ranks(tasks.collect_errors)]
 
 
 @needs_ranks
@@ -312,8 +315,8 @@ def test_after_a_refusal_they_can_still_work_together(refused):
 
 
 @needs_ranks
-def test_what_cannot_be_trained_on_is_refused_on_both_before_the_first_step(tmp_path):
-    first, second = (end.result for end in together(work.refused_set_up, tmp_path))
+def test_what_cannot_be_trained_on_is_rejected_on_both_before_the_first_step(tmp_path):
+    first, second = (end.result for end in run_on_ranks(tasks.collect_setup_errors, tmp_path))
     assert first == second
     assert "held.png: cannot be read" in first["held out"]
     assert "there is no checkpoint to resume" in first["nothing to resume"]

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from scenes import alternating, ball_scene, exposed_scene
+from scenes import alternating_gains, ball_scene, exposed_scene
 
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
@@ -151,7 +151,7 @@ def test_steps_are_adams_with_a_pull_to_one_and_keep_the_mean():
         assert exposures.values.mean(0).abs().max() < 1e-7
 
 
-def test_a_gradient_that_is_not_finite_is_told_and_changes_nothing():
+def test_a_gradient_that_is_not_finite_is_reported_and_changes_nothing():
     views = ball_scene(2).train
     exposures = Exposures(views, np.array([[0.3, 0.3, 0.3], [-0.3, -0.3, -0.3]]), CPU)
     before = exposures.values.detach().clone()
@@ -179,7 +179,7 @@ def trained(scene: Scene, config: TrainConfig = SHORT) -> Trainer:
 
 
 def test_gains_that_are_known_are_found_and_the_model_keeps_the_mean():
-    gains = alternating(8) * np.array([1.1, 1.0, 0.9]) ** np.linspace(-1, 1, 8)[:, None]
+    gains = alternating_gains(8) * np.array([1.1, 1.0, 0.9]) ** np.linspace(-1, 1, 8)[:, None]
     scene = exposed_scene(gains, side=128)
 
     trainer = trained(scene, dataclasses.replace(SHORT, steps=60))
@@ -189,7 +189,7 @@ def test_gains_that_are_known_are_found_and_the_model_keeps_the_mean():
 
 
 def test_gains_are_not_learnt_by_default_even_where_photos_differ_by_a_stop():
-    scene = exposed_scene(alternating(6, stops=1.0))
+    scene = exposed_scene(alternating_gains(6, stops=1.0))
     default = dataclasses.replace(SHORT, exposure=TrainConfig().exposure)
 
     by_default, without = trained(scene, default), trained(dataclasses.replace(scene, tracks={}), default)
@@ -199,13 +199,13 @@ def test_gains_are_not_learnt_by_default_even_where_photos_differ_by_a_stop():
 
 
 def test_gains_of_photos_without_tracks_start_at_one():
-    trainer = Trainer(dataclasses.replace(exposed_scene(alternating(6)), tracks={}), SHORT)
+    trainer = Trainer(dataclasses.replace(exposed_scene(alternating_gains(6)), tracks={}), SHORT)
     assert trainer.choices["exposure"] == "per-image gains; no tracks show the photos' exposures"
     assert torch.equal(trainer.exposures.values, torch.zeros(6, 3))
 
 
-def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path):
-    scene, path = exposed_scene(alternating(6)), tmp_path / "checkpoint.pt"
+def test_an_interrupted_run_continues_to_the_same_bytes(tmp_path):
+    scene, path = exposed_scene(alternating_gains(6)), tmp_path / "checkpoint.pt"
     whole, first = trained(scene), Trainer(scene, SHORT)
     assert not first.run(checkpoint=path, stop=lambda: first.step == 17)
 
@@ -219,7 +219,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path):
         Trainer(scene, dataclasses.replace(SHORT, exposure=False)).load(path)
 
 
-def test_exposure_of_photos_with_transparency_is_refused():
+def test_exposure_of_photos_with_transparency_is_rejected():
     with pytest.raises(HyrfTrainingError, match=r"balls: photos with transparency .*leave out `exposure`"):
         Trainer(ball_scene(4, alpha=True), SHORT)
 

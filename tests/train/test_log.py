@@ -85,7 +85,7 @@ def test_what_masks_leave_nothing_of_is_null(tmp_path: Path) -> None:
     assert first["loss"] is first["psnr"] is None and second["loss"] == 0 and second["psnr"] == 100
 
 
-def test_a_resumed_run_adds_to_its_log_and_another_begins_anew(tmp_path: Path) -> None:
+def test_a_resumed_run_adds_to_its_log_and_another_begins_again(tmp_path: Path) -> None:
     where, file = tmp_path / "run", tmp_path / "log.jsonl"
     stop = iter([False] * 9 + [True])
     with pytest.MonkeyPatch.context() as patch:

@@ -144,7 +144,7 @@ def test_replacing_keeps_rows_and_moments_and_starts_new_ones_at_zero():
     assert fields and all(torch.equal(after[key], moments[key]) for key in fields)
 
 
-def test_kept_rows_go_on_as_if_nothing_happened():
+def test_kept_rows_continue_as_if_nothing_happened():
     edited, alone = a_model(), a_model()
     optimizers = Optimizer(edited, RATES), Optimizer(alone, RATES)
     for model, optimizer in zip((edited, alone), optimizers, strict=True):
@@ -194,7 +194,7 @@ def test_resetting_sets_values_and_forgets_moments_of_one_group():
             assert torch.equal(value, before[key])
 
 
-def test_a_state_dict_goes_on_with_the_same_bits():
+def test_a_state_dict_continues_with_the_same_bits():
     model = a_model()
     optimizer = Optimizer(model, RATES)
     taken(model, optimizer, range(5))
@@ -213,7 +213,7 @@ def test_a_state_dict_goes_on_with_the_same_bits():
     assert all(torch.equal(states[1][key], states[0][key]) for key in states[0])
 
 
-def test_a_state_of_no_steps_goes_on_too():
+def test_a_state_of_no_steps_continues_too():
     model, copy = a_model(), a_model()
     optimizer, restored = Optimizer(model, RATES), Optimizer(copy, RATES)
     restored.load_state_dict(optimizer.state_dict())

@@ -74,11 +74,11 @@ def test_metrics_that_make_no_sense_are_as_none(reading, run, tmp_path):
     assert photos_of(changed(run, tmp_path / "run", **reading)) is None
 
 
-def test_photos_that_are_gone_are_one_sentence(run, tmp_path):
+def test_photos_that_are_gone_are_a_clear_error(run, tmp_path):
     with pytest.raises(HyrfDataError, match="no such folder"):
         photos_of(changed(run, tmp_path / "run", path=str(tmp_path / "moved")))
 
 
-def test_photos_that_are_others_now_are_one_sentence(run, tmp_path):
+def test_photos_that_are_others_now_are_a_clear_error(run, tmp_path):
     with pytest.raises(HyrfDataError, match="name the photos with `data`"):
         photos_of(changed(run, tmp_path / "run", test_every=2))

@@ -199,7 +199,7 @@ def interrupted_at(step: int):
 
 
 @pytest.mark.usefixtures("short", "signals")
-def test_a_run_that_goes_on_keeps_its_budget_and_the_reason(tmp_path, monkeypatch):
+def test_a_run_that_continues_keeps_its_budget_and_the_reason(tmp_path, monkeypatch):
     config = TrainConfig(steps=10)
     train(a_scene(), tmp_path / "whole", config, quiet=True)
     assert train(a_scene(), tmp_path / "again", config, report=interrupted_at(6)).step == 6
@@ -362,7 +362,7 @@ def test_a_short_run_without_a_decision_learns_no_gains():
 
 
 @pytest.mark.usefixtures("short", "signals")
-def test_a_run_that_goes_on_keeps_its_exposure_compensation(tmp_path, monkeypatch):
+def test_a_run_that_continues_keeps_its_exposure_compensation(tmp_path, monkeypatch):
     monkeypatch.setattr(decisions, "MIN_EXPOSURE_STEPS", 10)
     monkeypatch.setattr(decisions, "measure_exposure", lambda *_: (True, "by a coin"))
     scene, config = relit(a_scene(), [0.5, -0.5]), TrainConfig(steps=10)

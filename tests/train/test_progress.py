@@ -212,7 +212,7 @@ def test_compiling_in_the_first_steps_does_not_count_as_slowness(capsys, monkeyp
     assert "2.0 s/step" in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_more_than_an_hour_is_told_once_with_what_would_shorten_it(capsys, monkeypatch):
+def test_more_than_an_hour_is_reported_once_with_what_would_shorten_it(capsys, monkeypatch):
     trained(Clock(monkeypatch), steps=3000, seconds=12.0, count=40, advice="fewer --steps")
     told = [line for line in capsys.readouterr().err.splitlines() if "hours" in line]
     assert told == ["this takes 10.0 more hours; fewer --steps would shorten it"]
@@ -236,7 +236,7 @@ def test_quiet_is_not_told_of_hours(capsys, monkeypatch):
 # -- standard error that is not there --------------------------------------------------------------------------------
 
 
-def test_without_standard_error_nothing_is_shown_and_training_goes_on(capsys, monkeypatch):
+def test_without_standard_error_nothing_is_shown_and_training_continues(capsys, monkeypatch):
     monkeypatch.setattr(sys, "stderr", None)
     with ProgressLine(3, 0) as line:
         line.update(3, 1.0, 0.1, 5)

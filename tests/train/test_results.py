@@ -221,7 +221,7 @@ def test_the_log_of_a_completed_run_ends_with_its_scores(full, tmp_path):
 # -- progress --------------------------------------------------------------------------------------------------------
 
 
-def test_all_work_around_the_steps_is_told_with_its_share(tmp_path):
+def test_all_work_around_the_steps_is_reported_with_its_share(tmp_path):
     told: list[tuple[str, int, int]] = []
     train(a_scene(), tmp_path, CONFIG, quiet=True, phase=lambda *progress: told.append(progress))
     assert list(dict.fromkeys(what for what, _, _ in told)) == [

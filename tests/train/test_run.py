@@ -144,13 +144,13 @@ def test_overwriting_replaces_the_run(tmp_path):
     assert json.loads((tmp_path / "metrics.json").read_text())["settings"]["seed"] == 9
 
 
-def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
+def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(HyrfError, match="file is a file, not a folder"):
         train(a_scene(), tmp_path / "file" / "run", CONFIG, quiet=True)
 
 
-def test_resuming_nothing_is_one_sentence(tmp_path):
+def test_resuming_nothing_is_a_clear_error(tmp_path):
     with pytest.raises(HyrfError, match="no checkpoint to resume; leave out `resume=True`"):
         train(a_scene(), tmp_path / "run", CONFIG, resume=True, quiet=True)
     assert not (tmp_path / "run").exists()

@@ -162,7 +162,7 @@ def test_one_camera_without_points_frames_what_is_in_front_of_it():
     assert frame.scale == 1
 
 
-def test_a_camera_that_is_nowhere_is_refused():
+def test_a_camera_that_is_nowhere_is_rejected():
     camera = camera_at((3.0, 0, 0))
     camera.camera_from_world[0, 3] = np.nan
     with pytest.raises(HyrfDataError, match="not finite"):
@@ -417,7 +417,7 @@ def test_building_leaves_the_global_generators_alone():
     assert torch.equal(torch.rand(3), expected[0]) and np.array_equal(np.random.rand(3), expected[1])
 
 
-def test_a_scene_without_training_views_is_refused():
+def test_a_scene_without_training_views_is_rejected():
     scene = ball_scene()
     with pytest.raises(HyrfTrainingError, match="no views are left for training"):
         build_model(Scene("s", "colmap", [], scene.train, scene.points, scene.point_colors), TrainConfig())

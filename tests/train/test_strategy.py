@@ -68,7 +68,7 @@ def test_a_strategy_of_ones_own_decides_which_gaussians_there_are():
     assert strategy.steps == list(range(1, 13)) and strategy.sizes == [(24, 24)] * 12
 
 
-def test_it_goes_on_from_a_checkpoint_with_what_it_had_collected(tmp_path):
+def test_it_continues_from_a_checkpoint_with_what_it_had_collected(tmp_path):
     whole, first, then = a_trainer(LeastSeen()), a_trainer(LeastSeen()), a_trainer(LeastSeen())
     whole.run()
     first.run(checkpoint=tmp_path / "checkpoint", stop=lambda: first.step == 6)

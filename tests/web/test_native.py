@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scenes import camera_at, moved
+from scenes import camera_at, shift_cameras
 from web.pages import Browser, json_of, psnr, shown, until
 
 from hyrfpack.format.codec import encode_model
@@ -62,7 +62,7 @@ def made_up(count: int = 2600, seed: int = 0, **config: object) -> HybridModel:
 def cameras(width: int = 120, height: int = 90) -> list[Camera]:
     """Around, among and away from the Gaussians, in the world."""
     local = [camera_at(place, up=UP, width=width, height=height, focal=100.0) for place in PLACES]
-    return moved([replace(camera, camera_from_world=_scaled(camera)) for camera in local], CENTER)
+    return shift_cameras([replace(camera, camera_from_world=_scaled(camera)) for camera in local], CENTER)
 
 
 def _scaled(camera: Camera) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from made_up_splats import EDITS, LENGTHS, damaged
+from made_up_splats import FILE_EDITS, KEPT_FRACTIONS, damage_file
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats import compressed_ply, ply
@@ -105,13 +105,13 @@ def test_decode_refuses_with_a_sentence(data, words):
 
 @settings(max_examples=40, deadline=None, derandomize=True, database=None)
 @given(
-    edits=EDITS,
-    length=LENGTHS,
+    edits=FILE_EDITS,
+    length=KEPT_FRACTIONS,
 )
 def test_damaged_files_become_splats_or_a_sentence(edits, length):
     data = file_of(5, WORDS, colored=True, rest=9)
     try:
-        splats = ply.decode(damaged(data, edits, length), "a.ply")
+        splats = ply.decode(damage_file(data, edits, length), "a.ply")
     except HyrfDataError as error:
         assert str(error).startswith("a.ply: ")
     else:

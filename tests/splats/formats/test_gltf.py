@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up_splats import made_up
+from made_up_splats import random_splats
 from scipy.spatial.transform import Rotation
 
 from hyrfpack.errors import HyrfDataError
@@ -45,18 +45,18 @@ def glb_of(content: dict, binary: bytes) -> bytes:
 
 @pytest.mark.parametrize("degree", range(4))
 def test_what_is_written_is_read_in_the_same_axes(degree):
-    splats = made_up(degree=degree)
+    splats = random_splats(degree=degree)
     read = gltf.decode(gltf.encode(splats, Hints(Y_DOWN)), "a.glb")
     assert same(read, splats)
     np.testing.assert_array_equal(read.positions, splats.positions.astype(np.float32))
 
 
 def test_the_same_splats_make_the_same_bytes():
-    assert gltf.encode(made_up(), Hints(Z_UP)) == gltf.encode(made_up(), Hints(Z_UP))
+    assert gltf.encode(random_splats(), Hints(Z_UP)) == gltf.encode(random_splats(), Hints(Z_UP))
 
 
 def test_attributes_lie_where_the_specification_says():
-    splats = made_up(3, degree=1)
+    splats = random_splats(3, degree=1)
     data = gltf.encode(splats, Hints(Y_DOWN))
     content = json_of(data)
     primitive = content["meshes"][0]["primitives"][0]
@@ -85,7 +85,7 @@ def test_attributes_lie_where_the_specification_says():
 
 
 def test_viewers_without_the_extension_see_coloured_upright_points():
-    splats = made_up(50)
+    splats = random_splats(50)
     cloud = trimesh.load_scene(io.BytesIO(gltf.encode(splats, Hints(Y_DOWN))), file_type="glb").to_geometry()
     np.testing.assert_allclose(cloud.vertices, splats.positions * (1, -1, -1), atol=1e-6)
     srgb = np.clip(0.5 + splats.harmonics[:, 0] / np.sqrt(4 * np.pi), 0, 1)
@@ -96,7 +96,7 @@ def test_viewers_without_the_extension_see_coloured_upright_points():
 
 @pytest.mark.parametrize("up", [Y_DOWN, -Y_DOWN, Z_UP, -Z_UP, np.array([1.0, 0, 0]), np.array([0.48, -0.6, 0.64])])
 def test_the_node_turns_up_to_y(up):
-    splats = made_up(5)
+    splats = random_splats(5)
     data = gltf.encode(splats, Hints(up))
     turn = Rotation.from_quat(json_of(data)["nodes"][0]["rotation"])
     np.testing.assert_allclose(turn.apply(up), (0, 1, 0), atol=1e-12)
@@ -111,11 +111,11 @@ def test_y_down_turns_by_half_about_x_and_z_up_by_a_quarter():
 
 
 def test_a_scene_far_away_keeps_its_precision():
-    splats = made_up(100, shift=(5e5, -4e6, 120.0))
+    splats = random_splats(100, shift=(5e5, -4e6, 120.0))
     data = gltf.encode(splats, Hints(Z_UP))
     np.testing.assert_allclose(gltf.decode(data, "a.glb").positions, splats.positions, rtol=0, atol=1e-6)
     assert np.abs(json_of(data)["accessors"][0]["max"]).max() < 8
-    assert not local_origin(made_up(100, shift=(2, 2, 2)).positions).any()
+    assert not local_origin(random_splats(100, shift=(2, 2, 2)).positions).any()
 
 
 def test_smaller_integers_strides_and_matrices_of_others_are_read():
@@ -161,7 +161,7 @@ def test_smaller_integers_strides_and_matrices_of_others_are_read():
 
 def test_nothing_is_refused_in_a_sentence():
     with pytest.raises(HyrfDataError, match="no Gaussian"):
-        gltf.encode(made_up()[:0], Hints(Y_DOWN))
+        gltf.encode(random_splats()[:0], Hints(Y_DOWN))
 
 
 @pytest.mark.parametrize(
@@ -180,14 +180,14 @@ def test_nothing_is_refused_in_a_sentence():
     ],
 )
 def test_what_cannot_be_read_is_refused_in_a_sentence(change, sentence):
-    data = gltf.encode(made_up(40, degree=0), Hints(Y_DOWN))
+    data = gltf.encode(random_splats(40, degree=0), Hints(Y_DOWN))
     content = json_of(data)
     change(content)
     with pytest.raises(HyrfDataError, match=f"^a.glb: .*{sentence}"):
         gltf.decode(glb_of(content, data[-content["buffers"][0]["byteLength"] :]), "a.glb")
 
 
-_SMALL = gltf.encode(made_up(3, degree=1), Hints(Y_DOWN))
+_SMALL = gltf.encode(random_splats(3, degree=1), Hints(Y_DOWN))
 
 
 @settings(max_examples=150, deadline=None)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up_splats import EDITS, LENGTHS, damaged
+from made_up_splats import FILE_EDITS, KEPT_FRACTIONS, damage_file
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats import ply
@@ -199,8 +199,8 @@ def test_read_ply_refuses_with_a_sentence(data, words):
 @settings(max_examples=50, deadline=None, derandomize=True, database=None)
 @given(
     text=st.booleans(),
-    edits=EDITS,
-    length=LENGTHS,
+    edits=FILE_EDITS,
+    length=KEPT_FRACTIONS,
 )
 def test_damaged_files_become_splats_or_a_sentence(text, edits, length):
     data = ply.encode(make_splats(5, 0))
@@ -209,7 +209,7 @@ def test_damaged_files_become_splats_or_a_sentence(text, edits, length):
         names = ["x", "y", "z", "nx", "ny", "nz", *NAMES[3:]]
         data = file_of(names, "float", "\n".join(" ".join(map(str, row)) for row in values).encode(), 5, "ascii")
     try:
-        splats = ply.decode(damaged(data, edits, length), "a.ply")
+        splats = ply.decode(damage_file(data, edits, length), "a.ply")
     except HyrfDataError as error:
         assert str(error).startswith("a.ply: ")
     else:

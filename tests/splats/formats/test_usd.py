@@ -7,7 +7,7 @@ from io import BytesIO
 
 import numpy as np
 import pytest
-from made_up_splats import made_up
+from made_up_splats import random_splats
 from scenes import look_at
 from scipy.spatial.transform import Rotation
 
@@ -38,7 +38,7 @@ def opened(pxr, tmp_path, splats: Splats, hints: Hints, extension: str = "usdc",
 @pytest.mark.parametrize("extension", EXTENSIONS)
 @pytest.mark.parametrize("degree", [0, 3])
 def test_what_is_written_is_read_in_the_same_axes(pxr, extension, degree):
-    splats = made_up(degree=degree, shift=(5e5, -4e6, 120.0))
+    splats = random_splats(degree=degree, shift=(5e5, -4e6, 120.0))
     read = usd.decode(usd.encode(splats, Hints(Y_DOWN), extension=extension), "a", extension)
     np.testing.assert_allclose(read.positions, splats.positions, rtol=0, atol=1e-6)
     np.testing.assert_allclose(read.quats, splats.quats, rtol=0, atol=1e-7)
@@ -48,13 +48,13 @@ def test_what_is_written_is_read_in_the_same_axes(pxr, extension, degree):
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
 def test_the_same_splats_make_the_same_bytes(pxr, extension):
-    first, second = (usd.encode(made_up(), Hints(Y_DOWN, CAMERA), extension=extension) for _ in range(2))
+    first, second = (usd.encode(random_splats(), Hints(Y_DOWN, CAMERA), extension=extension) for _ in range(2))
     assert first == second
 
 
 def test_the_validator_of_others_finds_nothing_even_far_away_and_with_scales_of_0(pxr, tmp_path):
     validator = pytest.importorskip("omni.asset_validator")
-    splats = made_up(shift=(1e6, 1e6, 1e6))
+    splats = random_splats(shift=(1e6, 1e6, 1e6))
     splats = replace(splats, scales=np.maximum(splats.scales - 0.02, 0))
     assert (splats.scales == 0).any()
     opened(pxr, tmp_path, splats, Hints(Y_DOWN, CAMERA))
@@ -64,7 +64,7 @@ def test_the_validator_of_others_finds_nothing_even_far_away_and_with_scales_of_
 
 
 def test_usds_own_validators_find_nothing(pxr, tmp_path):
-    stage = opened(pxr, tmp_path, made_up(), Hints(Z_UP, CAMERA), "usdz")
+    stage = opened(pxr, tmp_path, random_splats(), Hints(Z_UP, CAMERA), "usdz")
     registry = pxr("UsdValidation").ValidationRegistry()
     validators = [registry.GetOrLoadValidatorByName(each.name) for each in registry.GetAllValidatorMetadata()]
     assert validators
@@ -75,7 +75,7 @@ def test_usds_own_validators_find_nothing(pxr, tmp_path):
     ("up", "axis"), [(Y_DOWN, "Y"), (Z_UP, "Z"), (-Z_UP, "Y"), (np.array([0.48, -0.6, 0.64]), "Z")]
 )
 def test_the_stage_turns_up_to_its_own(pxr, tmp_path, up, axis):
-    stage = opened(pxr, tmp_path, made_up(5), Hints(up), meters_per_unit=0.25)
+    stage = opened(pxr, tmp_path, random_splats(5), Hints(up), meters_per_unit=0.25)
     assert (stage.GetMetadata("upAxis"), stage.GetMetadata("metersPerUnit")) == (axis, 0.25)
     world = pxr("UsdGeom").Xformable(stage.GetDefaultPrim())
     turned = world.GetLocalTransformation().TransformDir(pxr("Gf").Vec3d(*up))
@@ -84,14 +84,14 @@ def test_the_stage_turns_up_to_its_own(pxr, tmp_path, up, axis):
 
 
 def test_upright_splats_turn_with_their_harmonics(pxr):
-    splats, turn = made_up(), np.diag([1.0, -1.0, -1.0])
+    splats, turn = random_splats(), np.diag([1.0, -1.0, -1.0])
     read = usd.decode(usd.encode(splats, Hints(Y_DOWN), extension="usdc"), "a", "usdc", upright=True)
     np.testing.assert_allclose(read.positions, splats.positions * (1, -1, -1), atol=1e-6)
     np.testing.assert_allclose(read.harmonics, splats.rotated(turn).harmonics, atol=1e-6)
 
 
 def test_the_extent_is_the_box_of_all_points_at_three_sigma(pxr, tmp_path):
-    splats = made_up(30)
+    splats = random_splats(30)
     stage = opened(pxr, tmp_path, splats, Hints(Y_DOWN))
     field = pxr("UsdVol").ParticleField3DGaussianSplat.Get(stage, "/World/Gaussians")
     sphere = np.random.default_rng(0).normal(size=(20_000, 3))
@@ -105,7 +105,7 @@ def test_the_extent_is_the_box_of_all_points_at_three_sigma(pxr, tmp_path):
 
 
 def test_the_camera_projects_as_opencv_does(pxr, tmp_path):
-    splats = made_up(20)
+    splats = random_splats(20)
     up = np.array([0.1, -0.7, 0.2]) / np.sqrt(0.54)
     stage = opened(pxr, tmp_path, splats, Hints(up, CAMERA))
     field, camera = stage.GetPrimAtPath("/World/Gaussians"), stage.GetPrimAtPath("/World/Camera")
@@ -123,14 +123,14 @@ def test_the_camera_projects_as_opencv_does(pxr, tmp_path):
 
 
 def test_files_within_a_package_start_at_multiples_of_64(pxr):
-    data = usd.encode(made_up(), Hints(Y_DOWN), extension="usdz")
+    data = usd.encode(random_splats(), Hints(Y_DOWN), extension="usdz")
     (info,) = zipfile.ZipFile(BytesIO(data)).infolist()
     start = info.header_offset + 30 + sum(np.frombuffer(data, "<u2", 2, info.header_offset + 26).tolist())
     assert start % 64 == 0 and data[start : start + 8] == b"PXR-USDC" and info.compress_type == zipfile.ZIP_STORED
 
 
 def test_no_splats_are_a_field_of_none(pxr):
-    assert len(usd.decode(usd.encode(made_up()[:0], Hints(Y_DOWN), extension="usda"), "a", "usda")) == 0
+    assert len(usd.decode(usd.encode(random_splats()[:0], Hints(Y_DOWN), extension="usda"), "a", "usda")) == 0
 
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
@@ -150,7 +150,7 @@ def test_what_is_no_usd_is_refused_in_a_sentence(pxr, extension):
     ],
 )
 def test_what_does_not_fit_is_refused_in_a_sentence(pxr, old, new, sentence):
-    text = usd.encode(made_up(2, degree=0), Hints(Z_UP), extension="usda").decode()
+    text = usd.encode(random_splats(2, degree=0), Hints(Z_UP), extension="usda").decode()
     assert old in text
     with pytest.raises(HyrfDataError, match=f"^a.usda: .*{sentence}"):
         usd.decode(text.replace(old, new).encode(), "a.usda", "usda")
@@ -159,4 +159,4 @@ def test_what_does_not_fit_is_refused_in_a_sentence(pxr, old, new, sentence):
 def test_without_usd_core_the_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pxr", None)
     with pytest.raises(HyrfError, match="pip install usd-core"):
-        usd.encode(made_up(), Hints(Y_DOWN), extension="usda")
+        usd.encode(random_splats(), Hints(Y_DOWN), extension="usda")

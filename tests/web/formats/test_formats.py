@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up_splats import damaged, made_up
+from made_up_splats import damage_file, random_splats
 from splats.formats import test_compressed_ply, test_ply, test_splat, test_spz
 from splats.formats.test_spz import file_of, sections_of_one
 from web.formats.comparison import PageSplats, read_in_node
@@ -51,8 +51,8 @@ def spz3(splats: Splats) -> bytes:
 
 @pytest.mark.parametrize("ending", IN_NODE)
 def test_files_are_read_as_python_reads_them(ending: str, tmp_path: Path) -> None:
-    kinds = [made_up(count, degree) for count in (0, 1, 600) for degree in range(4)]
-    kinds += [replace(made_up(50, 2), antialiased=True), made_up(300, 1, shift=(4e5, -3e4, 7.0))]
+    kinds = [random_splats(count, degree) for count in (0, 1, 600) for degree in range(4)]
+    kinds += [replace(random_splats(50, 2), antialiased=True), random_splats(300, 1, shift=(4e5, -3e4, 7.0))]
     encode = spz3 if ending == ".spz" else FORMATS[ending].encode
     if ending == ".splat":
         kinds = [splats.with_degree(0) for splats in kinds]
@@ -92,7 +92,7 @@ def test_every_version_of_spz_with_gzip_is_read_as_python_reads_it(tmp_path: Pat
 
 
 def test_spz_4_is_read_or_refused_in_a_sentence_that_says_why(tmp_path: Path) -> None:
-    splats = made_up(200, 3)
+    splats = random_splats(200, 3)
     files = [("a.spz", FORMATS[".spz"].encode(splats, Hints(spz_version=4)))]
     (answer,), _ = read_in_node(tmp_path, files)
     if isinstance(answer, PageSplats):  # where zstd is known
@@ -130,22 +130,24 @@ def test_damaged_files_meet_the_verdict_of_python(tmp_path: Path) -> None:
     rng = np.random.default_rng(7)
     text = " ".join(["0.5"] * 14)
     whole = [
-        ("a.ply", FORMATS[".ply"].encode(made_up(5, 1))),
+        ("a.ply", FORMATS[".ply"].encode(random_splats(5, 1))),
         ("a.ply", test_ply.file_of(test_ply.NAMES, "float", f"{text}\n{text}\n".encode(), 2, "ascii")),
         ("a.ply", test_compressed_ply.file_of(5, test_compressed_ply.WORDS, colored=True, rest=9)),
-        ("a.splat", FORMATS[".splat"].encode(made_up(5, 0))),
+        ("a.splat", FORMATS[".splat"].encode(random_splats(5, 0))),
     ]
     files = []
     for _ in range(100):
         for name, data in whole:
             places = (rng.random(rng.integers(1, 4)) ** 3).clip(0, 0.999)  # mostly near the start
             edits = [(place, rng.bytes(rng.integers(0, 3))) for place in places]
-            files.append((name, damaged(data, edits, rng.choice([1.0, 1.0, 0.9, 0.3]))))
-        inside = bytearray(gzip.decompress(spz3(made_up(20, 1))))
+            files.append((name, damage_file(data, edits, rng.choice([1.0, 1.0, 0.9, 0.3]))))
+        inside = bytearray(gzip.decompress(spz3(random_splats(20, 1))))
         for place in rng.random(2) ** 4:
             inside[int(place * len(inside))] = rng.integers(256)
         files.append(("a.spz", gzip.compress(bytes(inside))))
-        files.append(("a.spz", damaged(spz3(made_up(20, 1)), [(rng.random(), rng.bytes(1))], rng.choice([1.0, 0.7]))))
+        files.append(
+            ("a.spz", damage_file(spz3(random_splats(20, 1)), [(rng.random(), rng.bytes(1))], rng.choice([1.0, 0.7])))
+        )
     refused = assert_same(tmp_path, files)
     assert len(files) / 4 < refused < len(files)
 
@@ -165,7 +167,7 @@ def test_small_files_that_promise_much_take_no_memory(tmp_path: Path) -> None:
 
 
 def test_readers_are_chosen_by_the_ending_or_by_how_a_file_begins(tmp_path: Path) -> None:
-    splats = made_up(3, 1)
+    splats = random_splats(3, 1)
     ply, spz = FORMATS[".ply"].encode(splats), spz3(splats)
     files = [
         ("scene.PLY", ply),

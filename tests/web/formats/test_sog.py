@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up_splats import made_up
+from made_up_splats import random_splats
 from PIL import Image
 from splats.formats.test_sog import packed, webp
 from web.formats.comparison import PageSplats
@@ -72,11 +72,11 @@ def zipped(files: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
 
 
 SPLATS = {
-    **{f"degree {degree}": made_up(300, degree) for degree in range(4)},
-    "one": made_up(1, 2),
-    "none": made_up(0, 3),
-    "antialiased": replace(made_up(70, 1), antialiased=True),
-    "far": made_up(70, 1, shift=(3e4, 0, -2e3)),
+    **{f"degree {degree}": random_splats(300, degree) for degree in range(4)},
+    "one": random_splats(1, 2),
+    "none": random_splats(0, 3),
+    "antialiased": replace(random_splats(70, 1), antialiased=True),
+    "far": random_splats(70, 1, shift=(3e4, 0, -2e3)),
 }
 
 
@@ -165,7 +165,7 @@ def test_what_python_refuses_is_refused_in_a_sentence(reader: Reader, name: str)
 
 def test_spz_4_is_read_where_the_browser_knows_zstd(reader: Reader, shared_data: Path) -> None:
     known = reader.browser.evaluate("try { !!new DecompressionStream('zstd') } catch { false }")
-    data = FORMATS[".spz"].encode(made_up(200, 3), Hints(spz_version=4))
+    data = FORMATS[".spz"].encode(random_splats(200, 3), Hints(spz_version=4))
     answer = reader.read("a.spz", data)
     if known:
         assert isinstance(answer, PageSplats), answer

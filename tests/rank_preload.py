@@ -1,4 +1,4 @@
-"""Loaded by the process that `ranked` forks others from: what takes long is done once, before there are any."""
+"""Loads and compiles what `rank_processes` needs, once, in the process from which it forks others."""
 
 from __future__ import annotations
 
@@ -10,4 +10,4 @@ import hyrfpack.evaluate  # noqa: F401
 from hyrfpack.train import TrainConfig, Trainer
 
 torch.set_num_threads(1)
-Trainer(ball_scene(2, 20, side=16), TrainConfig(steps=1)).run()  # loads the kernels
+Trainer(ball_scene(2, 20, side=16), TrainConfig(steps=1)).run()  # compiles the kernels

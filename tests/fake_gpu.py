@@ -1,7 +1,7 @@
-"""A GPU that is not there: tensors that say they live on CUDA, compute on the CPU, and refuse to mix with others.
+"""A fake GPU for machines without one: tensors that claim to be on CUDA and compute on the CPU.
 
-What a mistake in devices does on a GPU ("expected all tensors to be on the same device", numpy on a CUDA tensor), it
-does here too. Triton's kernels run in its interpreter. What a GPU would be asked to do, `listening` tells.
+A mistake in devices fails here as on a GPU ("expected all tensors to be on the same device", numpy on a CUDA tensor).
+Triton's kernels run in its interpreter. `listen_to_gpu` reports the work that a GPU would be given.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ import torch
 from torch.utils._pytree import tree_leaves, tree_map
 
 aten = torch.ops.aten
-CUDA = torch.device("cuda", 0)
+CUDA_DEVICE = torch.device("cuda", 0)
 
 Listener = Callable[[str, str], None]
 _listeners: list[Listener] = []
 
 
 @contextmanager
-def listening(listener: Listener) -> Iterator[None]:
-    """Within it, the listener is told of what a GPU is asked to do, by kind and name.
+def listen_to_gpu(listener: Listener) -> Iterator[None]:
+    """Call the listener with the kind and name of each operation that a GPU is given inside this context.
 
-    Kinds: a "launch" of a kernel, torch's or Triton's; a "wait" of the host for the device; a "copy" from the host,
-    which is a wait, too, unless it is asked not to block. Views and memory that is not written yet ask for nothing.
+    A "launch" starts a kernel, torch's or Triton's. In a "wait" the host waits for the device. A "copy" from the host
+    is also a wait, unless it is non-blocking. Views and uninitialised memory give the GPU no work.
     """
     _listeners.append(listener)
     try:
@@ -37,35 +37,35 @@ def listening(listener: Listener) -> Iterator[None]:
         _listeners.remove(listener)
 
 
-def _tell(name: str, *kinds: str) -> None:
+def _report_work(name: str, *kinds: str) -> None:
     for listener in _listeners:
         for kind in kinds:
             listener(kind, name)
 
 
-class OnGpu(torch.Tensor):
-    """A tensor that says it is on CUDA; `here` is the CPU tensor behind it."""
+class FakeGpuTensor(torch.Tensor):
+    """A tensor that claims to be on CUDA; `cpu_tensor` is the CPU tensor that holds its values."""
 
-    here: torch.Tensor
+    cpu_tensor: torch.Tensor
 
     @staticmethod
-    def __new__(cls, here: torch.Tensor) -> OnGpu:
+    def __new__(cls, here: torch.Tensor) -> FakeGpuTensor:
         pretended = torch.Tensor._make_wrapper_subclass(
             cls, here.size(), here.stride(), here.storage_offset(), dtype=here.dtype, requires_grad=here.requires_grad
         )
-        pretended.here = here.detach()
+        pretended.cpu_tensor = here.detach()
         return pretended
 
-    device = property(lambda self: CUDA)
+    device = property(lambda self: CUDA_DEVICE)
     is_cuda = property(lambda self: True)
     is_cpu = property(lambda self: False)
 
     def __repr__(self) -> str:
-        return f"OnGpu({self.here})"
+        return f"FakeGpuTensor({self.cpu_tensor})"
 
-    def new_tensor(self, *args: Any, **kwargs: Any) -> OnGpu:
-        _tell("new_tensor", "copy", "wait")
-        return OnGpu(self.here.new_tensor(*args, **kwargs))
+    def new_tensor(self, *args: Any, **kwargs: Any) -> FakeGpuTensor:
+        _report_work("new_tensor", "copy", "wait")
+        return FakeGpuTensor(self.cpu_tensor.new_tensor(*args, **kwargs))
 
     def numpy(self, *_: Any, **__: Any) -> None:
         raise TypeError("can't convert cuda:0 device type tensor to numpy")
@@ -73,67 +73,74 @@ class OnGpu(torch.Tensor):
     __array__ = numpy
 
     def __deepcopy__(self, memo: dict) -> torch.Tensor:
-        copied = OnGpu(self.here.clone()).requires_grad_(self.requires_grad)
+        copied = FakeGpuTensor(self.cpu_tensor.clone()).requires_grad_(self.requires_grad)
         return torch.nn.Parameter(copied, self.requires_grad) if isinstance(self, torch.nn.Parameter) else copied
 
     def data_ptr(self) -> int:
-        return self.here.data_ptr()
+        return self.cpu_tensor.data_ptr()
 
     def tolist(self) -> Any:
-        _tell("tolist", "wait")
-        return self.here.tolist()
+        _report_work("tolist", "wait")
+        return self.cpu_tensor.tolist()
 
     @classmethod
     def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
-        # Indices may lie on the CPU, as those of a list do; they are copied.
+        # Indices may be on the CPU, as those of a list are; torch copies them.
         copies = func in (aten.copy_.default, aten._to_copy.default, aten.index.Tensor)
         for leaf in tree_leaves((args, kwargs)):
-            if isinstance(leaf, torch.Tensor) and not isinstance(leaf, OnGpu) and leaf.ndim and not copies:
+            if isinstance(leaf, torch.Tensor) and not isinstance(leaf, FakeGpuTensor) and leaf.ndim and not copies:
                 raise RuntimeError(f"{func}: expected all tensors to be on the same device, found cuda:0 and cpu")
         if _listeners:
-            _tell(func.overloadpacket.__name__, *_kinds(func, args, kwargs))
-        if func is aten.copy_.default and not isinstance(args[0], OnGpu):
-            args[0].copy_(args[1].here)
+            _report_work(func.overloadpacket.__name__, *_work_kinds(func, args, kwargs))
+        if func is aten.copy_.default and not isinstance(args[0], FakeGpuTensor):
+            args[0].copy_(args[1].cpu_tensor)
             return args[0]
-        result = func(*tree_map(_behind, args), **{**tree_map(_behind, kwargs)})
+        result = func(*tree_map(_unwrap, args), **{**tree_map(_unwrap, kwargs)})
         for name, value in zip(func._schema.arguments, args, strict=False):
             if name.alias_info is not None and name.alias_info.is_write:
-                return value if isinstance(result, torch.Tensor) else tree_map(_pretend, result)
-        return tree_map(_pretend, result)
+                return value if isinstance(result, torch.Tensor) else tree_map(_wrap, result)
+        return tree_map(_wrap, result)
 
 
-# They give memory, or an answer that needs no look at the numbers.
-NO_LAUNCH = ("_unsafe_view", "empty_like", "empty_strided", "is_same_size", "new_empty", "new_empty_strided")
+# These operations only allocate memory, or answer without looking at the values.
+OPERATIONS_WITHOUT_LAUNCH = (
+    "_unsafe_view",
+    "empty_like",
+    "empty_strided",
+    "is_same_size",
+    "new_empty",
+    "new_empty_strided",
+)
 
 
-def _kinds(func: Any, args: tuple, kwargs: dict) -> Iterator[str]:
-    """What one of torch's operations asks of a GPU."""
+def _work_kinds(func: Any, args: tuple, kwargs: dict) -> Iterator[str]:
+    """Yield what kinds of work one of torch's operations gives a GPU."""
     name, second = func.overloadpacket.__name__, args[1] if len(args) > 1 else None
-    if name == "_local_scalar_dense" or (name == "copy_" and not isinstance(args[0], OnGpu)):
+    if name == "_local_scalar_dense" or (name == "copy_" and not isinstance(args[0], FakeGpuTensor)):
         yield "wait"
         return
-    if name == "copy_" and not isinstance(second, OnGpu):
+    if name == "copy_" and not isinstance(second, FakeGpuTensor):
         yield from ("copy",) if len(args) > 2 and args[2] else ("copy", "wait")
         return
     leaves = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor) and leaf.ndim]
-    if not all(isinstance(leaf, OnGpu) for leaf in leaves):
+    if not all(isinstance(leaf, FakeGpuTensor) for leaf in leaves):
         yield from ("copy", "wait")
     elif name.startswith("index") and isinstance(second, list | tuple):
         if any(index is not None and index.dtype in (torch.bool, torch.uint8) for index in second):
-            yield "wait"  # how many a mask holds, the device knows
+            yield "wait"  # only the device knows how many elements a mask selects
     elif {torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape} & set(func.tags):
         yield "wait"
-    if not (func.is_view or name in NO_LAUNCH):
+    if not (func.is_view or name in OPERATIONS_WITHOUT_LAUNCH):
         yield "launch"
 
 
-def _behind(value: Any) -> Any:
-    return value.here if isinstance(value, OnGpu) else value
+def _unwrap(value: Any) -> Any:
+    return value.cpu_tensor if isinstance(value, FakeGpuTensor) else value
 
 
-def _pretend(value: Any) -> Any:
-    return OnGpu(value) if isinstance(value, torch.Tensor) and not isinstance(value, OnGpu) else value
+def _wrap(value: Any) -> Any:
+    return FakeGpuTensor(value) if isinstance(value, torch.Tensor) and not isinstance(value, FakeGpuTensor) else value
 
 
 def _is_cuda(value: Any) -> bool:
@@ -142,76 +149,88 @@ def _is_cuda(value: Any) -> bool:
     return isinstance(value, str) and value.partition(":")[0] == "cuda"
 
 
-FACTORIES = ("arange", "as_tensor", "empty", "eye", "full", "linspace", "ones", "rand", "randint", "randn", "tensor")
-FACTORIES += ("zeros", "empty_like", "full_like", "ones_like", "zeros_like")
-_to = torch.Tensor.to
+TENSOR_FACTORIES = (
+    "arange",
+    "as_tensor",
+    "empty",
+    "eye",
+    "full",
+    "linspace",
+    "ones",
+    "rand",
+    "randint",
+    "randn",
+    "tensor",
+)
+TENSOR_FACTORIES += ("zeros", "empty_like", "full_like", "ones_like", "zeros_like")
+_original_to = torch.Tensor.to
 
 
-def _makes(factory: Callable) -> Callable:
-    """A factory function that knows the device."""
+def _wrap_factory(factory: Callable) -> Callable:
+    """Wrap a factory function of torch so that it can create tensors on the fake GPU."""
 
     def make(*args: Any, **kwargs: Any) -> torch.Tensor:
         kwargs.pop("pin_memory", None)
         if not _is_cuda(kwargs.get("device")):
             return factory(*args, **kwargs)
         if factory.__name__ in ("as_tensor", "tensor"):
-            _tell(factory.__name__, "copy", "wait")
+            _report_work(factory.__name__, "copy", "wait")
         elif not factory.__name__.startswith("empty"):
-            _tell(factory.__name__, "launch")
-        return OnGpu(factory(*tree_map(_behind, args), **{**kwargs, "device": "cpu"}))
+            _report_work(factory.__name__, "launch")
+        return FakeGpuTensor(factory(*tree_map(_unwrap, args), **{**kwargs, "device": "cpu"}))
 
     return make
 
 
 def _move(tensor: torch.Tensor, *args: Any, **kwargs: Any) -> torch.Tensor:
-    """`Tensor.to`."""
+    """Replace `Tensor.to`."""
     other = next((v for v in args if isinstance(v, torch.Tensor)), None)
     places = [v for v in (*args, kwargs.get("device"), getattr(other, "device", None)) if v is not None]
     place = next((torch.device(v) for v in places if isinstance(v, torch.device | str)), tensor.device)
     dtypes = [v for v in (*args, kwargs.get("dtype"), getattr(other, "dtype", None)) if isinstance(v, torch.dtype)]
-    if isinstance(tensor, OnGpu) != (place.type == "cuda"):
-        blocks = isinstance(tensor, OnGpu) or not kwargs.get("non_blocking")
-        kinds = [] if isinstance(tensor, OnGpu) else ["copy"]
-        _tell(f"to {place.type}", *kinds, *["wait"] * blocks)
-        tensor = (_ToCpu if isinstance(tensor, OnGpu) else _ToGpu).apply(tensor)
-    return _to(tensor, dtypes[0]) if dtypes else tensor
+    if isinstance(tensor, FakeGpuTensor) != (place.type == "cuda"):
+        blocks = isinstance(tensor, FakeGpuTensor) or not kwargs.get("non_blocking")
+        kinds = [] if isinstance(tensor, FakeGpuTensor) else ["copy"]
+        _report_work(f"to {place.type}", *kinds, *["wait"] * blocks)
+        tensor = (_ToCpu if isinstance(tensor, FakeGpuTensor) else _ToGpu).apply(tensor)
+    return _original_to(tensor, dtypes[0]) if dtypes else tensor
 
 
 class _ToGpu(torch.autograd.Function):
     @staticmethod
     def forward(ctx, tensor):
-        return OnGpu(tensor.detach().clone())
+        return FakeGpuTensor(tensor.detach().clone())
 
     @staticmethod
     def backward(ctx, grad):
-        _tell("to cpu", "wait")
-        return grad.here
+        _report_work("to cpu", "wait")
+        return grad.cpu_tensor
 
 
 class _ToCpu(torch.autograd.Function):
     @staticmethod
     def forward(ctx, tensor):
-        return tensor.here.clone()
+        return tensor.cpu_tensor.clone()
 
     @staticmethod
     def backward(ctx, grad):
-        _tell("to cuda", "copy", "wait")
-        return OnGpu(grad)
+        _report_work("to cuda", "copy", "wait")
+        return FakeGpuTensor(grad)
 
 
 @contextmanager
-def pretended_gpu() -> Iterator[torch.device]:
-    """Within it, torch seems to have one CUDA device, which is what is yielded."""
+def use_fake_gpu() -> Iterator[torch.device]:
+    """Make torch see one CUDA device inside this context, and yield that device."""
     interpreter = pytest.importorskip("triton.runtime.interpreter", reason="Triton is not installed")
     launch = interpreter.GridExecutor.__call__
 
     def on_the_cpu(self, *args, **kwargs):
-        _tell(self.fn.__name__, "launch")
-        return launch(self, *tree_map(_behind, args), **tree_map(_behind, kwargs))
+        _report_work(self.fn.__name__, "launch")
+        return launch(self, *tree_map(_unwrap, args), **tree_map(_unwrap, kwargs))
 
     properties = SimpleNamespace(multi_processor_count=2, total_memory=1 << 33, name="a GPU that is not there")
     with (
-        # Modules get new parameters when they move, for old ones are of another type.
+        # A module gets new parameters when it moves, because the old ones are of another type.
         mock.patch.object(torch.__future__, "get_overwrite_module_params_on_conversion", lambda: True),
         mock.patch.object(torch.cuda, "is_available", lambda: True),
         mock.patch.object(torch.cuda, "device_count", lambda: 1),
@@ -224,6 +243,6 @@ def pretended_gpu() -> Iterator[torch.device]:
         mock.patch.object(interpreter.GridExecutor, "__call__", on_the_cpu),
         mock.patch.object(torch.Tensor, "to", _move),
         mock.patch.object(torch.Tensor, "cpu", lambda tensor: _move(tensor, "cpu")),
-        mock.patch.multiple(torch, **{name: _makes(getattr(torch, name)) for name in FACTORIES}),
+        mock.patch.multiple(torch, **{name: _wrap_factory(getattr(torch, name)) for name in TENSOR_FACTORIES}),
     ):
-        yield CUDA
+        yield CUDA_DEVICE

@@ -1,0 +1,263 @@
+"""Functions that tests run in several processes by `rank_processes.run_on_ranks`."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+import torch
+import torch.distributed as dist
+from scenes import alternating_gains, ball_scene, exposed_scene
+
+from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.parallel.ranks import Ranks, join_processes
+from hyrfpack.scene import Picture, Scene
+from hyrfpack.train import DensityConfig, TrainConfig, Trainer, train
+from hyrfpack.train import trainer as trainers
+from hyrfpack.train.distributed import average_gradients, digest
+
+DENSITY_CONFIG = DensityConfig(start=0.05, stop=0.68, peak=0.4, excess=1.5, rounds=5, gradient=1e-5, resets=1)
+# Two processes take 60 steps. Density control acts after every 7th step from 3 to 38, and the last rounds prune.
+SIX_PHOTO_CONFIG = TrainConfig(steps=400, seed=3, max_gaussians=80, density=DENSITY_CONFIG)
+# Three photos for two processes, so that in some steps both render the same photo.
+EXPOSURE_CONFIG = dataclasses.replace(SIX_PHOTO_CONFIG, steps=59, exposure=True)
+RUN_CONFIG = dataclasses.replace(SIX_PHOTO_CONFIG, steps=60, checkpoint_every=5)
+
+
+def six_photo_scene() -> Scene:
+    return ball_scene(views=6, points=60, side=24)
+
+
+def three_photo_scene() -> Scene:
+    return exposed_scene(alternating_gains(3), side=32, points=60)
+
+
+def held_out_scene() -> Scene:
+    scene = ball_scene(views=7, points=60, side=24)
+    return dataclasses.replace(scene, train=scene.train[2:], test=scene.train[:2])
+
+
+def error_message(work: Callable[[], object]) -> str | None:
+    """Call a function and return the text of the HyrfError that it raises, or None."""
+    try:
+        work()
+    except HyrfError as error:
+        return str(error)
+    return None
+
+
+# -- collective operations -------------------------------------------------------------------------------------------
+
+
+def call_collectives(ranks: Ranks) -> dict:
+    """Call each collective operation once and return what it gives."""
+
+    def refuse(who: int) -> Callable[[], None]:
+        def work() -> None:
+            if ranks.rank >= who:
+                raise HyrfDataError(f"photo {ranks.rank} is bad")
+
+        return work
+
+    weight, idle = torch.nn.Parameter(torch.zeros(2, 3)), torch.nn.Parameter(torch.zeros(2))
+    weight.grad = torch.full((2, 3), float(ranks.rank))
+    sums = average_gradients(ranks, [weight, idle], torch.tensor([1.0, ranks.rank]))
+    with join_processes() as again:
+        pass
+    return {
+        "ranks": ranks,
+        "joined again": again,
+        "still initialized": dist.is_initialized(),
+        "gathered": ranks.all_gather({"rank": ranks.rank}),
+        "broadcast": ranks.broadcast(("by", ranks.rank)),
+        "summed": ranks.all_reduce(torch.tensor([1.0, ranks.rank])).tolist(),
+        "returned": ranks.run_on_all(lambda: ranks.rank * 10),
+        "error on the last": error_message(lambda: ranks.run_on_all(refuse(ranks.size - 1))),
+        "error on all": error_message(lambda: ranks.run_on_all(refuse(0))),
+        "averaged": weight.grad.tolist(),
+        "averaged of idle": None if idle.grad is None else idle.grad.tolist(),
+        "sums": sums.tolist(),
+        "threads": os.environ["HYRFPACK_THREADS"],
+    }
+
+
+def exit_one_rank(ranks: Ranks, leaver: int) -> None:
+    """End one process silently, while the others call a collective operation."""
+    ranks.all_gather("here")
+    if ranks.rank == leaver:
+        os._exit(0)
+    ranks.all_reduce(torch.ones(3))
+
+
+# -- training --------------------------------------------------------------------------------------------------------
+
+
+def record_training(ranks: Ranks, scene: Scene, config: TrainConfig) -> dict:
+    """Train a run and return its curve, a digest of the parameters after each step and the final parameters."""
+    trainer, rows, digests = Trainer(scene, config, ranks=ranks), [], []
+
+    def report(trainer: Trainer, loss: float, error: float) -> None:
+        rows.append((loss, error, len(trainer.model)))
+        digests.append(digest(trainer.model.parameters()))
+
+    assert trainer.run(report=report)
+    gains = None if trainer.exposures is None else trainer.exposures.values.detach().numpy()
+    parameters = {name: p.detach().numpy() for name, p in trainer.model.named_parameters()}
+    return {"rows": rows, "digests": digests, "gains": gains, "records": trainer.records, "parameters": parameters}
+
+
+def train_both_scenes(ranks: Ranks) -> list[dict]:
+    return [
+        record_training(ranks, six_photo_scene(), SIX_PHOTO_CONFIG),
+        record_training(ranks, three_photo_scene(), EXPOSURE_CONFIG),
+    ]
+
+
+def signal_at_step(number: int, at: int) -> Callable[[int, float, float, int], None]:
+    """Return a report function that sends its own process a signal after a step."""
+
+    def report(step: int, loss: float, error: float, gaussians: int) -> None:
+        if step == at:
+            os.kill(os.getpid(), number)
+
+    return report
+
+
+def report_nothing(step: int, loss: float, error: float, gaussians: int) -> None:
+    pass
+
+
+def train_run(ranks: Ranks, out: Path, resume: bool = False, overwrite: bool = False) -> tuple[bool, int, bool]:
+    result = train(
+        held_out_scene(),
+        out,
+        RUN_CONFIG,
+        ranks=ranks,
+        resume=resume,
+        overwrite=overwrite,
+        device="cpu",
+        report=report_nothing,
+    )
+    return result.complete, result.step, bool(result.metrics)
+
+
+def train_and_kill(ranks: Ranks, out: Path, who: int, step: int) -> None:
+    report = signal_at_step(signal.SIGKILL, step) if ranks.rank == who else report_nothing
+    train(held_out_scene(), out, RUN_CONFIG, ranks=ranks, device="cpu", report=report)
+
+
+def stop_and_resume(ranks: Ranks, whole: Path, parts: Path, alone: Path) -> dict:
+    """Train one run without a stop, and one that rank 1 stops twice; resume one that a single process has started.
+
+    Returns:
+        For each run whether it completed, its last step and whether it has metrics; the errors; whether the checkpoint
+        is kept.
+    """
+    said = {"whole": train_run(ranks, whole)}
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    # All ranks receive the stop with the next step: before the first regular checkpoint, and between density rounds.
+    for name, step in (("first", 2), ("second", 16)):
+        report = signal_at_step(signal.SIGTERM, step) if ranks.rank == 1 else report_nothing
+        result = train(
+            held_out_scene(), parts, RUN_CONFIG, ranks=ranks, resume=name == "second", device="cpu", report=report
+        )
+        said[name] = result.complete, result.step, bool(result.metrics)
+    said["other size"] = error_message(lambda: train_run(ranks, alone, resume=True))
+    said["there already"] = error_message(lambda: train_run(ranks, whole))
+    said["checkpoint stays"] = ranks.run_on_all((parts / "checkpoint.pt").is_file)
+    return said
+
+
+def train_after_restart(ranks: Ranks, out: Path) -> list[tuple[bool, int, bool]]:
+    """Train as after a restart by torchrun, first in an empty folder, then in one with a checkpoint."""
+    again = dataclasses.replace(ranks, restarts=1)
+    steps: list[int] = []
+    first = train(
+        held_out_scene(),
+        out / "none",
+        dataclasses.replace(RUN_CONFIG, steps=4),
+        ranks=again,
+        device="cpu",
+        report=report_nothing,
+    )
+    train(
+        held_out_scene(),
+        out / "some",
+        RUN_CONFIG,
+        ranks=again,
+        device="cpu",
+        report=lambda step, *_: steps.append(step),
+    )
+    return [first.step, steps]
+
+
+# -- errors ----------------------------------------------------------------------------------------------------------
+
+
+def collect_errors(ranks: Ranks) -> dict[str, str | None]:
+    """Return the error of each input that one rank alone, or all ranks, cannot use."""
+
+    def unreadable() -> NoReturn:
+        raise HyrfDataError("003.png: cannot be read")
+
+    def scene_with(load: Callable[[], Picture]) -> Scene:
+        scene = six_photo_scene()
+        view = scene.train[3]
+        scene.train[3] = dataclasses.replace(view, load=load)
+        return scene
+
+    broken = np.array(six_photo_scene().train[3].load().rgb, np.float32)
+    broken[3, 5, 1] = np.nan
+    short = dataclasses.replace(SIX_PHOTO_CONFIG, steps=12)
+    mine = ranks.rank == 1
+    fewer = dataclasses.replace(six_photo_scene(), train=six_photo_scene().train[:5])
+    cases: dict[str, Callable[[], object]] = {
+        "photo": lambda: record_training(ranks, scene_with(unreadable) if mine else six_photo_scene(), short),
+        "nan": lambda: record_training(ranks, scene_with(lambda: Picture(broken)), short),
+        "nan on one": lambda: record_training(
+            ranks, scene_with(lambda: Picture(broken)) if mine else six_photo_scene(), short
+        ),
+        "seed": lambda: record_training(
+            ranks, six_photo_scene(), dataclasses.replace(short, seed=4) if mine else short
+        ),
+        "photos": lambda: record_training(ranks, fewer if mine else six_photo_scene(), short),
+    }
+    said = {name: error_message(case) for name, case in cases.items()}
+    version, trainers.__version__ = trainers.__version__, "0.0" if mine else trainers.__version__
+    said["version"] = error_message(lambda: record_training(ranks, six_photo_scene(), short))
+    trainers.__version__ = version
+    said["checkpoint"] = error_message(lambda: Trainer(six_photo_scene(), short, ranks=ranks).load(Path("nowhere.pt")))
+    said["none"] = error_message(lambda: record_training(ranks, six_photo_scene(), short))
+    return said
+
+
+def collect_setup_errors(ranks: Ranks, out: Path) -> dict[str, str | None]:
+    """Return the errors with which `train` ends on all ranks before the first step."""
+    scene = held_out_scene()
+    held_out = [dataclasses.replace(scene.test[0], load=_unreadable)]
+    bad = dataclasses.replace(scene, test=held_out)
+    return {
+        "held out": error_message(
+            lambda: train(bad, out, RUN_CONFIG, ranks=ranks, device="cpu", report=report_nothing)
+        ),
+        "nothing to resume": error_message(lambda: train_run(ranks, out, resume=True)),
+        "device": error_message(
+            lambda: train(
+                held_out_scene(),
+                out,
+                RUN_CONFIG,
+                ranks=ranks,
+                device="what" if ranks.rank else "cpu",
+                report=report_nothing,
+            )
+        ),
+    }
+
+
+def _unreadable() -> NoReturn:
+    raise HyrfDataError("held.png: cannot be read")
