@@ -100,8 +100,9 @@ def pending_file(
     try:
         make_folder(Path(os.path.realpath(path)).parent)
         if overwrite and os.path.exists(path) and not os.path.isfile(path):
-            kind = "folder; name a file in it" if os.path.isdir(path) else "device or a pipe; name a file"
-            raise HyrfError(f"{path}: this is a {kind}")
+            if os.path.isdir(path):
+                raise HyrfError(f"{path}: this is a folder", fix="name a file in it")
+            raise HyrfError(f"{path}: this is a device or a pipe", fix="name a file")
         target = Path(os.path.realpath(path) if overwrite else os.path.join(os.path.realpath(path.parent), path.name))
         with _temporary_file(target.parent) as temporary:
             pending = PendingFile(temporary, path)
@@ -114,7 +115,7 @@ def pending_file(
                 pending.path = path.with_name(_move_to_free_name(temporary, target, rename).name)
         _sync_folder(target.parent)
     except OSError as error:
-        raise HyrfError(_write_error_message(path, length, error)) from error
+        raise _write_error(path, length, error) from error
 
 
 def numbered_names(path: Path) -> Iterator[Path]:
@@ -154,8 +155,8 @@ def _move_to_free_name(temporary: Path, target: Path, rename: bool) -> Path:
         except FileExistsError:
             if not rename:
                 raise HyrfError(
-                    f"{target}: another program created this file in the meantime, and it is kept; name another place, "
-                    "or replace it with `overwrite=True`"
+                    f"{target}: another program created this file in the meantime, and it is kept",
+                    fix="name another place, or replace it with `overwrite=True`",
                 ) from None
     raise AssertionError("numbers never end")
 
@@ -189,7 +190,8 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise HyrfError(
-            f"{path}: the folder cannot be made ({error.strerror or error}); choose another place"
+            f"{path}: the folder cannot be made ({error.strerror or error})",
+            fix="choose another place",
         ) from error
 
 
@@ -204,7 +206,8 @@ def check_writable(folder: Path) -> None:
             pass
     except OSError as error:
         raise HyrfError(
-            f"{folder}: no file can be made in this folder ({error.strerror or error}); choose another place"
+            f"{folder}: no file can be made in this folder ({error.strerror or error})",
+            fix="choose another place",
         ) from error
 
 
@@ -270,12 +273,18 @@ def _sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-def _write_error_message(path: str | os.PathLike[str], length: int | None, error: OSError) -> str:
+def _write_error(path: str | os.PathLike[str], length: int | None, error: OSError) -> HyrfError:
+    """Return the error for a file that the system could not write; `length` is its size in bytes, if it is known."""
     size = "some space" if length is None else f"{length:,} bytes"
     if error.errno == errno.ENOSPC:
-        return f"{path}: the disk is full and this file was not written; free {size} and try again"
+        return HyrfError(f"{path}: the disk is full and this file was not written", fix=f"free {size} and try again")
     if error.errno == errno.EDQUOT:
-        return f"{path}: your quota is used up and this file was not written; free {size} and try again"
+        return HyrfError(
+            f"{path}: your quota is used up and this file was not written", fix=f"free {size} and try again"
+        )
     if error.errno == errno.EFBIG:
-        return f"{path}: so large a file is not allowed here (see 'ulimit -f'); choose another place"
-    return f"{path}: the file cannot be written ({error.strerror or error}); choose another place or repair this one"
+        return HyrfError(f"{path}: so large a file is not allowed here (see 'ulimit -f')", fix="choose another place")
+    return HyrfError(
+        f"{path}: the file cannot be written ({error.strerror or error})",
+        fix="choose another place or repair this one",
+    )

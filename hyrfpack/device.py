@@ -46,13 +46,13 @@ def choose_device(
     if isinstance(name, torch.device):
         name = str(name) if name.type == "cuda" else name.type
     if not re.fullmatch(r"auto|cpu|mps|cuda(:[0-9]{1,3})?", name):
-        raise HyrfError(f"'{name}' is not a device; use auto, cpu, cuda, cuda:N or mps")
+        raise HyrfError(f"'{name}' is not a device", fix="use auto, cpu, cuda, cuda:N or mps")
     kind, _, number = name.partition(":")
     # Asking torch for GPUs marks later forks as bad, also on a machine without a GPU; hence the check is_available().
     if kind in ("auto", "cuda") and torch.cuda._is_in_bad_fork() and torch.cuda.is_available():
         raise HyrfError(
-            "this process was forked from one that uses the GPU, and cannot use it too; start it with "
-            "multiprocessing's method 'spawn', or take the device 'cpu'"
+            "this process was forked from one that uses the GPU, and cannot use it too",
+            fix="start it with multiprocessing's method 'spawn', or take the device 'cpu'",
         )
     if kind == "auto":
         kind = name = "cuda" if torch.cuda.is_available() and has_triton() else "cpu"
@@ -61,7 +61,8 @@ def choose_device(
         if int(number or 0) >= count:
             there = f"torch sees {count} of them" if count else "torch sees no NVIDIA or AMD GPU"
             raise HyrfError(
-                f"device '{name}' is not there, {there}; install a GPU build of torch or use `device='cpu'`"
+                f"device '{name}' is not there, {there}",
+                fix="install a GPU build of torch or use `device='cpu'`",
             )
         if not has_triton():
             say(NO_TRITON_NOTE)
@@ -70,7 +71,7 @@ def choose_device(
         make_current(torch.device(name))
     if kind == "mps":
         if not torch.backends.mps.is_available():
-            raise HyrfError("device 'mps' is not there, torch sees no Apple GPU; use `device='cpu'`")
+            raise HyrfError("device 'mps' is not there, torch sees no Apple GPU", fix="use `device='cpu'`")
         say(NO_METAL_NOTE)
     return torch.device(name)
 
@@ -94,8 +95,8 @@ def choose_own_device(
         gpus = ranks.all_gather(str(torch.cuda.get_device_properties(device).uuid))
         if len(set(gpus)) < len(gpus):
             raise HyrfError(
-                f"{ranks.size} processes have {len(set(gpus))} GPUs between them, and each needs its own; start as "
-                "many as there are GPUs, with `device='cuda'`, or use `device='cpu'`"
+                f"{ranks.size} processes have {len(set(gpus))} GPUs between them, and each needs its own",
+                fix="start as many as there are GPUs, with `device='cuda'`, or use `device='cpu'`",
             )
     return device
 

@@ -1,13 +1,17 @@
 """The errors that a user can cause and correct.
 
-Each message is one sentence that says what is wrong, where, and what to do. The command line prints it and exits with
-code 2. Any other exception is a bug in hyrfpack and keeps its traceback.
+Each error has a problem (what happened, and where) and a fix (what to do next). The command line prints both as one
+line and exits with code 2. Any other exception is a bug in hyrfpack and keeps its traceback.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
+from typing import TypeVar
+
+ErrorT = TypeVar("ErrorT", bound="HyrfError")
 
 
 def printable(text: str) -> str:
@@ -18,11 +22,32 @@ def printable(text: str) -> str:
 class HyrfError(Exception):
     """The input or the request is wrong, and the user can correct it.
 
-    Messages quote hostile files, so every message is made `printable`.
+    `str(error)` is one line, "problem; fix". Both parts are made `printable`, because they quote hostile files.
+
+    Attributes:
+        problem: what happened, and where: the path, the setting, the value. Contents of files are quoted here alone.
+        fix: what to do next, as an instruction to a user of the library. Settings are Python arguments in backticks:
+            "replace it with `overwrite=True`". The command line writes its options in their place, in the fix only.
+
+    Example:
+        >>> from hyrfpack.errors import HyrfError
+        >>> error = HyrfError("out.hyrf: there is a file of this name", fix="replace it with `overwrite=True`")
+        >>> print(error)
+        out.hyrf: there is a file of this name; replace it with `overwrite=True`
     """
 
-    def __init__(self, sentence: str) -> None:
-        super().__init__(printable(sentence))
+    def __init__(self, problem: str, fix: str) -> None:
+        self.problem, self.fix = printable(problem), printable(fix)
+        super().__init__(self.problem, self.fix)  # the arguments from which an error is made again when it is copied
+
+    def __str__(self) -> str:
+        return f"{self.problem}; {self.fix}"
+
+    def with_text(self: ErrorT, problem: str | None = None, fix: str | None = None) -> ErrorT:
+        """Return a copy of the error, of the same type and with the same attributes, with another problem or fix."""
+        error = copy(self)
+        HyrfError.__init__(error, self.problem if problem is None else problem, self.fix if fix is None else fix)
+        return error
 
 
 class HyrfDataError(HyrfError):
@@ -44,8 +69,8 @@ class HyrfSizeError(HyrfError):
         min_bytes: approximate size of the smallest file that holds the model; 0 where that is not known.
     """
 
-    def __init__(self, sentence: str, min_bytes: int = 0) -> None:
-        super().__init__(sentence)
+    def __init__(self, problem: str, fix: str, min_bytes: int = 0) -> None:
+        super().__init__(problem, fix)
         self.min_bytes = min_bytes
 
 
@@ -54,8 +79,8 @@ class HyrfTrainingError(HyrfError):
 
 
 def strip_path(error: HyrfError, path: object) -> str:
-    """Return an error's message without the path at its start, for a sentence that names the file itself."""
-    return str(error).removeprefix(f"{printable(str(path))}: ")
+    """Return an error's problem without the path at its start, for a sentence that names the file itself."""
+    return error.problem.removeprefix(f"{printable(str(path))}: ")
 
 
 def short_reason(error: Exception, max_length: int = 120) -> str:
@@ -77,4 +102,4 @@ def needs_package(package: str, task: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise HyrfError(f"{task} needs {package}; run 'pip install {package}'") from error
+        raise HyrfError(f"{task} needs {package}", fix=f"run 'pip install {package}'") from error

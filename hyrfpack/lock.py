@@ -79,8 +79,8 @@ def _lock(folder: Path, remedy: str) -> int | None:
         except BlockingIOError:
             os.close(handle)
             raise HyrfError(
-                f"{folder}: another hyrfpack command is at work in this folder; wait until it has ended, or name "
-                f"{remedy}"
+                f"{folder}: another hyrfpack command is at work in this folder",
+                fix=f"wait until it has ended, or name {remedy}",
             ) from None
         except OSError:  # this file system has no locks
             return handle

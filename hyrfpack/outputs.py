@@ -101,18 +101,20 @@ class Outputs:
         """
         path = Path(path)
         if os.path.isdir(path):
-            raise HyrfError(f"{path}: this is a folder; name a file in it")
+            raise HyrfError(f"{path}: this is a folder", fix="name a file in it")
         self._check(path)
         if endings and not str(path).lower().endswith(endings):
-            raise HyrfError(f"{path}: what is written here ends in {' or '.join(endings)}; name the file so")
+            raise HyrfError(f"{path}: what is written here ends in {' or '.join(endings)}", fix="name the file so")
         if os.path.lexists(path):
             if not self.overwrite:
                 raise HyrfError(
-                    f"{path}: there is a file of this name; name another, or replace it with `overwrite=True`"
+                    f"{path}: there is a file of this name",
+                    fix="name another, or replace it with `overwrite=True`",
                 )
         elif not self.overwrite and _belongs_to_photo_set(_resolved_folder(path)):
             raise HyrfError(
-                f"{path}: photos or poses lie in this folder; name another, or write there with `overwrite=True`"
+                f"{path}: photos or poses lie in this folder",
+                fix="name another, or write there with `overwrite=True`",
             )
         _check_name_lengths([path])
         _check_folder(_resolved_folder(path))
@@ -125,7 +127,7 @@ class Outputs:
             names: paths of the files, relative to the folder.
         """
         if os.path.lexists(folder) and not os.path.isdir(folder):
-            raise HyrfError(f"{folder}: this is a file; name a folder")
+            raise HyrfError(f"{folder}: this is a file", fix="name a folder")
         paths = [Path(folder, name) for name in names]
         folders = list(dict.fromkeys((Path(folder), *(path.parent for path in paths))))
         for place in folders:
@@ -138,13 +140,14 @@ class Outputs:
                 more = f" and {len(existing) - 1} more" if len(existing) > 1 else ""
                 raise HyrfError(
                     f"{folder}: {existing[0].relative_to(folder)}{more} of the files to be written "
-                    f"{'are' if more else 'is'} there; name another folder, or replace them with `overwrite=True`"
+                    f"{'are' if more else 'is'} there",
+                    fix="name another folder, or replace them with `overwrite=True`",
                 )
             for place in folders:
                 if _has_poses(place) or _has_pictures(place):
                     raise HyrfError(
-                        f"{place}: photos or poses lie in this folder; name another, or write there with "
-                        "`overwrite=True`"
+                        f"{place}: photos or poses lie in this folder",
+                        fix="name another, or write there with `overwrite=True`",
                     )
         for place in folders:
             _check_folder(place)
@@ -153,16 +156,19 @@ class Outputs:
     def _check(self, path: StrPath) -> None:
         """Refuse a path that is read, under whatever name, and one that exists and is not a file."""
         if _file_ids([path]) & self._files:
-            raise HyrfError(f"{path}: the output is an input itself; name another file")
+            raise HyrfError(f"{path}: the output is an input itself", fix="name another file")
         if os.path.exists(path) and not os.path.isfile(path):
             kind = "folder" if os.path.isdir(path) else "device or a pipe"
-            raise HyrfError(f"{path}: this is a {kind}; name a file")
+            raise HyrfError(f"{path}: this is a {kind}", fix="name a file")
         self._check_folder_not_read(_resolved_folder(path))
 
     def _check_folder_not_read(self, folder: StrPath) -> None:
         """Refuse a folder whose photos or poses are read."""
         if _file_ids([folder]) & self._folders:
-            raise HyrfError(f"{folder}: the same command reads what lies in this folder; name another to write into")
+            raise HyrfError(
+                f"{folder}: the same command reads what lies in this folder",
+                fix="name another to write into",
+            )
 
 
 def _folders_between(top: StrPath, files: Iterable[StrPath]) -> set[Path]:
@@ -197,7 +203,7 @@ def _resolved(path: StrPath) -> Path:
     try:
         return Path(os.path.realpath(path))
     except OSError as error:  # the working folder was removed
-        raise HyrfError(f"{path}: the place cannot be found ({error.strerror}); name a whole path") from error
+        raise HyrfError(f"{path}: the place cannot be found ({error.strerror})", fix="name a whole path") from error
 
 
 def _check_name_lengths(paths: Iterable[StrPath]) -> None:
@@ -205,9 +211,9 @@ def _check_name_lengths(paths: Iterable[StrPath]) -> None:
     for path in map(os.path.abspath, paths):
         for part in Path(path).parts:
             if len(os.fsencode(part)) > MAX_NAME_BYTES:
-                raise HyrfError(f"{part[:40]}...: the name is longer than {MAX_NAME_BYTES} bytes; shorten it")
+                raise HyrfError(f"{part[:40]}...: the name is longer than {MAX_NAME_BYTES} bytes", fix="shorten it")
         if len(os.fsencode(path)) > MAX_PATH_BYTES:
-            raise HyrfError(f"{path[:40]}...: the path is longer than {MAX_PATH_BYTES} bytes; shorten it")
+            raise HyrfError(f"{path[:40]}...: the path is longer than {MAX_PATH_BYTES} bytes", fix="shorten it")
 
 
 def _check_folder(folder: Path) -> None:
@@ -215,7 +221,7 @@ def _check_folder(folder: Path) -> None:
     resolved = _resolved(folder)
     existing = next(path for path in (resolved, *resolved.parents) if os.path.lexists(path))
     if not existing.is_dir():
-        raise HyrfError(f"{folder}: {existing} is a file, not a folder; name another place")
+        raise HyrfError(f"{folder}: {existing} is a file, not a folder", fix="name another place")
     check_writable(existing)
 
 

@@ -60,10 +60,15 @@ def read_header(data: bytes, name: str) -> PlyHeader:
         HyrfDataError: this is not a PLY file, or its header is malformed.
     """
     if not re.match(rb"ply\r?\n", data):
-        raise HyrfDataError(f"{name}: this is not a PLY file, for its first line is not 'ply'")
+        raise HyrfDataError(
+            f"{name}: this is not a PLY file, because its first line is not 'ply'", fix="check the path"
+        )
     end = _END_OF_HEADER.search(data, 0, _MAX_HEADER_BYTES)
     if end is None:
-        raise HyrfDataError(f"{name}: its PLY header has no end within {_MAX_HEADER_BYTES:,} bytes; it is damaged")
+        raise HyrfDataError(
+            f"{name}: its PLY header has no end within {_MAX_HEADER_BYTES:,} bytes",
+            fix="it is damaged",
+        )
     order, elements = "", dict[str, Element]()
     properties: dict[str, str] | None = None
     for line in data[: end.start()].decode("utf-8", "replace").split("\n")[1:]:
@@ -82,9 +87,11 @@ def read_header(data: bytes, name: str) -> PlyHeader:
             case ["property", "list", _, _, label] if properties is not None and label not in properties:
                 properties[label] = ""
             case _:
-                raise HyrfDataError(f"{name}: the line '{line[:80]}' of its PLY header is not understood")
+                raise HyrfDataError(
+                    f"{name}: the line '{line[:80]}' of its PLY header is not understood", fix="export it again"
+                )
     if not order:
-        raise HyrfDataError(f"{name}: its PLY header does not say in which format its rows are; it is damaged")
+        raise HyrfDataError(f"{name}: its PLY header does not say in which format its rows are", fix="it is damaged")
     return PlyHeader(order, elements, end.end())
 
 
@@ -112,8 +119,8 @@ def read_elements(data: bytes, header: PlyHeader, wanted: set[str], name: str) -
         kinds = element.properties
         if "" in kinds.values() and element.count and (text is None or label in wanted):
             raise HyrfDataError(
-                f"{name}: its element '{label}' has properties that are lists, which are not read; export it again as "
-                "a plain one"
+                f"{name}: its element '{label}' has properties that are lists, which are not read",
+                fix="export it again as a plain one",
             )
         if text is not None:
             lines = (line for line in text if not line.isspace())
@@ -149,13 +156,20 @@ def _parse_rows(lines: list[str], kinds: dict[str, str], label: str, name: str) 
     try:
         table = np.loadtxt(lines, np.float64, comments=None, ndmin=2)
     except ValueError as error:
-        raise HyrfDataError(f"{name}: a row of its element '{label}' is not made of numbers; it is damaged") from error
+        raise HyrfDataError(
+            f"{name}: a row of its element '{label}' is not made of numbers",
+            fix="it is damaged",
+        ) from error
     if table.shape != (len(lines), len(kinds)):
         raise HyrfDataError(
-            f"{name}: rows of its element '{label}' have {table.shape[1]} numbers, and the header says {len(kinds)}"
+            f"{name}: rows of its element '{label}' have {table.shape[1]} numbers, and the header says {len(kinds)}",
+            fix="export it again",
         )
     return np.ascontiguousarray(table).view(layout)[:, 0]
 
 
 def _truncated_error(name: str, label: str, count: int) -> HyrfDataError:
-    return HyrfDataError(f"{name}: the file ends before the {count:,} rows of its element '{label}'; it is truncated")
+    return HyrfDataError(
+        f"{name}: the file ends before the {count:,} rows of its element '{label}'",
+        fix="it is truncated",
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from click.testing import CliRunner, Result
 
 from hyrfpack.cli import main
+from hyrfpack.cli.wording import use_option_names
 
 
 def hyrfpack(*arguments: object) -> Result:
@@ -29,4 +30,5 @@ def refused(*arguments: object) -> str:
     assert result.stdout == ""
     assert "Traceback" not in result.stderr
     (sentence,) = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
+    assert use_option_names(sentence) == sentence, "an argument is named in place of its option"
     return sentence

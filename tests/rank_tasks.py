@@ -60,7 +60,7 @@ def call_collectives(ranks: Ranks) -> dict:
     def refuse(who: int) -> Callable[[], None]:
         def work() -> None:
             if ranks.rank >= who:
-                raise HyrfDataError(f"photo {ranks.rank} is bad")
+                raise HyrfDataError(f"photo {ranks.rank} is bad", fix="replace it")
 
         return work
 
@@ -203,7 +203,7 @@ def collect_errors(ranks: Ranks) -> dict[str, str | None]:
     """Return the error of each input that one rank alone, or all ranks, cannot use."""
 
     def unreadable() -> NoReturn:
-        raise HyrfDataError("003.png: cannot be read")
+        raise HyrfDataError("003.png: cannot be read", fix="replace it")
 
     def scene_with(load: Callable[[], Picture]) -> Scene:
         scene = six_photo_scene()
@@ -260,4 +260,4 @@ def collect_setup_errors(ranks: Ranks, out: Path) -> dict[str, str | None]:
 
 
 def _unreadable() -> NoReturn:
-    raise HyrfDataError("held.png: cannot be read")
+    raise HyrfDataError("held.png: cannot be read", fix="replace it")

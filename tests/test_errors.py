@@ -1,16 +1,77 @@
-"""A missing package that only one task needs is a clear error."""
+"""An error is one line with a problem and a fix, also where a package is missing that only one task needs."""
 
 from __future__ import annotations
 
+import ast
+import pickle
 import sys
+from collections.abc import Iterator
+from copy import copy
+from pathlib import Path
 
 import pytest
 from scenes import small_model
 
+import hyrfpack
 from hyrfpack.data import load_scene
-from hyrfpack.errors import HyrfError, needs_package
+from hyrfpack.errors import HyrfDataError, HyrfError, HyrfSizeError, needs_package, strip_path
 from hyrfpack.evaluate.figures import draw_training_curve
 from hyrfpack.format import save
+
+LIBRARY = Path(hyrfpack.__file__).parent
+
+
+def raised_errors() -> Iterator[tuple[str, ast.Call]]:
+    """Yield (place, call) for every error that hyrfpack makes by the name of its class."""
+    for path in sorted(LIBRARY.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ERRORS:
+                yield f"{path.relative_to(LIBRARY).as_posix()}:{node.lineno}", node
+
+
+ERRORS = {name for name in vars(hyrfpack.errors) if name.startswith("Hyrf")}
+
+
+def literal_text(node: ast.AST) -> str:
+    """The text of all literals in an expression."""
+    return "".join(
+        part.value for part in ast.walk(node) if isinstance(part, ast.Constant) and isinstance(part.value, str)
+    )
+
+
+def test_every_error_names_its_fix():
+    calls = list(raised_errors())
+    assert len(calls) > 400
+    assert [place for place, call in calls if "fix" not in [keyword.arg for keyword in call.keywords]] == []
+
+
+def test_settings_are_named_in_the_fix_where_the_command_line_translates_them():
+    assert [place for place, call in raised_errors() if "`" in literal_text(call.args[0])] == []
+
+
+def test_an_error_is_one_line_of_problem_and_fix():
+    error = HyrfDataError("a\nb.png: the picture is empty", fix="copy {it} again with `overwrite=True`")
+
+    assert str(error) == "a\\nb.png: the picture is empty; copy {it} again with `overwrite=True`"
+    assert (error.problem, error.fix) == ("a\\nb.png: the picture is empty", "copy {it} again with `overwrite=True`")
+    assert strip_path(error, "a\nb.png") == "the picture is empty"
+
+
+@pytest.mark.parametrize("copied", [copy, lambda error: pickle.loads(pickle.dumps(error))], ids=["copy", "pickle"])
+def test_a_copied_error_keeps_its_parts(copied):
+    error = copied(HyrfSizeError("it is too large", fix="ask for more", min_bytes=7))
+
+    assert (str(error), error.fix, error.min_bytes) == ("it is too large; ask for more", "ask for more", 7)
+
+
+def test_an_error_with_other_text_keeps_its_type_and_attributes():
+    error = HyrfSizeError("it is too large", fix="ask for more", min_bytes=7)
+
+    other = error.with_text(f"packing failed: {error.problem}")
+
+    assert isinstance(other, HyrfSizeError) and other.min_bytes == 7
+    assert str(other) == "packing failed: it is too large; ask for more"
+    assert str(error) == "it is too large; ask for more"
 
 
 @pytest.fixture

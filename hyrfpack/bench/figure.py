@@ -85,7 +85,10 @@ def plot_format(path: str | os.PathLike[str]) -> str:
     """
     suffix = Path(path).suffix.lower().removeprefix(".")
     if suffix not in PLOT_FORMATS:
-        raise HyrfError(f"{path}: a plot is written as {', '.join(PLOT_FORMATS)}; give it one of these extensions")
+        raise HyrfError(
+            f"{path}: a plot is written as {', '.join(PLOT_FORMATS)}",
+            fix="give it one of these extensions",
+        )
     return suffix
 
 

@@ -105,7 +105,7 @@ def read_subject(path: str | os.PathLike[str], scene: Scene | None) -> Subject:
     """
     facts, model = describe(path), load(path)
     if len(model) == 0:
-        raise HyrfError(f"{path}: the model has no Gaussians, so there is nothing to measure; name another")
+        raise HyrfError(f"{path}: the model has no Gaussians, so there is nothing to measure", fix="name another")
     capture = Capture(facts, scene)
     if scene is None:
         cameras, photos = orbit(capture.viewpoint, MAX_VIEWS), None
@@ -151,5 +151,8 @@ def _load_held_out_photos(scene: Scene, model: HybridModel) -> tuple[list[View],
             views.append(view)
             photos.append((photo, mask))
     if not views:
-        raise HyrfError(f"{scene.path}: no held-out photo can be scored; name a smaller `test_every` or other masks")
+        raise HyrfError(
+            f"{scene.path}: no held-out photo can be scored",
+            fix="name a smaller `test_every` or other masks",
+        )
     return views, photos

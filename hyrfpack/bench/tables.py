@@ -92,7 +92,10 @@ def fill_page(text: str, blocks: dict[str, str], name: str = "the page") -> str:
         start = f"<!-- bench {key} -->"
         place = re.search(f"^{re.escape(start)}\n(.*?)^{BLOCK_END}$", text, re.MULTILINE | re.DOTALL)
         if place is None:
-            raise HyrfError(f"{name}: there is no place for {key}; add the lines '{start}' and '{BLOCK_END}' to it")
+            raise HyrfError(
+                f"{name}: there is no place for {key}",
+                fix=f"add the lines '{start}' and '{BLOCK_END}' to it",
+            )
         text = f"{text[: place.start(1)]}\n{block}\n\n{text[place.end(1) :]}"
     return text
 

@@ -117,7 +117,8 @@ class Capture:
             return [camera_from_numbers(numbers) for numbers in self._stored_cameras or self._coarse_cameras]
         except (TypeError, ValueError, ArithmeticError) as error:
             raise HyrfDataError(
-                f"the cameras that the file keeps are not valid ({error!s:.160}); name the photos with `data`"
+                f"the cameras that the file keeps are not valid ({error!s:.160})",
+                fix="name the photos with `data`",
             ) from error
 
     @property
@@ -144,7 +145,8 @@ class Capture:
             return Viewpoint.from_json(stored)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise HyrfDataError(
-                f"the model's viewpoint cannot be used ({error}); render with `data` or `cameras` instead"
+                f"the model's viewpoint cannot be used ({error})",
+                fix="render with `data` or `cameras` instead",
             ) from error
 
     @property

@@ -102,28 +102,30 @@ def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise HyrfDataError(
-            f"{path}: the cameras cannot be read ({error.strerror or error}); check the path"
+            f"{path}: the cameras cannot be read ({error.strerror or error})",
+            fix="check the path",
         ) from error
     except (ValueError, RecursionError) as error:
-        raise HyrfDataError(f"{path}: this is not JSON ({error}); name a JSON file of cameras") from error
+        raise HyrfDataError(f"{path}: this is not JSON ({error})", fix="name a JSON file of cameras") from error
     if isinstance(content, dict) and isinstance(content.get("frames"), list):
         parse, items, shared = _parse_transforms_frame, content["frames"], content
     elif isinstance(content, list):
         parse, items, shared = _parse_camera, content, {}
     else:
         raise HyrfDataError(
-            f"{path}: there is neither a list of cameras nor 'frames' in it; see the help of 'hyrfpack render'"
+            f"{path}: there is neither a list of cameras nor 'frames' in it",
+            fix="see the help of 'hyrfpack render'",
         )
     cameras = []
     for number, item in enumerate(items):
         try:
             cameras.append(parse({**shared, **item}, f"{number:04d}"))
         except KeyError as error:
-            raise HyrfDataError(f"{path}: camera {number} has no {error}; add it") from error
+            raise HyrfDataError(f"{path}: camera {number} has no {error}", fix="add it") from error
         except (TypeError, ValueError, ArithmeticError) as error:
-            raise HyrfDataError(f"{path}: camera {number} is not valid ({error!s:.160}); correct it") from error
+            raise HyrfDataError(f"{path}: camera {number} is not valid ({error!s:.160})", fix="correct it") from error
     if not cameras:
-        raise HyrfDataError(f"{path}: there is no camera in it; add at least one")
+        raise HyrfDataError(f"{path}: there is no camera in it", fix="add at least one")
     return cameras
 
 

@@ -69,7 +69,7 @@ class _CommandGroup(click.Group):
         except HyrfError as error:
             if is_verbose():
                 traceback.print_exc()
-            raise _UserError(use_option_names(str(error))) from error
+            raise _UserError(f"{error.problem}; {use_option_names(error.fix)}") from error
         except OSError as error:
             # Functions that write files raise HyrfError, so that this error comes from printing onto a full disk.
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):

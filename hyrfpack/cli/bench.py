@@ -108,4 +108,4 @@ def _read_page(path: Path | None) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, ValueError) as error:
-        raise HyrfError(f"{path}: the page cannot be read ({error}); name another with --markdown") from error
+        raise HyrfError(f"{path}: the page cannot be read ({error})", fix="name another with --markdown") from error

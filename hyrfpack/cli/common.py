@@ -223,7 +223,10 @@ def resolve_model_file(path: Path) -> Path:
 
     if is_splats(path):
         model = Path(path.stem).with_suffix(".hyrf")
-        raise HyrfError(f"{path}: these are splats, not a model; import it first: 'hyrfpack import {path} -o {model}'")
+        raise HyrfError(
+            f"{path}: these are splats, not a model",
+            fix=f"import it first: 'hyrfpack import {path} -o {model}'",
+        )
     return find_model(path)
 
 
@@ -235,7 +238,7 @@ def select_views(scene: Scene, split: str) -> list[View]:
     """
     views = {"test": scene.test, "train": scene.train, "all": scene.views}[split]
     if not views:
-        raise HyrfError(f"{scene.path}: no photo is in the split '{split}'; name another --split or --test-every")
+        raise HyrfError(f"{scene.path}: no photo is in the split '{split}'", fix="name another --split or --test-every")
     return views
 
 

@@ -156,15 +156,18 @@ def export(
     kind = find_file_kind(output, colmap)
     if len(models) != 1 and kind is not PLAYER_FOLDER:
         what = "there is no MODEL to write" if not models else "several models make a gallery, which is a folder"
-        raise HyrfError(f"{output}: {what}; name one MODEL")
+        raise HyrfError(f"{output}: {what}", fix="name one MODEL")
     splats = [model for model in models if is_splats(model)]
     if splats and kind is not PLAYER_FOLDER:
-        raise HyrfError(_splats_message(splats[0], output, kind))
+        raise _splats_error(splats[0], output, kind)
     files = [model if model in splats else find_model(model) for model in models]
     if splats and data:
-        raise HyrfError(f"{splats[0]}: photos go with .hyrf files only; leave out --data, or this file")
+        raise HyrfError(f"{splats[0]}: photos go with .hyrf files only", fix="leave out --data, or this file")
     if data and len(data) != len(models):
-        raise HyrfError(f"--data is given {len(data)} times, for {len(models)} models; give it once for each, or not")
+        raise HyrfError(
+            f"--data is given {len(data)} times, for {len(models)} models",
+            fix="give it once for each, or not",
+        )
     check_request(kind, output, degree, crop, min_opacity, background, baked, exposure)
     scenes = [read_scene(path, reader_options, describe(model)) for path, model in zip(data, files, strict=False)]
     if kind is PLAYER_FOLDER:
@@ -200,15 +203,18 @@ def export(
     _print_report(report)
 
 
-def _splats_message(source: Path, output: Path, kind: FileKind) -> str:
-    """Return the error message that names the right command for splats of another program."""
+def _splats_error(source: Path, output: Path, kind: FileKind) -> HyrfError:
+    """Return the error that names the right command for splats of another program."""
     from hyrfpack.splats.table import FORMATS
 
     if kind.ending in FORMATS:
-        return f"{source}: these are splats, not a model; convert them with 'hyrfpack convert {source} {output}'"
-    return (
-        f"{source}: splats are played from a folder (-o player/); for {kind.ending or 'this'} import them first: "
-        f"'hyrfpack import {source} -o {source.with_suffix('.hyrf').name}'"
+        return HyrfError(
+            f"{source}: these are splats, not a model", fix=f"convert them with 'hyrfpack convert {source} {output}'"
+        )
+    return HyrfError(
+        f"{source}: splats are played from a folder (-o player/)",
+        fix=f"for {kind.ending or 'this'} import them first: "
+        f"'hyrfpack import {source} -o {source.with_suffix('.hyrf').name}'",
     )
 
 

@@ -30,6 +30,7 @@ from hyrfpack.cli.common import (
 )
 from hyrfpack.cli.processes import processes_option
 from hyrfpack.cli.progress import show_progress
+from hyrfpack.cli.wording import use_option_names
 from hyrfpack.errors import printable
 from hyrfpack.outputs import ARCHIVE_SUFFIXES, PICTURE_SUFFIXES, VIDEO_SUFFIXES, Outputs
 from hyrfpack.progress import report_part
@@ -249,7 +250,7 @@ def _print_photos(path: Path, as_json: bool) -> None:
 
 def _print_run(folder: Path, as_json: bool) -> None:
     from hyrfpack.format import describe, read_run_status
-    from hyrfpack.format.run_folder import MODEL_FILE, describe_unfinished_run
+    from hyrfpack.format.run_folder import FINISH_RUN_ADVICE, MODEL_FILE, describe_unfinished_run
 
     run = read_run_status(folder)
     facts = describe(folder) if (folder / MODEL_FILE).is_file() else {}
@@ -261,7 +262,7 @@ def _print_run(folder: Path, as_json: bool) -> None:
         seconds = "" if run.seconds is None else f" in {run.seconds:,.0f} s"
         _print_line(f"{folder}: a finished training run{steps}{seconds}")
     else:
-        _print_line(f"{folder}: {describe_unfinished_run(run)}")
+        _print_line(f"{folder}: {describe_unfinished_run(run)}; {use_option_names(FINISH_RUN_ADVICE)}")
     if run.photos is not None:
         _print_line(f"photos: {run.photos}, {run.train} to train on and {run.test} held out")
     if run.psnr is not None and run.ssim is not None:

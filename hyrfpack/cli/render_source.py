@@ -49,7 +49,7 @@ class RenderSource:
         """
         if is_splats(path):
             if allow_partial:
-                raise HyrfError(f"{path}: splats are read whole; leave out --allow-partial")
+                raise HyrfError(f"{path}: splats are read whole", fix="leave out --allow-partial")
             splats = read_splats(path)
             drawable = Drawable.from_splats(splats, WeightedSplats.from_splats(splats, str(path)).frame, device)
             return cls(path, device, precision, None, splats=drawable)

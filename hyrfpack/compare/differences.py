@@ -43,9 +43,10 @@ def check_scores(runs: Sequence[Run], names: Sequence[str]) -> None:
         if other.held_out != first.held_out:
             odd = min(other.held_out ^ first.held_out)
             raise HyrfDataError(
-                f"{other.folder}: other photos are held out of '{name}' ({len(other.held_out)}) than of '{first_name}' "
-                f"({len(first.held_out)}; '{odd}' of one of them alone), so that scores cannot be compared; train "
-                "both on the same photos with the same `test_every`"
+                f"{other.folder}: other photos are held out of '{name}' ({len(other.held_out)}) than of "
+                f"'{first_name}' ({len(first.held_out)}; '{odd}' of one of them alone), so that scores cannot be "
+                "compared",
+                fix="train both on the same photos with the same `test_every`",
             )
 
 

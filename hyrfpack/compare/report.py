@@ -64,7 +64,10 @@ def compare(runs: Sequence[StrPath], out: StrPath, *, overwrite: bool = False) -
         raise TypeError(f"runs must be several folders, not {os.fspath(runs)!r} alone; give a list of them")
     folders = [Path(run) for run in runs]
     if len({os.path.realpath(folder) for folder in folders}) < max(2, len(folders)):
-        raise HyrfError("there are not two different runs to compare; name two folders of runs or more, each once")
+        raise HyrfError(
+            "there are not two different runs to compare",
+            fix="name two folders of runs or more, each once",
+        )
     loaded_runs = [read_run(folder) for folder in folders]
     source_files = [
         path

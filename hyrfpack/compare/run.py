@@ -99,26 +99,30 @@ def read_run(folder: StrPath) -> Run:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise HyrfDataError(f"{folder}: there is no such folder; name one that 'hyrfpack train' wrote to")
+        raise HyrfDataError(f"{folder}: there is no such folder", fix="name one that 'hyrfpack train' wrote to")
     if (folder / CHECKPOINT_FILE).exists():
         raise HyrfDataError(
-            f"{folder}: this run is not finished ({CHECKPOINT_FILE} is there); the 'hyrfpack train' command that "
-            "started it finishes it with `resume=True` (instead of `overwrite=True`)"
+            f"{folder}: this run is not finished ({CHECKPOINT_FILE} is there)",
+            fix="the 'hyrfpack train' command that started it finishes it with `resume=True` (instead of "
+            "`overwrite=True`)",
         )
     for name in (METRICS_FILE, MODEL_FILE):
         if not (folder / name).is_file():
-            raise HyrfDataError(f"{folder}: there is no {name}, so this is no finished run; name a folder of one")
+            raise HyrfDataError(f"{folder}: there is no {name}, so this is no finished run", fix="name a folder of one")
     path = folder / METRICS_FILE
     try:
         metrics = json.loads(path.read_text("utf-8"), parse_constant=_refuse_constant)
         return _parse_run(folder, metrics)
     except OSError as error:
-        raise HyrfDataError(f"{path}: the file cannot be read ({error.strerror}); check its permissions") from error
+        raise HyrfDataError(
+            f"{path}: the file cannot be read ({error.strerror})",
+            fix="check its permissions",
+        ) from error
     except _DamagedMetrics as error:
         reason = str(error)
     except (ValueError, RecursionError):
         reason = "it is no JSON"
-    raise HyrfDataError(f"{path}: the metrics are damaged ({reason}); train the run anew with `overwrite=True`")
+    raise HyrfDataError(f"{path}: the metrics are damaged ({reason})", fix="train the run anew with `overwrite=True`")
 
 
 def _refuse_constant(name: str) -> None:

@@ -58,7 +58,8 @@ def _read_photo_and_render(path: Path) -> tuple[Image.Image, Image.Image]:
         photo, render, _ = split_comparison(Image.fromarray(pixels))
     except ValueError as error:
         raise HyrfDataError(
-            f"{path}: this is no picture of photo, render and error map ({error}); remove it, and the view is left out"
+            f"{path}: this is no picture of photo, render and error map ({error})",
+            fix="remove it, and the view is left out",
         ) from error
     return photo, render
 

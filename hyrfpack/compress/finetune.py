@@ -129,8 +129,8 @@ def finetune(
                 views_of_step = shuffled(views, seed, range(step * ranks.size, (step + 1) * ranks.size))
                 raise HyrfTrainingError(
                     f"fine-tuning stopped at step {step + 1} on view "
-                    f"{' or '.join(repr(view.name) for view in views_of_step)}: the loss or a gradient is not "
-                    "finite; compress without `finetune_steps`"
+                    f"{' or '.join(repr(view.name) for view in views_of_step)}: the loss or a gradient is not finite",
+                    fix="compress without `finetune_steps`",
                 )
             report(step + 1, float(loss))
     plan, placed = replan_moved(plan, tuned)

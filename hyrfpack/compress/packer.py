@@ -145,20 +145,27 @@ def compress(
     ranks.run_on_all(lambda: outputs.file(target) if ranks.is_main else None)
     if profile != "compact":
         if data is not None or finetune_steps or target_bytes or max_psnr_drop is not None or distortion:
-            raise HyrfError(f"profile '{profile}' has no settings to fit to photos, sizes or losses; use 'compact'")
+            raise HyrfError(
+                f"profile '{profile}' has no settings to fit to photos, sizes or losses",
+                fix="use 'compact'",
+            )
         repacked = ranks.run_on_all(
             lambda: repack(source, target, profile, overwrite=overwrite, **settings) if ranks.is_main else None
         )
         return cast(CompressionReport, ranks.broadcast(repacked))
     if settings:
-        raise HyrfError(f"profile 'compact' has no setting '{next(iter(settings))}'")
+        raise HyrfError(f"profile 'compact' has no setting '{next(iter(settings))}'", fix="leave it out")
     if data is None and (finetune_steps or max_psnr_drop is not None):
-        raise HyrfError("fine-tuning and limits on PSNR need photos; name their folder with `data`")
+        raise HyrfError("fine-tuning and limits on PSNR need photos", fix="name their folder with `data`")
     if sum(option is not None for option in (target_bytes, max_psnr_drop, distortion)) > 1:
-        raise HyrfError("a target size and a largest loss of PSNR each decide how fine the file is; give one of them")
+        raise HyrfError(
+            "a target size and a largest loss of PSNR each decide how fine the file is",
+            fix="give one of them",
+        )
     if data is not None and not data.train:
         raise HyrfError(
-            f"{data.path}: all photos are held out, so there is none to measure at; use a larger `test_every`"
+            f"{data.path}: all photos are held out, so there is none to measure at",
+            fix="use a larger `test_every`",
         )
     model, provenance = load_with_provenance(source)
     kept = quantized_provenance(provenance, model.config.frame.scale)
@@ -167,7 +174,10 @@ def compress(
     model = model.to(choose_own_device(device, ranks, say))
     model.precision = "float32"  # quantisation errors are smaller than the rounding of lower precisions on a GPU
     if len(model) == 0:
-        raise HyrfError(f"{source}: there is no Gaussian in it, so there is nothing to measure; use profile 'paper'")
+        raise HyrfError(
+            f"{source}: there is no Gaussian in it, so there is nothing to measure",
+            fix="use profile 'paper'",
+        )
     cameras = Capture(describe(source), data).cameras
     say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
     start = distortion or default_distortion(provenance, finetune_steps)
@@ -348,9 +358,9 @@ class Packer:
         if answer is None:
             smallest = len(self.encode(DISTORTION_RANGE[1]).data)
             raise HyrfSizeError(
-                f"the model does not fit into {limit:,} bytes, the least is about {smallest:,}; "
-                "ask for more, or train with fewer Gaussians (`max_gaussians`)",
-                smallest,
+                f"the model does not fit into {limit:,} bytes, the least is about {smallest:,}",
+                fix="ask for more, or train with fewer Gaussians (`max_gaussians`)",
+                min_bytes=smallest,
             )
         distortion, candidate = answer
         return candidate, f"distortion {distortion:.2g} gives {len(candidate.data):,} of {limit:,} bytes"
@@ -383,7 +393,8 @@ class Packer:
         )
         if answer is None:
             raise HyrfError(
-                f"even the finest file loses more than {limit:g} dB of PSNR; allow more, or use profile 'raw'"
+                f"even the finest file loses more than {limit:g} dB of PSNR",
+                fix="allow more, or use profile 'raw'",
             )
         distortion, candidate = answer
         return (

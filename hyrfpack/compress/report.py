@@ -286,4 +286,4 @@ def _read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise HyrfError(f"{path}: the file cannot be read ({error.strerror or error}); write it again") from error
+        raise HyrfError(f"{path}: the file cannot be read ({error.strerror or error})", fix="write it again") from error

@@ -205,7 +205,7 @@ def _summary(source: Path, packed: Path, report: CompressionReport, findings: Fi
         sentences.append(
             f"Its pictures were compared with {findings.views}: PSNR {after.psnr:.2f} dB, SSIM {after.ssim:.4f}. PSNR "
             "says how near pictures are, and so does SSIM, up to 1; more is nearer. From 40 dB on differences are hard "
-            "to see. Name photos of the scene with --data to learn what was lost against them."
+            "to see. A report made with photos of the scene tells what was lost against them."
         )
     if report.found:
         sentences.append(f"The search came to this: {report.found}.")
@@ -260,8 +260,8 @@ def _alternatives(findings: Findings) -> list[Element]:
     caption = (
         "Other files that the same model could be. The line joins those of profile compact at its defaults, without "
         "fine-tuning, that allow pictures more or less distortion; paper is the recipe of the HyRF paper, raw stores "
-        "every number exactly. Below: how long each takes to decode. For another file on the line ask for its size "
-        "with --target-size."
+        "every number exactly. Below: how long each takes to decode. For another file on the line compress "
+        "the model again with its size as the target size."
     )
     return [
         _element(

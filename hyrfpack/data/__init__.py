@@ -14,7 +14,7 @@ from hyrfpack.data.cache import PictureCache
 from hyrfpack.data.folder import list_photos, list_raw_photos
 from hyrfpack.data.layouts import LAYOUTS
 from hyrfpack.data.search import find_set
-from hyrfpack.data.unusable import explain_no_photos, raise_if_single_photo
+from hyrfpack.data.unusable import no_photos_error, raise_if_single_photo
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
 from hyrfpack.outputs import VIDEO_SUFFIXES
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
@@ -99,9 +99,12 @@ def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any], hel
     chosen = layout or found[0]
     reader, options = LAYOUTS[chosen], {"images": images, "model": model}
     if images is not None and "images" not in reader.options:
-        raise HyrfDataError(f"{folder}: a {chosen} set names its own pictures; leave out the folder '{images}'")
+        raise HyrfDataError(f"{folder}: a {chosen} set names its own pictures", fix=f"leave out the folder '{images}'")
     if model is not None and "model" not in reader.options:
-        raise HyrfDataError(f"{folder}: the {chosen} layout has no COLMAP models to choose from; leave out '{model}'")
+        raise HyrfDataError(
+            f"{folder}: the {chosen} layout has no COLMAP models to choose from",
+            fix=f"leave out '{model}'",
+        )
     wanted = {name: options[name] for name in reader.options}
     every = reading["test_every"] if held_out is None else 0
     scene = reader.read(folder, test_every=every, max_size=reading["max_size"], **wanted)
@@ -114,7 +117,7 @@ def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any], hel
         try:
             scene = scene.with_held_out(held_out)
         except ValueError as error:
-            raise HyrfDataError(f"{folder}: {error}; name other photos to hold out") from error
+            raise HyrfDataError(f"{folder}: {error}", fix="name other photos to hold out") from error
         reading["held_out"] = sorted(held_out)
     return replace(scene, files=files, reading={"path": os.path.abspath(given), **reading})
 
@@ -122,16 +125,19 @@ def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any], hel
 def _open_folder(given: Path, notes: list[str]) -> Path:
     """Return the folder that the user named, or unpack the archive that was named and return its folder with a note."""
     if not os.path.exists(given):  # the methods of Path raise if a name is too long
-        raise HyrfDataError(f"{given}: no such folder; check the path")
+        raise HyrfDataError(f"{given}: no such folder", fix="check the path")
     if is_archive(given):
         folder = unpack(given)
         notes.append(f"{given.name} was unpacked into {folder}, where it is found again")
         return folder
     if not os.path.isdir(given):
         if given.suffix.lower() in VIDEO_SUFFIXES:
-            raise HyrfNoPosesError(f"{given}: a video has no poses; {pose_commands(given)}")
+            raise HyrfNoPosesError(f"{given}: a video has no poses", fix=pose_commands(given))
         raise_if_single_photo(given)
-        raise HyrfDataError(f"{given}: a file, not a folder; give the folder that holds photos and poses, or its .zip")
+        raise HyrfDataError(
+            f"{given}: a file, not a folder",
+            fix="give the folder that holds photos and poses, or its .zip",
+        )
     return given
 
 
@@ -163,13 +169,14 @@ def _no_poses(given: Path, folder: Path, layout: str | None, other: bool) -> Hyr
     """Return the exception for a folder without poses, or without poses of the requested layout."""
     photos = [] if other or layout else list_photos(folder)
     if photos:
-        return HyrfNoPosesError(f"{given}: no poses found for the {len(photos)} photos; {pose_commands(given)}")
+        return HyrfNoPosesError(f"{given}: no poses found for the {len(photos)} photos", fix=pose_commands(given))
     if not (other or layout) and list_raw_photos(folder):
-        return HyrfDataError(explain_no_photos(given, folder))
+        return no_photos_error(given, folder)
     files = [LAYOUTS[layout].files] if layout else [reader.files for reader in LAYOUTS.values()]
     kind = f"{layout} " if layout else ""
     return HyrfDataError(
-        f"{given}: no {kind}poses found (looked for {', '.join(files)}); give the folder that holds them"
+        f"{given}: no {kind}poses found (looked for {', '.join(files)})",
+        fix="give the folder that holds them",
     )
 
 

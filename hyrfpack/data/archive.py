@@ -62,17 +62,18 @@ def unpack(archive: Path) -> Path:
         raise
     except OSError as error:
         raise HyrfDataError(
-            f"{archive}: its files cannot be unpacked ({error.strerror or error}); make room, or unpack it yourself "
-            "and give the folder"
+            f"{archive}: its files cannot be unpacked ({error.strerror or error})",
+            fix="make room, or unpack it yourself and give the folder",
         ) from error
     except (NotImplementedError, RuntimeError) as error:
         raise HyrfDataError(
-            f"{archive}: the archive is packed in a way that cannot be read here ({str(error)[:120]}); unpack it "
-            "yourself and give the folder"
+            f"{archive}: the archive is packed in a way that cannot be read here ({str(error)[:120]})",
+            fix="unpack it yourself and give the folder",
         ) from error
     except Exception as error:  # zipfile and its decompressors raise exceptions of many types
         raise HyrfDataError(
-            f"{archive}: the archive is damaged ({short_reason(error)}); copy or make it again"
+            f"{archive}: the archive is damaged ({short_reason(error)})",
+            fix="copy or make it again",
         ) from error
 
 
@@ -95,12 +96,13 @@ def archive_paths_in_errors() -> Iterator[None]:
     try:
         yield
     except HyrfError as error:
-        sentence = str(error)
+        renamed = error
         for folder, archive in _archive_by_folder.items():
-            sentence = sentence.replace(str(folder), str(archive))
-        if sentence == str(error):
+            problem, fix = (text.replace(str(folder), str(archive)) for text in (renamed.problem, renamed.fix))
+            renamed = renamed.with_text(problem, fix)
+        if str(renamed) == str(error):
             raise
-        raise type(error)(sentence) from error
+        raise renamed from error
 
 
 def _common_folder(paths: Iterable[str]) -> Path:
@@ -119,23 +121,25 @@ def _checked_entries(archive: Path, content: zipfile.ZipFile) -> dict[str, zipfi
         if name.startswith("/") or ".." in parts or ":" in parts[0] or "\0" in name:
             raise HyrfDataError(
                 f"{archive}: holds a file '{name[:80]}' that would be written outside its folder, so nothing of it is "
-                "unpacked; make it again"
+                "unpacked",
+                fix="make it again",
             )
         if stat.S_ISLNK(info.external_attr >> 16):
-            raise HyrfDataError(f"{archive}: holds a link, '{name[:80]}'; make it again of the files themselves")
+            raise HyrfDataError(f"{archive}: holds a link, '{name[:80]}'", fix="make it again of the files themselves")
         if info.flag_bits & _ENCRYPTED_FLAG:
-            raise HyrfDataError(f"{archive}: the archive is encrypted; unpack it yourself and give the folder")
+            raise HyrfDataError(f"{archive}: the archive is encrypted", fix="unpack it yourself and give the folder")
         path = "/".join(parts)
         if path in entries:
-            raise HyrfDataError(f"{archive}: holds '{path[:80]}' twice; make it again")
+            raise HyrfDataError(f"{archive}: holds '{path[:80]}' twice", fix="make it again")
         entries[path] = info
     if not entries:
-        raise HyrfDataError(f"{archive}: the archive holds no file; give one of a set of photos")
+        raise HyrfDataError(f"{archive}: the archive holds no file", fix="give one of a set of photos")
     total = sum(info.file_size for info in entries.values())
     if len(entries) > _MAX_FILES or total > _MAX_UNPACKED_RATIO * os.path.getsize(archive) + _UNPACKED_SLACK_BYTES:
         raise HyrfDataError(
             f"{archive}: would unpack to {len(entries):,} files of {total / 1e9:,.1f} GB together, which is no likely "
-            "set of photos; unpack it yourself if you trust it"
+            "set of photos",
+            fix="unpack it yourself if you trust it",
         )
     return entries
 
@@ -164,7 +168,8 @@ def _write_entries(archive: Path, content: zipfile.ZipFile, entries: dict[str, z
     if total > free:
         raise HyrfDataError(
             f"{archive}: its {total / 1e9:.1f} GB of files do not fit on the disk of {folder.parent}, which has "
-            f"{free / 1e9:.1f} GB left; make room, or unpack it elsewhere and give the folder"
+            f"{free / 1e9:.1f} GB left",
+            fix="make room, or unpack it elsewhere and give the folder",
         )
     partial = Path(tempfile.mkdtemp(prefix=_PARTIAL_FOLDER_PREFIX, dir=folder.parent))
     try:
@@ -214,4 +219,4 @@ def _cache_folder() -> Path:
                 return folder
         except OSError:
             continue
-    raise HyrfDataError(f"{caches}: no file can be made in this folder; set XDG_CACHE_HOME to one where they can")
+    raise HyrfDataError(f"{caches}: no file can be made in this folder", fix="set XDG_CACHE_HOME to one where they can")

@@ -93,12 +93,13 @@ def make_scene(
     """
     if not photos:
         raise HyrfDataError(
-            f"{path}: its poses are of no photo at all; reconstruct again, or correct lists of file names"
+            f"{path}: its poses are of no photo at all",
+            fix="reconstruct again, or correct lists of file names",
         )
     photos = _apply_orientations(sorted(photos, key=lambda photo: photo.name), notes)
     for first, second in zip(photos, photos[1:], strict=False):
         if first.name == second.name:
-            raise HyrfDataError(f"{path}: photo {first.name} is listed twice; remove one of the entries")
+            raise HyrfDataError(f"{path}: photo {first.name} is listed twice", fix="remove one of the entries")
     if test_names is None:
         test_names = {photo.name for photo in photos[::test_every]} if test_every else set()
     photos, mask_notes = (photos, []) if masks is None else _assign_masks(photos, masks)
@@ -108,8 +109,8 @@ def make_scene(
     test = [view for view in views if view.name in test_names]
     if not train:
         raise HyrfDataError(
-            f"{path}: all {len(test)} photos are held out for testing and none is left to train on; "
-            "add photos or hold out fewer (0 holds out none)"
+            f"{path}: all {len(test)} photos are held out for testing and none is left to train on",
+            fix="add photos or hold out fewer (0 holds out none)",
         )
     raw_photos = _list_raw_photos_beside(photos)
     notes += [*_shared_pose_notes(views), *_loading_notes(photos, max_size, mask_notes), *raw_photos_notes(raw_photos)]
@@ -180,12 +181,14 @@ def missing_photos_notes(
     if ambiguous and not photos:
         raise HyrfDataError(
             f"{path}: which file is which of the {len(missing)} photos that {where} lists is unclear, because "
-            f"{min(ambiguous)} fits more than one file, or its file more than one name; name the files as the poses do"
+            f"{min(ambiguous)} fits more than one file, or its file more than one name",
+            fix="name the files as the poses do",
         )
     if missing and not photos:
         raise HyrfDataError(
             f"{path}: none of the {len(missing)} photos that {where} lists is on disk (looked for {min(missing)}; "
-            f"{_describe_folder(path, min(missing))}); put them where the poses name them, as JPEG or PNG"
+            f"{_describe_folder(path, min(missing))})",
+            fix="put them where the poses name them, as JPEG or PNG",
         )
     if not missing:
         return []
@@ -284,12 +287,14 @@ def _make_view(photo: Photo, max_size: int) -> View:
     if not _is_plausible(lens):
         raise HyrfDataError(
             f"{photo.path}: the camera of this photo has unusable intrinsics (size {lens.width} x {lens.height}, "
-            f"focal lengths {lens.fx:g} and {lens.fy:g}, centre {lens.cx:g}, {lens.cy:g}); calibrate it again"
+            f"focal lengths {lens.fx:g} and {lens.fy:g}, centre {lens.cx:g}, {lens.cy:g})",
+            fix="calibrate it again",
         )
     if not has_same_aspect(header.width, header.height, lens.width, lens.height):
         raise HyrfDataError(
             f"{photo.path}: the picture is {header.width} x {header.height} but its camera says {lens.width} x "
-            f"{lens.height}, which is not a uniform rescaling; use the pictures that were calibrated (unrotated)"
+            f"{lens.height}, which is not a uniform rescaling",
+            fix="use the pictures that were calibrated (unrotated)",
         )
     size = fit_size(*header.size, max_size)
     if size != (lens.width, lens.height):
@@ -300,8 +305,8 @@ def _make_view(photo: Photo, max_size: int) -> View:
         sizes = {mask.size, mask.turned(photo.orientation).size}
         if not any(has_same_aspect(*shape, *whole) for shape in sizes):
             raise HyrfDataError(
-                f"{photo.mask}: the mask is {mask.width} x {mask.height} but its photo {whole[0]} x "
-                f"{whole[1]}; make it the photo's size"
+                f"{photo.mask}: the mask is {mask.width} x {mask.height} but its photo {whole[0]} x {whole[1]}",
+                fix="make it the photo's size",
             )
     pose = _orthonormal_pose(photo.camera_from_world, photo.path)
     camera = Camera(*size, lens.fx, lens.fy, lens.cx, lens.cy, pose)
@@ -326,7 +331,7 @@ def _orthonormal_pose(pose: np.ndarray, path: Path) -> np.ndarray:
     try:
         pose = rigid_pose(pose)
     except ValueError as error:
-        raise HyrfDataError(f"{path}: {error}; correct it, or register this photo again") from error
+        raise HyrfDataError(f"{path}: {error}", fix="correct it, or register this photo again") from error
     u, _, vt = np.linalg.svd(pose[:3, :3])
     rigid = np.eye(4)
     rigid[:3, :3] = u @ vt

@@ -53,7 +53,7 @@ def _read_split(path: Path, split: str, notes: list[str]) -> list[Photo]:
     content = read_transforms(file)
     angle = finite_number(content, "camera_angle_x", file)
     if angle is None:
-        raise HyrfDataError(f"{file}: has no 'camera_angle_x', so the focal length is unknown; add it")
+        raise HyrfDataError(f"{file}: has no 'camera_angle_x', so the focal length is unknown", fix="add it")
     photos: list[Photo] = []
     missing: list[str] = []
     index = PictureIndex(path)

@@ -51,12 +51,13 @@ def read_bundler(path: Path, *, test_every: int, max_size: int) -> Scene:
     """
     bundle = find_bundle(path)
     if bundle is None:
-        raise HyrfDataError(f"{path}: no bundle file ('# Bundle file v0.3'); give the folder that holds it")
+        raise HyrfDataError(f"{path}: no bundle file ('# Bundle file v0.3')", fix="give the folder that holds it")
     names, listing = _read_list(path, bundle)
     cameras, points, colors = _read_bundle(bundle)
     if len(names) != len(cameras):
         raise HyrfDataError(
-            f"{bundle}: holds {len(cameras)} cameras, but {listing.name} lists {len(names)} photos; export both again"
+            f"{bundle}: holds {len(cameras)} cameras, but {listing.name} lists {len(names)} photos",
+            fix="export both again",
         )
     entries: list[PoseEntry] = []
     for name, camera in zip(names, cameras, strict=True):
@@ -89,8 +90,8 @@ def _check_full_size(folder: Path) -> Path:
     """Return the folder of the photos; raise HyrfDataError if its name is that of a folder of smaller copies."""
     if downscale_factor(folder.name):
         raise HyrfDataError(
-            f"{folder}: a Bundler file does not say how large its photos are, so copies of another size cannot be "
-            "used; put the photos that were posed into images"
+            f"{folder}: a Bundler file does not say how large its photos are, so copies of another size cannot be used",
+            fix="put the photos that were posed into images",
         )
     return folder
 
@@ -117,7 +118,8 @@ def _read_list(path: Path, bundle: Path) -> tuple[list[str], Path]:
     listing = next((file for file in lists if file.is_file()), None)
     if listing is None:
         raise HyrfDataError(
-            f"{bundle}: the list of its photos is missing (looked for list.txt and *.lst beside it); export it, too"
+            f"{bundle}: the list of its photos is missing (looked for list.txt and *.lst beside it)",
+            fix="export it, too",
         )
     lines = _read_text(listing).splitlines()
     # Lists that Bundler itself writes have 0 and the focal length from EXIF after each name.
@@ -131,17 +133,20 @@ def _read_bundle(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     try:
         cameras, points = map(int, lines[0].split()[:2])
     except (IndexError, ValueError) as error:
-        raise HyrfDataError(f"{file}: does not say how many cameras and points it holds; export it again") from error
+        raise HyrfDataError(
+            f"{file}: does not say how many cameras and points it holds",
+            fix="export it again",
+        ) from error
     needed = 1 + 5 * cameras + 3 * points
     if cameras < 1 or points < 0 or len(lines) < needed:
         raise HyrfDataError(
-            f"{file}: {cameras} cameras and {points} points take {needed} lines, but there are {len(lines)}; the file "
-            "is truncated, export it again"
+            f"{file}: {cameras} cameras and {points} points take {needed} lines, but there are {len(lines)}",
+            fix="the file is truncated, export it again",
         )
     first = 1 + 5 * cameras
     table = _parse_numbers(lines[1:first], file).reshape(cameras, 5, 3)
     if not np.isfinite(table).all():
-        raise HyrfDataError(f"{file}: a camera in it has numbers that are not finite; export it again")
+        raise HyrfDataError(f"{file}: a camera in it has numbers that are not finite", fix="export it again")
     colors = np.clip(_parse_numbers(lines[first + 1 : needed : 3], file) / 255, 0, 1)
     return table, _parse_numbers(lines[first:needed:3], file), np.nan_to_num(colors, nan=0.5)
 
@@ -153,7 +158,7 @@ def _parse_numbers(lines: list[str], file: Path) -> np.ndarray:
     except ValueError:
         rows = [()]
     if any(len(row) != 3 for row in rows):
-        raise HyrfDataError(f"{file}: a line that should have three numbers has not; export it again")
+        raise HyrfDataError(f"{file}: a line that should have three numbers has not", fix="export it again")
     return np.array(rows, np.float64).reshape(-1, 3)
 
 
@@ -161,4 +166,4 @@ def _read_text(file: Path) -> str:
     try:
         return file.read_bytes().decode("utf-8-sig", errors="replace")
     except OSError as error:
-        raise HyrfDataError(f"{file}: cannot be read ({error.strerror}); restore the file") from error
+        raise HyrfDataError(f"{file}: cannot be read ({error.strerror})", fix="restore the file") from error

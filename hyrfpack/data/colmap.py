@@ -103,7 +103,7 @@ def _photo_folder(path: Path, base: Path, images: str | None, names: Sequence[st
     if images is not None:
         named = next((parent / images for parent in (path, base) if os.path.isdir(parent / images)), None)
         if named is None:
-            raise HyrfDataError(f"{path}: no photo folder '{images}'; {describe_subfolders(path)}")
+            raise HyrfDataError(f"{path}: no photo folder '{images}'", fix=describe_subfolders(path))
         return named
     found = find_photo_folder(base) or find_photo_folder(path)
     if found is None:  # the cameras of a rig have one folder each, and the listed names begin with these folders
@@ -111,7 +111,8 @@ def _photo_folder(path: Path, base: Path, images: str | None, names: Sequence[st
     if found is None:
         raise HyrfDataError(
             f"{path}: no photo folder 'images' beside the COLMAP model, and no other that is clearly meant; "
-            f"{describe_subfolders(path)}; name the one of the photos with `images`, or give the folder that holds both"
+            f"{describe_subfolders(path)}",
+            fix="name the one of the photos with `images`, or give the folder that holds both",
         )
     return found
 
@@ -119,7 +120,7 @@ def _photo_folder(path: Path, base: Path, images: str | None, names: Sequence[st
 def _choose_model(path: Path, models: Sequence[Path], name: str | None) -> tuple[Path, list[str]]:
     """Select the model of this name, or the one with the most photos; also return a note if there are several."""
     if not models:
-        raise HyrfDataError(f"{path}: no COLMAP model in sparse or colmap/sparse; run the reconstruction first")
+        raise HyrfDataError(f"{path}: no COLMAP model in sparse or colmap/sparse", fix="run the reconstruction first")
     if name is None and len(models) == 1:
         return models[0], []
     sizes = {model: _count_registered_photos(model) for model in models}
@@ -129,7 +130,10 @@ def _choose_model(path: Path, models: Sequence[Path], name: str | None) -> tuple
     if name is not None:
         named = [model for model in models if model.name == name]
         if not named:
-            raise HyrfDataError(f"{path}: there is no COLMAP model '{name}'; name one of those that are there: {there}")
+            raise HyrfDataError(
+                f"{path}: there is no COLMAP model '{name}'",
+                fix=f"name one of those that are there: {there}",
+            )
         chosen, why = named[0], "as asked for"
     return chosen, [f"there are {len(models)} COLMAP models: {there}; {chosen.name} was taken, {why}"]
 
@@ -178,7 +182,7 @@ def lens_from_colmap(model: str, width: int, height: int, params: np.ndarray) ->
             return Lens(width, height, p[0], p[0], p[1], p[2], "fisheye", (k1, k2, 0.0, 0.0))
         case "OPENCV_FISHEYE":
             return Lens(width, height, p[0], p[1], p[2], p[3], "fisheye", tuple(p[4:]))
-    raise HyrfDataError(f"camera model {model} is not supported; undistort the photos with COLMAP first")
+    raise HyrfDataError(f"camera model {model} is not supported", fix="undistort the photos with COLMAP first")
 
 
 def _read_model(model: Path) -> tuple[dict[int, Lens], list[_Image], int, np.ndarray, np.ndarray]:
@@ -207,10 +211,11 @@ def _read_model(model: Path) -> tuple[dict[int, Lens], list[_Image], int, np.nda
         points = np.array([point.xyz for point in table]).reshape(-1, 3)
         colors = np.array([point.color for point in table], np.float32).reshape(-1, 3) / 255
     except HyrfDataError as error:
-        raise HyrfDataError(f"{model}: {error}") from error
+        raise error.with_text(f"{model}: {error.problem}") from error
     except Exception as error:  # pycolmap raises what its C++ checks throw, of many types
         raise HyrfDataError(
-            f"{model}: the model's tables do not fit together ({short_reason(error, 160)}); export it again"
+            f"{model}: the model's tables do not fit together ({short_reason(error, 160)})",
+            fix="export it again",
         ) from error
     if kind == ".txt":
         for name, count in zip(COLMAP_TABLES, (len(cameras), len(images), len(points)), strict=True):
@@ -220,7 +225,7 @@ def _read_model(model: Path) -> tuple[dict[int, Lens], list[_Image], int, np.nda
         posed = [image._replace(visible_points=None) for image in posed]
     unknown = next((image.name for image in posed if image.camera not in cameras), None)
     if unknown is not None:
-        raise HyrfDataError(f"{model}: photo {unknown} has a camera that the model lacks; export the model again")
+        raise HyrfDataError(f"{model}: photo {unknown} has a camera that the model lacks", fix="export the model again")
     return cameras, posed, len(images) - len(posed), points, colors
 
 
@@ -237,7 +242,7 @@ def _model_kind(model: Path) -> str:
         if not missing(kind):
             return kind
     kind = ".bin" if any((model / f"{table}.bin").is_file() for table in COLMAP_TABLES) else ".txt"
-    raise HyrfDataError(f"{model / missing(kind)[0]}: missing; export the whole COLMAP model again")
+    raise HyrfDataError(f"{model / missing(kind)[0]}: missing", fix="export the whole COLMAP model again")
 
 
 def _visible_rows(image, ids: np.ndarray) -> np.ndarray:
@@ -267,4 +272,7 @@ def _check_text_count(file: Path, count: int) -> None:
     """Check that a text table has as many entries as it states; otherwise lost lines would go unnoticed."""
     stated = _stated_count(file) if file.is_file() else None
     if stated is not None and stated != count:
-        raise HyrfDataError(f"{file}: says {stated} entries but holds {count}; the file is truncated, export it again")
+        raise HyrfDataError(
+            f"{file}: says {stated} entries but holds {count}",
+            fix="the file is truncated, export it again",
+        )

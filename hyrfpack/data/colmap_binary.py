@@ -61,7 +61,7 @@ class _TableReader:
         try:
             self.data = path.read_bytes()
         except OSError as error:
-            raise HyrfDataError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+            raise HyrfDataError(f"{path}: cannot be read ({error.strerror})", fix="check its permissions") from error
         self.offset = 0
 
     def skip(self, size: int) -> int:
@@ -70,7 +70,8 @@ class _TableReader:
         if self.offset > len(self.data):
             raise HyrfDataError(
                 f"{self.path}: the file ends after {len(self.data)} bytes, inside a record that extends to "
-                f"{self.offset}; it is truncated or damaged, export the model again"
+                f"{self.offset}",
+                fix="it is truncated or damaged, export the model again",
             )
         return start
 
@@ -90,14 +91,17 @@ class _TableReader:
         try:
             name.decode()
         except UnicodeDecodeError as error:
-            raise HyrfDataError(f"{self.path}: a photo's name is not UTF-8 text; export the model again") from error
+            raise HyrfDataError(
+                f"{self.path}: a photo's name is not UTF-8 text",
+                fix="export the model again",
+            ) from error
 
     def finish(self) -> None:
         """Check that no bytes follow the last record."""
         if self.offset != len(self.data):
             raise HyrfDataError(
-                f"{self.path}: {len(self.data) - self.offset} bytes follow the last record that its count announces; "
-                "it is damaged, export the model again"
+                f"{self.path}: {len(self.data) - self.offset} bytes follow the last record that its count announces",
+                fix="it is damaged, export the model again",
             )
 
 
@@ -106,7 +110,8 @@ def _check_cameras(table: _TableReader) -> None:
         _, model, _, _ = table.read(_CAMERA_STRUCT)
         if model not in _PARAMETER_COUNTS:
             raise HyrfDataError(
-                f"{table.path}: camera model number {model} is not supported; undistort the photos with COLMAP first"
+                f"{table.path}: camera model number {model} is not supported",
+                fix="undistort the photos with COLMAP first",
             )
         table.skip(8 * _PARAMETER_COUNTS[model])
 

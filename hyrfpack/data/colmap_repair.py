@@ -62,7 +62,7 @@ def _read_text(file: Path) -> str:
     try:
         content = file.read_bytes().removeprefix(codecs.BOM_UTF8)
     except OSError as error:
-        raise HyrfDataError(f"{file}: cannot be read ({error.strerror}); check its permissions") from error
+        raise HyrfDataError(f"{file}: cannot be read ({error.strerror})", fix="check its permissions") from error
     try:
         return content.decode()
     except UnicodeDecodeError:

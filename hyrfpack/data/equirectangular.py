@@ -90,7 +90,7 @@ class FaceFile:
         rgb, alpha = read_pixels(self.path)
         if rgb.shape[1::-1] != self.stored:
             shown = display_path(self.path)
-            raise HyrfDataError(f"{shown}: the picture changed its size since the scene was read; read it again")
+            raise HyrfDataError(f"{shown}: the picture changed its size since the scene was read", fix="read it again")
         mask = None
         if self.mask is not None:
             whole = read_mask(self.mask, *rgb.shape[:2])
@@ -217,8 +217,8 @@ def panorama_lens(path: Path, header: PictureHeader) -> Lens:
     width, height = header.size
     if not has_same_aspect(width, height, 2, 1):
         raise HyrfDataError(
-            f"{path}: an equirectangular picture is twice as wide as high, but this one is {width} x {height}; use the "
-            "whole panorama"
+            f"{path}: an equirectangular picture is twice as wide as high, but this one is {width} x {height}",
+            fix="use the whole panorama",
         )
     focal = width / (2 * math.pi)
     return Lens(width, height, focal, focal, width / 2, height / 2, "equirectangular")

@@ -126,11 +126,14 @@ def _list_files(root: Path, is_wanted: Callable[[str], bool], photos_only: bool)
     """List the files below a folder whose names are wanted, sorted by their relative paths."""
     if not os.path.isdir(root):  # Path.is_dir raises if a name is too long
         what = "is a file, not a folder of photos" if os.path.exists(root) else "there is no such folder"
-        raise HyrfDataError(f"{root}: {what}; name the folder that holds the photos")
+        raise HyrfDataError(f"{root}: {what}", fix="name the folder that holds the photos")
     try:
         found = list(_walk_files(root, set(), is_wanted, photos_only))
     except OSError as error:
-        raise HyrfDataError(f"{root}: the folder cannot be read ({error.strerror}); check its permissions") from error
+        raise HyrfDataError(
+            f"{root}: the folder cannot be read ({error.strerror})",
+            fix="check its permissions",
+        ) from error
     return sorted(found, key=lambda path: path.relative_to(root).as_posix())
 
 

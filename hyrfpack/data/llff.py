@@ -41,11 +41,15 @@ def read_llff(path: Path, *, test_every: int, images: str | None, max_size: int)
     try:
         names = sorted(entry.name for entry in os.scandir(folder) if is_picture_name(entry.name) and entry.is_file())
     except OSError as error:
-        raise HyrfDataError(f"{folder}: the folder cannot be read ({error.strerror}); check its permissions") from error
+        raise HyrfDataError(
+            f"{folder}: the folder cannot be read ({error.strerror})",
+            fix="check its permissions",
+        ) from error
     if len(names) != len(rows):
         raise HyrfDataError(
             f"{path / POSES_FILE}: holds the poses of {len(rows)} photos, but {folder.name} holds {len(names)}, and "
-            "photos are matched by their order; leave just those that were posed in that folder"
+            "photos are matched by their order",
+            fix="leave just those that were posed in that folder",
         )
     entries: list[PoseEntry] = []
     for name, row in zip(names, rows, strict=True):
@@ -74,12 +78,19 @@ def _read_table(file: Path) -> np.ndarray:
         table = np.load(file, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # a damaged header makes numpy raise exceptions of many types
         raise HyrfDataError(
-            f"{file}: not a table that can be read ({short_reason(error)}); restore the file"
+            f"{file}: not a table that can be read ({short_reason(error)})",
+            fix="restore the file",
         ) from error
     if not isinstance(table, np.ndarray) or table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind not in "fiu":
-        raise HyrfDataError(f"{file}: not a table of 17 numbers for each photo, as LLFF writes it; restore the file")
+        raise HyrfDataError(
+            f"{file}: not a table of 17 numbers for each photo, as LLFF writes it",
+            fix="restore the file",
+        )
     rows = np.array(table, np.float64)
     sizes = rows[:, [4, 9]]
     if not len(rows) or not np.isfinite(rows[:, :15]).all() or not ((sizes >= 0.5) & (sizes < 1e6)).all():
-        raise HyrfDataError(f"{file}: a pose or a size in it is not finite, or there is none; estimate the poses again")
+        raise HyrfDataError(
+            f"{file}: a pose or a size in it is not finite, or there is none",
+            fix="estimate the poses again",
+        )
     return rows

@@ -75,7 +75,7 @@ def read_metashape(path: Path, *, test_every: int, images: str | None, max_size:
     """
     table = find_metashape(path)
     if table is None:
-        raise HyrfDataError(f"{path}: no cameras of Metashape (.xml); export them with Export Cameras")
+        raise HyrfDataError(f"{path}: no cameras of Metashape (.xml)", fix="export them with Export Cameras")
     chunk, notes = _choose_chunk(_parse(table), table)
     frame, component, frame_notes = _choose_frame(chunk, table)
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
@@ -90,9 +90,12 @@ def read_metashape(path: Path, *, test_every: int, images: str | None, max_size:
             continue
         where = f"{table}: camera {(label or camera.get('id') or '')[:80]!r}"
         if not label:
-            raise HyrfDataError(f"{where} has no label, which is the name of its photo; export the cameras again")
+            raise HyrfDataError(f"{where} has no label, which is the name of its photo", fix="export the cameras again")
         if key not in sensors:
-            raise HyrfDataError(f"{where} is of a sensor that the file does not describe; export the cameras again")
+            raise HyrfDataError(
+                f"{where} is of a sensor that the file does not describe",
+                fix="export the cameras again",
+            )
         if key not in lenses:
             lenses[key] = _lens(sensors[key], f"{table}: sensor {key}")
         matrix = _parse_numbers(transform, 16, where).reshape(4, 4)
@@ -134,13 +137,13 @@ def _parse(table: Path) -> Element:
     try:
         data = table.read_bytes()
     except OSError as error:
-        raise HyrfDataError(f"{table}: cannot be read ({error.strerror}); restore the file") from error
+        raise HyrfDataError(f"{table}: cannot be read ({error.strerror})", fix="restore the file") from error
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # entities can expand a line to gigabytes
-        raise HyrfDataError(f"{table}: declares entities, which Metashape does not; export the cameras again")
+        raise HyrfDataError(f"{table}: declares entities, which Metashape does not", fix="export the cameras again")
     try:
         return ElementTree.fromstring(data)
     except Exception as error:  # raised by the parser, or by the codec of the encoding that the file declares
-        raise HyrfDataError(f"{table}: not valid XML ({str(error)[:120]}); export the cameras again") from error
+        raise HyrfDataError(f"{table}: not valid XML ({str(error)[:120]})", fix="export the cameras again") from error
 
 
 def _cameras(chunk: Element) -> list[Element]:
@@ -153,7 +156,10 @@ def _choose_chunk(document: Element, table: Path) -> tuple[Element, list[str]]:
     sizes = [(sum(c.find("transform") is not None for c in _cameras(chunk)), chunk) for chunk in document.iter("chunk")]
     most = max((size for size, _ in sizes), default=0)
     if not most:
-        raise HyrfDataError(f"{table}: no camera in it has a pose; align the photos, then export the cameras again")
+        raise HyrfDataError(
+            f"{table}: no camera in it has a pose",
+            fix="align the photos, then export the cameras again",
+        )
     chosen = next(chunk for size, chunk in sizes if size == most)
     if len(sizes) == 1:
         return chosen, []
@@ -186,7 +192,7 @@ def _choose_frame(chunk: Element, table: Path) -> tuple[_Frame, str | None, list
         float(_parse_numbers(transform.findtext("scale") or "1", 1, where)[0]),
     )
     if not frame.scale > 0 or np.abs(frame.rotation @ frame.rotation.T - np.eye(3)).max() > 1e-3:
-        raise HyrfDataError(f"{where} is no rotation with a positive scale; export the cameras again")
+        raise HyrfDataError(f"{where} is no rotation with a positive scale", fix="export the cameras again")
     if np.abs(frame.translation).max() > _MIN_GEOCENTRIC_COORDINATE:
         notes.append("the cameras are placed on the Earth; they were kept in the coordinates of their component")
         return _IDENTITY_FRAME, component, notes
@@ -201,7 +207,7 @@ def _lens(sensor: Element, where: str) -> Lens | Callable[[Path, PictureHeader],
     if kind == _PANORAMA_TYPE:
         return panorama_lens
     if calibration is None:
-        raise HyrfDataError(f"{where} has no calibration; align the photos, then export the cameras again")
+        raise HyrfDataError(f"{where} has no calibration", fix="align the photos, then export the cameras again")
     values = dict.fromkeys(_CALIBRATION_KEYS, 0.0)
     for name in _CALIBRATION_KEYS:
         text = calibration.findtext(name)
@@ -215,12 +221,18 @@ def _lens(sensor: Element, where: str) -> Lens | Callable[[Path, PictureHeader],
     cx, cy = width / 2 + values["cx"], height / 2 + values["cy"]
     lens = Lens(width, height, f + values["b1"], f, cx, cy, skew=values["b2"])
     if values["p3"] or values["p4"]:
-        raise HyrfDataError(f"{where} has p3 or p4, which are not supported; calibrate without them, or undistort")
+        raise HyrfDataError(
+            f"{where} has p3 or p4, which are not supported",
+            fix="calibrate without them, or undistort",
+        )
     if kind == "frame":
         return replace(lens, model="brown", coefficients=brown_coefficients(k[0], k[1], *p, k[2], 0, 0, 0, k[3]))
     if kind in _FISHEYE_TYPES:
         return replace(lens, model="fisheye", coefficients=(*k, *p) if any(p) else tuple(k))
-    raise HyrfDataError(f"{where} is of type {kind[:40]!r}, which is not supported; export undistorted photos instead")
+    raise HyrfDataError(
+        f"{where} is of type {kind[:40]!r}, which is not supported",
+        fix="export undistorted photos instead",
+    )
 
 
 def _pixels(size: Element | None, side: str, where: str) -> int:
@@ -236,5 +248,8 @@ def _parse_numbers(text: str | None, count: int, where: str) -> np.ndarray:
     except ValueError:
         values = []
     if len(values) != count or not all(map(math.isfinite, values)):
-        raise HyrfDataError(f"{where} needs {count} finite numbers where it says {str(text)[:60]!r}; export it again")
+        raise HyrfDataError(
+            f"{where} needs {count} finite numbers where it says {str(text)[:60]!r}",
+            fix="export it again",
+        )
     return np.array(values)

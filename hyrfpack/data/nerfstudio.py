@@ -52,7 +52,7 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None, max_size
     content = read_transforms(file)
     frames = content["frames"]
     if images is not None and not (path / images).is_dir():
-        raise HyrfDataError(f"{path}: no photo folder '{images}'; {describe_subfolders(path)}")
+        raise HyrfDataError(f"{path}: no photo folder '{images}'", fix=describe_subfolders(path))
     keep, test_names, notes = _listed_split(content, file)
     frames = [frame for frame in frames if keep is None or PurePosixPath(frame["file_path"]) in keep]
     strip = _common_folder([frame["file_path"] for frame in content["frames"]])
@@ -112,7 +112,7 @@ def _listed_split(content: dict[str, Any], file: Path) -> tuple[set | None, set,
     for key in ("train_filenames", "val_filenames", "test_filenames"):
         names = content.get(key) or []
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise HyrfDataError(f"{file}: '{key}' is not a list of file names; correct or remove it")
+            raise HyrfDataError(f"{file}: '{key}' is not a list of file names", fix="correct or remove it")
         lists[key] = {PurePosixPath(with_forward_slashes(name)) for name in names}
     train, val, test = lists.values()
     held_out = test or val
@@ -176,8 +176,8 @@ def _check_scale_is_known(content: dict[str, Any], frame: dict[str, Any], file: 
     entries = {**content, **frame}
     if entries.get("w") is None and entries.get("camera_angle_x") is None:
         raise HyrfDataError(
-            f"{file}: has no 'w' and 'h', so focal lengths cannot be brought to the size of photos of another folder; "
-            "add the size that was calibrated"
+            f"{file}: has no 'w' and 'h', so focal lengths cannot be brought to the size of photos of another folder",
+            fix="add the size that was calibrated",
         )
 
 
@@ -199,7 +199,7 @@ def _lens(content: dict[str, Any], frame: dict[str, Any], header: PictureHeader,
     if fx is None:
         fx = fy
     if fx is None or fy is None:
-        raise HyrfDataError(f"{where} has neither 'fl_x' nor 'camera_angle_x'; add its focal length")
+        raise HyrfDataError(f"{where} has neither 'fl_x' nor 'camera_angle_x'", fix="add its focal length")
     cx, cy = value("cx"), value("cy")
     pinhole = (width, height, fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
 
@@ -210,13 +210,16 @@ def _lens(content: dict[str, Any], frame: dict[str, Any], header: PictureHeader,
     if model in _FISHEYE_MODELS:
         return Lens(*pinhole, "fisheye", (k1, k2, k3, k4))
     if model not in _PERSPECTIVE_MODELS:
-        raise HyrfDataError(f"{where} has camera model {str(model)[:40]!r}, which is not supported; undistort it first")
+        raise HyrfDataError(
+            f"{where} has camera model {str(model)[:40]!r}, which is not supported",
+            fix="undistort it first",
+        )
     if model in ("PINHOLE", "SIMPLE_PINHOLE"):
         return Lens(*pinhole)
     if model != "FULL_OPENCV" and (k4 or k5 or k6):
         raise HyrfDataError(
-            f"{where} has 'k4' or more, which camera model {model} does not define; "
-            "say FULL_OPENCV (rational) or OPENCV_FISHEYE, or set it to 0"
+            f"{where} has 'k4' or more, which camera model {model} does not define",
+            fix="say FULL_OPENCV (rational) or OPENCV_FISHEYE, or set it to 0",
         )
     return Lens(*pinhole, "brown", brown_coefficients(k1, k2, p1, p2, k3, k4, k5, k6))
 
@@ -228,7 +231,10 @@ def _listed_mask(masks: PictureIndex, frame: dict[str, Any], name: str, file: Pa
         return None
     mask = masks.find(with_forward_slashes(listed)) if isinstance(listed, str) else None
     if mask is None:
-        raise HyrfDataError(f"{file}: mask {str(listed)[:80]} of {name} is not on disk; restore it or drop 'mask_path'")
+        raise HyrfDataError(
+            f"{file}: mask {str(listed)[:80]} of {name} is not on disk",
+            fix="restore it or drop 'mask_path'",
+        )
     return mask
 
 
@@ -239,5 +245,8 @@ def _read_points(path: Path, content: dict[str, Any], file: Path) -> tuple[np.nd
         return None, None
     ply = path / with_forward_slashes(str(listed))
     if not isinstance(listed, str) or not os.path.isfile(ply):  # Path.is_file raises if a name is too long
-        raise HyrfDataError(f"{file}: points {str(listed)[:80]} are not on disk; restore them or drop 'ply_file_path'")
+        raise HyrfDataError(
+            f"{file}: points {str(listed)[:80]} are not on disk",
+            fix="restore them or drop 'ply_file_path'",
+        )
     return read_ply_points(ply)

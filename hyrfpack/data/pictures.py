@@ -92,7 +92,8 @@ class PhotoFile:
     def _size_changed_error(self) -> HyrfDataError:
         """Return the exception for a file whose size differs from that of the scene."""
         return HyrfDataError(
-            f"{display_path(self.path)}: the picture changed its size since the scene was read; read it again"
+            f"{display_path(self.path)}: the picture changed its size since the scene was read",
+            fix="read it again",
         )
 
 
@@ -128,29 +129,34 @@ def open_picture(path: Path) -> ImageFile:
 
     try:
         if path.suffix.lower() in RAW_PHOTO_SUFFIXES:  # many are TIFF files, of which Pillow would read the preview
-            raise HyrfDataError(f"{shown}: raw files are not supported; {RAW_REMEDY}")
+            raise HyrfDataError(f"{shown}: raw files are not supported", fix=RAW_REMEDY)
         if os.path.getsize(path) == 0:
-            raise HyrfDataError(f"{shown}: the picture file is empty (0 bytes); copy it again")
+            raise HyrfDataError(f"{shown}: the picture file is empty (0 bytes)", fix="copy it again")
         _register_heic(path)
         image = Image.open(path)
         if image.format == "EPS":  # PostScript is a program, and Pillow would run it with Ghostscript
-            raise HyrfDataError(f"{shown}: PostScript is not a photo; save it as PNG or JPEG")
+            raise HyrfDataError(f"{shown}: PostScript is not a photo", fix="save it as PNG or JPEG")
     except HyrfError:
         raise
     except FileNotFoundError as error:
-        raise HyrfDataError(f"{shown}: the picture is missing; restore it or read the scene again") from error
+        raise HyrfDataError(f"{shown}: the picture is missing", fix="restore it or read the scene again") from error
     except PermissionError as error:
-        raise HyrfDataError(f"{shown}: the picture may not be read; check its permissions") from error
+        raise HyrfDataError(f"{shown}: the picture may not be read", fix="check its permissions") from error
     except UnidentifiedImageError as error:  # the text of this exception is only the path
         raise HyrfDataError(
-            f"{shown}: not a picture that can be read, its format is unknown; replace the file"
+            f"{shown}: not a picture that can be read, its format is unknown",
+            fix="replace the file",
         ) from error
     except Exception as error:  # Pillow's header parsers raise exceptions of many types
         raise HyrfDataError(
-            f"{shown}: not a picture that can be read ({short_reason(error)}); replace the file"
+            f"{shown}: not a picture that can be read ({short_reason(error)})",
+            fix="replace the file",
         ) from error
     if min(image.size) < 1:
-        raise HyrfDataError(f"{shown}: the picture has no pixels ({image.size[0]} x {image.size[1]}); replace the file")
+        raise HyrfDataError(
+            f"{shown}: the picture has no pixels ({image.size[0]} x {image.size[1]})",
+            fix="replace the file",
+        )
     return image
 
 
@@ -217,7 +223,8 @@ def read_pixels(
 
         if image.mode == "F":
             raise HyrfDataError(
-                f"{display_path(path)}: floating-point pictures have no display values; save it as 8-bit PNG"
+                f"{display_path(path)}: floating-point pictures have no display values",
+                fix="save it as 8-bit PNG",
             )
         try:
             # `draft` returns the box of the picture within the draft, which may end inside the last row and column.
@@ -246,7 +253,8 @@ def read_pixels(
         except Exception as error:  # Pillow's decoders raise exceptions of many types
             shown = display_path(path)
             raise HyrfDataError(
-                f"{shown}: cannot decode the picture ({short_reason(error)}); replace the file"
+                f"{shown}: cannot decode the picture ({short_reason(error)})",
+                fix="replace the file",
             ) from error
     if pixels.ndim == 2:
         return np.repeat(pixels[..., None], 3, axis=2), None
@@ -312,5 +320,5 @@ def _register_heic(path: Path) -> None:
         try:
             import pillow_heif
         except ModuleNotFoundError as error:
-            raise HyrfDataError(f"{display_path(path)}: {HEIC_REQUIREMENT}; {HEIC_REMEDY}") from error
+            raise HyrfDataError(f"{display_path(path)}: {HEIC_REQUIREMENT}", fix=HEIC_REMEDY) from error
         pillow_heif.register_heif_opener()

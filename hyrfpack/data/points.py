@@ -27,12 +27,15 @@ def read_ply_points(ply: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         data = ply.read_bytes()
     except OSError as error:
-        raise HyrfDataError(f"{name}: the points cannot be read ({short_reason(error)}); export them again") from error
+        raise HyrfDataError(
+            f"{name}: the points cannot be read ({short_reason(error)})",
+            fix="export them again",
+        ) from error
     header = read_header(data, name)
     vertex = header.elements.get("vertex")
     kinds = vertex.properties if vertex else {}
     if not all(kinds.get(label) for label in _POSITION_PROPERTIES):
-        raise HyrfDataError(f"{name}: it has no points, or no x, y and z of them; export them again")
+        raise HyrfDataError(f"{name}: it has no points, or no x, y and z of them", fix="export them again")
     rows = read_elements(data, header, {"vertex"}, name)["vertex"]
     points = stack_columns(rows, _POSITION_PROPERTIES).astype(np.float64)
     if not all(kinds.get(label) for label in _COLOR_PROPERTIES):

@@ -46,7 +46,7 @@ def read_polycam(path: Path, *, test_every: int, max_size: int) -> Scene:
             "there are no corrected_cameras in keyframes; the poses are those that the phone tracked, and drift"
         )
     if not (path / images).is_dir():
-        raise HyrfDataError(f"{path}: there is {cameras} but no {images}; export the raw data again")
+        raise HyrfDataError(f"{path}: there is {cameras} but no {images}", fix="export the raw data again")
     tables = _camera_files(path / cameras)
     entries: list[PoseEntry] = []
     for table in tables:
@@ -80,7 +80,7 @@ def _required_number(content: dict[str, Any], key: str, table: Path) -> Any:
     """Return the number under a key, rounded for sizes; raise HyrfDataError if it is missing."""
     value = finite_number(content, key, table)
     if value is None:
-        raise HyrfDataError(f"{table}: has no '{key}'; export the raw data again")
+        raise HyrfDataError(f"{table}: has no '{key}'", fix="export the raw data again")
     if key in ("width", "height"):
         return round(value)
     return value

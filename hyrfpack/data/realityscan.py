@@ -59,7 +59,7 @@ def read_realityscan(path: Path, *, test_every: int, images: str | None, max_siz
     """
     table = find_realityscan(path)
     if table is None:
-        raise HyrfDataError(f"{path}: no camera parameters of RealityScan (.csv); {_EXPORT_ADVICE}")
+        raise HyrfDataError(f"{path}: no camera parameters of RealityScan (.csv)", fix=_EXPORT_ADVICE)
     names, values = _read_table(table)
     poses = np.array([[row[column] for column in _POSE_COLUMNS] for row in values])
     _check_units(poses[:, :3], table)
@@ -102,14 +102,14 @@ def _read_table(table: Path) -> tuple[list[str], list[dict[str, float]]]:
     try:
         text = table.read_bytes().decode("utf-8-sig", errors="replace")
     except OSError as error:
-        raise HyrfDataError(f"{table}: cannot be read ({error.strerror}); restore the file") from error
+        raise HyrfDataError(f"{table}: cannot be read ({error.strerror})", fix="restore the file") from error
     header, _, body = text.partition("\n")
     columns = _parse_header(header) or []
     names, values = [], []
     try:
         rows = list(csv.reader(io.StringIO(body)))
     except csv.Error as error:
-        raise HyrfDataError(f"{table}: not a table that can be read ({error}); export it again") from error
+        raise HyrfDataError(f"{table}: not a table that can be read ({error})", fix="export it again") from error
     for number, row in enumerate(rows, 2):
         if not row or row[0].startswith("#"):
             continue
@@ -120,16 +120,18 @@ def _read_table(table: Path) -> tuple[list[str], list[dict[str, float]]]:
             line = {"f": np.nan}
         if len(row) < len(columns) or not np.isfinite(list(line.values())).all():
             raise HyrfDataError(
-                f"{table}: line {number} is cut short or has something else for a number; export it again"
+                f"{table}: line {number} is cut short or has something else for a number",
+                fix="export it again",
             )
         if line["t1"] or line["t2"]:
             raise HyrfDataError(
-                f"{table}: {cells['name'][:80]!r} has tangential distortion, which is not read; {_EXPORT_ADVICE}"
+                f"{table}: {cells['name'][:80]!r} has tangential distortion, which is not read",
+                fix=_EXPORT_ADVICE,
             )
         names.append(cells["name"].strip())
         values.append(line)
     if not names:
-        raise HyrfDataError(f"{table}: lists no photo; align the photos, then export again")
+        raise HyrfDataError(f"{table}: lists no photo", fix="align the photos, then export again")
     return names, values
 
 
@@ -142,8 +144,8 @@ def _check_units(positions: np.ndarray, table: Path) -> None:
     degrees = abs(middle[0]) <= 180 and abs(middle[1]) <= 90 and np.hypot(*middle[:2]) > 100 * across
     if geocentric or (len(positions) > 1 and degrees and spread[2] > 100 * across):
         raise HyrfDataError(
-            f"{table}: the cameras are in {'geocentric' if geocentric else 'geographic'} coordinates; export them "
-            "again in the grid plane or in local Euclidean ones"
+            f"{table}: the cameras are in {'geocentric' if geocentric else 'geographic'} coordinates",
+            fix="export them again in the grid plane or in local Euclidean ones",
         )
 
 

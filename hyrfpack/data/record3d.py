@@ -42,19 +42,23 @@ def read_record3d(path: Path, *, test_every: int, max_size: int) -> Scene:
     """
     recording = find_record3d(path)
     if recording is None:
-        raise HyrfDataError(f"{path}: no metadata beside a folder of frames (rgbd or rgb); unpack the recording again")
+        raise HyrfDataError(
+            f"{path}: no metadata beside a folder of frames (rgbd or rgb)",
+            fix="unpack the recording again",
+        )
     table, folder = recording
     content = read_json_object(table)
     width, height = (round(finite_number(content, key, table) or 0) for key in ("w", "h"))
     poses = _array(content.get("poses"), 7)
     if poses is None:
-        raise HyrfDataError(f"{table}: has no list of 'poses' of 7 numbers; record again, with the LiDAR camera")
+        raise HyrfDataError(f"{table}: has no list of 'poses' of 7 numbers", fix="record again, with the LiDAR camera")
     lenses = _array(content.get("perFrameIntrinsicCoeffs"), 4)
     if lenses is None or len(lenses) != len(poses):
         matrix = _array([content.get("K")], 9)
         if matrix is None:
             raise HyrfDataError(
-                f"{table}: has neither 'K' nor 'perFrameIntrinsicCoeffs' for each pose; export it again"
+                f"{table}: has neither 'K' nor 'perFrameIntrinsicCoeffs' for each pose",
+                fix="export it again",
             )
         lenses = np.repeat(matrix[:, [0, 4, 6, 7]], len(poses), axis=0)
     entries: list[PoseEntry] = []

@@ -103,8 +103,8 @@ def find_set(path: Path, holds: Callable[[Path], bool]) -> Path | None:
         if len(sets) > 1:
             some = ", ".join(str(folder.relative_to(path)) for folder in sets[:4])
             raise HyrfDataError(
-                f"{path}: holds {len(sets)} sets of photos with poses ({some}{', ...' if len(sets) > 4 else ''}); "
-                "give the folder of one of them"
+                f"{path}: holds {len(sets)} sets of photos with poses ({some}{', ...' if len(sets) > 4 else ''})",
+                fix="give the folder of one of them",
             )
         if sets:
             return sets[0]
@@ -128,7 +128,7 @@ def _models_in(base: Path) -> list[Path]:
     inside = _subfolders(base / "sparse")
     for folder in (base / "sparse", *inside):
         if os.path.isdir(folder) and not os.access(folder, os.R_OK | os.X_OK):
-            raise HyrfDataError(f"{folder}: the folder may not be read; check its permissions")
+            raise HyrfDataError(f"{folder}: the folder may not be read", fix="check its permissions")
     inside.sort(key=lambda entry: (int(entry.name) if entry.name.isdecimal() else math.inf, entry.name))
     models = [folder for folder in (*inside, base / "sparse") if holds_model(folder)]
     return models or [base] * holds_model(base)

@@ -21,11 +21,11 @@ def read_json_object(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_bytes())
     except OSError as error:
-        raise HyrfDataError(f"{path}: cannot be read ({error.strerror}); restore the file") from error
+        raise HyrfDataError(f"{path}: cannot be read ({error.strerror})", fix="restore the file") from error
     except (ValueError, RecursionError) as error:
-        raise HyrfDataError(f"{path}: not valid JSON ({str(error)[:120]}); the file is damaged") from error
+        raise HyrfDataError(f"{path}: not valid JSON ({str(error)[:120]})", fix="the file is damaged") from error
     if not isinstance(content, dict):
-        raise HyrfDataError(f"{path}: not a JSON object; the file is damaged, or of another program")
+        raise HyrfDataError(f"{path}: not a JSON object", fix="the file is damaged, or of another program")
     return content
 
 
@@ -40,10 +40,10 @@ def read_transforms(path: Path) -> dict[str, Any]:
     content = read_json_object(path)
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise HyrfDataError(f"{path}: has no list of 'frames'; it is not a transforms file, or it is empty")
+        raise HyrfDataError(f"{path}: has no list of 'frames'", fix="it is not a transforms file, or it is empty")
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-            raise HyrfDataError(f"{path}: frame {index} has no 'file_path'; correct or remove the frame")
+            raise HyrfDataError(f"{path}: frame {index} has no 'file_path'", fix="correct or remove the frame")
         frame["file_path"] = with_forward_slashes(frame["file_path"])
     return content
 
@@ -63,7 +63,7 @@ def finite_number(entries: dict[str, Any], key: str, path: Path) -> float | None
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not _is_finite(value):
-        raise HyrfDataError(f"{path}: '{key}' is {str(value)[:40]!r} and not a finite number; correct the entry")
+        raise HyrfDataError(f"{path}: '{key}' is {str(value)[:40]!r} and not a finite number", fix="correct the entry")
     return float(value)
 
 
@@ -80,7 +80,8 @@ def focal_from_angle(angle: float, size: int, path: Path) -> float:
     """
     if not 0 < angle < math.pi or 0.5 * angle == 0:  # half of the smallest positive float is 0
         raise HyrfDataError(
-            f"{path}: a field of view of {angle:g} radians is outside (0, pi); correct 'camera_angle_x'"
+            f"{path}: a field of view of {angle:g} radians is outside (0, pi)",
+            fix="correct 'camera_angle_x'",
         )
     return 0.5 * size / math.tan(0.5 * angle)
 
@@ -99,7 +100,8 @@ def pose_from_opengl(frame: dict[str, Any], path: Path) -> np.ndarray:
         matrix = np.empty(0)
     if matrix.shape not in ((3, 4), (4, 4)):
         raise HyrfDataError(
-            f"{path}: frame {frame['file_path'][:80]} has no 4 x 4 'transform_matrix' of numbers; correct or remove it"
+            f"{path}: frame {frame['file_path'][:80]} has no 4 x 4 'transform_matrix' of numbers",
+            fix="correct or remove it",
         )
     with np.errstate(invalid="ignore", over="ignore"):
         return pose_from_camera_axes(matrix[:3, :3] * (1, -1, -1), matrix[:3, 3])

@@ -33,9 +33,9 @@ def raise_if_single_photo(path: Path) -> None:
     """Raise HyrfDataError if a path is a single photo or raw file and not a folder of photos."""
     ending = path.suffix.lower()
     if ending in RAW_PHOTO_SUFFIXES and path.is_file():
-        raise HyrfDataError(f"{path}: raw files are not supported; {RAW_REMEDY}")
+        raise HyrfDataError(f"{path}: raw files are not supported", fix=RAW_REMEDY)
     if ending in READABLE_PICTURE_SUFFIXES and path.is_file():
-        raise HyrfDataError(f"{path}: this is one photo, not a folder of photos; name the folder of all photos")
+        raise HyrfDataError(f"{path}: this is one photo, not a folder of photos", fix="name the folder of all photos")
 
 
 def raw_photos_notes(raw_photos: Sequence[Path]) -> list[str]:
@@ -60,16 +60,34 @@ def unreadable_sentences(reasons: Mapping[str, str], count: int) -> list[str]:
         >>> unreadable_sentences({"a.jpg": "the picture file is empty"}, 40)
         ['1 of 40 photos cannot be read: a.jpg (the picture file is empty); copy it again, or remove it']
     """
+    return [f"{problem}; {fix}" for problem, fix in _unreadable_problems(reasons, count)]
+
+
+def unreadable_error(place: Path, reasons: Mapping[str, str], count: int, consequence: str = "") -> HyrfDataError:
+    """Return the error for photos that cannot be read.
+
+    Args:
+        place: the path that the user named.
+        reasons, count: as in `unreadable_sentences`; at least one reason.
+        consequence: end of the problem: ", and the 2 that can be read are too few".
+    """
+    (problem, fix), *others = _unreadable_problems(reasons, count)
+    more = [f"{other_problem}; {other_fix}" for other_problem, other_fix in others]
+    return HyrfDataError(f"{place}: {problem}{consequence}", fix="; ".join([fix, *more]))
+
+
+def _unreadable_problems(reasons: Mapping[str, str], count: int) -> list[tuple[str, str]]:
+    """Return (problem, fix) for each remedy that unreadable photos need."""
     heic = [name for name, reason in reasons.items() if reason.startswith(HEIC_REQUIREMENT)]
     other = [name for name in reasons if name not in heic]
-    sentences = []
+    problems = []
     if heic:
-        sentences.append(f"{_cannot_be_read(heic, count)} ({HEIC_REQUIREMENT}); {HEIC_REMEDY}")
+        problems.append((f"{_cannot_be_read(heic, count)} ({HEIC_REQUIREMENT})", HEIC_REMEDY))
     if other:
         first, it = reasons[other[0]], "it" if len(other) == 1 else "them"
         reason = first if len({reasons[name] for name in other}) == 1 else f"{other[0]}: {first}"
-        sentences.append(f"{_cannot_be_read(other, count)} ({reason}); copy {it} again, or remove {it}")
-    return sentences
+        problems.append((f"{_cannot_be_read(other, count)} ({reason})", f"copy {it} again, or remove {it}"))
+    return problems
 
 
 def _cannot_be_read(names: Sequence[str], count: int) -> str:
@@ -77,8 +95,8 @@ def _cannot_be_read(names: Sequence[str], count: int) -> str:
     return f"{len(names):,} of {format_photo_count(count)} cannot be read: {format_file_names(names)}"
 
 
-def explain_no_photos(given: Path, folder: Path) -> str:
-    """Explain why a folder has no usable photo, and what to do.
+def no_photos_error(given: Path, folder: Path) -> HyrfDataError:
+    """Return the error for a folder without a usable photo; it says why there is none.
 
     Args:
         given: the path that the user named.
@@ -86,7 +104,9 @@ def explain_no_photos(given: Path, folder: Path) -> str:
     """
     videos = sorted(entry.name for entry in folder.iterdir() if entry.suffix.lower() in VIDEO_SUFFIXES)
     if videos:
-        return f"{given}: there are no photos in this folder, but the video {videos[0]}; name the video itself"
+        return HyrfDataError(
+            f"{given}: there are no photos in this folder, but the video {videos[0]}", fix="name the video itself"
+        )
     raw_photos = list_raw_photos(folder)
     if raw_photos:
         photos = (
@@ -94,8 +114,12 @@ def explain_no_photos(given: Path, folder: Path) -> str:
             if len(raw_photos) == 1
             else f"all {len(raw_photos):,} photos here are raw files"
         )
-        return f"{given}: {photos} ({_format_extensions(raw_photos)}), and raw files are not supported; {RAW_REMEDY}"
-    return f"{given}: there are no photos here (JPEG, PNG, WebP, TIFF or HEIC); name the folder that holds them"
+        return HyrfDataError(
+            f"{given}: {photos} ({_format_extensions(raw_photos)}), and raw files are not supported", fix=RAW_REMEDY
+        )
+    return HyrfDataError(
+        f"{given}: there are no photos here (JPEG, PNG, WebP, TIFF or HEIC)", fix="name the folder that holds them"
+    )
 
 
 def _format_extensions(files: Iterable[Path]) -> str:

@@ -90,7 +90,7 @@ def distill_model(
     light = mean_sent_light(original, evenly_spaced(train, LIGHT_MEASUREMENT_VIEWS))
     kept = torch.from_numpy(_indices_without_faint(light.cpu().numpy())).to(device)
     if not len(kept):
-        raise HyrfDataError(f"{name}: no view shows anything of the Gaussians; give others with `cameras`")
+        raise HyrfDataError(f"{name}: no view shows anything of the Gaussians", fix="give others with `cameras`")
     say(f"{len(splats) - len(kept):,} Gaussians are hardly seen and left out; fitting the fields to the others")
     share = min(1.0, max(MIN_REGRESSION_SHARE, config.steps / FULL_REGRESSION_STEPS))
     model = initial_model(original[kept], light[kept], train, config.seed, share, report_part(report, 0.1, 0.4))

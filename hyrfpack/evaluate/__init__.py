@@ -138,7 +138,7 @@ def evaluate(
     for view in views if isinstance(views, Sequence) else [views]:
         check_type("each of the views", view, View)
     if not views:
-        raise HyrfError("there is no view to score; name a split that has photos or a smaller `test_every`")
+        raise HyrfError("there is no view to score", fix="name a split that has photos or a smaller `test_every`")
     perceptual = None if lpips_weights is None else LPIPS.load(lpips_weights)
     if isinstance(model, Drawable):
         solid, device, count = np.zeros(3, np.float32), model.device, len(model.positions)
@@ -193,7 +193,7 @@ def evaluate(
         all_rows = sorted((row for rows in rows_of_ranks for row in rows), key=lambda row: row[0])
     scores = [score for _, score, _ in all_rows if score is not None]
     if not scores:
-        raise HyrfError("the masks of all views leave no pixel to score; check that white means 'use this pixel'")
+        raise HyrfError("the masks of all views leave no pixel to score", fix="check that white means 'use this pixel'")
     return Evaluation(
         psnr=statistics.fmean(score.psnr for score in scores),
         psnr_consistent=_mean(score.psnr_consistent for score in scores),

@@ -119,14 +119,18 @@ class LPIPS:
             state = torch.load(path, map_location="cpu", weights_only=True)
         except OSError as error:
             raise HyrfError(
-                f"{path}: the LPIPS weights cannot be read ({error.strerror or error}); {advice}"
+                f"{path}: the LPIPS weights cannot be read ({error.strerror or error})",
+                fix=advice,
             ) from error
         except Exception as error:  # torch's unpickler raises exceptions of many types, with long advice
-            raise HyrfError(f"{path}: these are no LPIPS weights (no tensors saved by torch); {advice}") from error
+            raise HyrfError(
+                f"{path}: these are no LPIPS weights (no tensors saved by torch)",
+                fix=advice,
+            ) from error
         try:
             return cls(state if isinstance(state, dict) else {})
         except ValueError as error:
-            raise HyrfError(f"{path}: these are no LPIPS weights ({error}); {advice}") from error
+            raise HyrfError(f"{path}: these are no LPIPS weights ({error})", fix=advice) from error
 
     @torch.no_grad()
     def __call__(self, image: Tensor, reference: Tensor) -> float:
@@ -138,7 +142,8 @@ class LPIPS:
         if min(image.shape[:2]) < self.network.min_size_pixels:
             raise HyrfError(
                 f"LPIPS ({self.name}) needs pictures of {self.network.min_size_pixels} pixels a side and these have "
-                f"{image.shape[1]} x {image.shape[0]}; score without `lpips_weights`"
+                f"{image.shape[1]} x {image.shape[0]}",
+                fix="score without `lpips_weights`",
             )
         pair = torch.stack((image, reference)).permute(0, 3, 1, 2).float().cpu() * 2 - 1
         features = (pair - pair.new_tensor(INPUT_MEANS).view(3, 1, 1)) / pair.new_tensor(INPUT_STDS).view(3, 1, 1)

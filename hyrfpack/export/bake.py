@@ -264,6 +264,6 @@ def check_finite(name: str, values: Tensor) -> None:
     """Raise HyrfError, with the name of the values, unless all are finite."""
     if not values.isfinite().all():
         raise HyrfError(
-            f"the bake's {name} hold NaN or infinity, from a broken model or numbers beyond float32; "
-            "train the model again or correct the cameras"
+            f"the bake's {name} hold NaN or infinity, from a broken model or numbers beyond float32",
+            fix="train the model again or correct the cameras",
         )

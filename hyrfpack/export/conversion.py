@@ -101,7 +101,10 @@ def convert(
     report(f"reading {Path(source).name}", 0.0)
     splats = read_splats(source)
     if not len(splats):
-        raise HyrfDataError(f"{source}: there is no Gaussian in it, so there is nothing to convert; name another file")
+        raise HyrfDataError(
+            f"{source}: there is no Gaussian in it, so there is nothing to convert",
+            fix="name another file",
+        )
     whole = splats if crop is None else select_splats(splats, crop)
     kept = select_splats(whole, None, min_opacity)
     kept = kept.with_degree(min(kept.degree, kind.max_degree, kept.degree if degree is None else degree))
@@ -138,19 +141,24 @@ def find_target_format(source: str | os.PathLike[str], target: str | os.PathLike
     if not is_splats(source):
         if Path(source).suffix.lower() == ".hyrf":
             raise HyrfError(
-                f"{source}: this is a model, not splats; write it with 'hyrfpack export {source} -o {target}'"
+                f"{source}: this is a model, not splats",
+                fix=f"write it with 'hyrfpack export {source} -o {target}'",
             )
         raise HyrfError(
-            f"{source}: this is no file of splats; name one of {', '.join(READABLE_ENDINGS)}, or the folder of a SOG"
+            f"{source}: this is no file of splats",
+            fix=f"name one of {', '.join(READABLE_ENDINGS)}, or the folder of a SOG",
         )
     name = Path(target).name.lower()
     if name.endswith(".hyrf"):
-        raise HyrfError(f"{target}: a model is learnt from splats; run 'hyrfpack import {source} -o {target}'")
+        raise HyrfError(f"{target}: a model is learnt from splats", fix=f"run 'hyrfpack import {source} -o {target}'")
     if name.endswith(".compressed.ply"):
-        raise HyrfError(f"{target}: compressed PLY is read, not written; name a .sog or .spz file, which are smaller")
+        raise HyrfError(
+            f"{target}: compressed PLY is read, not written",
+            fix="name a .sog or .spz file, which are smaller",
+        )
     kind = FORMATS.get(Path(name).suffix)
     if kind is None:
-        raise HyrfError(f"{target}: the ending names the format; end it in one of {', '.join(FORMATS)}")
+        raise HyrfError(f"{target}: the ending names the format", fix=f"end it in one of {', '.join(FORMATS)}")
     return kind
 
 
@@ -159,8 +167,8 @@ def _check_limits(kind: SplatFormat, splats: Splats, kept: Splats, say: Callable
     reach = float(np.abs(kept.positions).max())
     if reach > kind.max_coordinate:
         raise HyrfError(
-            f"the splats reach {reach:,.0f} units from the origin, and {kind.ending} {kind.max_coordinate:,}; "
-            "name another format, or leave the far ones out with `crop`"
+            f"the splats reach {reach:,.0f} units from the origin, and {kind.ending} {kind.max_coordinate:,}",
+            fix="name another format, or leave the far ones out with `crop`",
         )
     if splats.degree > kind.max_degree:
         say(

@@ -50,12 +50,14 @@ def find_file_kind(
     if colmap:
         if name.endswith(ENDINGS) and not os.path.isdir(target):
             raise HyrfError(
-                f"{target}: a COLMAP model is a folder of tables; name one without ending for `colmap=True`"
+                f"{target}: a COLMAP model is a folder of tables",
+                fix="name one without ending for `colmap=True`",
             )
         return COLMAP_FOLDER
     if name.endswith(".compressed.ply"):
         raise HyrfError(
-            f"{target}: compressed PLY is read, not written; .sog and .spz are small, .ply is not compressed"
+            f"{target}: compressed PLY is read, not written",
+            fix=".sog and .spz are small, .ply is not compressed",
         )
     for ending, kind in _KINDS_BY_ENDING.items():
         if name.endswith(ending):
@@ -63,8 +65,8 @@ def find_file_kind(
     if os.path.isdir(target) or not Path(name).suffix:
         return PLAYER_FOLDER
     raise HyrfError(
-        f"{target}: the ending names the format; end it in one of {', '.join((*other_endings, *ENDINGS))}, or name a "
-        "folder for a player"
+        f"{target}: the ending names the format",
+        fix=f"end it in one of {', '.join((*other_endings, *ENDINGS))}, or name a folder for a player",
     )
 
 
@@ -80,17 +82,24 @@ def check_request(
 ) -> None:
     """Check the arguments of `export` before any work. Raises HyrfError if they do not go together."""
     if degree is not None and degree not in range(MAX_DEGREE + 1):
-        raise HyrfError(f"spherical harmonics of degree {degree} are not known; name 0 to {MAX_DEGREE}")
+        raise HyrfError(f"spherical harmonics of degree {degree} are not known", fix=f"name 0 to {MAX_DEGREE}")
     if crop is not None and (np.shape(crop) != (6,) or np.isnan(crop).any()):
-        raise HyrfError(f"the crop {crop} is not a box; name the least x, y, z, then the greatest, in world units")
+        raise HyrfError(
+            f"the crop {crop} is not a box",
+            fix="name the least x, y, z, then the greatest, in world units",
+        )
     if not 0 <= min_opacity <= 1:
-        raise HyrfError(f"an opacity of {min_opacity} cannot be asked for; name 0 to 1")
+        raise HyrfError(f"an opacity of {min_opacity} cannot be asked for", fix="name 0 to 1")
     if kind is TRANSFORMS_JSON and (crop is not None or min_opacity > 0):
         raise HyrfError(
-            f"{target}: this holds cameras only, and `crop` and `min_opacity` choose Gaussians; leave them out"
+            f"{target}: this file holds only cameras, so that Gaussians cannot be selected",
+            fix="leave out `crop` and `min_opacity`",
         )
     if baked and kind is PLAYER_FOLDER:
-        raise HyrfError(f"{target}: a player's folder holds the model file itself; for `baked=True` name a file .html")
+        raise HyrfError(
+            f"{target}: a player's folder holds the model file itself",
+            fix="for `baked=True` name a file .html",
+        )
     asked = {
         "`degree`": degree is not None,
         "`crop`": crop is not None,
@@ -101,8 +110,8 @@ def check_request(
     if any(asked.values()) and (kind is PLAYER_FOLDER or (kind is HTML_PAGE and not baked)):
         names = " and ".join(name for name, given in asked.items() if given)
         raise HyrfError(
-            f"{target}: the model goes along whole, and {names} would change it; leave it out, or write splats into a "
-            "page with `baked=True`"
+            f"{target}: the output holds the whole model, which these settings cannot change",
+            fix=f"leave out {names}, or write baked splats into a page with `baked=True`",
         )
     if kind.package:
         module, package = kind.package
@@ -139,7 +148,8 @@ def check_model(loaded: Source, kind: FileKind, crop: Sequence[float] | None, mi
     if reach > kind.max_coordinate:
         raise HyrfError(
             f"the scene reaches {reach:,.0f} units from the origin with its background, and {kind.ending} "
-            f"{kind.max_coordinate:,}; export another format, or try `background=False`"
+            f"{kind.max_coordinate:,}",
+            fix="export another format, or try `background=False`",
         )
 
 
@@ -165,11 +175,11 @@ def selection_mask(
     if crop is not None:
         keep &= ((positions >= crop[:3]) & (positions <= crop[3:])).all(axis=1)
     if not len(positions):
-        raise HyrfError("no Gaussian is left: no camera sees any; name the photos with `data`, or train again")
+        raise HyrfError("no Gaussian is left: no camera sees any", fix="name the photos with `data`, or train again")
     if not keep.any():
         low, high = (corner.round(4).tolist() for corner in (positions.min(0), positions.max(0)))
         raise HyrfError(
-            f"no Gaussian is left: centres lie between {low} and {high}, opacities reach {opacities.max():.3f}; "
-            "widen `crop` or lower `min_opacity`"
+            f"no Gaussian is left: centres lie between {low} and {high}, opacities reach {opacities.max():.3f}",
+            fix="widen `crop` or lower `min_opacity`",
         )
     return keep

@@ -159,7 +159,10 @@ def _export_checked(
         return write_native_page(loaded, source, target, say, overwrite)
     if kind in (TRANSFORMS_JSON, COLMAP_FOLDER) and (loaded.has_coarse_cameras or not loaded.cameras):
         kept = "only coarse cameras" if loaded.has_coarse_cameras else "no cameras"
-        raise HyrfError(f"{source}: it keeps {kept}; export them from the file that training wrote, or name `data`")
+        raise HyrfError(
+            f"{source}: it keeps {kept}",
+            fix="export them from the file that training wrote, or name `data`",
+        )
     if kind is TRANSFORMS_JSON:
         return _export_cameras(loaded, target, overwrite)
     points = kind in (COLMAP_FOLDER, *POINT_FILES)

@@ -40,7 +40,7 @@ def encode_points(splats: Splats, cameras: Sequence[Camera], extension: Literal[
         HyrfDataError: there is nothing to show, or positions are beyond float32.
     """
     if not len(splats) and not cameras:
-        raise HyrfDataError("there are neither points nor cameras to export; name a model that has some")
+        raise HyrfDataError("there are neither points nor cameras to export", fix="name a model that has some")
     frusta = _make_frusta(cameras, splats.positions)
     origin = local_origin(np.concatenate((splats.positions, frusta.reshape(-1, 3))))
     return _encode_glb(splats, frusta, origin, up) if extension == "glb" else _encode_ply(splats, frusta, origin)

@@ -62,13 +62,16 @@ class Source:
         """
         facts, model = describe(path), load(path)
         if not len(model):
-            raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to export; train it again")
+            raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to export", fix="train it again")
         capture = Capture(facts, data)
         try:
             viewpoint = capture.viewpoint
         except HyrfDataError as error:  # photos would not help, because the model's own viewpoint is needed
             why = error.__cause__
-            raise HyrfDataError(f"{path}: its viewpoint cannot be used ({why!s:.160}); train the model again") from why
+            raise HyrfDataError(
+                f"{path}: its viewpoint cannot be used ({why!s:.160})",
+                fix="train the model again",
+            ) from why
         up, center = viewpoint.up / math.hypot(*viewpoint.up), viewpoint.center
         stated = provenance_mse(facts["provenance"])
         cameras = capture.cameras

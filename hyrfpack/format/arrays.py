@@ -61,7 +61,8 @@ def to_arrays(model: HybridModel) -> dict[str, np.ndarray]:
         if wrong := int(np.count_nonzero(~np.isfinite(values))):
             raise HyrfError(
                 f"{wrong} of {values.size} numbers in the model's {sections.SECTION_CONTENTS[group]} are NaN or "
-                "infinite; train it again from an earlier checkpoint"
+                "infinite",
+                fix="train it again from an earlier checkpoint",
             )
         matrices[group] = values
     return matrices
@@ -120,8 +121,8 @@ def check_rules(rules: dict) -> None:
     for name in sorted({*rules, *MODEL_RULES}):
         if name not in MODEL_RULES or rules.get(name) != MODEL_RULES[name]:
             raise HyrfFormatError(
-                f"rule {name!r:.40} is {rules.get(name)!r:.40} and this hyrfpack knows only {MODEL_RULES.get(name)!r}; "
-                "update hyrfpack"
+                f"rule {name!r:.40} is {rules.get(name)!r:.40} and this hyrfpack knows only {MODEL_RULES.get(name)!r}",
+                fix="update hyrfpack",
             )
 
 
@@ -135,5 +136,6 @@ def parse_config(values: dict) -> ModelConfig:
         return ModelConfig.from_dict(values)
     except (TypeError, ValueError, KeyError) as error:
         raise HyrfFormatError(
-            f"the model's configuration is not valid ({error!s:.200}); write the file again"
+            f"the model's configuration is not valid ({error!s:.200})",
+            fix="write the file again",
         ) from error

@@ -108,7 +108,7 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
     """
     check_type("model", model, HybridModel)
     if profile not in PROFILES:
-        raise HyrfError(f"there is no profile '{profile}'; use one of: {', '.join(PROFILES)}")
+        raise HyrfError(f"there is no profile '{profile}'", fix=f"use one of: {', '.join(PROFILES)}")
     sections, used = PROFILES[profile](model, **settings)
     counts = [section.raw_length // 12 for section in sections if group_and_layer(section.type)[0] == POSITIONS]
     layers = counts if len(counts) > 1 else []
@@ -124,7 +124,8 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
     if raw_length > raw_bytes_limit(stored) or sum(counts) > gaussian_limit(stored):
         raise HyrfError(
             f"{raw_length:,} bytes of numbers, nearly all alike, would take only {stored:,}, and readers do not "
-            "unpack so much from so few; keep this model as profile raw"
+            "unpack so much from so few",
+            fix="keep this model as profile raw",
         )
     return write_container(sections, minor=minor)
 
@@ -265,7 +266,7 @@ def _decode(container: Container) -> HybridModel:
         check_rules(metadata.rules)
         config = parse_config(metadata.config)
     except HyrfFormatError as error:
-        raise HyrfFormatError(f"{name}: {error}") from error
+        raise error.with_text(f"{name}: {error.problem}") from error
     layers = metadata.layers or [metadata.gaussians]
     shapes = {}
     for layer, count in enumerate(layers):
@@ -276,13 +277,14 @@ def _decode(container: Container) -> HybridModel:
     for tag, (rows, columns) in shapes.items():
         entry = container.entries.get(tag)
         if entry is None:
-            raise HyrfFormatError(f"{name}: there is no section '{tag}'; the file is incomplete, write it again")
+            raise HyrfFormatError(f"{name}: there is no section '{tag}'", fix="the file is incomplete, write it again")
         if entry.codec not in DECODER_BY_CODEC and entry.codec not in compact.SECTIONS_BY_CODEC:
-            raise HyrfFormatError(f"{name}: section '{tag}' has the unknown codec {entry.codec}; update hyrfpack")
+            raise HyrfFormatError(f"{name}: section '{tag}' has the unknown codec {entry.codec}", fix="update hyrfpack")
         if entry.raw_length != 4 * rows * columns:
             raise HyrfFormatError(
                 f"{name}: section '{tag}' says it decodes to {entry.raw_length} bytes and the metadata asks for "
-                f"{4 * rows * columns}; the file is damaged, write it again"
+                f"{4 * rows * columns}",
+                fix="the file is damaged, write it again",
             )
     # Of a partial file the first layer must be complete; further layers are used up to the first incomplete one.
     layer_count = 1
@@ -295,12 +297,13 @@ def _decode(container: Container) -> HybridModel:
         needed = max(container.entries[tag].end for tag in used_tags)
         raise HyrfFormatError(
             f"{name}: the first {needed:,} of {container.length:,} bytes make a model, and only "
-            f"{container.available:,} are there or allowed; take more of the file"
+            f"{container.available:,} are there or allowed",
+            fix="take more of the file",
         )
     if sum(layers[:layer_count]) > (limit := gaussian_limit(container.available)):
         raise HyrfFormatError(
-            f"{name}: it says {sum(layers[:layer_count]):,} Gaussians, and so few bytes may hold {limit:,}; the file "
-            "is damaged, copy or write it again"
+            f"{name}: it says {sum(layers[:layer_count]):,} Gaussians, and so few bytes may hold {limit:,}",
+            fix="the file is damaged, copy or write it again",
         )
     sections = {tag: container[tag] for tag in used_tags}
     arrays: dict[str, np.ndarray] = {}
@@ -330,7 +333,10 @@ def _decode(container: Container) -> HybridModel:
     run_tasks(decode, len(rest))
     for tag, values in arrays.items():
         if not np.isfinite(values).all():
-            raise HyrfFormatError(f"{name}: section '{tag}' holds numbers that are not finite; write the file again")
+            raise HyrfFormatError(
+                f"{name}: section '{tag}' holds numbers that are not finite",
+                fix="write the file again",
+            )
     for group in LAYERED_SECTIONS if layer_count > 1 else ():
         arrays[group] = np.concatenate([arrays.pop(layer_section(group, layer)) for layer in range(layer_count)])
     model = to_model(config, arrays).requires_grad_(False)
@@ -346,5 +352,7 @@ def _add_error_context(name: str, group: str) -> Iterator[None]:
     """Add the file and the section to the message of a format error."""
     try:
         yield
-    except (HyrfFormatError, DamagedDataError) as error:
-        raise HyrfFormatError(f"{name}: section '{group}': {error}") from error
+    except HyrfFormatError as error:
+        raise error.with_text(f"{name}: section '{group}': {error.problem}") from error
+    except DamagedDataError as error:
+        raise HyrfFormatError(f"{name}: section '{group}': {error}", fix="copy or write the file again") from error

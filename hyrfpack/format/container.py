@@ -122,7 +122,7 @@ class Container:
                 file is damaged.
         """
         if fraction is not None and not 0 <= fraction <= 1:
-            raise HyrfFormatError(f"{name}: there is no part of {fraction} of a file; ask for 0 to 1")
+            raise HyrfFormatError(f"{name}: there is no part of {fraction} of a file", fix="ask for 0 to 1")
         self._read_at = read_at
         self.name = name
         self.length = self.available = length
@@ -152,7 +152,10 @@ class Container:
             # The mode is checked before opening, because opening a named pipe would wait for a writer.
             mode = os.stat(path).st_mode
             if not stat.S_ISREG(mode):
-                raise HyrfFormatError(f"{name}: this is not a regular file; copy its content to a .hyrf file first")
+                raise HyrfFormatError(
+                    f"{name}: this is not a regular file",
+                    fix="copy its content to a .hyrf file first",
+                )
             file = open(path, "rb")
         except (OSError, ValueError) as error:
             raise _unreadable_error(name, error) from error
@@ -181,12 +184,16 @@ class Container:
             HyrfFormatError: the file lacks this section, or its bytes are damaged.
         """
         if tag not in self.entries or (self._known is not None and tag not in self._known):
-            raise HyrfFormatError(f"{self.name}: there is no section '{tag}'; the file is incomplete, write it again")
+            raise HyrfFormatError(
+                f"{self.name}: there is no section '{tag}'",
+                fix="the file is incomplete, write it again",
+            )
         entry = self.entries[tag]
         if not self._is_available(entry):
             raise HyrfFormatError(
-                f"{self.name}: section '{tag}' ends at byte {entry.end:,} and only {self.available:,} of the "
-                f"file's {self.length:,} bytes are there or allowed; take more of the file"
+                f"{self.name}: section '{tag}' ends at byte {entry.end:,} and only {self.available:,} of the file's "
+                f"{self.length:,} bytes are there or allowed",
+                fix="take more of the file",
             )
         stored = memoryview(self._read_at(entry.offset, _padded_length(entry.length)))
         data = stored[: entry.length]
@@ -216,14 +223,15 @@ class Container:
         if not start:
             raise self._damaged_error("the file is empty")
         if start[: len(MAGIC)] != MAGIC[: len(start)]:
-            raise HyrfFormatError(f"{self.name}: this is not a .hyrf file; check the path, or write it again")
+            raise HyrfFormatError(f"{self.name}: this is not a .hyrf file", fix="check the path, or write it again")
         # The version is checked first, because another major version may change the layout of all that follows.
         if len(start) >= len(MAGIC) + _VERSION_STRUCT.size:
             major, minor = _VERSION_STRUCT.unpack_from(start, len(MAGIC))
             if major != MAJOR_VERSION:
                 raise HyrfFormatError(
                     f"{self.name}: this file has format version {major}.{minor} and this hyrfpack reads version "
-                    f"{MAJOR_VERSION}; update hyrfpack"
+                    f"{MAJOR_VERSION}",
+                    fix="update hyrfpack",
                 )
         if len(start) < _TOC_OFFSET:
             raise self._damaged_error(f"the file ends after {len(start)} bytes, within its header")
@@ -236,19 +244,20 @@ class Container:
         )
         if flags:
             raise HyrfFormatError(
-                f"{self.name}: the header sets flags {flags:#x} that this hyrfpack does not know; update hyrfpack"
+                f"{self.name}: the header sets flags {flags:#x} that this hyrfpack does not know",
+                fix="update hyrfpack",
             )
         if file_length > length and self._fraction is None:
             raise HyrfFormatError(
-                f"{self.name}: the header says {file_length:,} bytes and there are {length:,}; the file is truncated, "
-                f"copy or write it again"
+                f"{self.name}: the header says {file_length:,} bytes and there are {length:,}",
+                fix="the file is truncated, copy or write it again",
             )
         if file_length < length:
             raise self._damaged_error(f"the header says {file_length:,} bytes and there are {length:,}")
         if file_length > MAX_FILE_BYTES:
             raise HyrfFormatError(
-                f"{self.name}: {file_length:,} bytes are more than a .hyrf file may have ({MAX_FILE_BYTES:,}); "
-                f"compress the model"
+                f"{self.name}: {file_length:,} bytes are more than a .hyrf file may have ({MAX_FILE_BYTES:,})",
+                fix="compress the model",
             )
         if count > MAX_SECTIONS:
             raise self._damaged_error(
@@ -287,7 +296,8 @@ class Container:
             if required and self._known is not None and tag not in self._known:
                 raise HyrfFormatError(
                     f"{self.name}: section '{tag}' is required and this hyrfpack does not know it (the file has "
-                    f"format version {self.version[0]}.{self.version[1]}); update hyrfpack"
+                    f"format version {self.version[0]}.{self.version[1]})",
+                    fix="update hyrfpack",
                 )
             if flags & ~_REQUIRED_FLAG or reserved:
                 raise self._damaged_error(f"section '{tag}' sets reserved bits")
@@ -309,7 +319,7 @@ class Container:
         return entries
 
     def _damaged_error(self, what: str) -> HyrfFormatError:
-        return HyrfFormatError(f"{self.name}: {what}; the file is damaged, copy or write it again")
+        return HyrfFormatError(f"{self.name}: {what}", fix="the file is damaged, copy or write it again")
 
 
 def write_container(sections: Sequence[Section], minor: int) -> bytes:
@@ -398,13 +408,16 @@ def _read_file_at(file: BinaryIO, name: str, offset: int, count: int) -> bytes:
     except OSError as error:
         raise _unreadable_error(name, error) from error
     if len(data) != count:
-        raise HyrfFormatError(f"{name}: the file became shorter while it was read; read it again once it is complete")
+        raise HyrfFormatError(
+            f"{name}: the file became shorter while it was read",
+            fix="read it again once it is complete",
+        )
     return data
 
 
 def _unreadable_error(name: str, error: OSError | ValueError) -> HyrfFormatError:
     """Return the error for a file that the system could not open or read."""
     if isinstance(error, FileNotFoundError):
-        return HyrfFormatError(f"{name}: there is no such file; check the path")
+        return HyrfFormatError(f"{name}: there is no such file", fix="check the path")
     reason = getattr(error, "strerror", None) or error
-    return HyrfFormatError(f"{name}: the file cannot be read ({reason}); check the path and its permissions")
+    return HyrfFormatError(f"{name}: the file cannot be read ({reason})", fix="check the path and its permissions")

@@ -50,4 +50,4 @@ def decode_exposure(codec: int, data: memoryview, raw_length: int) -> ExposureMa
             weights=np.ascontiguousarray(centers["weight"]).astype(np.int16),
         )
     except ValueError as error:
-        raise HyrfFormatError(f"{error}; the file is damaged, write it again") from error
+        raise HyrfFormatError(f"{error}", fix="the file is damaged, write it again") from error

@@ -68,7 +68,7 @@ def read_exposure_header(codec: int, data: bytes | memoryview, raw_length: int) 
             bytes are not zero, or a number is not finite.
     """
     if codec != CODEC_EXPOSURE:
-        raise HyrfFormatError(f"the codec {codec} is unknown; update hyrfpack")
+        raise HyrfFormatError(f"the codec {codec} is unknown", fix="update hyrfpack")
     data = memoryview(data)
     if (
         len(data) < _HEADER_STRUCT.size
@@ -76,13 +76,14 @@ def read_exposure_header(codec: int, data: bytes | memoryview, raw_length: int) 
         or len(data) != _HEADER_STRUCT.size + data[0] * BYTES_PER_CENTER
     ):
         raise HyrfFormatError(
-            f"its {len(data)} bytes are no exposure map of {raw_length} bytes; the file is damaged, write it again"
+            f"its {len(data)} bytes are no exposure map of {raw_length} bytes",
+            fix="the file is damaged, write it again",
         )
     centers, reserved, *numbers = _HEADER_STRUCT.unpack_from(data)
     if any(reserved):
-        raise HyrfFormatError("its reserved bytes are not zero; the file is damaged, write it again")
+        raise HyrfFormatError("its reserved bytes are not zero", fix="the file is damaged, write it again")
     if not all(map(math.isfinite, numbers)):
-        raise HyrfFormatError("it holds numbers that are not finite; the file is damaged, write it again")
+        raise HyrfFormatError("it holds numbers that are not finite", fix="the file is damaged, write it again")
     values = iter(numbers)
     fields = {name: tuple(next(values) for _ in range(count)) for name, count in _FLOATS_PER_FIELD.items()}
     return ExposureHeader(centers, **fields), data[_HEADER_STRUCT.size :]

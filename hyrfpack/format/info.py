@@ -88,5 +88,5 @@ def _describe_exposure(container: Container) -> dict | None:
     try:
         head, _ = read_exposure_header(section.codec, section.data, section.raw_length)
     except HyrfFormatError as error:
-        raise HyrfFormatError(f"{container.name}: section '{EXPOSURE}': {error}") from error
+        raise error.with_text(f"{container.name}: section '{EXPOSURE}': {error.problem}") from error
     return {"centers": head.centers, "stops": list(head.stops)}

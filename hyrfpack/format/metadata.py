@@ -80,14 +80,18 @@ class Metadata:
         if not self.layers:
             del values["layers"]
         if _is_too_deep(values):
-            raise HyrfError(f"the metadata is nested deeper than {MAX_NESTING_DEPTH} levels; flatten the provenance")
+            raise HyrfError(
+                f"the metadata is nested deeper than {MAX_NESTING_DEPTH} levels",
+                fix="flatten the provenance",
+            )
         try:
             text = json.dumps(values, sort_keys=True, separators=(",", ":"), allow_nan=False)
         except TypeError as error:
             raise ValueError(f"the metadata is not JSON: {error}") from error
         if len(text) > MAX_METADATA_BYTES:
             raise HyrfError(
-                f"the metadata takes {len(text)} bytes and may take {MAX_METADATA_BYTES}; shorten the provenance"
+                f"the metadata takes {len(text)} bytes and may take {MAX_METADATA_BYTES}",
+                fix="shorten the provenance",
             )
         data = text.encode("ascii")
         return (
@@ -111,14 +115,14 @@ def read_metadata(container: Container) -> Metadata:
     name, entry = container.name, container.entries.get(METADATA)
     if entry is not None and (entry.raw_length > MAX_METADATA_BYTES or entry.codec not in (CODEC_JSON, CODEC_DEFLATED)):
         raise HyrfFormatError(
-            f"{name}: the metadata has {entry.raw_length} bytes in codec {entry.codec}, and {MAX_METADATA_BYTES} bytes "
-            f"at most in codecs {CODEC_JSON} and {CODEC_DEFLATED} can be read; the file is damaged or newer than this "
-            "hyrfpack"
+            f"{name}: the metadata has {entry.raw_length} bytes in codec {entry.codec}, and {MAX_METADATA_BYTES} "
+            f"bytes at most in codecs {CODEC_JSON} and {CODEC_DEFLATED} can be read",
+            fix="the file is damaged or newer than this hyrfpack",
         )
     if entry is not None and entry.codec == CODEC_JSON and entry.raw_length != entry.length:
         raise HyrfFormatError(
-            f"{name}: the metadata has {entry.length} bytes and says it decodes to {entry.raw_length}; the file is "
-            "damaged, write it again"
+            f"{name}: the metadata has {entry.length} bytes and says it decodes to {entry.raw_length}",
+            fix="the file is damaged, write it again",
         )
     data = bytes(container[METADATA].data)  # raises HyrfFormatError if the section is absent
     if entry is not None and entry.codec == CODEC_DEFLATED:
@@ -127,12 +131,16 @@ def read_metadata(container: Container) -> Metadata:
         values = json.loads(data.decode("utf-8"), parse_constant=_parse_finite, parse_float=_parse_finite)
     # Deep nesting overflows the parser's stack, and Python converts no integer of 5,000 digits (ValueError).
     except (ValueError, RecursionError) as error:
-        raise HyrfFormatError(f"{name}: the metadata is not valid JSON ({error}); write the file again") from error
+        raise HyrfFormatError(
+            f"{name}: the metadata is not valid JSON ({error})",
+            fix="write the file again",
+        ) from error
     if not isinstance(values, dict):
-        raise HyrfFormatError(f"{name}: the metadata is not a JSON object; write the file again")
+        raise HyrfFormatError(f"{name}: the metadata is not a JSON object", fix="write the file again")
     if _is_too_deep(values):
         raise HyrfFormatError(
-            f"{name}: the metadata is nested deeper than {MAX_NESTING_DEPTH} levels; write the file again"
+            f"{name}: the metadata is nested deeper than {MAX_NESTING_DEPTH} levels",
+            fix="write the file again",
         )
     values = {"layers": [], **values}
     values = {item.name: values.get(item.name) for item in fields(Metadata)}
@@ -149,7 +157,7 @@ def read_metadata(container: Container) -> Metadata:
         if layers and (min(layers) < 0 or sum(layers) != values["gaussians"]):
             raise ValueError(f"its layers do not add up to {values['gaussians']} Gaussians")
     except ValueError as error:
-        raise HyrfFormatError(f"{name}: the metadata is not valid: {error}; write the file again") from error
+        raise HyrfFormatError(f"{name}: the metadata is not valid: {error}", fix="write the file again") from error
     return Metadata(**values)
 
 
@@ -159,9 +167,12 @@ def _inflate(data: bytes, length: int, name: str) -> bytes:
     try:
         text = inflater.decompress(data, length + 1)
     except zlib.error as error:
-        raise HyrfFormatError(f"{name}: the metadata cannot be unpacked ({error}); write the file again") from error
+        raise HyrfFormatError(
+            f"{name}: the metadata cannot be unpacked ({error})",
+            fix="write the file again",
+        ) from error
     if len(text) != length or not inflater.eof or inflater.unused_data:
-        raise HyrfFormatError(f"{name}: the metadata does not unpack to {length} bytes; write the file again")
+        raise HyrfFormatError(f"{name}: the metadata does not unpack to {length} bytes", fix="write the file again")
     return text
 
 

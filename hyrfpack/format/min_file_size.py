@@ -72,8 +72,8 @@ def check_target_bytes(target_bytes: int, provenance: dict | None = None, exposu
     )
     remedy = f"did you mean {target_bytes}{unit}?" if unit else "ask for more"
     raise HyrfError(
-        f"a target size of {target_bytes:,} bytes is below the smallest possible file, about {smallest:,} bytes; "
-        f"{remedy}"
+        f"a target size of {target_bytes:,} bytes is below the smallest possible file, about {smallest:,} bytes",
+        fix=remedy,
     )
 
 

@@ -65,8 +65,8 @@ class PaperSettings:
         for stages, size in (self.color, self.scale, self.opacity):
             if not (1 <= stages <= MAX_VQ_STAGES and 1 <= size <= 256):
                 raise HyrfError(
-                    f"the paper profile was asked for {stages} stages of {size} codewords; use 1 to {MAX_VQ_STAGES} "
-                    "stages of 1 to 256"
+                    f"the paper profile was asked for {stages} stages of {size} codewords",
+                    fix=f"use 1 to {MAX_VQ_STAGES} stages of 1 to 256",
                 )
 
 
@@ -111,8 +111,8 @@ def _clip_opacity_logits(model: HybridModel, opacity_logits: np.ndarray) -> np.n
     neural = model.geometry(model.cube_coords(model.gaussians.positions))[:, :1].cpu().numpy()
     if not np.isfinite(neural).all():
         raise HyrfError(
-            "the model's geometry field gives opacities that are NaN or infinite; train it again with lower learning "
-            "rates"
+            "the model's geometry field gives opacities that are NaN or infinite",
+            fix="train it again with lower learning rates",
         )
     return np.clip(opacity_logits, -LOGIT_LIMIT - neural, LOGIT_LIMIT - neural)
 
@@ -123,7 +123,8 @@ def _check_half_range(tag: str, values: np.ndarray) -> None:
     if largest > FLOAT16_MAX:
         raise HyrfError(
             f"numbers in the model's {sections.SECTION_CONTENTS[tag]} reach {largest:.6g} and half precision ends at "
-            f"{FLOAT16_MAX:.0f}; keep this model as profile raw, or train it again without such outliers"
+            f"{FLOAT16_MAX:.0f}",
+            fix="keep this model as profile raw, or train it again without such outliers",
         )
 
 
@@ -162,31 +163,37 @@ def _encode_residual_vq(tag: str, values: np.ndarray, shape: tuple[int, int], se
 
 def _decode_residual_vq(data: memoryview, shape: tuple[int, int]) -> np.ndarray:
     if len(data) < _VQ_HEADER_STRUCT.size:
-        raise HyrfFormatError(f"it has {len(data)} bytes, fewer than the header of a residual quantiser")
+        raise HyrfFormatError(
+            f"it has {len(data)} bytes, fewer than the header of a residual quantiser",
+            fix="copy or write the file again",
+        )
     stages, columns, size = _VQ_HEADER_STRUCT.unpack_from(data)
     position = _VQ_HEADER_STRUCT.size + 2 * stages * size * columns
     if not (1 <= stages <= MAX_VQ_STAGES and size) or columns != shape[1] or position > len(data):
-        raise HyrfFormatError(f"it says {stages} codebooks of {size} codewords of {columns} numbers; it is damaged")
+        raise HyrfFormatError(
+            f"it says {stages} codebooks of {size} codewords of {columns} numbers",
+            fix="it is damaged",
+        )
     codebooks = np.frombuffer(data[_VQ_HEADER_STRUCT.size : position], "<f2").reshape(stages, size, columns)
     if not np.isfinite(codebooks).all():
-        raise HyrfFormatError("its codebooks hold numbers that are not finite; it is damaged")
+        raise HyrfFormatError("its codebooks hold numbers that are not finite", fix="it is damaged")
     decoded = np.zeros(shape, np.float32)
     for stage in range(stages):
         start = position + _STREAM_LENGTH_STRUCT.size
         position = start + (_STREAM_LENGTH_STRUCT.unpack_from(data, position)[0] if start <= len(data) else 0)
         if not start <= position <= len(data):
-            raise HyrfFormatError(f"it ends within stage {stage} of {stages}; it is damaged")
+            raise HyrfFormatError(f"it ends within stage {stage} of {stages}", fix="it is damaged")
         indices = _decode_huffman(data[start:position], shape[0])
         decoded += ResidualVectorQuantizer.decode(indices[:, None], codebooks[stage : stage + 1])
     if position != len(data):
-        raise HyrfFormatError(f"{len(data) - position} bytes follow its last stage; it is damaged")
+        raise HyrfFormatError(f"{len(data) - position} bytes follow its last stage", fix="it is damaged")
     return decoded
 
 
 def _decode_huffman(data: memoryview, count: int) -> np.ndarray:
     stream = HuffmanStream.from_bytes(bytes(data))
     if stream.count != count:
-        raise HyrfFormatError(f"it codes {stream.count} symbols and the metadata asks for {count}; it is damaged")
+        raise HyrfFormatError(f"it codes {stream.count} symbols and the metadata asks for {count}", fix="it is damaged")
     return huffman_decode(stream)
 
 

@@ -41,7 +41,10 @@ def decode_plain(data: memoryview, shape: tuple[int, int], dtype: str) -> np.nda
     """
     expected = shape[0] * shape[1] * np.dtype(dtype).itemsize
     if len(data) != expected:
-        raise HyrfFormatError(f"it has {len(data)} bytes and the metadata asks for {expected}; the file is damaged")
+        raise HyrfFormatError(
+            f"it has {len(data)} bytes and the metadata asks for {expected}",
+            fix="the file is damaged",
+        )
     return np.frombuffer(data, dtype).astype(np.float32).reshape(shape)
 
 

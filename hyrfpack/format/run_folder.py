@@ -13,6 +13,7 @@ from hyrfpack.errors import HyrfFormatError
 MODEL_FILE = "model.hyrf"
 CHECKPOINT_FILE = "checkpoint.pt"
 METRICS_FILE = "metrics.json"
+FINISH_RUN_ADVICE = "finish it by running its 'hyrfpack train' command again with `resume=True`"
 
 
 @dataclass(frozen=True)
@@ -67,16 +68,17 @@ def find_model(path: str | os.PathLike[str]) -> Path:
     if (path / MODEL_FILE).is_file():
         return path / MODEL_FILE
     if (path / CHECKPOINT_FILE).is_file():
-        raise HyrfFormatError(f"{path}: {describe_unfinished_run(read_run_status(path))}")
+        raise HyrfFormatError(f"{path}: {describe_unfinished_run(read_run_status(path))}", fix=FINISH_RUN_ADVICE)
     raise HyrfFormatError(
-        f"{path}: this folder holds no {MODEL_FILE}; name a .hyrf file, or a folder that 'hyrfpack train' wrote"
+        f"{path}: this folder holds no {MODEL_FILE}",
+        fix="name a .hyrf file, or a folder that 'hyrfpack train' wrote",
     )
 
 
 def describe_unfinished_run(run: RunStatus) -> str:
-    """Return a message clause that says how far an unfinished run is and how to finish it."""
+    """Return a message clause that says how far an unfinished run is; FINISH_RUN_ADVICE says how to finish it."""
     done = "" if run.step is None or run.steps is None else f" (step {run.step:,} of {run.steps:,})"
-    return f"the run has not finished{done}; finish it by running its 'hyrfpack train' command again with `resume=True`"
+    return f"the run has not finished{done}"
 
 
 def read_run_status(folder: str | os.PathLike[str]) -> RunStatus:

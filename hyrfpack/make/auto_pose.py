@@ -47,7 +47,7 @@ def auto_pose(
     scene, source = run / SCENE_FOLDER, Source.from_path(photos, LoadSettings(images))
     _check_run_folder(source, run, overwrite=True)
     if Path(os.path.realpath(run)).is_relative_to(os.path.realpath(source.path)):
-        raise HyrfError(f"{run}: the run would lie among the photos; name another folder")
+        raise HyrfError(f"{run}: the run would lie among the photos", fix="name another folder")
     with exclusive_folder(run):
         _check_run_folder(source, run, overwrite=overwrite or resume)
         _estimate_unless_posed(source.path, scene, overwrite, report, say)

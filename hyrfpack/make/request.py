@@ -28,7 +28,7 @@ def default_work_folder(output: Path) -> Path:
     """Return the default work folder of an output, which lies beside it. Raises HyrfError: the output has no name."""
     absolute = output if output.name.strip(".") else Path(os.path.realpath(output))
     if not absolute.name:
-        raise HyrfError(f"{output}: this is the top of all folders; name a folder or a file in it")
+        raise HyrfError(f"{output}: this is the top of all folders", fix="name a folder or a file in it")
     return absolute.with_name(f"{absolute.stem}.work")
 
 
@@ -75,8 +75,8 @@ class Request:
         """Check an existing output. Raises HyrfError: it was made by an earlier call and may not be replaced."""
         if not self.overwrite and os.path.lexists(self.output) and self.is_output_unchanged(state):
             raise HyrfError(
-                f"{self.output}: this was made of other photos or with other settings; name another, or replace it "
-                "with `overwrite=True`"
+                f"{self.output}: this was made of other photos or with other settings",
+                fix="name another, or replace it with `overwrite=True`",
             )
 
     def is_output_unchanged(self, state: WorkFolderState) -> bool:
@@ -93,7 +93,7 @@ class Request:
         if not self._is_model:
             check_request(find_file_kind(self.output, other_endings=(".hyrf",)), self.output)
         elif source.kind == "model":
-            raise HyrfError(f"{source.path}: this is a .hyrf file already; 'hyrfpack compress' makes it smaller")
+            raise HyrfError(f"{source.path}: this is a .hyrf file already", fix="'hyrfpack compress' makes it smaller")
         if source.kind in ("model", "splats"):
             options = {
                 "minutes": self.minutes,
@@ -103,15 +103,15 @@ class Request:
             }
             for name, value in options.items():
                 if value is not None:
-                    raise HyrfError(f"{source.path}: {name} can be asked for with photos only; leave it out")
+                    raise HyrfError(f"{source.path}: {name} can be asked for with photos only", fix="leave it out")
         if self.target_bytes is not None and self.max_gaussians is not None:
             raise HyrfError(
-                "a target size and a number of Gaussians each decide how large the model is; give one of them "
-                "(`target_bytes` or `max_gaussians`)"
+                "a target size and a number of Gaussians each decide how large the model is",
+                fix="give one of them (`target_bytes` or `max_gaussians`)",
             )
         self._check_target()
         if source.kind == "photos" and not list_photos(source.path):
-            raise HyrfDataError(f"{source.path}: there is no photo in this folder; name one that has some")
+            raise HyrfDataError(f"{source.path}: there is no photo in this folder", fix="name one that has some")
 
     def _check_target(self) -> None:
         """Reject a target size that no file of these photos can have; photos without poses get a weaker check."""
@@ -129,11 +129,11 @@ class Request:
             outputs.folder(self.work, [RECORD_NAME])
         work, output = (Path(os.path.realpath(path)) for path in (self.work, self.output))
         if self.source.kind == "photos" and work.is_relative_to(os.path.realpath(self.source.path)):
-            raise HyrfError(f"{self.work}: the work folder would lie among the photos; name another with `work`")
+            raise HyrfError(f"{self.work}: the work folder would lie among the photos", fix="name another with `work`")
         if output.is_relative_to(work) or work.is_relative_to(output):
             raise HyrfError(
-                f"{self.output}: the output and the work folder {self.work} lie in each other; name another folder "
-                "with `work`"
+                f"{self.output}: the output and the work folder {self.work} lie in each other",
+                fix="name another folder with `work`",
             )
 
     def _check_output(self, outputs: Outputs, *, overwrite: bool) -> None:

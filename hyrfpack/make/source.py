@@ -73,15 +73,15 @@ class Source:
         """
         path = Path(path)
         if not os.path.lexists(path):
-            raise HyrfDataError(f"{path}: no such file or folder; check the path")
+            raise HyrfDataError(f"{path}: no such file or folder", fix="check the path")
         ending = path.suffix.lower()
         if path.is_file() and (ending == ".hyrf" or ending in READABLE_ENDINGS or path.name == _SOG_INDEX_NAME):
             return cls(path, "model" if ending == ".hyrf" else "splats")
         if path.is_file() and not (is_archive(path) or ending in VIDEO_SUFFIXES):
             what = "this is one photo" if ending in PICTURE_SUFFIXES else "nothing can be made of this file"
             raise HyrfDataError(
-                f"{path}: {what}; name a folder of photos, its .zip, a video, a .hyrf file, or splats of another "
-                "program"
+                f"{path}: {what}",
+                fix="name a folder of photos, its .zip, a video, a .hyrf file, or splats of another program",
             )
         try:
             return cls(path, "scene", reading.load(path))
@@ -97,10 +97,10 @@ class Source:
                 sorted(p.name for p in path.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES) if path.is_dir() else []
             )
             if videos and not list_photos(path):
-                message = f"{path}: there are no photos in this folder, but {videos[0]}; name the video"
-                raise HyrfDataError(message) from None
+                problem = f"{path}: there are no photos in this folder, but {videos[0]}"
+                raise HyrfDataError(problem, fix="name the video") from None
             if path.is_dir() and not any(path.iterdir()):
-                raise HyrfDataError(f"{path}: the folder is empty; name the one that holds the photos") from None
+                raise HyrfDataError(f"{path}: the folder is empty", fix="name the one that holds the photos") from None
             raise
 
     def files(self) -> list[Path]:

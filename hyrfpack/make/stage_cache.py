@@ -113,7 +113,8 @@ class StageCache:
             self.state.add_seconds(name, clock.unrecorded_seconds())
             raise Stopped(name) from error
         except HyrfError as error:
-            raise type(error)(f"{name} failed: {error}{self._describe_kept_products(name, clock)}") from error
+            kept = self._describe_kept_products(name, clock)
+            raise error.with_text(f"{name} failed: {error.problem}", f"{error.fix}{kept}") from error
         self.state.finish(name, files, facts, clock.unrecorded_seconds())
         self.seconds[name] = self.state.seconds(name)
         return facts
@@ -167,7 +168,10 @@ def _remove_product(path: Path) -> None:
         else:
             path.unlink(missing_ok=True)
     except OSError as error:
-        raise HyrfError(f"{path}: what an earlier call left cannot be removed ({error.strerror}); remove it") from error
+        raise HyrfError(
+            f"{path}: what an earlier call left cannot be removed ({error.strerror})",
+            fix="remove it",
+        ) from error
 
 
 @contextmanager

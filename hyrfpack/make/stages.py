@@ -127,7 +127,7 @@ def run_training_stage(
             if not trained.complete:
                 raise KeyboardInterrupt
             if not (run / METRICS_FILE).is_file():  # the disk was full; the next call writes them
-                raise HyrfError(trained.missing)
+                raise HyrfError(trained.missing, fix="run it again, which writes what is missing")
         metrics = json.loads((run / METRICS_FILE).read_bytes())
         facts = {key: metrics[key] for key in ("gaussians", "bytes", "choices", "device")}
         psnr = describe(run / MODEL_FILE)["provenance"]["psnr"]
@@ -205,8 +205,9 @@ def run_compression_stage(stage_cache: StageCache, scene: Scene, plan: Plan, dev
         except HyrfSizeError as error:
             advice = ", or name another work folder (`work`) to train a smaller model for this size"
             raise HyrfError(
-                f"the trained model does not fit into {plan.target_bytes:,} bytes; ask for {error.min_bytes:,} bytes "
-                f"or more (`target_bytes`){advice if trained_target_bytes(stage_cache) != plan.target_bytes else ''}"
+                f"the trained model does not fit into {plan.target_bytes:,} bytes",
+                fix=f"ask for {error.min_bytes:,} bytes or more "
+                f"(`target_bytes`){advice if trained_target_bytes(stage_cache) != plan.target_bytes else ''}",
             ) from error
         return {"bytes": report.bytes_after, "gaussians": report.gaussians, "found": report.found}, [PACKED_MODEL]
 

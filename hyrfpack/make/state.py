@@ -48,11 +48,11 @@ class WorkFolderState:
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise HyrfError(
-                f"{self._path}: what was done so far cannot be read ({reason}); name another folder with `work`, or "
-                "delete this one to begin anew"
+                f"{self._path}: what was done so far cannot be read ({reason})",
+                fix="name another folder with `work`, or delete this one to begin anew",
             ) from error
         if entries and RECORD_NAME not in entries and not all(name.startswith(".") for name in entries):
-            raise HyrfError(f"{folder}: this folder holds something else; name another with `work`")
+            raise HyrfError(f"{folder}: this folder holds something else", fix="name another with `work`")
 
     def was_begun(self, stage: str, inputs: dict[str, Any]) -> bool:
         """Return whether a stage was begun with these inputs and is not finished."""
@@ -180,7 +180,10 @@ def file_digest(path: Path) -> str:
     except FileNotFoundError:
         return ""
     except OSError as error:
-        raise HyrfDataError(f"{path}: the file cannot be read ({error.strerror}); check its permissions") from error
+        raise HyrfDataError(
+            f"{path}: the file cannot be read ({error.strerror})",
+            fix="check its permissions",
+        ) from error
 
 
 def files_digest(files: Iterable[os.PathLike[str] | str], root: Path) -> str:

@@ -18,11 +18,12 @@ from hyrfpack.data.archive import display_path, is_archive, unpack
 from hyrfpack.data.folder import PhotoFacts, list_photos, list_raw_photos, read_photo_facts
 from hyrfpack.data.quality import MIN_SHARPNESS, Exposure, is_blurred, measure_exposure, measure_sharpness, read_gray
 from hyrfpack.data.unusable import (
-    explain_no_photos,
     format_file_names,
     format_photo_count,
+    no_photos_error,
     raise_if_single_photo,
     raw_photos_notes,
+    unreadable_error,
     unreadable_sentences,
 )
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError, strip_path
@@ -140,12 +141,12 @@ def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | Non
     posed = _posed_files(scene)
     photos = sorted({*photos, *posed})
     if not photos:
-        raise HyrfDataError(explain_no_photos(path, folder))
+        raise no_photos_error(path, folder)
     facts, unreadable = _read_header_facts(photos, folder, report_progress)
     measurements, undecodable = _measure_all_pixels([fact.path for fact in facts], folder, report_progress)
     unreadable |= undecodable
     if not measurements:
-        raise HyrfDataError(f"{path}: {'; '.join(unreadable_sentences(unreadable, len(photos)))}")
+        raise unreadable_error(path, unreadable, len(photos))
     blurred = [
         measurement.path
         for measurement, bad in zip(measurements, is_blurred([x.sharpness for x in measurements]), strict=True)
@@ -282,7 +283,7 @@ def _measure_pixels(path: Path) -> _PixelMeasurement | str:
 
 def _unreadable_reason(error: HyrfDataError, path: Path) -> str:
     """Return why a photo cannot be read, without its path and the advice, which all such photos share."""
-    return strip_path(error, display_path(path)).partition(";")[0]
+    return strip_path(error, display_path(path))
 
 
 def _count_problems(count: int, scene: Scene | None, posed: int, path: Path) -> list[str]:

@@ -31,7 +31,10 @@ def measure_error(values: Tensor, reference: Tensor, what: str) -> Error:
         HyrfError: a tensor holds NaN or infinity.
     """
     if not (torch.isfinite(values).all() and torch.isfinite(reference).all()):
-        raise HyrfError(f"{what}: the result holds NaN or infinity, so there is no error to tell; check the model")
+        raise HyrfError(
+            f"{what}: the result holds NaN or infinity, so there is no error to tell",
+            fix="check the model",
+        )
     deviation = values.detach().double() - reference.detach().double()
     if not deviation.numel():
         return Error(0.0, 0.0)

@@ -49,10 +49,11 @@ class Frame:
         half = (high - low) / 2
         scale = float(half.max())
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
-            raise HyrfDataError("the scene's box is not finite; check the poses and points for NaN or infinity")
+            raise HyrfDataError("the scene's box is not finite", fix="check the poses and points for NaN or infinity")
         if not scale > 0:
             raise HyrfDataError(
-                "cameras and points all lie at one place, so the scene has no size; give views from different places"
+                "cameras and points all lie at one place, so the scene has no size",
+                fix="give views from different places",
             )
         half = np.maximum(half / scale, MIN_HALF_EXTENT)
         (x, y, z), (a, b, c) = ((low + high) / 2).tolist(), half.tolist()

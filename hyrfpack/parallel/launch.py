@@ -34,7 +34,8 @@ def launch(command: Sequence[str], processes: int, say: Callable[[str], None] = 
         from torch.distributed.launcher.api import LaunchConfig, elastic_launch
     except ImportError as error:
         raise HyrfError(
-            f"this build of torch cannot start processes that talk to each other ({error}); leave out `processes`"
+            f"this build of torch cannot start processes that talk to each other ({error})",
+            fix="leave out `processes`",
         ) from error
     logging.disable()  # the launcher would repeat the errors that the processes print themselves
     config = LaunchConfig(
@@ -52,12 +53,13 @@ def launch(command: Sequence[str], processes: int, say: Callable[[str], None] = 
         rank, failure = error.get_first_failure()
         if failure.exitcode >= 0:
             return failure.exitcode
-        killed = (
+        killed = HyrfError(
             f"process {rank} of {processes} was ended by {signal.Signals(-failure.exitcode).name}, perhaps for want of "
-            "memory; what was written before is kept"
+            "memory",
+            fix="what was written before is kept",
         )
         if rank == 0:
-            raise HyrfError(killed) from error
+            raise killed from error
         say(f"Error: {killed}")
         return 2
     except SignalException:

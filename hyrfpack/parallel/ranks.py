@@ -142,12 +142,13 @@ class Ranks:
         Raises:
             HyrfError: some rank has an error.
         """
-        problems = self.all_gather(None if problem is None else str(problem))
-        failed = [rank for rank, sentence in enumerate(problems) if sentence]
+        errors = self.all_gather(None if problem is None else (problem.problem, problem.fix))
+        failed = [(rank, *error) for rank, error in enumerate(errors) if error is not None]
         if problem is not None and len(failed) == self.size:
             raise problem  # an error of all processes reads as that of a single one
         if failed:
-            raise HyrfError(f"process {failed[0]} of {self.size}: {problems[failed[0]]}") from problem
+            rank, what, fix = failed[0]
+            raise HyrfError(f"process {rank} of {self.size}: {what}", fix=fix) from problem
 
     @contextmanager
     def _communication_errors(self) -> Iterator[None]:
@@ -159,8 +160,8 @@ class Ranks:
                 raise
             reason = re.sub(r"\[\S*/\S*:\d+\] ", "", short_reason(error, 300))  # less the location in gloo's source
             raise HyrfError(
-                f"one of the {self.size} processes has ended or says nothing any more ({reason}); see what it said, "
-                "and whether memory was short"
+                f"one of the {self.size} processes has ended or says nothing any more ({reason})",
+                fix="see what it said, and whether memory was short",
             ) from error
 
 
@@ -191,8 +192,8 @@ def join_processes(environment: Mapping[str, str] | None = None) -> Iterator[Ran
         return
     if not (dist.is_available() and dist.is_gloo_available()):
         raise HyrfError(
-            f"torch {torch.__version__} was built without gloo, by which processes talk; install another build of it, "
-            "or start one process"
+            f"torch {torch.__version__} was built without gloo, by which processes talk",
+            fix="install another build of it, or start one process",
         )
     if "TORCHELASTIC_RUN_ID" in environment:
         _stop_when_launcher_ends()
@@ -213,8 +214,8 @@ def join_processes(environment: Mapping[str, str] | None = None) -> Iterator[Ran
     except (RuntimeError, ValueError) as error:
         hint = "set MASTER_PORT to a free one" if "EADDRINUSE" in str(error) else "see whether all were started"
         raise HyrfError(
-            f"process {ranks.rank} of {ranks.size} did not find the others at {address}:{port} "
-            f"({short_reason(error)}); {hint}"
+            f"process {ranks.rank} of {ranks.size} did not find the others at {address}:{port} ({short_reason(error)})",
+            fix=hint,
         ) from error
     try:
         yield ranks
@@ -263,8 +264,9 @@ def ranks_from_environment(environment: Mapping[str, str]) -> Ranks:
         return SINGLE_PROCESS
     if not (0 <= rank < size and 0 <= local_rank < local_size <= size):
         raise HyrfError(
-            f"the environment speaks of process {rank} of {size}, number {local_rank} of {local_size} on this machine, "
-            "which cannot be; start them by torchrun or srun, or unset RANK and WORLD_SIZE"
+            f"the environment speaks of process {rank} of {size}, number {local_rank} of {local_size} on this "
+            "machine, which cannot be",
+            fix="start them by torchrun or srun, or unset RANK and WORLD_SIZE",
         )
     return Ranks(rank, size, local_rank, local_size, restarts)
 
@@ -311,6 +313,7 @@ def _read_count(name: str, environment: Mapping[str, str], default: int | None =
     if text is None or not re.fullmatch("[0-9]{1,15}", text):
         raise HyrfError(
             f"the environment variable {name} is {'missing' if text is None else repr(text)}, where the number of a "
-            "process or a port should be; start the processes by torchrun or srun, or unset RANK and WORLD_SIZE"
+            "process or a port should be",
+            fix="start the processes by torchrun or srun, or unset RANK and WORLD_SIZE",
         )
     return int(text)

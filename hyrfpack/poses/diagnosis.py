@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hyrfpack.data.quality import is_blurred
-from hyrfpack.data.unusable import explain_no_photos, unreadable_sentences
+from hyrfpack.data.unusable import no_photos_error, unreadable_error
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.poses.prepare import COPY_REASON_PREFIX, select_unreadable
 
@@ -36,18 +36,19 @@ def check_photo_count(given: Path, folder: Path, usable: int, left_out: Mapping[
     count = usable + len(left_out)
     copies = [reason for reason in left_out.values() if reason.startswith(COPY_REASON_PREFIX)]
     if not count:
-        raise HyrfDataError(explain_no_photos(given, folder))
+        raise no_photos_error(given, folder)
     if copies and usable + len(copies) >= MIN_PHOTOS:
         raise HyrfDataError(
             f"{given}: {len(copies)} of {count} files are copies of another, and {usable} different "
-            f"{'photo is' if usable == 1 else 'photos are'} too few; take photos from many places"
+            f"{'photo is' if usable == 1 else 'photos are'} too few",
+            fix="take photos from many places",
         )
     if unreadable := select_unreadable(left_out):
-        left = f"; the {usable} that can be read {'is' if usable == 1 else 'are'} too few" if usable else ""
-        raise HyrfDataError(f"{given}: {'; '.join(unreadable_sentences(unreadable, count))}{left}")
+        left = f", and the {usable} that can be read {'is' if usable == 1 else 'are'} too few" if usable else ""
+        raise unreadable_error(given, unreadable, count, left)
     raise HyrfDataError(
-        f"{given}: {usable} {'photo is' if usable == 1 else 'photos are'} too few to find poses; take 20 or more from "
-        "different places, each sharing two thirds of its view with the next"
+        f"{given}: {usable} {'photo is' if usable == 1 else 'photos are'} too few to find poses",
+        fix="take 20 or more from different places, each sharing two thirds of its view with the next",
     )
 
 
@@ -65,11 +66,12 @@ def check_features(folder: Path, count: int, features: Mapping[str, Any], unread
     """
     counts = list(features["keypoints"].values())
     if len(counts) < MIN_PHOTOS:
-        raise HyrfDataError(f"{folder}: {'; '.join(unreadable_sentences(unreadable, count))}")
+        raise unreadable_error(folder, unreadable, count)
     if np.median(counts) < _MIN_TYPICAL_FEATURES:
         raise HyrfDataError(
             f"{folder}: there is hardly anything in these photos that can be recognised in another (a typical one has "
-            f"{int(np.median(counts))} features); take sharp, well lit photos of things that have texture"
+            f"{int(np.median(counts))} features)",
+            fix="take sharp, well lit photos of things that have texture",
         )
 
 
@@ -81,13 +83,14 @@ def check_matches(folder: Path, count: int, matches: Mapping[str, Any]) -> None:
     """
     if len(matches["matched"]) < MIN_PHOTOS:
         raise HyrfDataError(
-            f"{folder}: {matches['pairs'] or 'no'} pairs of these {count} photos show the same thing; take sharp "
-            "photos of one scene, each sharing two thirds of its view with the next"
+            f"{folder}: {matches['pairs'] or 'no'} pairs of these {count} photos show the same thing",
+            fix="take sharp photos of one scene, each sharing two thirds of its view with the next",
         )
     if matches["turned"] >= _PANORAMA_PAIR_RATIO:
         raise HyrfDataError(
-            f"{folder}: the photos are all taken from one place, where the camera turned at most, so that no depth can "
-            "be seen in them; walk around the scene, a step to the side between photos"
+            f"{folder}: the photos are all taken from one place, where the camera turned at most, so that no depth "
+            "can be seen in them",
+            fix="walk around the scene, a step to the side between photos",
         )
 
 
@@ -99,8 +102,8 @@ def check_registered(folder: Path, count: int, found: Mapping[str, Any]) -> None
     """
     if len(found["registered"]) < MIN_PHOTOS:
         raise HyrfDataError(
-            f"{folder}: no poses could be found, for these {count} photos share too little with each other; take more "
-            "between them, each sharing two thirds of its view with the next"
+            f"{folder}: no poses could be found, for these {count} photos share too little with each other",
+            fix="take more between them, each sharing two thirds of its view with the next",
         )
 
 

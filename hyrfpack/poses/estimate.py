@@ -216,7 +216,10 @@ class _PoseEstimation:
         self.user_names = self._map_user_names(photos)
         masks = find_masks(photos, mask_folder) if mask_folder else {}
         if self.masks is not None and not masks:
-            raise HyrfDataError(f"{self.masks}: no mask is named as a photo is ({photos[0].source}.png); rename them")
+            raise HyrfDataError(
+                f"{self.masks}: no mask is named as a photo is ({photos[0].source}.png)",
+                fix="rename them",
+            )
         copies_masks = bool(masks) and mask_folder is not None and not is_same_path(mask_folder, self.out / "masks")
         if copies_masks:
             self.output.check_free("masks")
@@ -271,7 +274,7 @@ class _PoseEstimation:
         """Return the folder of masks that is given or found beside the photos; None if there is none."""
         if self.masks is not None:
             if not Path(self.masks).is_dir():
-                raise HyrfDataError(f"{self.masks}: there is no such folder of masks; name another")
+                raise HyrfDataError(f"{self.masks}: there is no such folder of masks", fix="name another")
             return Path(self.masks)
         if self.photos.is_file():
             return None

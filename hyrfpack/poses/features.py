@@ -87,7 +87,7 @@ def _write_working_copy(job: Job, folder: Path, size: tuple[int, int], name: str
     try:
         rgb, alpha = read_pixels(job.images / name, size)
     except HyrfDataError as error:
-        return 0.0, strip_path(error, job.images / name).partition(";")[0]
+        return 0.0, strip_path(error, job.images / name)
     grey = rgb.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
     if alpha is not None:
         grey *= alpha.astype(np.float32) / 255

@@ -201,8 +201,13 @@ def _measure_video(path: Path, video: Video, report_progress: Report) -> _VideoM
         share = min(1.0, time / video.seconds) if video.seconds else 0.0
         report_progress(f"looking at frame {decoded_count:,}, {time:.0f} s{length}", _MEASURED_PROGRESS * share)
     if decoded_count < _MIN_DECODED_FRAMES:
-        cut = " that can be decoded; copy it again in full, or film" if video.damaged_count else "; film"
-        raise HyrfDataError(f"{path}: the video has only {decoded_count} frames{cut} for at least ten seconds")
+        can_be_decoded, copy_or = (
+            (" that can be decoded", "copy it again in full, or ") if video.damaged_count else ("", "")
+        )
+        raise HyrfDataError(
+            f"{path}: the video has only {decoded_count} frames{can_be_decoded}",
+            fix=f"{copy_or}film for at least ten seconds",
+        )
     if video.damaged_count or time < _MIN_DURATION_RATIO * video.seconds:
         notes.append(
             f"the video is damaged or cut off: {decoded_count} frames of {time:.1f} s could be read, of "
@@ -228,7 +233,10 @@ def _choose_spaced_frames(
     """Return the frames to take, as number -> time in seconds, and the report about them."""
     blurred = is_blurred(measured.sharpness)
     if blurred.all():
-        raise HyrfDataError(f"{path}: all frames of the video are blurred; film again, slower and with more light")
+        raise HyrfDataError(
+            f"{path}: all frames of the video are blurred",
+            fix="film again, slower and with more light",
+        )
     sharp = np.flatnonzero(~blurred)
 
     def progress(done: int) -> None:
@@ -252,7 +260,8 @@ def _choose_spaced_frames(
     if len(picked) < _MIN_TAKEN_FRAMES:
         raise HyrfDataError(
             f"{path}: the camera hardly moves, so that {len(picked)} of {measured.decoded_count} frames can serve as "
-            f"photos, and {_MIN_TAKEN_FRAMES} is the least; walk around what you film"
+            f"photos, and {_MIN_TAKEN_FRAMES} is the least",
+            fix="walk around what you film",
         )
     steps = np.array(
         [motion_distances(places, a, slice(b, b + 1))[0] for a, b in zip(picked, picked[1:], strict=False)]

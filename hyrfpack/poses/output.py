@@ -47,9 +47,9 @@ class SceneOutput:
     def check_paths(self, photos: Path) -> None:
         """Check both paths. Raises HyrfError: the photos do not exist, or a file has the name of the scene's folder."""
         if not photos.exists():
-            raise HyrfDataError(f"{photos}: there is no such folder or video; name the one that holds the photos")
+            raise HyrfDataError(f"{photos}: there is no such folder or video", fix="name the one that holds the photos")
         if os.path.lexists(self.scene) and not self.scene.is_dir():
-            raise HyrfError(f"{self.scene}: this is a file; name a folder for the scene")
+            raise HyrfError(f"{self.scene}: this is a file", fix="name a folder for the scene")
 
     def check_replaceable(self, photos: Path, overwrite: bool) -> None:
         """Check that the folder can be written and has nothing that may not be replaced.
@@ -65,15 +65,16 @@ class SceneOutput:
         if names.intersection((*COLMAP_MODEL_FOLDERS, *COLMAP_TABLE_NAMES, *POSE_FILE_NAMES, "colmap")):
             if read_report(self.scene) is None:
                 raise HyrfError(
-                    f"{self.scene}: the folder has poses of another program, which are kept; train on them, or name "
-                    "another folder"
+                    f"{self.scene}: the folder has poses of another program, which are kept",
+                    fix="train on them, or name another folder",
                 )
             if not overwrite:
                 raise HyrfError(
-                    f"{self.scene}: the folder has poses already; use them, or replace them with `overwrite=True`"
+                    f"{self.scene}: the folder has poses already",
+                    fix="use them, or replace them with `overwrite=True`",
                 )
         if not is_same_path(photos, self.scene) and any(name.lower().endswith(PICTURE_SUFFIXES) for name in names):
-            raise HyrfError(f"{self.scene}: photos lie in this folder; name another for the scene")
+            raise HyrfError(f"{self.scene}: photos lie in this folder", fix="name another for the scene")
         check_writable(self.scene)
 
     def check_free(self, name: str) -> None:
@@ -86,8 +87,8 @@ class SceneOutput:
         }
         if os.path.lexists(folder) and not has_only(self.scene, name, ours):
             raise HyrfError(
-                f"{folder}: there are files that are not of these photos; name another folder for the scene, or "
-                f"{self.scene} itself as that of the photos"
+                f"{folder}: there are files that are not of these photos",
+                fix=f"name another folder for the scene, or {self.scene} itself as that of the photos",
             )
 
     def protect(self, files: Collection[Path]) -> None:
@@ -198,13 +199,15 @@ def explain_disk_errors(out: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise HyrfError(
-                f"{out}: the disk is full; free some space and run the same command again, which resumes here"
+                f"{out}: the disk is full",
+                fix="free some space and run the same command again, which resumes here",
             ) from error
         if isinstance(error, FileNotFoundError):
             raise HyrfError(
-                f"{error.filename or out}: was removed or moved meanwhile; put it back and run the same command again"
+                f"{error.filename or out}: was removed or moved meanwhile",
+                fix="put it back and run the same command again",
             ) from error
         raise HyrfError(
-            f"{error.filename or out}: cannot be read or written ({error.strerror or error}); check the folder's "
-            "permissions and the disk"
+            f"{error.filename or out}: cannot be read or written ({error.strerror or error})",
+            fix="check the folder's permissions and the disk",
         ) from error

@@ -102,8 +102,8 @@ def read_headers(
         if panorama:
             if in_place:
                 raise HyrfDataError(
-                    f"{path}: this picture shows all around and cannot be cut into photos where it is; put such "
-                    "pictures into a folder, name it, and another one for the scene"
+                    f"{path}: this picture shows all around and cannot be cut into photos where it is",
+                    fix="put such pictures into a folder, name it, and another one for the scene",
                 )
             faces = _make_faces(facts, source)
             if taken.isdisjoint(face.name for face in faces):
@@ -213,7 +213,8 @@ def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) ->
                 image.load()
             except Exception as error:  # Pillow's decoders raise many types of errors
                 raise HyrfDataError(
-                    f"{mask}: the mask cannot be decoded ({short_reason(error)}); replace it"
+                    f"{mask}: the mask cannot be decoded ({short_reason(error)})",
+                    fix="replace it",
                 ) from error
             stored = photo.facts.size[::-1] if photo.facts.orientation >= 5 else photo.facts.size
             turned = photo.facts.orientation != 1 and image.size == stored
@@ -246,7 +247,7 @@ def _is_panorama_or_reason(path: Path) -> bool | str:
 
 def _unusable_reason(error: HyrfDataError, path: Path) -> str:
     """Return why a photo cannot be used, without its path and the advice, which all such photos share."""
-    return strip_path(error, display_path(path)).partition(";")[0]
+    return strip_path(error, display_path(path))
 
 
 def _report_counts(items: Iterable[Item], progress: CountCallback) -> Iterator[Item]:

@@ -76,9 +76,10 @@ def run_stage(job: Path, stage: str, report_progress: Report, *arguments: str) -
         finally:
             _terminate(process)
     if "refused" in answer:
-        raise HyrfDataError(answer["refused"])
+        problem, fix = answer["refused"]
+        raise HyrfDataError(problem, fix=fix)
     if code or not answer:
-        raise StageCrashedError(_explain_crash(stage, code, log))
+        raise _crash_error(stage, code, log)
     return answer
 
 
@@ -130,20 +131,22 @@ def _terminate(process: subprocess.Popen) -> None:
                 pipe.close()
 
 
-def _explain_crash(stage: str, code: int, log: Path) -> str:
-    """Return a sentence that says why a process ended without an answer and what to do."""
+def _crash_error(stage: str, code: int, log: Path) -> StageCrashedError:
+    """Return the error that says why a process ended without an answer."""
     doing = _STAGE_DESCRIPTIONS.get(stage, _FINISH_DESCRIPTION)
     text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
     if "disk is full" in text or "No space left" in text or "disk I/O error" in text:
-        return f"{log.parent}: the disk is full; free some space and run the same command again, which resumes here"
+        return StageCrashedError(
+            f"{log.parent}: the disk is full", fix="free some space and run the same command again, which resumes here"
+        )
     if "MemoryError" in text or "bad_alloc" in text or code == -signal.SIGKILL:
-        return (
-            f"{log.parent}: {doing} took more memory than there is; close other programs and run the same command "
-            "again, which resumes here"
+        return StageCrashedError(
+            f"{log.parent}: {doing} took more memory than there is",
+            fix="close other programs and run the same command again, which resumes here",
         )
     how = f"by signal {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
     last = next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "it said nothing")
-    return (
-        f"{log.parent}: {doing} ended {how} ({last[-160:]}); run the same command again, which resumes here, and "
-        f"report it with {log.name} if it ends so again"
+    return StageCrashedError(
+        f"{log.parent}: {doing} ended {how} ({last[-160:]})",
+        fix=f"run the same command again, which resumes here, and report it with {log.name} if it ends so again",
     )

@@ -97,18 +97,19 @@ def open_video(path: Path) -> Iterator[Video]:
         import av
     if not path.is_file():
         what = "this is a folder, not a video" if path.is_dir() else "there is no such file"
-        raise HyrfDataError(f"{path}: {what}; check the path")
+        raise HyrfDataError(f"{path}: {what}", fix="check the path")
     if path.stat().st_size == 0:
-        raise HyrfDataError(f"{path}: the video is empty (0 bytes); copy it again")
+        raise HyrfDataError(f"{path}: the video is empty (0 bytes)", fix="copy it again")
     try:
         container = av.open(str(path))
     except Exception as error:  # PyAV passes on many types of errors, of FFmpeg's demuxers and of the system
         raise HyrfDataError(
-            f"{path}: this cannot be read as a video ({_error_text(error)}); copy it again in full, or save it as .mp4"
+            f"{path}: this cannot be read as a video ({_error_text(error)})",
+            fix="copy it again in full, or save it as .mp4",
         ) from error
     try:
         if not container.streams.video:
-            raise HyrfDataError(f"{path}: there are no pictures in this file, sound at most; name a video")
+            raise HyrfDataError(f"{path}: there are no pictures in this file, sound at most", fix="name a video")
         yield Video(container)
     finally:
         container.close()

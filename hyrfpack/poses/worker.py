@@ -62,7 +62,7 @@ def main(job: str, stage: str, *models: str) -> None:
     try:
         answer = run(Job.load(Path(job)), stage, list(models))
     except HyrfError as error:
-        answer = {"refused": str(error)}
+        answer = {"refused": [error.problem, error.fix]}
     send_message({"answer": answer})
 
 

@@ -227,8 +227,8 @@ def _check_finite(**values: Tensor) -> None:
 def _nonfinite_error(name: str) -> HyrfError:
     """Return the error for numbers of a view that are not finite."""
     return HyrfError(
-        f"the view's {name} hold NaN or infinity, from a broken model or a pose beyond float32; "
-        "train the model again or correct the pose"
+        f"the view's {name} hold NaN or infinity, from a broken model or a pose beyond float32",
+        fix="train the model again or correct the pose",
     )
 
 

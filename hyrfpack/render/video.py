@@ -39,7 +39,10 @@ def write_video(
     """
     program = shutil.which("ffmpeg")
     if program is None:
-        raise HyrfError(f"{path}: no video was made because there is no ffmpeg program; install ffmpeg and try again")
+        raise HyrfError(
+            f"{path}: no video was made because there is no ffmpeg program",
+            fix="install ffmpeg and try again",
+        )
     command = [program, "-hide_banner", "-loglevel", "error", "-y", "-f", "image2pipe", "-c:v", "png"]
     command += [
         "-framerate",
@@ -66,5 +69,5 @@ def write_video(
             _, complaint = process.communicate()
         if process.returncode:
             lines = complaint.decode(errors="replace").strip().splitlines() or ["it gave no reason"]
-            raise HyrfError(f"{path}: ffmpeg could not make the video ({lines[-1]}); the pictures are in place")
+            raise HyrfError(f"{path}: ffmpeg could not make the video ({lines[-1]})", fix="the pictures are in place")
     return pending.path

@@ -54,12 +54,16 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
             return sog.decode_files(_read_unbundled_sog(path), str(path))
         if path.exists() and extension not in READABLE_ENDINGS:
             raise HyrfDataError(
-                f"{path}: files with this ending are not known; name one of {', '.join(READABLE_ENDINGS)}"
+                f"{path}: files with this ending are not known",
+                fix=f"name one of {', '.join(READABLE_ENDINGS)}",
             )
         data = _read_bytes(path)
         return FORMATS[extension].decode(data, str(path))
     except OSError as error:
-        raise HyrfDataError(f"{path}: the file cannot be read ({error.strerror or error}); check the path") from error
+        raise HyrfDataError(
+            f"{path}: the file cannot be read ({error.strerror or error})",
+            fix="check the path",
+        ) from error
 
 
 def _read_unbundled_sog(folder: Path) -> dict[str, bytes]:
@@ -70,7 +74,8 @@ def _read_unbundled_sog(folder: Path) -> dict[str, bytes]:
         advice = f"name {splats[0]} in it" if splats else "name another"
         raise HyrfDataError(
             f"{folder}: a folder is read as a loose SOG, {sog.META_NAME} with its pictures, and this one holds "
-            f"{_format_names(names)}; {advice}"
+            f"{_format_names(names)}",
+            fix=advice,
         )
     files = {sog.META_NAME: _read_bytes(folder / sog.META_NAME)}
     for name in sog.picture_names(files[sog.META_NAME], str(folder)):
@@ -86,5 +91,5 @@ def _format_names(names: list[str]) -> str:
 
 def _read_bytes(path: Path) -> bytes:
     if path.stat().st_size > MAX_FILE_BYTES:
-        raise HyrfDataError(f"{path}: the file is larger than {MAX_FILE_BYTES:,} bytes; split it first")
+        raise HyrfDataError(f"{path}: the file is larger than {MAX_FILE_BYTES:,} bytes", fix="split it first")
     return path.read_bytes()

@@ -61,7 +61,7 @@ def local_positions(splats: Splats, origin: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore"):
         positions = (splats.positions - origin).astype(np.float32)
     if not np.isfinite(positions).all():
-        raise HyrfDataError("positions are beyond the range of float32; scale the scene down")
+        raise HyrfDataError("positions are beyond the range of float32", fix="scale the scene down")
     return positions
 
 
@@ -92,7 +92,7 @@ def apply_transform(splats: Splats, matrix: np.ndarray, turn: np.ndarray, name: 
                 splats.antialiased,
             )
     except ValueError as error:
-        raise HyrfDataError(f"{name}: moved as its transform says, {error}; correct the transform") from error
+        raise HyrfDataError(f"{name}: moved as its transform says, {error}", fix="correct the transform") from error
 
 
 def decompose_similarity(matrix: np.ndarray, name: str) -> tuple[float, np.ndarray]:
@@ -108,7 +108,8 @@ def decompose_similarity(matrix: np.ndarray, name: str) -> tuple[float, np.ndarr
         if np.allclose(u @ vt, linear / scale, rtol=0, atol=1e-4):
             return scale, u @ vt
     raise HyrfDataError(
-        f"{name}: the transform of its splats mirrors, skews or scales axes differently; apply it to them first"
+        f"{name}: the transform of its splats mirrors, skews or scales axes differently",
+        fix="apply it to them first",
     )
 
 

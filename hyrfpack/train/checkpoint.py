@@ -78,8 +78,8 @@ def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor]
         key for key in saved.keys() | settings.keys() if saved.get(key) != _plain(settings.get(key))
     ):
         raise HyrfTrainingError(
-            f"{path}: the run was started with other settings ({', '.join(different)}); "
-            "resume with the same ones or train anew with `overwrite=True`"
+            f"{path}: the run was started with other settings ({', '.join(different)})",
+            fix="resume with the same ones or train anew with `overwrite=True`",
         )
     return tensors, progress
 
@@ -87,7 +87,7 @@ def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor]
 def _read(path: Path) -> tuple[dict, dict[str, torch.Tensor], dict]:
     """Return settings, tensors and progress."""
     if not path.is_file():
-        raise HyrfTrainingError(f"{path}: there is no checkpoint to resume from; train without `resume=True`")
+        raise HyrfTrainingError(f"{path}: there is no checkpoint to resume from", fix="train without `resume=True`")
     try:
         data = path.read_bytes()
         if hashlib.sha256(data[:-DIGEST_BYTES]).digest() != data[-DIGEST_BYTES:]:
@@ -101,13 +101,14 @@ def _read(path: Path) -> tuple[dict, dict[str, torch.Tensor], dict]:
         raise _damaged(path) from error
     if version != CHECKPOINT_VERSION:
         raise HyrfTrainingError(
-            f"{path}: the checkpoint is of another version of hyrfpack; train anew with `overwrite=True`"
+            f"{path}: the checkpoint is of another version of hyrfpack",
+            fix="train anew with `overwrite=True`",
         )
     return saved, tensors, progress
 
 
 def _damaged(path: Path) -> HyrfTrainingError:
-    return HyrfTrainingError(f"{path}: the checkpoint is damaged; delete it and train anew")
+    return HyrfTrainingError(f"{path}: the checkpoint is damaged", fix="delete it and train anew")
 
 
 def _plain(value: object) -> object:

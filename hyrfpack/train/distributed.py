@@ -92,7 +92,8 @@ def check_settings(ranks: Ranks, settings: Mapping[str, object]) -> None:
         if different := sorted(name for name in first.keys() | theirs.keys() if first.get(name) != theirs.get(name)):
             raise HyrfTrainingError(
                 f"process {rank} of {ranks.size} was started with other settings than process 0 "
-                f"({', '.join(different)}); start all with the same command, photos and versions"
+                f"({', '.join(different)})",
+                fix="start all with the same command, photos and versions",
             )
 
 

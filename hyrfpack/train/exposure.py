@@ -246,7 +246,8 @@ def exposures_for(
         return None, "off"
     if scene.has_alpha:
         raise HyrfTrainingError(
-            f"{scene.path}: photos with transparency are laid over a colour of one exposure; leave out `exposure`"
+            f"{scene.path}: photos with transparency are laid over a colour of one exposure",
+            fix="leave out `exposure`",
         )
     observed = observe(scene, cache)
     gains = gains_from(observed, len(scene.train))

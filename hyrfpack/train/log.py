@@ -72,7 +72,7 @@ class TrainingLog:
             else:
                 self.file = _open_new(path)
         except OSError as error:
-            raise HyrfError(f"{path}: the log cannot be written ({error.strerror}); name another file") from error
+            raise HyrfError(f"{path}: the log cannot be written ({error.strerror})", fix="name another file") from error
         self.path = Path(self.file.name)
         if self.path != path:
             warn(describe_rename(path, self.path))

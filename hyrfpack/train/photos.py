@@ -45,7 +45,8 @@ def photos_of(model: str | os.PathLike[str]) -> Scene | None:
     if sizes != (len(scene.train), len(scene.test)):
         raise HyrfDataError(
             f"{path}: {len(scene.train)} photos to train on and {len(scene.test)} held out, where {model} was trained "
-            f"on {sizes[0]} of {sum(sizes)}; name the photos with `data`"
+            f"on {sizes[0]} of {sum(sizes)}",
+            fix="name the photos with `data`",
         )
     return scene
 

@@ -364,9 +364,8 @@ def _naming_the_checkpoint(trainer: Trainer, overwrite: bool) -> Iterator[None]:
     except HyrfError as error:
         if isinstance(error, HyrfTrainingError) or trainer.saved is None:
             raise
-        raise type(error)(
-            f"{error}; the checkpoint of step {trainer.saved:,} is kept, {resuming(overwrite)} continues from there"
-        ) from error
+        kept = f"the checkpoint of step {trainer.saved:,} is kept, {resuming(overwrite)} continues from there"
+        raise error.with_text(fix=f"{error.fix}; {kept}") from error
 
 
 def _prepare(
@@ -376,15 +375,18 @@ def _prepare(
     if record is not None:
         if different := changed_settings(record, scene, config):
             raise HyrfTrainingError(
-                f"{out}: the folder holds a model that was trained with other settings ({', '.join(different)}); "
-                "use the same ones to complete its results, or replace it with `overwrite=True`"
+                f"{out}: the folder holds a model that was trained with other settings ({', '.join(different)})",
+                fix="use the same ones to complete its results, or replace it with `overwrite=True`",
             )
     elif resume and not (out / CHECKPOINT_FILE).is_file():
-        raise HyrfError(f"{out}: there is no checkpoint to resume; leave out `resume=True` to start a run")
+        raise HyrfError(f"{out}: there is no checkpoint to resume", fix="leave out `resume=True` to start a run")
     left = [name for name in (MODEL_FILE, CHECKPOINT_FILE) if (out / name).exists()]
     if left and not (resume or overwrite or record is not None):
         hint = "`resume=True` continues it, " if CHECKPOINT_FILE in left else ""
-        raise HyrfError(f"{out}: the folder holds an earlier run ({left[-1]}); {hint}`overwrite=True` replaces it")
+        raise HyrfError(
+            f"{out}: the folder holds an earlier run ({left[-1]})",
+            fix=f"{hint}`overwrite=True` replaces it",
+        )
     _check_outputs(out, scene, overwrite=resume or overwrite or record is not None)
 
 
@@ -413,8 +415,8 @@ def _check_photos(scene: Scene, cache: PictureCache, phase: Phase) -> None:
 
 def _nothing_left(scene: Scene, views: list[View], purpose: str) -> HyrfTrainingError:
     return HyrfTrainingError(
-        f"{scene.path}: the masks of all {len(views)} photos {purpose} leave no pixel, {views[0].name} for one; check "
-        "that white means 'use this pixel'"
+        f"{scene.path}: the masks of all {len(views)} photos {purpose} leave no pixel, {views[0].name} for one",
+        fix="check that white means 'use this pixel'",
     )
 
 

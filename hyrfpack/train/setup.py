@@ -154,7 +154,8 @@ def build_model(scene: Scene, config: TrainConfig) -> tuple[HybridModel, int, di
     """
     if not scene.train:
         raise HyrfTrainingError(
-            f"{scene.path}: no views are left for training; use fewer test views (`test_every=0` trains on all)"
+            f"{scene.path}: no views are left for training",
+            fix="use fewer test views (`test_every=0` trains on all)",
         )
     preset, why_preset = (config.preset, "asked for") if config.preset != "auto" else detect_preset(scene)
     frame = scene_frame(scene, preset)

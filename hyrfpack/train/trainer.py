@@ -310,8 +310,8 @@ class Trainer:
         where = ", ".join(groups) if groups else "none; look at the photo itself"
         views = " or ".join(f"'{view.name}'" for view in self._views_of_step())
         raise HyrfTrainingError(
-            f"training stopped at step {self.step} on view {views}: {what} (parameter groups: {where}); "
-            "lower the learning rates or remove the view"
+            f"training stopped at step {self.step} on view {views}: {what} (parameter groups: {where})",
+            fix="lower the learning rates or remove the view",
         )
 
     @contextmanager

@@ -242,4 +242,4 @@ def _data_url(data: bytes, kind: str) -> str:
 
 
 def _invalid_page_error(name: str) -> HyrfDataError:
-    return HyrfDataError(f"{name}: this is not a page of hyrfpack's, or it is damaged; export it again")
+    return HyrfDataError(f"{name}: this is not a page of hyrfpack's, or it is damaged", fix="export it again")

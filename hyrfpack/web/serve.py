@@ -214,16 +214,23 @@ def _create_server(host: str, port: int, page: bytes, files: ServedFiles) -> _Se
         address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
 
     if not host.strip():  # a socket would listen at every address
-        raise HyrfError(f"'{host}' is not an address to listen at; name {LOCAL_HOST}, or 0.0.0.0 to let others look")
+        raise HyrfError(
+            f"'{host}' is not an address to listen at",
+            fix=f"name {LOCAL_HOST}, or 0.0.0.0 to let others look",
+        )
     try:
         server = Server((host, port), _Handler)
     except (OSError, UnicodeError) as error:  # UnicodeError comes from a malformed host name
         if getattr(error, "errno", None) == errno.EADDRINUSE:
             raise HyrfError(
-                f"port {port} of {host} is taken by another program; name another, or 0 for any free one"
+                f"port {port} of {host} is taken by another program",
+                fix="name another, or 0 for any free one",
             ) from error
         reason = getattr(error, "strerror", None) or error
-        raise HyrfError(f"nothing can listen at port {port} of {host} ({reason}); name another port or host") from error
+        raise HyrfError(
+            f"nothing can listen at port {port} of {host} ({reason})",
+            fix="name another port or host",
+        ) from error
     server.page = page
     server.files = {f"/{name}": file if isinstance(file, MemoryFile) else Path(file) for name, file in files.items()}
     return server

@@ -53,7 +53,10 @@ def find_playable_file(path: str | os.PathLike[str]) -> Path:
     if not is_splats(path):
         return find_model(path)
     if sog_folder(path) is not None:
-        raise HyrfDataError(f"{path}: a page plays single files; bundle these with 'hyrfpack convert {path} scene.sog'")
+        raise HyrfDataError(
+            f"{path}: a page plays single files",
+            fix=f"bundle these with 'hyrfpack convert {path} scene.sog'",
+        )
     return Path(path)
 
 
@@ -62,6 +65,9 @@ def _check_readable(path: str | os.PathLike[str]) -> None:
     try:
         with open(path, "rb") as file:
             if not file.read(1):
-                raise HyrfDataError(f"{path}: the file is empty; write it again")
+                raise HyrfDataError(f"{path}: the file is empty", fix="write it again")
     except OSError as error:
-        raise HyrfDataError(f"{path}: the file cannot be read ({error.strerror or error}); check the path") from error
+        raise HyrfDataError(
+            f"{path}: the file cannot be read ({error.strerror or error})",
+            fix="check the path",
+        ) from error

@@ -27,7 +27,7 @@ from commands import hyrfpack
 from PIL import Image
 
 REFUSED, REPLACED, WRITTEN = "refused", "replaced", "written"
-WORK_BEGAN = "the work begins"  # said in place of what would take minutes
+WORK_BEGAN, WORK_ENDS = "the work begins", "let it"  # said in place of what would take minutes
 
 # -- what commands read ------------------------------------------------------------------------------------------------
 
@@ -312,7 +312,7 @@ def run_case(case: Case, world: Path, before: dict[str, str], overwrite: bool) -
 
     changed = sorted(path for path in before.keys() | after.keys() if before.get(path) != after.get(path))
     errors = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
-    began = errors == [f"Error: {WORK_BEGAN}"]
+    began = errors == [f"Error: {WORK_BEGAN}; {WORK_ENDS}"]
     if "Traceback" in result.output or (result.exit_code and not (result.exit_code == 2 and len(errors) == 1)):
         return f"exit code {result.exit_code}, {len(errors)} sentences", result
     if result.exit_code and not began:
@@ -332,7 +332,7 @@ def _replace_work(patch: pytest.MonkeyPatch) -> None:
     from hyrfpack.errors import HyrfError
 
     def begin(*arguments: object, **options: object) -> None:
-        raise HyrfError(WORK_BEGAN)
+        raise HyrfError(WORK_BEGAN, fix=WORK_ENDS)
 
     patch.setattr(import_module("hyrfpack.bench"), "bench", begin)
     patch.setattr(import_module("hyrfpack.demo.run"), "run_demo", begin)

@@ -246,14 +246,14 @@ def test_photos_that_cannot_be_read_do_not_end_the_work(monkeypatch):
     monkeypatch.setattr(running.Packer, "decode", lambda packer, trial: trial.data)
 
     def fail(shown, views, report):
-        raise HyrfError("a.png: the file is gone")
+        raise HyrfError("a.png: the file is gone", fix="copy it again")
 
     monkeypatch.setattr(running, "evaluate", fail)
     assert (
         packer.encode_to_distortion(1e-3, SimpleNamespace(measure_error=lambda distortion: distortion), 0.1).data
         == 1e-3
     )
-    assert said == ["a.png: the file is gone; the loss on training photos is not measured"]
+    assert said == ["a.png: the file is gone; copy it again; the loss on training photos is not measured"]
 
 
 def test_without_photos_it_looks_from_the_cameras_that_the_file_keeps(trained, scene, tmp_path):

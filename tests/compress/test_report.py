@@ -157,7 +157,7 @@ def test_folder_that_cannot_be_made_is_refused_before_the_work(source, tmp_path)
 
 def test_page_appears_only_after_its_pictures(source, tmp_path, monkeypatch):
     def full(path, image, **options):
-        raise HyrfError("the disk is full")
+        raise HyrfError("the disk is full", fix="free some space")
 
     monkeypatch.setattr("hyrfpack.compress.report.save_picture", full)
     with pytest.raises(HyrfError, match="full"):

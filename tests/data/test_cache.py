@@ -20,7 +20,7 @@ class Photo:
     def __call__(self) -> Picture:
         self.loads += 1
         if self.fails:
-            raise HyrfDataError("gone.png: the picture is missing; restore it")
+            raise HyrfDataError("gone.png: the picture is missing", fix="restore it")
         return Picture(np.full((self.size, self.size, 3), self.value, np.uint8))
 
 

@@ -110,7 +110,7 @@ def test_a_file_that_could_be_smaller_goes_along_and_that_is_said(model, compact
     ],
 )
 def test_what_would_change_the_model_is_refused_and_baked_is_named(target, options, name, model, tmp_path):
-    with pytest.raises(HyrfError, match=rf"^[^\n]*{target}: [^\n]* {name} [^\n]*`baked=True`$"):
+    with pytest.raises(HyrfError, match=rf"^[^\n]*{target}: [^\n]* {name}, [^\n]*`baked=True`$"):
         export(model, tmp_path / target, **options)
     assert list(tmp_path.iterdir()) == []
 

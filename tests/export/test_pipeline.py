@@ -400,7 +400,7 @@ def test_options_that_cannot_be_met_are_one_sentence_before_the_bake(options, pl
 
 def test_choosing_gaussians_for_a_file_of_cameras_is_refused(plain, tmp_path):
     for options in ({"crop": CROP}, {"min_opacity": 0.5}):
-        with pytest.raises(HyrfError, match=r"holds cameras only[^\n]*$"):
+        with pytest.raises(HyrfError, match=r"holds only cameras[^\n]*$"):
             export(plain, tmp_path / "a.json", **options)
 
 
@@ -445,7 +445,7 @@ def test_packages_that_are_not_there_are_missed_before_the_bake(
 @pytest.mark.parametrize("failing", ["encode", "decode", "background_splats"])
 def test_what_goes_wrong_leaves_the_old_file_as_it_was(failing, sphere, tmp_path, monkeypatch):
     def fail(*arguments, **options):
-        raise HyrfError("no")
+        raise HyrfError("no", fix="none")
 
     if failing == "background_splats":
         monkeypatch.setattr(pipeline, failing, fail)

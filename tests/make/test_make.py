@@ -372,12 +372,12 @@ def test_what_cannot_be_is_rejected_before_any_work(posed, photos, made, tmp_pat
 
 def test_a_stage_that_fails_names_its_folder_and_keeps_what_is_finished(posed, tmp_path, monkeypatch):
     def full(*arguments, **options):
-        raise HyrfError("the disk is full")
+        raise HyrfError("the disk is full", fix="free some space")
 
     with monkeypatch.context() as patch:
         patch.setattr("hyrfpack.make.stages.compress", full)
         sentence = refused("make", posed, "-o", tmp_path / "scene.html", "--quality", "draft")
-    assert "compression failed: the disk is full; what is finished is kept in" in sentence
+    assert "compression failed: the disk is full; free some space; what is finished is kept in" in sentence
     assert make(posed, tmp_path / "scene.html", quality="draft").kept == ("training",)
 
 
@@ -396,7 +396,7 @@ def test_what_fails_before_any_stage_is_finished_leaves_nothing_behind(given, tm
 
 def test_a_failure_after_poses_keeps_them_and_says_so(photos, poses, tmp_path, monkeypatch):
     def fail(*arguments, **options):
-        raise HyrfError("the masks leave nothing")
+        raise HyrfError("the masks leave nothing", fix="check them")
 
     with monkeypatch.context() as patch:
         patch.setattr(stages, "train", fail)

@@ -114,7 +114,7 @@ def test_a_call_that_fails_leaves_old_poses_with_their_own_photos(tmp_path, monk
     before = contents(scene)
 
     def refuse(*arguments) -> dict:
-        raise hyrfpack.HyrfDataError("these photos cannot be matched")
+        raise hyrfpack.HyrfDataError("these photos cannot be matched", fix="take others")
 
     monkeypatch.setattr("hyrfpack.poses.estimate.run_stage", refuse)
     with pytest.raises(hyrfpack.HyrfDataError, match="cannot be matched"):
@@ -158,7 +158,7 @@ def test_what_is_rejected_or_fails_before_anything_is_done_leaves_nothing(tmp_pa
         hyrfpack.estimate_poses(photos(tmp_path / "two", count=2), out)
 
     def refuse(*arguments) -> dict:
-        raise hyrfpack.HyrfDataError("these photos cannot be matched")
+        raise hyrfpack.HyrfDataError("these photos cannot be matched", fix="take others")
 
     monkeypatch.setattr("hyrfpack.poses.estimate.run_stage", refuse)
     with pytest.raises(hyrfpack.HyrfDataError, match="cannot be matched"):

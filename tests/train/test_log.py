@@ -108,13 +108,13 @@ def _interrupt() -> None:
 
 def test_a_run_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
-        raise HyrfError("it is broken")
+        raise HyrfError("it is broken", fix="repair it")
 
     monkeypatch.setattr("hyrfpack.train.trainer.Trainer._train_step", fail)
     with pytest.raises(HyrfError):
         train(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "log.jsonl")
 
-    assert read(tmp_path / "log.jsonl") == [{"event": "end", "complete": False, "error": "it is broken"}]
+    assert read(tmp_path / "log.jsonl") == [{"event": "end", "complete": False, "error": "it is broken; repair it"}]
 
 
 def test_a_log_that_cannot_be_begun_is_found_before_the_first_step(tmp_path: Path) -> None:

@@ -116,7 +116,7 @@ def test_a_held_out_photo_that_is_gone_after_the_last_step_does_not_fail_the_run
     def vanishing():
         reads[0] += 1
         if reads[0] == 2:  # the first time is before the first step
-            raise HyrfDataError("photos/0000.png: the file is gone; copy it again")
+            raise HyrfDataError("photos/0000.png: the file is gone", fix="copy it again")
         return scene.train[0].load()
 
     test = [dataclasses.replace(scene.test[0], load=vanishing), scene.test[1]]

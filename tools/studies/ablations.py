@@ -59,7 +59,7 @@ def run(variant: Variant, scene: Scene, config: TrainConfig, full_path: Path, ca
         with culling(variant):
             trainer.run()
         if not all(parameter.isfinite().all() for parameter in trainer.model.parameters()):
-            raise HyrfTrainingError("a parameter is not finite after the last step")
+            raise HyrfTrainingError("a parameter is not finite after the last step", fix="choose another seed")
     except HyrfTrainingError as error:
         return {"failed": str(error)}
     if variant is FULL:

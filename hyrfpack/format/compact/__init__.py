@@ -69,11 +69,11 @@ def decode_section(
         HyrfFormatError: this codec is not allowed for the section, or needs positions of another codec.
     """
     if group not in SECTIONS_BY_CODEC[codec]:
-        raise HyrfFormatError(f"it cannot have codec {codec}; the file is damaged, write it again")
+        raise HyrfFormatError(f"it cannot have codec {codec}", fix="the file is damaged, write it again")
     if group in DECODER_SECTIONS:
         return decode_groups(data, build_step_groups(group, config)).reshape(shape)
     if points is None:
-        raise HyrfFormatError(f"codec {codec} needs positions of codec {CODEC_POINTS}; write the file again")
+        raise HyrfFormatError(f"codec {codec} needs positions of codec {CODEC_POINTS}", fix="write the file again")
     if codec == CODEC_CHANNELS:
         return decode_channels(data, points, shape[1])
     return decode_groups(data, build_step_groups(group, config, points)).reshape(shape)

@@ -70,17 +70,17 @@ def decode(data: bytes, name: str) -> Splats:
         )
     rest = [f"f_rest_{index}" for index in range(len(properties_by_element.get("sh", {})))]
     if len(rest) not in (0, 9, 24, 45):
-        raise HyrfDataError(f"{name}: {len(rest)} properties of its element 'sh' fit no degree; 9, 24 or 45 do")
+        raise HyrfDataError(f"{name}: {len(rest)} properties of its element 'sh' fit no degree", fix="9, 24 or 45 do")
     _require_properties(properties_by_element, "sh", rest, "u1", name)
     if header.order == "=":
-        raise HyrfDataError(f"{name}: a compressed PLY file in text cannot be read; export it as a binary one")
+        raise HyrfDataError(f"{name}: a compressed PLY file in text cannot be read", fix="export it as a binary one")
     rows = read_elements(data, header, {"vertex", "chunk"} | ({"sh"} if rest else set()), name)
     vertex, chunk = rows["vertex"], rows["chunk"]
     count = len(vertex)
     if len(chunk) != -(-count // _GAUSSIANS_PER_CHUNK) or (rest and len(rows["sh"]) != count):
         raise HyrfDataError(
-            f"{name}: {len(chunk):,} chunks do not fit {count:,} Gaussians, {_GAUSSIANS_PER_CHUNK} each; "
-            "the file is damaged"
+            f"{name}: {len(chunk):,} chunks do not fit {count:,} Gaussians, {_GAUSSIANS_PER_CHUNK} each",
+            fix="the file is damaged",
         )
     color_and_opacity = _unpack_fractions(vertex["packed_color"], (24, 16, 8, 0), (8, 8, 8, 8))
     harmonics = np.empty((count, len(rest) // 3 + 1, 3), np.float32)
@@ -122,7 +122,8 @@ def _require_properties(
         if properties_by_element.get(element, {}).get(label) != kind:
             raise HyrfDataError(
                 f"{name}: its element '{element}' has no property {label} of the right type, so this is not a "
-                "compressed PLY file of Gaussians"
+                "compressed PLY file of Gaussians",
+                fix="export it again",
             )
 
 

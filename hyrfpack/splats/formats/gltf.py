@@ -70,7 +70,7 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
         HyrfDataError: there are no splats, or they do not fit into float32 or into 4 GiB.
     """
     if not len(splats):
-        raise HyrfDataError("there is no Gaussian, and glTF has no form for nothing; export at least one")
+        raise HyrfDataError("there is no Gaussian, and glTF has no form for nothing", fix="export at least one")
     origin, turn = local_origin(splats.positions), upright_rotation(hints.up, np.array(GLTF_UP))
     attributes = {"POSITION": local_positions(splats, origin)}
     attributes["COLOR_0"] = linear_colors(splats)
@@ -118,7 +118,8 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     if length > _MAX_FILE_BYTES:
         raise HyrfDataError(
             f"{len(splats):,} Gaussians of degree {splats.degree} come to {length:,} bytes and a .glb file holds "
-            f"{_MAX_FILE_BYTES:,}; lower `degree`"
+            f"{_MAX_FILE_BYTES:,}",
+            fix="lower `degree`",
         )
     head = _HEADER_STRUCT.pack(b"glTF", 2, length) + _CHUNK_HEADER_STRUCT.pack(len(text), _JSON_CHUNK_TYPE) + text
     return b"".join((head, _CHUNK_HEADER_STRUCT.pack(binary, _BINARY_CHUNK_TYPE), *parts))
@@ -145,13 +146,14 @@ def decode(data: bytes, name: str, *, upright: bool = False) -> Splats:
         found = list(_find_splat_primitives(content, name))
         if not found:
             raise HyrfDataError(
-                f"{name}: there are no Gaussian splats in it ({SPLATTING_EXTENSION}); name another file"
+                f"{name}: there are no Gaussian splats in it ({SPLATTING_EXTENSION})",
+                fix="name another file",
             )
         counts = [
             integer(_get_item(content, "accessors", item["attributes"]["POSITION"])["count"]) for _, item in found
         ]
         if sum(max(count, 0) for count in counts) * _MIN_BYTES_PER_SPLAT > len(data):
-            raise HyrfDataError(f"{name}: its nodes show the same splats many times; export each once")
+            raise HyrfDataError(f"{name}: its nodes show the same splats many times", fix="export each once")
         turn = np.eye(3) if upright else decompose_similarity(found[0][0], name)[1].T
         parts = [
             apply_transform(_read_primitive(content, binary, primitive, name), matrix, turn, name)
@@ -159,7 +161,8 @@ def decode(data: bytes, name: str, *, upright: bool = False) -> Splats:
         ]
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise HyrfDataError(
-            f"{name}: its parts do not fit together ({str(error) or type(error).__name__:.120}); export it again"
+            f"{name}: its parts do not fit together ({str(error) or type(error).__name__:.120})",
+            fix="export it again",
         ) from error
     return concatenate(parts)
 
@@ -195,30 +198,33 @@ def linear_colors(splats: Splats) -> np.ndarray:
 def _read_chunks(data: bytes, name: str) -> tuple[dict[str, Any], memoryview]:
     """Return the parsed JSON and the binary chunk, which is empty where the file has none."""
     if len(data) < _HEADER_STRUCT.size + _CHUNK_HEADER_STRUCT.size or data[:4] != b"glTF":
-        raise HyrfDataError(f"{name}: this is not a .glb file; check the path")
+        raise HyrfDataError(f"{name}: this is not a .glb file", fix="check the path")
     _, version, length = _HEADER_STRUCT.unpack_from(data)
     if version != 2 or length != len(data):
         raise HyrfDataError(
-            f"{name}: it says version {version} and {length:,} bytes, but version 2 is read and it has {len(data):,}; "
-            "export it again"
+            f"{name}: it says version {version} and {length:,} bytes, but version 2 is read and it has {len(data):,}",
+            fix="export it again",
         )
     chunks: dict[int, memoryview] = {}
     offset = _HEADER_STRUCT.size
     while offset < len(data):
         if offset + _CHUNK_HEADER_STRUCT.size > len(data):
-            raise HyrfDataError(f"{name}: it ends within the head of a chunk; the file is damaged")
+            raise HyrfDataError(f"{name}: it ends within the head of a chunk", fix="the file is damaged")
         size, kind = _CHUNK_HEADER_STRUCT.unpack_from(data, offset)
         offset += _CHUNK_HEADER_STRUCT.size
         if offset + size > len(data):
-            raise HyrfDataError(f"{name}: a chunk of {size:,} bytes goes past the end; the file is damaged")
+            raise HyrfDataError(f"{name}: a chunk of {size:,} bytes goes past the end", fix="the file is damaged")
         chunks.setdefault(kind, memoryview(data)[offset : offset + size])
         offset += size
     try:
         content = json.loads(bytes(chunks.get(_JSON_CHUNK_TYPE, memoryview(b""))))
     except (ValueError, RecursionError) as error:
-        raise HyrfDataError(f"{name}: its JSON cannot be read ({str(error):.120}); the file is damaged") from error
+        raise HyrfDataError(
+            f"{name}: its JSON cannot be read ({str(error):.120})",
+            fix="the file is damaged",
+        ) from error
     if not isinstance(content, dict):
-        raise HyrfDataError(f"{name}: its JSON is not an object; the file is damaged")
+        raise HyrfDataError(f"{name}: its JSON is not an object", fix="the file is damaged")
     return content, chunks.get(_BINARY_CHUNK_TYPE, memoryview(b""))
 
 
@@ -230,7 +236,7 @@ def _find_splat_primitives(content: dict[str, Any], name: str) -> Iterator[tuple
     while waiting:
         number, above = waiting.pop()
         if number in visited or len(visited) >= _MAX_NODES:
-            raise HyrfDataError(f"{name}: its nodes form no tree, or more than {_MAX_NODES:,}; export it again")
+            raise HyrfDataError(f"{name}: its nodes form no tree, or more than {_MAX_NODES:,}", fix="export it again")
         visited.add(number)
         node = _get_item(content, "nodes", number)
         matrix = above @ _local_transform(node)
@@ -259,8 +265,8 @@ def _read_primitive(content: dict[str, Any], binary: memoryview, primitive: dict
     kernel, space = extension.get("kernel"), extension.get("colorSpace")
     if kernel != "ellipse" or space != "srgb_rec709_display" or extension.get("extensions"):
         raise HyrfDataError(
-            f"{name}: kernel {kernel!r:.40} in {space!r:.40}, or an extension of them, is not read; export it as "
-            "'ellipse' in 'srgb_rec709_display'"
+            f"{name}: kernel {kernel!r:.40} in {space!r:.40}, or an extension of them, is not read",
+            fix="export it as 'ellipse' in 'srgb_rec709_display'",
         )
 
     def read(semantic: str, width: int) -> np.ndarray:
@@ -271,7 +277,8 @@ def _read_primitive(content: dict[str, Any], binary: memoryview, primitive: dict
     positions, scales = read("POSITION", 3), read(f"{SPLATTING_EXTENSION}:SCALE", 3)
     if (scales < 0).any():
         raise HyrfDataError(
-            f"{name}: there are negative scales, for it follows a draft with logarithms; export it again"
+            f"{name}: there are negative scales, for it follows a draft with logarithms",
+            fix="export it again",
         )
     quats, opacities = (
         read(f"{SPLATTING_EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]],
@@ -286,20 +293,23 @@ def _read_primitive(content: dict[str, Any], binary: memoryview, primitive: dict
 def _read_accessor(content: dict[str, Any], binary: memoryview, accessor: dict, width: int, name: str) -> np.ndarray:
     """Read an accessor as (count, width) float32; integers are normalised where the accessor says so."""
     if "sparse" in accessor or "bufferView" not in accessor:
-        raise HyrfDataError(f"{name}: sparse or absent data is not read; export it plainly")
+        raise HyrfDataError(f"{name}: sparse or absent data is not read", fix="export it plainly")
     view = _get_item(content, "bufferViews", accessor["bufferView"])
     buffer = _get_item(content, "buffers", view["buffer"])
     if integer(view["buffer"]) != 0 or "uri" in buffer or view.get("extensions"):
-        raise HyrfDataError(f"{name}: only plain data within the .glb file is read; pack it into one file")
+        raise HyrfDataError(f"{name}: only plain data within the .glb file is read", fix="pack it into one file")
     dtype = np.dtype(_DTYPE_BY_COMPONENT_TYPE[accessor["componentType"]])
     count, size = integer(accessor["count"]), width * dtype.itemsize
     start, length = integer(view.get("byteOffset", 0)), integer(view["byteLength"])
     offset, stride = integer(accessor.get("byteOffset", 0)), integer(view.get("byteStride", size))
     if _WIDTH_BY_ACCESSOR_TYPE[accessor["type"]] != width:
-        raise HyrfDataError(f"{name}: an attribute is {accessor['type']!r:.20}, not of width {width}; export it again")
+        raise HyrfDataError(
+            f"{name}: an attribute is {accessor['type']!r:.20}, not of width {width}",
+            fix="export it again",
+        )
     within = min(start, length, offset, count) >= 0 and start + length <= len(binary) and stride >= size
     if not within or (count and offset + stride * (count - 1) + size > length):
-        raise HyrfDataError(f"{name}: an attribute goes past the end of the data; the file is damaged")
+        raise HyrfDataError(f"{name}: an attribute goes past the end of the data", fix="the file is damaged")
     dtype = dtype.newbyteorder("<")
     values = np.ndarray((count, width), dtype, binary, start + offset, (stride, dtype.itemsize))
     if accessor.get("normalized") is True and dtype.kind in "iu":

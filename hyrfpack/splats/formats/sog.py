@@ -89,7 +89,8 @@ def encode_files(splats: Splats) -> dict[str, bytes]:
     count = len(splats)
     if count > _MAX_GAUSSIANS:
         raise HyrfDataError(
-            f"SOG: {count:,} Gaussians are too many, a file holds {_MAX_GAUSSIANS:,}; write a PLY instead"
+            f"SOG: {count:,} Gaussians are too many, a file holds {_MAX_GAUSSIANS:,}",
+            fix="write a PLY instead",
         )
     log_positions = np.sign(splats.positions) * np.log1p(np.abs(splats.positions))
     mins, maxs = (log_positions.min(0), log_positions.max(0)) if count else (np.zeros(3), np.zeros(3))
@@ -160,7 +161,7 @@ def unzip(data: bytes, name: str) -> dict[str, bytes]:
     except HyrfDataError:
         raise
     except Exception as error:  # zipfile passes on a dozen types of error from the modules that it uses
-        raise HyrfDataError(f"{name}: the zip cannot be unpacked ({error}); get the file again") from error
+        raise HyrfDataError(f"{name}: the zip cannot be unpacked ({error})", fix="get the file again") from error
     return files
 
 
@@ -198,7 +199,10 @@ def decode_files(files: Mapping[str, bytes], name: str) -> Splats:
     count = meta.get("count")
     size = sum(map(len, files.values()))
     if type(count) is not int or not 0 <= count <= min(_MAX_GAUSSIANS, size + _MAX_GAUSSIANS_WITHOUT_BYTES):
-        raise HyrfDataError(f"{name}: {META_NAME} gives {count!r:.40} as count of Gaussians in {size:,} bytes; damaged")
+        raise HyrfDataError(
+            f"{name}: {META_NAME} gives {count!r:.40} as count of Gaussians in {size:,} bytes",
+            fix="damaged",
+        )
 
     def pixels(group: str, number: int = 0) -> np.ndarray:
         file = _get_picture_name(meta, group, number, name)
@@ -207,7 +211,10 @@ def decode_files(files: Mapping[str, bytes], name: str) -> Splats:
         )
         picture = picture.reshape(-1, 4)
         if len(picture) < count:
-            raise HyrfDataError(f"{name}: {file} has {len(picture):,} pixels for {count:,} Gaussians; it is damaged")
+            raise HyrfDataError(
+                f"{name}: {file} has {len(picture):,} pixels for {count:,} Gaussians",
+                fix="it is damaged",
+            )
         return picture[:count]
 
     mins, maxs = (_get_floats(meta, "means", key, name, 3) for key in ("mins", "maxs"))
@@ -222,7 +229,10 @@ def decode_files(files: Mapping[str, bytes], name: str) -> Splats:
         palette = _read_palette(meta, files, name)
         labels = pixels("shN", 1)[:, :2] @ np.array((1, 256))
         if labels.max(initial=0) >= len(palette):
-            raise HyrfDataError(f"{name}: a label names row {labels.max()} of {len(palette)}; shN_labels is damaged")
+            raise HyrfDataError(
+                f"{name}: a label names row {labels.max()} of {len(palette)}",
+                fix="shN_labels is damaged",
+            )
         harmonics = np.concatenate((harmonics, palette[labels]), axis=1)
     quats = _unpack_quats(pixels("quats"), name)
     opacities = colors[:, 3] / np.float32(255)
@@ -288,7 +298,7 @@ def _read_palette(meta: dict, files: Mapping[str, bytes], name: str) -> np.ndarr
     picture = _read_picture(_get_file(files, file, name), _MAX_PALETTE_ROWS * 15, f"{name}: {file}")[..., :3]
     height, width, _ = picture.shape
     if width not in (64 * 3, 64 * 8, 64 * 15) or height * _PALETTE_ROWS_PER_PICTURE_ROW > _MAX_PALETTE_ROWS:
-        raise HyrfDataError(f"{name}: {file} is {width} x {height}, no palette of degree 1 to 3; it is damaged")
+        raise HyrfDataError(f"{name}: {file} is {width} x {height}, no palette of degree 1 to 3", fix="it is damaged")
     return _look_up_codebook(meta, "shN", picture.reshape(height * _PALETTE_ROWS_PER_PICTURE_ROW, -1, 3), name)
 
 
@@ -302,7 +312,10 @@ def _unpack_quats(packed: np.ndarray, name: str) -> np.ndarray:
     """Unpack bytes (N, 4) into quaternions (N, 4) wxyz."""
     tags = packed[:, 3]
     if tags.min(initial=255) < 252:
-        raise HyrfDataError(f"{name}: a rotation has the tag {tags.min()}, not 252 to 255; its picture is damaged")
+        raise HyrfDataError(
+            f"{name}: a rotation has the tag {tags.min()}, not 252 to 255",
+            fix="its picture is damaged",
+        )
     return restore_largest(tags - 252, (packed[:, :3] / 127.5 - 1) * math.sqrt(0.5))
 
 
@@ -322,24 +335,27 @@ def _read_picture(data: bytes, max_pixels: int, name: str) -> np.ndarray:
                 # The size is checked before the pixels are decoded.
                 if picture.width * picture.height > max_pixels or picture.mode not in ("RGB", "RGBA"):
                     found = f"{picture.width} x {picture.height} pixels of {picture.mode}"
-                    raise HyrfDataError(f"{name} has {found}, not RGB or too many; it is damaged")
+                    raise HyrfDataError(f"{name} has {found}, not RGB or too many", fix="it is damaged")
                 return np.asarray(picture.convert("RGBA"))
     except HyrfDataError:
         raise
     except Exception as error:  # picture decoders raise many types of error
-        raise HyrfDataError(f"{name} is not a picture that can be read; get the file again") from error
+        raise HyrfDataError(f"{name} is not a picture that can be read", fix="get the file again") from error
 
 
 def _find_member(archive: zipfile.ZipFile, file: str, bytes_left: int, name: str) -> zipfile.ZipInfo:
     """Find a file in the zip and check that it has at most `bytes_left` bytes and a method that unpacks in pieces."""
     if file not in archive.NameToInfo:
-        raise HyrfDataError(f"{name}: the zip has no {file}; it is not a SOG, or damaged")
+        raise HyrfDataError(f"{name}: the zip has no {file}", fix="it is not a SOG, or damaged")
     member = archive.getinfo(file)
     if member.file_size > bytes_left:
-        raise HyrfDataError(f"{name}: {file} unpacks to {member.file_size:,} bytes, far too many; it is damaged")
+        raise HyrfDataError(f"{name}: {file} unpacks to {member.file_size:,} bytes, far too many", fix="it is damaged")
     # Other methods ignore the declared size when they unpack.
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise HyrfDataError(f"{name}: {file} is packed by method {member.compress_type}; zip it stored or deflated")
+        raise HyrfDataError(
+            f"{name}: {file} is packed by method {member.compress_type}",
+            fix="zip it stored or deflated",
+        )
     return member
 
 
@@ -347,23 +363,24 @@ def _get_file(files: Mapping[str, bytes], file: str, name: str) -> bytes:
     try:
         return files[file]
     except KeyError:
-        raise HyrfDataError(f"{name}: {file} is missing; put it beside the others") from None
+        raise HyrfDataError(f"{name}: {file} is missing", fix="put it beside the others") from None
 
 
 def _parse_meta(data: bytes, name: str) -> dict:
     """Parse a meta.json of version 2."""
     if len(data) > _MAX_META_BYTES:
-        raise HyrfDataError(f"{name}: {META_NAME} has {len(data):,} bytes, far too many; it is damaged")
+        raise HyrfDataError(f"{name}: {META_NAME} has {len(data):,} bytes, far too many", fix="it is damaged")
     try:
         meta = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise HyrfDataError(f"{name}: {META_NAME} is not JSON ({error}); get the file again") from error
+        raise HyrfDataError(f"{name}: {META_NAME} is not JSON ({error})", fix="get the file again") from error
     if not isinstance(meta, dict):
-        raise HyrfDataError(f"{name}: {META_NAME} holds no SOG; it is damaged")
+        raise HyrfDataError(f"{name}: {META_NAME} holds no SOG", fix="it is damaged")
     version = meta.get("version", 1)  # files of version 1 lack the key
     if version != 2:
         raise HyrfDataError(
-            f"{name}: this is SOG version {version!r:.40} and 2 is read; convert it with splat-transform"
+            f"{name}: this is SOG version {version!r:.40} and 2 is read",
+            fix="convert it with splat-transform",
         )
     return meta
 
@@ -381,7 +398,10 @@ def _get_picture_name(meta: dict, group: str, number: int, name: str) -> str:
     listed = meta[group].get("files") if isinstance(meta.get(group), dict) else None
     file = listed[number] if isinstance(listed, list) and number < len(listed) else None
     if not isinstance(file, str) or not file.isprintable() or file in ("", "..") or set(file) & set("/\\:"):
-        raise HyrfDataError(f"{name}: {META_NAME} names {file!r:.80} as picture {number + 1} of {group}; it is damaged")
+        raise HyrfDataError(
+            f"{name}: {META_NAME} names {file!r:.80} as picture {number + 1} of {group}",
+            fix="it is damaged",
+        )
     return file
 
 
@@ -392,7 +412,7 @@ def _get_floats(meta: dict, group: str, key: str, name: str, length: int) -> np.
     is_first_missing = length == _CODEBOOK_ENTRIES and values[0] is None  # as some old writers leave it
     # Numbers beyond float32 are as useless here as infinite ones.
     if not all(type(value) in (int, float) and abs(value) < 1e38 for value in values[is_first_missing:]):
-        raise HyrfDataError(f"{name}: {META_NAME} needs {length} finite numbers as {group}.{key}; it is damaged")
+        raise HyrfDataError(f"{name}: {META_NAME} needs {length} finite numbers as {group}.{key}", fix="it is damaged")
     if is_first_missing:
         values[0] = values[1] + (values[1] - values[-1]) / 255  # the value that PlayCanvas restores
     return np.array(values, np.float64)

@@ -32,7 +32,10 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
         HyrfDataError: a position is too large for float32.
     """
     if np.abs(splats.positions).max(initial=0) > np.finfo(np.float32).max:
-        raise HyrfDataError("a Gaussian lies farther from the origin than .splat's numbers reach; move the scene there")
+        raise HyrfDataError(
+            "a Gaussian lies farther from the origin than .splat's numbers reach",
+            fix="move the scene there",
+        )
     order = np.argsort(-splats.opacities * np.prod(splats.scales, axis=1, dtype=np.float64), kind="stable")
     colors = splats.base_colors
     records = np.empty(len(splats), _RECORD_DTYPE)
@@ -55,12 +58,12 @@ def decode(data: bytes, name: str) -> Splats:
     """
     if len(data) % _RECORD_DTYPE.itemsize:
         raise HyrfDataError(
-            f"{name}: {len(data):,} bytes are not a whole number of Gaussians of 32 bytes; this is not a .splat file, "
-            "or it is truncated"
+            f"{name}: {len(data):,} bytes are not a whole number of Gaussians of 32 bytes",
+            fix="this is not a .splat file, or it is truncated",
         )
     records = np.frombuffer(data, _RECORD_DTYPE)
     if (records["scale"] < 0).any():
-        raise HyrfDataError(f"{name}: a scale is negative; this is not a .splat file, or it is damaged")
+        raise HyrfDataError(f"{name}: a scale is negative", fix="this is not a .splat file, or it is damaged")
     colors = records["color"] / np.float32(255)
     return build_valid_splats(
         name,

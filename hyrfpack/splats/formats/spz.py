@@ -143,7 +143,10 @@ def decode(data: bytes, name: str) -> Splats:
     elif data[:4] == _MAGIC:
         unpacked = _read_streams(data, name)
     else:
-        raise HyrfDataError(f"{name}: this is not an SPZ file, for it starts with neither gzip's nor SPZ's own mark")
+        raise HyrfDataError(
+            f"{name}: this is not an SPZ file, because it starts with neither gzip's nor SPZ's own mark",
+            fix="check the path",
+        )
     version, degree, bits, flags, sections = unpacked
     positions, opacities, colors, scales, quats, harmonics = (np.frombuffer(part, np.uint8) for part in sections)
     count = len(opacities)
@@ -184,25 +187,30 @@ def _read_header(header: bytes, versions: range, stored: int, name: str) -> tupl
     """
     magic, version, count, degree, bits, flags, _ = _HEADER_STRUCT.unpack(header)
     if magic != _MAGIC:
-        raise HyrfDataError(f"{name}: this is not an SPZ file, for its contents do not start with 'NGSP'")
+        raise HyrfDataError(
+            f"{name}: this is not an SPZ file, because its contents do not start with 'NGSP'", fix="check the path"
+        )
     if version not in versions:
         raise HyrfDataError(
-            f"{name}: this is SPZ version {version}, and versions 1 to 3 (gzip) and 4 (plain header) can be read; "
-            "export it as one of these"
+            f"{name}: this is SPZ version {version}, and versions 1 to 3 (gzip) and 4 (plain header) can be read",
+            fix="export it as one of these",
         )
     if degree > _MAX_FILE_DEGREE or bits > 31:
         raise HyrfDataError(
             f"{name}: its header says harmonics of degree {degree} and {bits} fractional bits, and 4 and 31 are the "
-            "most; the file is damaged"
+            "most",
+            fix="the file is damaged",
         )
     if flags & _LOD_TREE_FLAG:
         raise HyrfDataError(
-            f"{name}: this SPZ file holds a tree of coarse copies for levels of detail; export it without them"
+            f"{name}: this SPZ file holds a tree of coarse copies for levels of detail",
+            fix="export it without them",
         )
     length = sum(_section_lengths(version, count, degree))
     if length > _UNCHECKED_CONTENT_BYTES and length > _MAX_COMPRESSION_RATIO * stored:
         raise HyrfDataError(
-            f"{name}: its header says {count:,} Gaussians, far more than {stored:,} bytes can hold; the file is damaged"
+            f"{name}: its header says {count:,} Gaussians, far more than {stored:,} bytes can hold",
+            fix="the file is damaged",
         )
     return version, count, degree, bits, flags
 
@@ -239,17 +247,17 @@ def _read_gzip(data: bytes, name: str) -> _UnpackedFile:
     try:
         header = stream.decompress(data, _HEADER_STRUCT.size)
         if len(header) < _HEADER_STRUCT.size:
-            raise HyrfDataError(f"{name}: the file ends within its header; it is truncated")
+            raise HyrfDataError(f"{name}: the file ends within its header", fix="it is truncated")
         version, count, degree, bits, flags = _read_header(header, range(1, 4), len(data), name)
         lengths = _section_lengths(version, count, degree)
         content = stream.decompress(stream.unconsumed_tail, sum(lengths) + 1)
     except zlib.error as error:
-        raise HyrfDataError(f"{name}: its gzip stream is damaged ({error}); fetch or export it again") from error
+        raise HyrfDataError(f"{name}: its gzip stream is damaged ({error})", fix="fetch or export it again") from error
     has_more = len(content) > sum(lengths)
     if len(content) < sum(lengths) or not (stream.eof or has_more):
-        raise HyrfDataError(f"{name}: the file ends before its {count:,} Gaussians do; it is truncated")
+        raise HyrfDataError(f"{name}: the file ends before its {count:,} Gaussians do", fix="it is truncated")
     if has_more and not flags & _EXTENSIONS_FLAG:
-        raise HyrfDataError(f"{name}: the file goes on after its {count:,} Gaussians; it is damaged")
+        raise HyrfDataError(f"{name}: the file goes on after its {count:,} Gaussians", fix="it is damaged")
     ends = np.cumsum([0, *lengths])
     sections = [content[start:end] for start, end in zip(ends[:-1], ends[1:], strict=True)]
     return version, degree, bits, flags, sections
@@ -258,29 +266,29 @@ def _read_gzip(data: bytes, name: str) -> _UnpackedFile:
 def _read_streams(data: bytes, name: str) -> _UnpackedFile:
     """Read the sections of a file of version 4."""
     if len(data) < _HEADER_STRUCT.size + _TABLE_OFFSET_STRUCT.size:
-        raise HyrfDataError(f"{name}: the file ends within its header; it is truncated")
+        raise HyrfDataError(f"{name}: the file ends within its header", fix="it is truncated")
     version, count, degree, bits, flags = _read_header(data[: _HEADER_STRUCT.size], range(4, 5), len(data), name)
     streams = data[_HEADER_STRUCT.size - 1]
     (table,) = _TABLE_OFFSET_STRUCT.unpack_from(data, _HEADER_STRUCT.size)
     lengths = _section_lengths(version, count, degree)
     if streams != sum(length > 0 for length in lengths):
         raise HyrfDataError(
-            f"{name}: {streams} streams do not fit harmonics of degree {degree} and {count:,} Gaussians; "
-            "the file is damaged"
+            f"{name}: {streams} streams do not fit harmonics of degree {degree} and {count:,} Gaussians",
+            fix="the file is damaged",
         )
     place = table + streams * _STREAM_LENGTHS_STRUCT.size
     if table < _HEADER_STRUCT.size + _TABLE_OFFSET_STRUCT.size or place > len(data):
-        raise HyrfDataError(f"{name}: its table of contents lies outside of the file; it is damaged or truncated")
+        raise HyrfDataError(f"{name}: its table of contents lies outside of the file", fix="it is damaged or truncated")
     sections, entries = [], _STREAM_LENGTHS_STRUCT.iter_unpack(data[table:place])
     for length in lengths:
         stored, raw = next(entries) if length else (0, 0)
         if raw != length:
             raise HyrfDataError(
-                f"{name}: a stream of {raw:,} bytes stands where {count:,} Gaussians need {length:,}; the file is "
-                "damaged"
+                f"{name}: a stream of {raw:,} bytes stands where {count:,} Gaussians need {length:,}",
+                fix="the file is damaged",
             )
         if stored > len(data) - place:
-            raise HyrfDataError(f"{name}: the file ends before its {count:,} Gaussians do; it is truncated")
+            raise HyrfDataError(f"{name}: the file ends before its {count:,} Gaussians do", fix="it is truncated")
         sections.append(_decompress_zstd(data[place : place + stored], length, name))
         place += stored
     return version, degree, bits, flags, sections
@@ -294,9 +302,12 @@ def _decompress_zstd(stream: bytes, length: int, name: str) -> bytes:
         with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(stream) as reader:
             content = reader.read(length + 1)
     except zstandard.ZstdError as error:
-        raise HyrfDataError(f"{name}: one of its zstd streams is damaged ({error}); export it again") from error
+        raise HyrfDataError(f"{name}: one of its zstd streams is damaged ({error})", fix="export it again") from error
     if len(content) != length:
-        raise HyrfDataError(f"{name}: a zstd stream does not hold the {length:,} bytes it should; the file is damaged")
+        raise HyrfDataError(
+            f"{name}: a zstd stream does not hold the {length:,} bytes it should",
+            fix="the file is damaged",
+        )
     return content
 
 
@@ -314,8 +325,8 @@ def _choose_fractional_bits(positions: np.ndarray) -> int:
         if np.rint(farthest * 2**bits) < 1 << 23:
             return bits
     raise HyrfDataError(
-        f"a Gaussian lies {farthest:,.0f} units from the origin, and SPZ reaches {MAX_COORDINATE:,}; "
-        "export another format (PLY)"
+        f"a Gaussian lies {farthest:,.0f} units from the origin, and SPZ reaches {MAX_COORDINATE:,}",
+        fix="export another format (PLY)",
     )
 
 

@@ -122,17 +122,18 @@ def decode(data: bytes, name: str, extension: Extension, *, upright: bool = Fals
         try:
             layer = Sdf.Layer.OpenAsAnonymous(str(path))
             if layer is None or layer.GetCompositionAssetDependencies():
-                raise HyrfDataError(f"{name}: this is not a USD file, or it needs others; flatten it into one")
+                raise HyrfDataError(f"{name}: this is not a USD file, or it needs others", fix="flatten it into one")
             stage = Usd.Stage.Open(layer)
             fields = [prim for prim in stage.Traverse() if prim.GetTypeName() == _SPLATS_TYPE_NAME]
             if len(fields) != 1:
                 raise HyrfDataError(
-                    f"{name}: it holds {len(fields)} {_SPLATS_TYPE_NAME}, and one is read; name another file"
+                    f"{name}: it holds {len(fields)} {_SPLATS_TYPE_NAME}, and one is read",
+                    fix="name another file",
                 )
             return _read_splats(fields[0], name, upright)
         except Tf.ErrorException as error:
             reason = str(error).strip().splitlines()[-1:] or ["no reason given"]
-            raise HyrfDataError(f"{name}: usd-core cannot read it ({reason[0]:.160}); export it again") from error
+            raise HyrfDataError(f"{name}: usd-core cannot read it ({reason[0]:.160})", fix="export it again") from error
 
 
 def _add_transform(prim: UsdGeom.Xformable, rotation: np.ndarray, translation: np.ndarray) -> None:
@@ -208,7 +209,7 @@ def _pack_usdz(binary: bytes, name: str) -> bytes:
     padding = -header % _USDZ_ALIGNMENT_BYTES
     info.extra = (0x1986).to_bytes(2, "little") + padding.to_bytes(2, "little") + bytes(padding)
     if len(binary) + 2 * header + 512 > _MAX_USDZ_BYTES:
-        raise HyrfDataError(f"the scene comes to {len(binary):,} bytes, too many for .usdz; write .usdc")
+        raise HyrfDataError(f"the scene comes to {len(binary):,} bytes, too many for .usdz", fix="write .usdc")
     package = io.BytesIO()
     with zipfile.ZipFile(package, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr(info, binary)
@@ -224,11 +225,14 @@ def _read_splats(prim: Usd.Prim, name: str, upright: bool) -> Splats:
     def read(attribute: Usd.Attribute, *shape: int) -> np.ndarray:
         values = np.array(attribute.Get() if attribute.HasValue() else (), np.float32)
         if values.size % int(np.prod(shape)):
-            raise HyrfDataError(f"{name}: {attribute.GetName()} has a wrong length; export it again")
+            raise HyrfDataError(f"{name}: {attribute.GetName()} has a wrong length", fix="export it again")
         return values.reshape(-1, *shape)
 
     if not 0 <= degree <= MAX_DEGREE:
-        raise HyrfDataError(f"{name}: harmonics of degree {degree} are not read, 0 to {MAX_DEGREE} are; export it so")
+        raise HyrfDataError(
+            f"{name}: harmonics of degree {degree} are not read, 0 to {MAX_DEGREE} are",
+            fix="export it so",
+        )
     splats: dict[str, Any] = {
         "positions": read(field.GetPositionsAttr(), 3),
         "scales": read(field.GetScalesAttr(), 3),
@@ -238,10 +242,10 @@ def _read_splats(prim: Usd.Prim, name: str, upright: bool) -> Splats:
     }
     counts = {key: len(values) for key, values in splats.items()}
     if len(set(counts.values())) > 1:
-        raise HyrfDataError(f"{name}: its arrays have different lengths ({counts}); export it again")
+        raise HyrfDataError(f"{name}: its arrays have different lengths ({counts})", fix="export it again")
     matrix = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())).T
     turn = np.eye(3) if upright else decompose_similarity(matrix, name)[1].T
     try:
         return apply_transform(build_valid_splats(name, **splats), matrix, turn, name)
     except ValueError as error:
-        raise HyrfDataError(f"{name}: {error}; export it again") from error
+        raise HyrfDataError(f"{name}: {error}", fix="export it again") from error

@@ -42,6 +42,7 @@ def build_valid_splats(
             bad = int(np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))[0])
             raise HyrfDataError(
                 f"{name}: the {part} of Gaussian {bad:,} of {len(values):,} is not a finite number; the file is "
-                "damaged, or its training failed; export it again"
+                "damaged, or its training failed",
+                fix="export it again",
             )
     return Splats(positions, scales, normalized_quats(quats), opacities, harmonics, antialiased)
